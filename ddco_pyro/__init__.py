@@ -1,0 +1,1 @@
+"""Discovery of deep continuous options (DDCO) as a Pyro model."""
