@@ -1,0 +1,36 @@
+"""Exact inference in the AHMM: two engines for one likelihood, and what follows from it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ddco_pyro.ahmm import Tables, complete
+from ddco_pyro.inference import enumeration, fused
+from ddco_pyro.inference.posteriors import Posterior, posterior, segment
+
+__all__ = ["Engine", "Posterior", "log_likelihood", "posterior", "segment", "total_log_likelihood"]
+
+Engine = Literal["fused", "enumerate"]
+
+
+def log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") -> Tensor:
+    """log p(ξ) in nats of each trajectory, [N] float64, differentiable in the tables.
+
+    :param lengths: steps of each trajectory, [N]; whatever the tables hold beyond is ignored.
+    """
+    if engine == "fused":
+        return fused.log_likelihood(complete(tables, lengths))
+    one_by_one = [
+        enumeration.total_log_likelihood(complete(tables.trajectory(n, int(length)), lengths[n : n + 1]))
+        for n, length in enumerate(lengths)
+    ]
+    return torch.stack(one_by_one)
+
+
+def total_log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") -> Tensor:
+    """Σ_n log p(ξ_n), a scalar; with ``engine="enumerate"`` in one elimination for the whole batch."""
+    chain = complete(tables, lengths)
+    return enumeration.total_log_likelihood(chain) if engine == "enumerate" else fused.log_likelihood(chain).sum()
