@@ -189,21 +189,26 @@ def _with_emission(level: LevelSpec, default: Emission) -> LevelSpec:
     return level.model_copy(update={"policy": level.policy.model_copy(update={"emits": emits})})
 
 
+Kind = Literal["flat", "per_timestep"]
+
+
 class BaselineSpec(_Model):
     """A policy without options, trained by behaviour cloning."""
 
-    kind: Literal["flat", "per_timestep"]
+    kind: Kind
     """``flat``: one policy for all times; ``per_timestep``: one policy for each time step."""
     policy: NetworkSpec = NetworkSpec()
     """The policy's network, π."""
 
 
-def _bare(key: str) -> BeforeValidator:
-    """Reads a bare string as ``{key: that}``."""
-    return BeforeValidator(lambda value: {key: value} if isinstance(value, str) else value)
+def _bare(key: str, allowed: Any) -> BeforeValidator:
+    """Reads a bare string as ``{key: that}``; ``allowed`` is the type that the JSON Schema shows."""
+    return BeforeValidator(
+        lambda value: {key: value} if isinstance(value, str) else value, json_schema_input_type=allowed
+    )
 
 
-Baseline = Annotated[BaselineSpec, _bare("kind")]
+Baseline = Annotated[BaselineSpec, _bare("kind", Kind | BaselineSpec)]
 
 # --- data and control -------------------------------------------------------------------------------------------------
 
@@ -236,7 +241,7 @@ class ObservationSpec(_Model):
     """Shift and scale to mean 0 and standard deviation 1 over the training demonstrations."""
 
 
-Observation = Annotated[ObservationSpec, _bare("key")]
+Observation = Annotated[ObservationSpec, _bare("key", str | ObservationSpec)]
 
 
 class LearnedStd(_Model):
@@ -663,7 +668,7 @@ def _nearest(given: Any, names: Iterable[str]) -> str:
 
 
 def _suggestion(parts: list[str]) -> str:
-    """The valid key nearest to an unknown one, beside it or of the same name elsewhere; else all that are valid there."""
+    """The valid key nearest to an unknown one: beside it, or of the same name elsewhere; else all that are valid."""
     *above, wrong = parts
     valid = [key for model in _models_at(above) for key in model.model_fields]
     close = difflib.get_close_matches(wrong, valid, n=1)

@@ -1,0 +1,491 @@
+"""The spec: what it accepts, what it refuses and in which words, and that writing and reading it changes nothing."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from ddco_pyro.spec import (
+    HierarchySpec,
+    LearnedStd,
+    LevelSpec,
+    Spec,
+    SpecError,
+    dump_spec,
+    load_spec,
+    parse_spec,
+    spec_schema,
+    with_overrides,
+)
+
+EXAMPLE = """\
+task: needle
+demonstrations: {count: 100, seed: 0}
+observations: [gripper_pose, needle_ellipse]
+control: {std: 0.1}
+hierarchy:
+  levels:
+    - name: option
+      count: 5
+      policy: {network: mlp, hidden: [64], dropout: 0.0}
+      termination: {network: linear}
+  meta_policy: {network: mlp, hidden: [64], emits: [options]}
+training:
+  initialize: vq
+  layerwise: true
+  optimizer: {name: adam, lr: 1.0e-3}
+  epochs: 200
+  batch_size: 16
+  restarts: 1
+inference: {engine: fused}
+selection: {folds: 10, grid: {hierarchy.levels.0.count: [1, 2, 3, 4, 5, 6, 7, 8]}}
+rollout: {episodes: 50}
+seed: 0
+"""
+
+SMALL = {"task": "needle", "observations": ["pose"], "hierarchy": {"levels": [{"count": 5}]}}
+
+
+def write(folder: Path, text: str | bytes) -> Path:
+    path = folder / "spec.yaml"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return path
+
+
+def refusal(overrides: dict[str, Any]) -> str:
+    with pytest.raises(SpecError) as caught:
+        parse_spec(SMALL, overrides)
+    return str(caught.value)
+
+
+# --- what it accepts --------------------------------------------------------------------------------------------------
+
+
+def test_the_example_of_the_documentation_is_read(tmp_path: Path) -> None:
+    spec = load_spec(write(tmp_path, EXAMPLE))
+    assert spec.hierarchy is not None
+    (level,) = spec.hierarchy.levels
+    assert (level.name, level.count, level.policy.hidden) == ("option", 5, (64,))
+    assert (level.policy.emits, spec.hierarchy.meta_policy.emits) == (("control",), ("options",))
+    assert [observation.key for observation in spec.observations] == ["gripper_pose", "needle_ellipse"]
+    assert spec.selection.grid == {"hierarchy.levels.0.count": (1, 2, 3, 4, 5, 6, 7, 8)}
+
+
+def test_defaults() -> None:
+    spec = parse_spec(SMALL)
+    assert (spec.control.std, spec.control.scale) == (0.1, "standardize")
+    assert (spec.demonstrations.count, spec.demonstrations.supervisor) == (100, "supervisor")
+    assert (spec.training.epochs, spec.training.patience, spec.training.clip_gradient) == (200, 20, None)
+    assert (spec.inference.engine, spec.rollout.seed, spec.baseline, spec.compare_with) == ("fused", 1000, None, ())
+    assert spec.hierarchy is not None
+    assert spec.hierarchy.levels[0].termination.network == "linear"
+    assert spec.hierarchy.levels[0].termination.hidden == ()
+
+
+def test_higher_levels_select_from_below_unless_told_otherwise() -> None:
+    levels = [
+        {"count": 2},
+        {"name": "b", "count": 2},
+        {"name": "c", "count": 2, "policy": {"emits": ["options", "control"]}},
+    ]
+    spec = parse_spec(SMALL, {"hierarchy.levels": levels})
+    assert spec.hierarchy is not None
+    assert [level.policy.emits for level in spec.hierarchy.levels] == [
+        ("control",),
+        ("options",),
+        ("options", "control"),
+    ]
+
+
+def test_a_hierarchy_made_in_python_is_completed_too() -> None:
+    hierarchy = HierarchySpec(levels=(LevelSpec(count=2), LevelSpec(name="upper", count=3)))
+    assert [level.policy.emits for level in hierarchy.levels] == [("control",), ("options",)]
+
+
+def test_a_bare_string_stands_for_a_mapping() -> None:
+    data = {"demonstrations": {"path": "demos.hdf5"}, "observations": ["pose"], "baseline": "flat"}
+    spec = parse_spec({**data, "compare_with": ["per_timestep"]})
+    assert spec.baseline is not None
+    assert (spec.baseline.kind, spec.baseline.policy.hidden) == ("flat", (64,))
+    assert [baseline.kind for baseline in spec.compare_with] == ["per_timestep"]
+
+
+def test_std_is_a_number_or_learned() -> None:
+    assert parse_spec(SMALL, {"control.std": 1}).control.std == 1.0
+    assert parse_spec(SMALL, {"control.std": {"learn": True}}).control.std == LearnedStd(learn=True, floor=0.01)
+    assert parse_spec(SMALL, {"control.scale": [1, 0.5]}).control.scale == (1.0, 0.5)
+
+
+def test_a_network_of_ones_own_takes_options() -> None:
+    network = {"network": "my_package.nets:Net", "options": {"width": 3, "names": ["a", "b"]}}
+    spec = parse_spec(SMALL, {"hierarchy.meta_policy": network})
+    assert spec.hierarchy is not None
+    assert spec.hierarchy.meta_policy.options == {"width": 3, "names": ["a", "b"]}
+
+
+def test_a_spec_is_frozen() -> None:
+    spec = parse_spec(SMALL)
+    with pytest.raises(ValidationError, match="frozen"):
+        spec.seed = 3  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("1e-3", 1e-3), ("1E5", 1e5), (".5", 0.5), ("1.0e-3", 1e-3), ("5.e-1", 0.5), ("2", 2.0), ("+.5e0", 0.5)],
+)
+def test_numbers_are_read_as_numbers(tmp_path: Path, text: str, value: float) -> None:
+    path = write(tmp_path, EXAMPLE.replace("lr: 1.0e-3", f"lr: {text}"))
+    assert load_spec(path).training.optimizer.lr == value
+
+
+# --- what it refuses --------------------------------------------------------------------------------------------------
+
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"hierarchy.levels.0.count": 0}, "hierarchy.levels.0.count: must be at least 1, got 0"),
+    ({"hierarchy.levels.0.count": "5"}, "hierarchy.levels.0.count: must be a whole number, got '5'"),
+    ({"hierarchy.levels.0.count": 5.0}, "hierarchy.levels.0.count: must be a whole number, got 5.0"),
+    ({"hierarchy.levels.0.count": True}, "hierarchy.levels.0.count: must be a whole number, got true"),
+    (
+        {"hierarchy.levels.0": {"name": "a"}},
+        "hierarchy.levels.0.count: missing; it has to be given",
+    ),
+    ({"hierarchy.levels": []}, "hierarchy.levels: must have at least 1 item(s), got []"),
+    ({"hierarchy.levels": {"count": 3}}, "hierarchy.levels: must be a list, got {'count': 3}"),
+    (
+        {"hierarchy.levels.0.cuont": 5},
+        "hierarchy.levels.0.cuont: unknown key; did you mean hierarchy.levels.0.count?",
+    ),
+    ({"epochs": 3}, "epochs: unknown key; did you mean training.epochs?"),
+    (
+        {"inference.xyz": 3},
+        "inference.xyz: unknown key; valid here: engine",
+    ),
+    (
+        {"hierarchy.levels": [{"count": 1}, {"count": 2}]},
+        "hierarchy.levels.1.name: 'option' is also the name of level 0; give each level its own",
+    ),
+    (
+        {"hierarchy.levels.0.name": "a b"},
+        "hierarchy.levels.0.name: must be letters, digits, '_' or '-', a letter first, got 'a b'",
+    ),
+    (
+        {"hierarchy.levels.0.policy.emits": []},
+        "hierarchy.levels.0.policy.emits: must have at least 1 item(s), got []",
+    ),
+    (
+        {"hierarchy.levels.0.policy.emits": ["options", "control"]},
+        "hierarchy.levels.0.policy.emits: the lowest level emits the control and nothing else; leave it out",
+    ),
+    (
+        {"hierarchy.meta_policy.emits": ["option"]},
+        "hierarchy.meta_policy.emits.0: must be options or control, got 'option' (did you mean options?)",
+    ),
+    (
+        {"hierarchy.meta_policy.emits": ["options", "options"]},
+        "hierarchy.meta_policy.emits: 'options' is given twice; keep one",
+    ),
+    (
+        {"hierarchy.meta_policy.network": "mpl"},
+        "hierarchy.meta_policy.network: no network is called 'mpl' (did you mean mlp?); "
+        "use one of linear, mlp, per_timestep, conv, module:Class",
+    ),
+    (
+        {"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}},
+        "hierarchy.meta_policy.hidden: does not apply to network 'linear'; leave it out",
+    ),
+    (
+        {"hierarchy.meta_policy": {"network": "mlp", "options": {"a": 1}}},
+        "hierarchy.meta_policy.options: does not apply to network 'mlp'; leave it out",
+    ),
+    ({"hierarchy.meta_policy.hidden": [8, 0]}, "hierarchy.meta_policy.hidden.1: must be at least 1, got 0"),
+    ({"hierarchy.meta_policy.dropout": 1}, "hierarchy.meta_policy.dropout: must be less than 1, got 1"),
+    ({"hierarchy": None}, "hierarchy: missing; declare a hierarchy, or a baseline in its place"),
+    (
+        {"baseline": "flat"},
+        "baseline: stands beside hierarchy; keep one of them (compare_with takes baselines to train beside)",
+    ),
+    ({"compare_with": ["flt"]}, "compare_with.0.kind: must be flat or per_timestep, got 'flt' (did you mean flat?)"),
+    ({"compare_with": [3]}, "compare_with.0: must be a mapping (key: value), got 3"),
+    ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),
+    ({"task": ""}, "task: must not be empty, got ''"),
+    ({"observations": []}, "observations: must have at least 1 item(s), got []"),
+    ({"observations": "pose"}, "observations: must be a list, got 'pose'"),
+    ({"observations": ["a", "a"]}, "observations.1.key: 'a' is given twice; keep one"),
+    ({"control.std": -0.1}, "control.std: must be a positive number or {learn: true}, got -0.1"),
+    ({"control.std": "0.1"}, "control.std: must be a positive number or {learn: true}, got '0.1'"),
+    ({"control.std": {"learn": False}}, "control.std.learn: must be true, got false"),
+    (
+        {"control.std": {"learn": True, "flor": 1}},
+        "control.std.flor: unknown key; did you mean control.std.floor?",
+    ),
+    (
+        {"control.scale": "standardise"},
+        "control.scale: must be standardize, none, or a list of positive numbers, got 'standardise' "
+        "(did you mean standardize?)",
+    ),
+    ({"control.scale": [1.0, 0.0]}, "control.scale.1: must be greater than 0, got 0.0"),
+    (
+        {"training.optimizer.name": "Adam"},
+        "training.optimizer.name: must be adam or momentum, got 'Adam' (did you mean adam?)",
+    ),
+    ({"training.optimizer.lr": float("inf")}, "training.optimizer.lr: must be a finite number, got inf"),
+    ({"training.layerwise": "yes"}, "training.layerwise: must be true or false, got 'yes'"),
+    ({"training": None}, "training: must be a mapping (key: value), got null"),
+    ({"seed": -1}, "seed: must be at least 0, got -1"),
+    ({"seed": 2**32}, "seed: must be at most 4294967295, got 4294967296"),
+    ({"demonstrations.valid_fraction": 0}, "demonstrations.valid_fraction: must be greater than 0, got 0"),
+    (
+        {"hierarchy.levels.0.policy.network": None},
+        "hierarchy.levels.0.policy.network: must be text, got null",
+    ),
+]
+
+
+@pytest.mark.parametrize(("overrides", "message"), REFUSED, ids=[message.partition(",")[0] for _, message in REFUSED])
+def test_refused_with_the_key_path_and_one_line(overrides: dict[str, Any], message: str) -> None:
+    assert refusal(overrides) == message
+
+
+def test_every_problem_has_its_line() -> None:
+    message = refusal({"seed": "a", "hierarchy.levels.0.count": 0, "traning": {}})
+    assert message.splitlines() == [
+        "hierarchy.levels.0.count: must be at least 1, got 0",
+        "seed: must be a whole number, got 'a'",
+        "traning: unknown key; did you mean training?",
+    ]
+
+
+def test_keys_that_are_not_text_are_refused() -> None:
+    with pytest.raises(SpecError, match=r"^selection\.grid\.3: a key must be text"):
+        parse_spec({**SMALL, "selection": {"grid": {3: [1]}}})
+    with pytest.raises(SpecError, match=r"^3: a key must be text"):
+        parse_spec({**SMALL, 3: 4})  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize(
+    ("grid", "message"),
+    [
+        (
+            {"hierarchy.levels.0.count": [1, 0]},
+            "selection.grid.hierarchy.levels.0.count: value 0: hierarchy.levels.0.count: must be at least 1, got 0",
+        ),
+        (
+            {"hierarchy.levels.0.cuont": [1]},
+            "selection.grid.hierarchy.levels.0.cuont: value 1: hierarchy.levels.0.cuont: unknown key; "
+            "did you mean hierarchy.levels.0.count?",
+        ),
+        (
+            {"hierarchy.levels.1.count": [1]},
+            "selection.grid.hierarchy.levels.1.count: value 1: hierarchy.levels.1.count: "
+            "'1' is not the number of one of the 1 items there (the first is 0)",
+        ),
+        (
+            {"selection.folds": [3]},
+            "selection.grid.selection.folds: the selection cannot be part of its own grid; remove it",
+        ),
+        ({"seed": []}, "selection.grid.seed: must have at least 1 item(s), got []"),
+        ({"seed": 3}, "selection.grid.seed: must be a list, got 3"),
+    ],
+)
+def test_every_value_of_a_grid_has_to_be_valid_in_place(grid: dict[str, Any], message: str) -> None:
+    assert refusal({"selection.grid": grid}) == message
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "the file is empty; it has to hold a spec"),
+        ("# nothing but a comment\n", "the file is empty; it has to hold a spec"),
+        ("- a\n- b\n", "the file holds ['a', 'b'], not a mapping (key: value)"),
+        ("seed: 1\ntask: [a\n", "line 3, column 1: not valid YAML: expected ',' or ']', but got '<stream end>'"),
+        ("seed: 1\ntask: a\nseed: 2\n", "line 3, column 1: not valid YAML: key 'seed' is given twice"),
+        ("control:\n  std: 1\n  std: 2\n", "line 3, column 3: not valid YAML: key 'std' is given twice"),
+        ("a: *b\n", "line 1, column 4: not valid YAML: found undefined alias 'b'"),
+        ("a: &x {b: *x}\n", "not valid YAML: nested too deeply"),
+        ("[" * 5000, "not valid YAML: nested too deeply"),
+        ("seed: !!python/name:os.system\n", "could not determine a constructor for the tag"),
+        (b"\x89HDF\r\n\x1a\n\x00\x00", "not valid YAML: "),
+        ("seed: 2024-13-45\n", "not valid YAML: "),
+    ],
+)
+def test_files_that_hold_no_spec(tmp_path: Path, text: str | bytes, message: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(SpecError) as caught:
+        load_spec(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(SpecError, match=r"none\.yaml: cannot be read: No such file or directory; check the path"):
+        load_spec(tmp_path / "none.yaml")
+    with pytest.raises(SpecError, match="cannot be read: Is a directory"):
+        load_spec(tmp_path)
+
+
+# --- overrides --------------------------------------------------------------------------------------------------------
+
+
+def test_overrides_are_applied_to_the_file(tmp_path: Path) -> None:
+    overrides = ["hierarchy.levels.0.count=3", "training.optimizer.lr=1e-2", "observations.1.differences=true"]
+    spec = load_spec(write(tmp_path, EXAMPLE), [*overrides, "rollout={episodes: 2, policies: [open_loop]}"])
+    assert spec.hierarchy is not None
+    assert spec.hierarchy.levels[0].count == 3
+    assert spec.training.optimizer.lr == 0.01
+    assert (spec.observations[1].key, spec.observations[1].differences) == ("needle_ellipse", True)
+    assert (spec.rollout.episodes, spec.rollout.policies) == (2, ("open_loop",))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("seed", "override 'seed': write it as key.path=value"),
+        ("=3", "override '=3': write it as key.path=value"),
+        ("seed=[1", "override 'seed=[1': line 1, column 3: not valid YAML"),
+        (
+            "control.std.learn=true",
+            "control.std.learn: cannot be set, because control.std is 0.1; set the whole of control.std",
+        ),
+        (
+            "observations.x.key=a",
+            "observations.x.key: 'x' is not the number of one of the 2 items there (the first is 0)",
+        ),
+        ("seeed=1", "seeed: unknown key; did you mean seed?"),
+    ],
+)
+def test_overrides_that_cannot_be_applied(tmp_path: Path, override: str, message: str) -> None:
+    with pytest.raises(SpecError, match=re.escape(message)):
+        load_spec(write(tmp_path, EXAMPLE), [override])
+
+
+def test_with_overrides_leaves_the_original_alone(tmp_path: Path) -> None:
+    spec = load_spec(write(tmp_path, EXAMPLE))
+    before = dump_spec(spec)
+    other = with_overrides(spec, {"hierarchy.levels.0.count": 2, "selection.grid.hierarchy.levels.0.count": [2, 3]})
+    assert other.hierarchy is not None
+    assert other.hierarchy.levels[0].count == 2
+    assert other.selection.grid == {"hierarchy.levels.0.count": (2, 3)}
+    assert dump_spec(spec) == before
+    assert with_overrides(spec, {}) == spec
+
+
+def test_another_network_drops_the_settings_of_the_old_one() -> None:
+    data = {**SMALL, "hierarchy": {"levels": [{"count": 5, "policy": {"hidden": [8, 8]}}]}}
+    path = "hierarchy.levels.0.policy"
+    linear = with_overrides(parse_spec(data), {f"{path}.network": "linear"})
+    assert linear.hierarchy is not None
+    assert linear.hierarchy.levels[0].policy.hidden == ()
+    with pytest.raises(SpecError, match="hidden: does not apply to network 'linear'"):
+        with_overrides(parse_spec(data), {f"{path}.hidden": [3], f"{path}.network": "linear"})
+
+
+def test_a_grid_over_networks_survives_writing() -> None:
+    grid = {"hierarchy.levels.0.policy.network": ["linear", "mlp", "conv"]}
+    spec = parse_spec(SMALL, {"selection.grid": grid})
+    assert parse_spec(yaml.safe_load(dump_spec(spec))) == spec
+
+
+# --- writing and the schema -------------------------------------------------------------------------------------------
+
+counts = st.integers(1, 10**6)
+positive = st.floats(1e-300, 1e300)
+shares = st.floats(0, 1, exclude_max=True)
+texts = st.text(
+    st.characters(codec="utf-8", exclude_categories=["Cs", "Cc"]), min_size=1, max_size=8
+) | st.sampled_from(["1e-3", ".5", "null", "yes", "1", "a: b", "- c", "~", "#", "2020-01-01"])
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | texts,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(texts, inner, max_size=3),
+    max_leaves=6,
+)
+networks = st.one_of(
+    st.fixed_dictionaries({"network": st.just("linear")}, optional={"dropout": shares}),
+    st.fixed_dictionaries(
+        {}, optional={"network": st.just("per_timestep"), "hidden": st.lists(counts, max_size=3), "dropout": shares}
+    ),
+    st.fixed_dictionaries({"network": st.just("conv")}, optional={"filters": counts, "kernel": counts}),
+    st.fixed_dictionaries(
+        {"network": st.just("a.b:C")}, optional={"options": st.dictionaries(texts, values, max_size=3)}
+    ),
+)
+emissions = st.lists(st.sampled_from(["options", "control"]), min_size=1, unique=True)
+
+
+@st.composite
+def hierarchies(draw: st.DrawFn) -> dict[str, Any]:
+    levels = []
+    for index in range(draw(st.integers(1, 3))):
+        policy = dict(draw(networks))
+        if index:
+            policy["emits"] = draw(emissions)
+        level = {"name": f"level-{index}", "count": draw(counts), "policy": policy, "termination": draw(networks)}
+        levels.append(level)
+    return {"levels": levels, "meta_policy": {**draw(networks), "emits": draw(emissions)}}
+
+
+@st.composite
+def specs(draw: st.DrawFn) -> dict[str, Any]:
+    baselines = st.sampled_from(["flat", "per_timestep"]) | st.fixed_dictionaries(
+        {"kind": st.just("flat"), "policy": networks}
+    )
+    observation = texts | st.fixed_dictionaries({"key": texts}, optional={"differences": st.booleans()})
+    names = st.lists(observation, min_size=1, max_size=3, unique_by=lambda o: o if isinstance(o, str) else o["key"])
+    std = positive | st.fixed_dictionaries({"learn": st.just(True)}, optional={"floor": positive})
+    scale = st.sampled_from(["standardize", "none"]) | st.lists(positive, min_size=1, max_size=3)
+    model = {"hierarchy": draw(hierarchies())} if draw(st.booleans()) else {"baseline": draw(baselines)}
+    return {
+        "demonstrations": {"path": draw(texts), "valid_fraction": draw(st.floats(0.01, 0.99))},
+        "observations": draw(names),
+        "control": {"std": draw(std), "scale": draw(scale)},
+        **model,
+        "compare_with": draw(st.lists(baselines, max_size=2)),
+        "training": {"patience": draw(st.none() | counts), "clip_gradient": draw(st.none() | positive)},
+        "selection": {"grid": draw(st.sampled_from([{}, {"seed": [1, 2]}, {"control.std": [0.1, {"learn": True}]}]))},
+        "rollout": {"policies": draw(st.lists(texts, max_size=2))},
+        "seed": draw(st.integers(0, 2**32 - 1)),
+    }
+
+
+@given(specs())
+def test_what_is_written_is_read_as_it_was(tmp_path_factory: pytest.TempPathFactory, data: dict[str, Any]) -> None:
+    spec = parse_spec(data)
+    path = tmp_path_factory.mktemp("spec") / "spec.yaml"
+    path.write_text(dump_spec(spec), encoding="utf-8")
+    assert load_spec(path) == spec
+
+
+def test_all_defaults_are_written() -> None:
+    written = yaml.safe_load(dump_spec(parse_spec(SMALL)))
+    assert written["training"]["optimizer"] == {"name": "adam", "lr": 1e-3, "momentum": 0.9, "weight_decay": 0.0}
+    assert written["hierarchy"]["levels"][0]["termination"] == {"network": "linear", "dropout": 0.0}
+    assert set(written) == set(Spec.model_fields)
+
+
+def described(schema: dict[str, Any]) -> list[str]:
+    """The names of the properties without a description."""
+    models = [schema, *schema["$defs"].values()]
+    fields = [(name, field) for model in models for name, field in model["properties"].items()]
+    return [name for name, field in fields if not {"description", "$ref"} & set(field)]  # "$ref" leads to one
+
+
+def test_the_schema_knows_the_keys_of_the_example() -> None:
+    schema = spec_schema()
+    example = yaml.safe_load(EXAMPLE)
+    assert set(example) <= set(schema["properties"])
+    assert set(example["training"]) <= set(schema["$defs"]["TrainingSpec"]["properties"])
+    assert set(example["hierarchy"]["levels"][0]) == set(schema["$defs"]["LevelSpec"]["properties"])
+    assert schema["required"] == ["observations"]
+    assert schema["additionalProperties"] is False
+    assert schema["$defs"]["LevelSpec"]["properties"]["count"]["minimum"] == 1
+    assert described(schema) == []
