@@ -1,0 +1,16 @@
+"""Simulated tasks for ddco-pyro, each a :class:`ddco_pyro.task.Task` (import name ``ddco_tasks``)."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+
+def _has_display() -> bool:
+    """Whether a window system could give an OpenGL context."""
+    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+# MuJoCo reads the variable once, when it is first imported, so it has to be set before any task is.
+if not _has_display():
+    os.environ.setdefault("MUJOCO_GL", "egl")

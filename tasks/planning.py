@@ -1,0 +1,86 @@
+"""Collision-free paths in joint space: RRT-Connect, then shortcuts, from the Open Motion Planning Library.
+
+A path is a function of its end points alone: the planner's random numbers start from the same seed for every path, and
+it ends by a count of iterations, not by the clock.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+from ompl import base, geometric, util
+
+SEED = 1
+RANGE = 0.3  # rad: the longest step of the tree
+RESOLUTION = 0.01  # of the extent of the joint space, between validity checks
+ITERATIONS = 20_000
+
+util.setLogLevel(util.LOG_ERROR)
+
+
+class NoPath(RuntimeError):
+    """No collision-free path was found."""
+
+
+def plan_path(
+    start: np.ndarray, goal: np.ndarray, ranges: np.ndarray, is_free: Callable[[np.ndarray], bool]
+) -> np.ndarray:
+    """The corners [K, J] of a short path from ``start`` [J] to ``goal`` [J] through joint angles where ``is_free`` holds.
+
+    :param ranges: the joints' limits [J, 2].
+    :raises NoPath: when the planner gives up.
+    """
+    joints = len(ranges)
+    _restart_random_numbers()
+    space = base.RealVectorStateSpace(joints)
+    bounds = base.RealVectorBounds(joints)
+    for joint, (low, high) in enumerate(ranges):
+        bounds.setLow(joint, float(low))
+        bounds.setHigh(joint, float(high))
+    space.setBounds(bounds)
+    setup = geometric.SimpleSetup(space)
+    setup.setStateValidityChecker(lambda state: bool(is_free(_to_array(state, joints))))
+    information = setup.getSpaceInformation()
+    information.setStateValidityCheckingResolution(RESOLUTION)
+    planner = geometric.RRTConnect(information)
+    planner.setRange(RANGE)
+    setup.setPlanner(planner)
+    setup.setStartAndGoalStates(_to_state(space, start), _to_state(space, goal))
+    iterations = itertools.count()
+    setup.solve(base.PlannerTerminationCondition(lambda: next(iterations) >= ITERATIONS))
+    if not setup.haveExactSolutionPath():
+        raise NoPath(f"no path from {np.round(start, 3)} to {np.round(goal, 3)} within {ITERATIONS} iterations")
+    path = setup.getSolutionPath()
+    geometric.PathSimplifier(information).reduceVertices(path)
+    return np.array([_to_array(path.getState(corner), joints) for corner in range(path.getStateCount())])
+
+
+def _restart_random_numbers() -> None:
+    """Let every generator made from here on start as in a new process.
+
+    OMPL calls it an error to do this twice, since generators that exist already keep their state. None is kept here.
+    """
+    level = util.getLogLevel()
+    util.setLogLevel(util.LOG_NONE)
+    util.RNG.setSeed(SEED)
+    util.setLogLevel(level)
+
+
+def points_along(path: np.ndarray, fractions: np.ndarray) -> np.ndarray:
+    """The points [N, J] at fractions [N] of the length of a path with corners [K, J]."""
+    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    at = fractions * lengths[-1]
+    return np.stack([np.interp(at, lengths, joint) for joint in path.T], axis=1)
+
+
+def _to_array(state: base.State, size: int) -> np.ndarray:
+    return np.array([state[i] for i in range(size)])  # iterating a state runs past its end
+
+
+def _to_state(space: base.RealVectorStateSpace, values: np.ndarray) -> base.State:
+    state = space.allocState()
+    for i, value in enumerate(values):
+        state[i] = float(value)
+    return state
