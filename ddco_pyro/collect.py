@@ -1,0 +1,59 @@
+"""Demonstrations collected from a task's supervisor, in parallel, kept by content and reused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.rollout import run_episodes, summarize
+from ddco_pyro.spec import DemonstrationsSpec
+from ddco_pyro.task import Task, find_task
+
+OnDemonstration = Callable[[int, int], None]
+"""Called with (how many are done, how many there will be)."""
+
+
+def cache_folder() -> Path:
+    """``$DDCO_PYRO_CACHE``, else ``ddco-pyro`` in the user's cache folder."""
+    own = os.environ.get("DDCO_PYRO_CACHE")
+    general = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(own) if own else Path(general) / "ddco-pyro"
+
+
+def cache_path(task: Task, name: str, spec: DemonstrationsSpec) -> Path:
+    """Where demonstrations of this task, policy, number and seeds are kept: the name changes with the task's code."""
+    digest = hashlib.sha256(json.dumps([name, spec.supervisor, spec.count, spec.seed]).encode())
+    for source in sorted(task.sources):
+        digest.update(hashlib.sha256(source.read_bytes()).digest())
+    return cache_folder() / "demonstrations" / f"{task.name}-{digest.hexdigest()[:16]}.hdf5"
+
+
+def collect(
+    task_name: str, spec: DemonstrationsSpec, path: Path | None = None, on_demonstration: OnDemonstration | None = None
+) -> Path:
+    """Record ``spec.count`` demonstrations, unless the file is there already; the path of the file.
+
+    The root of the file says how often the supervisor succeeded itself (``supervisor``, as JSON).
+
+    :raises DemonstrationsError: the task has no such scripted policy.
+    """
+    task = find_task(task_name)
+    if spec.supervisor not in task.policies:
+        known = ", ".join(sorted(task.policies))
+        raise DemonstrationsError(f"task {task.name!r} has no policy {spec.supervisor!r} to record (it has: {known})")
+    path = path or cache_path(task, task_name, spec)
+    if path.exists():
+        return path
+    records, outcomes = [], []
+    for episode in run_episodes(task_name, spec.supervisor, range(spec.seed, spec.seed + spec.count)):
+        records.append(episode.record)
+        outcomes.append(episode.outcome)
+        if on_demonstration:
+            on_demonstration(len(records), spec.count)
+    attributes = {"task": task.name, "policy": spec.supervisor, "supervisor": json.dumps(summarize(outcomes))}
+    Demonstrations(tuple(records), attributes=attributes).write(path)
+    return path

@@ -1,0 +1,79 @@
+"""The demonstrations a spec asks for, and what is known of their shapes before any work starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from ddco_pyro.collect import OnDemonstration, collect
+from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.encoding import Shapes
+from ddco_pyro.hierarchy import Hierarchy
+from ddco_pyro.networks import ShapeError
+from ddco_pyro.spec import Spec, SpecError
+from ddco_pyro.task import find_task
+
+
+@dataclass(frozen=True)
+class Dimensions:
+    """Shapes of the observations by name, control dimensions A, and the longest demonstration where it is known."""
+
+    shapes: Shapes
+    control_size: int
+    steps: int
+
+    @classmethod
+    def of(cls, demonstrations: Demonstrations) -> Dimensions:
+        """The dimensions of these demonstrations."""
+        return cls(demonstrations.observation_shapes, demonstrations.control_size, max(demonstrations.lengths))
+
+
+def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
+    """The spec's networks for these dimensions, randomly initialised.
+
+    :raises SpecError: something in the spec does not fit the observations or the control.
+    """
+    missing = [one.key for one in spec.observations if one.key not in dimensions.shapes]
+    if missing:
+        known = ", ".join(sorted(dimensions.shapes))
+        raise SpecError(f"observations: there is no {', '.join(missing)} (there are: {known})")
+    scale = spec.control.scale
+    if isinstance(scale, tuple) and len(scale) != dimensions.control_size:
+        raise SpecError(
+            f"control.scale: has {len(scale)} numbers, but the control has {dimensions.control_size} dimensions"
+        )
+    try:
+        return Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps)
+    except ShapeError as error:
+        raise SpecError(str(error)) from error
+
+
+def dimensions(spec: Spec) -> Dimensions:
+    """The dimensions of what the spec names, without collecting anything: from its file, or else from its task.
+
+    The task does not say how long a demonstration is; one step stands for it.
+    """
+    path = spec.demonstrations.path
+    if spec.task is None or (path is not None and Path(path).exists()):
+        assert path is not None  # a spec has a task or a file
+        return Dimensions.of(Demonstrations.read(path))
+    environment = find_task(spec.task).load(spec.demonstrations.seed)
+    try:
+        shapes = {name: tuple(one.shape) for name, one in environment.observation_spec().items()}
+        return Dimensions(shapes, environment.action_spec().shape[0], steps=1)
+    finally:
+        environment.close()
+
+
+def demonstrations(spec: Spec, on_demonstration: OnDemonstration | None = None) -> Demonstrations:
+    """The spec's demonstrations: read from its file, collected from its task's supervisor where there is none.
+
+    :raises DemonstrationsError: the file is missing or wrong, or lacks an observation or label that the spec names.
+    """
+    own = spec.demonstrations
+    path = Path(own.path) if own.path else None
+    if spec.task is not None and (path is None or not path.exists()):
+        path = collect(spec.task, own, path, on_demonstration)
+    assert path is not None  # a spec has a task or a file
+    labels = (own.labels,) if own.labels else ()
+    return Demonstrations.read(path, [one.key for one in spec.observations], labels)

@@ -1,0 +1,362 @@
+"""Demonstrations in memory and in HDF5 files of robomimic's layout.
+
+A file holds groups ``data/<name>`` with ``actions`` [T, A], ``obs/<key>`` [T, ...] and optionally ``labels/<name>`` [T],
+and optionally ``mask/<name>``, lists of names of demonstrations.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, overload
+
+import h5py
+import numpy as np
+
+from ddco_pyro.files import whole_file
+
+Attribute = float | int | str | bool
+
+LARGEST_INFLATION = 1100  # deflate, the strongest of HDF5's usual filters, stores at most 1032 bytes in one
+
+
+class DemonstrationsError(ValueError):
+    """Demonstrations that cannot be used; one line with the file, the demonstration and the key."""
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstration:
+    """One demonstration of T steps, s_0 a_0 ... s_{T-1} a_{T-1}.
+
+    :param observations: key to [T, ...]; uint8 (images, HWC) stays as it is, other numbers become float64.
+    :param actions: [T, A], the controls, float64.
+    :param labels: name to [T], ground-truth segments, int64.
+    :param attributes: what is known of the whole demonstration, such as its seed.
+    :raises DemonstrationsError: no steps, unequal lengths, NaN or infinite numbers, anything but numbers.
+    """
+
+    name: str
+    observations: Mapping[str, np.ndarray]
+    actions: np.ndarray
+    labels: Mapping[str, np.ndarray] = field(default_factory=dict)
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.name or "/" in self.name:
+            raise DemonstrationsError(
+                f"{self.name!r} cannot be the name of a demonstration; it must not be empty or have a /"
+            )
+        actions = _numbers(self.actions, f"{self.name}: actions")
+        if actions.ndim != 2 or actions.shape[1] == 0:
+            raise DemonstrationsError(
+                f"{self.name}: actions has shape {actions.shape}, it has to be [steps, dimensions]"
+            )
+        if len(actions) == 0:
+            raise DemonstrationsError(f"{self.name}: actions has no steps; remove this demonstration")
+        observations = {key: _numbers(one, f"{self.name}: obs/{key}") for key, one in self.observations.items()}
+        labels = {key: _integers(one, f"{self.name}: labels/{key}") for key, one in self.labels.items()}
+        for where, array in [
+            *((f"obs/{key}", one) for key, one in observations.items()),
+            *((f"labels/{key}", one) for key, one in labels.items()),
+        ]:
+            if array.shape[:1] != (len(actions),):
+                steps = f"{len(array)} steps" if array.ndim else "no steps"
+                raise DemonstrationsError(f"{self.name}: {where} has {steps}, but actions has {len(actions)}")
+        object.__setattr__(self, "actions", actions.astype(np.float64))
+        object.__setattr__(self, "observations", observations)
+        object.__setattr__(self, "labels", labels)
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+def _numbers(array: Any, where: str) -> np.ndarray:
+    """Numbers as float64, or as they are if uint8; everything finite."""
+    array = np.asarray(array)
+    if array.dtype == np.uint8:
+        return array
+    if array.dtype.kind not in "fiub":
+        raise DemonstrationsError(f"{where} holds {array.dtype}, it has to hold real numbers")
+    finite = np.isfinite(array)
+    if not finite.all():
+        place = np.argwhere(~finite)[0].tolist()
+        raise DemonstrationsError(
+            f"{where} is {array[tuple(place)]} at index {place}; repair or remove this demonstration"
+        )
+    return array.astype(np.float64)
+
+
+def _integers(array: Any, where: str) -> np.ndarray:
+    array = np.asarray(array)
+    if array.dtype.kind not in "iub" or array.ndim != 1:
+        raise DemonstrationsError(
+            f"{where} is {array.dtype} of shape {array.shape}, it has to be integers of shape [steps]"
+        )
+    return array.astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstrations(Sequence[Demonstration]):
+    """Demonstrations that go together: the same observations, of the same shapes, and controls of the same size.
+
+    :param masks: name to names of demonstrations, such as ``{"valid": ("demo_3", "demo_7")}``.
+    :param attributes: what is known of all of them.
+    :raises DemonstrationsError: none at all, a name given twice, they do not go together, a mask names an unknown one.
+    """
+
+    demonstrations: tuple[Demonstration, ...]
+    masks: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.demonstrations:
+            raise DemonstrationsError("there are no demonstrations; at least one is needed")
+        if len(set(self.names)) < len(self):
+            twice = next(name for name in self.names if self.names.count(name) > 1)
+            raise DemonstrationsError(f"{twice}: there are two demonstrations of this name; rename one")
+        for demo in self.demonstrations[1:]:
+            _check_alike(self.demonstrations[0], demo)
+        for mask, names in self.masks.items():
+            unknown = sorted(set(names) - set(self.names))
+            if unknown:
+                raise DemonstrationsError(f"mask/{mask}: {_unknown(unknown[0], self.names)}")
+
+    @classmethod
+    def read(
+        cls, path: str | Path, observations: Sequence[str] | None = None, labels: Sequence[str] = ()
+    ) -> Demonstrations:
+        """The demonstrations in an HDF5 file, ``demo_2`` before ``demo_10``.
+
+        :param observations: the keys to read; all of them if None.
+        :param labels: names of the ground-truth labels to read.
+        :raises DemonstrationsError: the file cannot be read or does not hold what was asked for.
+        """
+        try:
+            with h5py.File(path, "r") as file:
+                return cls(*_read(file, observations, labels))
+        except DemonstrationsError as error:
+            raise DemonstrationsError(f"{path}: {error}") from None
+        except FileNotFoundError:
+            raise DemonstrationsError(f"{path}: there is no such file; check the path") from None
+        except OSError as error:
+            raise DemonstrationsError(f"{path}: cannot be read as HDF5, or is cut short: {error}") from error
+
+    def write(self, path: str | Path) -> None:
+        """Write an HDF5 file, whole or not at all."""
+        with whole_file(Path(path)) as temporary, h5py.File(temporary, "w") as file:
+            file.attrs.update(self.attributes)
+            data = file.create_group("data")
+            data.attrs["total"] = sum(self.lengths)
+            for demo in self:
+                _write(data.create_group(demo.name), demo)
+            for name, members in self.masks.items():
+                file.create_dataset(f"mask/{name}", data=np.array([name.encode() for name in members], dtype=np.bytes_))
+
+    def __len__(self) -> int:
+        return len(self.demonstrations)
+
+    @overload
+    def __getitem__(self, index: int) -> Demonstration: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Demonstration, ...]: ...
+    def __getitem__(self, index: int | slice) -> Demonstration | tuple[Demonstration, ...]:
+        return self.demonstrations[index]
+
+    def __iter__(self) -> Iterator[Demonstration]:
+        return iter(self.demonstrations)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Their names, in order."""
+        return tuple(demo.name for demo in self.demonstrations)
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Their numbers of steps."""
+        return tuple(len(demo) for demo in self.demonstrations)
+
+    @property
+    def observation_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of each observation at one step."""
+        return {key: array.shape[1:] for key, array in self.demonstrations[0].observations.items()}
+
+    @property
+    def control_size(self) -> int:
+        """A, the number of control dimensions."""
+        return int(self.demonstrations[0].actions.shape[1])
+
+    def select(self, names: Iterable[str]) -> Demonstrations:
+        """The demonstrations of these names, in that order, without masks: those speak of the whole.
+
+        :raises DemonstrationsError: there is none of that name.
+        """
+        by_name = {demo.name: demo for demo in self.demonstrations}
+        chosen = tuple(names)
+        for name in chosen:
+            if name not in by_name:
+                raise DemonstrationsError(_unknown(name, self.names))
+        return Demonstrations(tuple(by_name[name] for name in chosen), attributes=self.attributes)
+
+    def split(self, valid_fraction: float, seed: int) -> tuple[Demonstrations, Demonstrations]:
+        """Training and validation demonstrations, at least one each.
+
+        The masks ``train`` and ``valid`` decide if there are any; one of them alone leaves the rest to the other.
+        Otherwise ``valid_fraction`` of the demonstrations are drawn with ``seed``.
+
+        :raises DemonstrationsError: there is only one, a mask leaves nothing, or the masks overlap.
+        """
+        train, valid = self.masks.get("train"), self.masks.get("valid")
+        if train is None and valid is None:
+            valid = self._draw(valid_fraction, seed)
+        train = self._without(valid or ()) if train is None else train
+        valid = self._without(train) if valid is None else valid
+        if not train or not valid:
+            raise DemonstrationsError(
+                f"no demonstration is left to {'validate' if train else 'train'} with; add demonstrations or change the masks"
+            )
+        both = set(train) & set(valid)
+        if both:
+            raise DemonstrationsError(f"{min(both)} is in mask/train and in mask/valid; remove it from one")
+        return self.select(train), self.select(valid)
+
+    def _without(self, names: Iterable[str]) -> tuple[str, ...]:
+        left_out = set(names)
+        return tuple(name for name in self.names if name not in left_out)
+
+    def _draw(self, fraction: float, seed: int) -> tuple[str, ...]:
+        number = min(max(round(fraction * len(self)), 1), len(self) - 1)
+        drawn = np.random.default_rng(seed).permutation(len(self))[:number]
+        return tuple(self.names[index] for index in sorted(drawn))
+
+
+def _check_alike(first: Demonstration, other: Demonstration) -> None:
+    if other.actions.shape[1:] != first.actions.shape[1:]:
+        raise DemonstrationsError(_differ(other, "actions", other.actions, first, first.actions))
+    if set(other.observations) != set(first.observations) or set(other.labels) != set(first.labels):
+        keys = sorted(set(other.observations) ^ set(first.observations) | set(other.labels) ^ set(first.labels))
+        raise DemonstrationsError(f"{other.name}: {', '.join(keys)} is only in one of {first.name} and {other.name}")
+    for key, array in other.observations.items():
+        if array.shape[1:] != first.observations[key].shape[1:]:
+            raise DemonstrationsError(_differ(other, f"obs/{key}", array, first, first.observations[key]))
+
+
+def _differ(other: Demonstration, where: str, array: np.ndarray, first: Demonstration, expected: np.ndarray) -> str:
+    return (
+        f"{other.name}: {where} has shape {array.shape[1:]} at each step, but {expected.shape[1:]} in {first.name}; "
+        "all demonstrations need the same"
+    )
+
+
+def _unknown(name: str, names: Sequence[str]) -> str:
+    return f"there is no demonstration {name!r}{_nearest(name, names)}"
+
+
+def _nearest(name: str, names: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(names), n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+# --- HDF5 -------------------------------------------------------------------------------------------------------------
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sorts ``demo_2`` before ``demo_10``."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def _read(
+    file: h5py.File, observations: Sequence[str] | None, labels: Sequence[str]
+) -> tuple[tuple[Demonstration, ...], dict[str, tuple[str, ...]], dict[str, Attribute]]:
+    data = _member(file, "data", h5py.Group, "")
+    names = sorted((name for name in data if isinstance(data.get(name), h5py.Group)), key=_natural)
+    if not names:
+        raise DemonstrationsError("the group 'data' holds no demonstrations; at least one is needed")
+    demonstrations = tuple(_read_one(data[name], name, observations, labels) for name in names)
+    masks = _member(file, "mask", h5py.Group, "") if "mask" in file else {}
+    return demonstrations, {mask: _read_mask(masks, mask) for mask in masks}, _attributes(file)
+
+
+def _read_one(group: h5py.Group, name: str, observations: Sequence[str] | None, labels: Sequence[str]) -> Demonstration:
+    actions = _array(group, "actions", f"{name}: ")
+    attributes = _attributes(group)
+    claimed = attributes.pop("num_samples", len(actions))
+    if claimed != len(actions):
+        raise DemonstrationsError(f"{name}: actions has {len(actions)} steps, but num_samples is {claimed}")
+    return Demonstration(
+        name=name,
+        observations=_arrays(group, "obs", observations, name),
+        actions=actions,
+        labels=_arrays(group, "labels", labels, name),
+        attributes=attributes,
+    )
+
+
+def _arrays(group: h5py.Group, folder: str, keys: Sequence[str] | None, name: str) -> dict[str, np.ndarray]:
+    """The arrays ``keys`` of a folder of a demonstration; all of them if None."""
+    if keys is not None and not keys:
+        return {}
+    members = _member(group, folder, h5py.Group, f"{name}: ")
+    return {key: _array(members, key, f"{name}: {folder}/") for key in (_datasets(members) if keys is None else keys)}
+
+
+def _datasets(group: h5py.Group) -> list[str]:
+    """The names of all datasets below a group; dm_control's own keys have a / in them."""
+    found: list[str] = []
+    group.visititems(lambda name, one: found.append(name) if isinstance(one, h5py.Dataset) else None)
+    return sorted(found)
+
+
+def _array(group: h5py.Group, key: str, where: str) -> np.ndarray:
+    dataset = _member(group, key, h5py.Dataset, where)
+    if dataset.shape is None or dataset.ndim == 0:
+        raise DemonstrationsError(f"{where}{key} has no steps; it has to be an array")
+    # A damaged header can claim any size, and HDF5 would fill what is not in the file with zeros.
+    stored = dataset.id.get_storage_size()
+    if not dataset.is_virtual and dataset.nbytes > LARGEST_INFLATION * stored:
+        raise DemonstrationsError(
+            f"{where}{key} claims {dataset.nbytes} bytes, but the file holds {stored}; write it again"
+        )
+    try:
+        return np.asarray(dataset[()])
+    except (OSError, MemoryError, ValueError) as error:
+        raise DemonstrationsError(f"{where}{key} cannot be read ({error}); the file may be damaged") from error
+
+
+def _member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
+    """A group or a dataset below ``group``."""
+    try:
+        found = group[key]
+    except (KeyError, OSError):
+        known = _datasets(group) if kind is h5py.Dataset else list(group)
+        raise DemonstrationsError(
+            f"{where}{key} is missing{_nearest(key, known)}; there is: {', '.join(known) or 'nothing'}"
+        ) from None
+    if not isinstance(found, kind):
+        raise DemonstrationsError(
+            f"{where}{key} has to be a {kind.__name__.lower()}, not a {type(found).__name__.lower()}"
+        )
+    return found
+
+
+def _read_mask(masks: h5py.Group, mask: str) -> tuple[str, ...]:
+    names = _array(masks, mask, "mask/").ravel().tolist()
+    return tuple(name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names)
+
+
+def _attributes(owner: h5py.HLObject) -> dict[str, Attribute]:
+    """The attributes that hold one number or text."""
+    values = {name: value.item() if isinstance(value, np.generic) else value for name, value in owner.attrs.items()}
+    return {name: value for name, value in values.items() if isinstance(value, Attribute)}
+
+
+def _write(group: h5py.Group, demo: Demonstration) -> None:
+    group.attrs.update(demo.attributes)
+    group.attrs["num_samples"] = len(demo)
+    group.create_dataset("actions", data=demo.actions)
+    for key, array in demo.observations.items():
+        group.create_dataset(f"obs/{key}", data=array)
+    for key, array in demo.labels.items():
+        group.create_dataset(f"labels/{key}", data=array)

@@ -1,0 +1,143 @@
+"""Demonstrations as the networks see them: features, scaled controls, padded batches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.networks import Inputs, InputShape
+from ddco_pyro.spec import ControlSpec, ObservationSpec
+
+Shapes = Mapping[str, tuple[int, ...]]
+IMAGE_DIMENSIONS = 3
+
+
+@dataclass(frozen=True)
+class Batch:
+    """N demonstrations padded to T steps: ``inputs``; ``actions`` [N, T, A] in scaled units; ``lengths`` [N]."""
+
+    inputs: Inputs
+    actions: Tensor
+    lengths: Tensor
+
+    def __len__(self) -> int:
+        return len(self.lengths)
+
+    @property
+    def steps(self) -> int:
+        """Steps in all, padding left out."""
+        return int(self.lengths.sum())
+
+    def select(self, rows: Tensor) -> Batch:
+        """The demonstrations ``rows`` [M], padded to the longest among them."""
+        lengths = self.lengths[rows]
+        steps = int(lengths.max())
+        images = {key: image[rows, :steps] for key, image in self.inputs.images.items()}
+        inputs = Inputs(self.inputs.vector[rows, :steps], images, self.inputs.time[:steps])
+        return Batch(inputs, self.actions[rows, :steps], lengths)
+
+
+class ObservationEncoder(nn.Module):
+    """Observations by name to one feature vector: differences appended, standardised where the spec says so.
+
+    Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model.
+    A dimension that never changes is only centred.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, specs: Sequence[ObservationSpec], shapes: Shapes) -> None:
+        super().__init__()
+        self.shapes = {spec.key: tuple(shapes[spec.key]) for spec in specs}
+        self.specs = tuple(spec for spec in specs if len(shapes[spec.key]) < IMAGE_DIMENSIONS)
+        self.images = {spec.key: shapes[spec.key] for spec in specs if len(shapes[spec.key]) == IMAGE_DIMENSIONS}
+        self.sizes = [int(np.prod(shapes[spec.key])) * (2 if spec.differences else 1) for spec in self.specs]
+        self.register_buffer("mean", torch.zeros(sum(self.sizes), dtype=torch.float64))
+        self.register_buffer("std", torch.ones(sum(self.sizes), dtype=torch.float64))
+
+    def shape(self, steps: int) -> InputShape:
+        """What networks are built for."""
+        return InputShape(sum(self.sizes), self.images, steps)
+
+    def fit(self, demonstrations: Demonstrations) -> None:
+        """Take mean and standard deviation from every step of these demonstrations."""
+        rows = np.concatenate([self.features(demo.observations) for demo in demonstrations])
+        standardize = np.repeat([spec.standardize for spec in self.specs], self.sizes)
+        spread = rows.std(0)
+        changes = standardize & (spread > 1e-9 * np.maximum(np.abs(rows).max(0, initial=0.0), 1e-9))
+        self.mean.copy_(torch.as_tensor(np.where(standardize, rows.mean(0), 0.0)))
+        self.std.copy_(torch.as_tensor(np.where(changes, spread, 1.0)))
+
+    def features(self, observations: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Observations [T, ...] by name to features [T, F], not yet standardised."""
+        steps = len(next(iter(observations.values())))
+        columns: list[np.ndarray] = [np.zeros((steps, 0))]
+        for spec in self.specs:
+            column = np.asarray(observations[spec.key], dtype=np.float64).reshape(steps, -1)
+            columns.append(column)
+            if spec.differences:
+                columns.append(np.diff(column, axis=0, prepend=column[:1]))
+        return np.concatenate(columns, axis=1)
+
+    def inputs(self, observations: Iterable[Mapping[str, np.ndarray]]) -> Inputs:
+        """Sequences of observations, each [T_n, ...] by name, to padded network inputs."""
+        sequences = list(observations)
+        vectors = [(self.features(one) - self.mean.numpy()) / self.std.numpy() for one in sequences]
+        images = {key: _pad([np.asarray(one[key]) for one in sequences]) for key in self.images}
+        vector = _pad(vectors).float()
+        return Inputs(vector, images, torch.arange(vector.shape[1]))
+
+
+class ControlScaling(nn.Module):
+    """Controls in the units of their own spread, z = (a - shift) / scale, and back."""
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(self, spec: ControlSpec, size: int) -> None:
+        super().__init__()
+        self.standardize = spec.scale == "standardize"
+        declared = spec.scale if isinstance(spec.scale, tuple) else (1.0,) * size
+        self.register_buffer("shift", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("scale", torch.tensor(declared, dtype=torch.float64))
+
+    def fit(self, demonstrations: Demonstrations) -> None:
+        """Where the spec says ``standardize``: take mean and spread of these demonstrations' controls."""
+        if self.standardize:
+            rows = np.concatenate([demo.actions for demo in demonstrations])
+            spread = rows.std(0)
+            self.shift.copy_(torch.as_tensor(rows.mean(0)))
+            self.scale.copy_(torch.as_tensor(np.where(spread > 1e-9, spread, 1.0)))
+
+    @property
+    def log_volume(self) -> Tensor:
+        """Σ log scale: subtracted from a log-density in scaled units it gives the one in the control's own units."""
+        return self.scale.log().sum()
+
+    def scaled(self, actions: np.ndarray) -> np.ndarray:
+        """[T, A] in the control's own units to scaled ones."""
+        found: np.ndarray = (actions - self.shift.numpy()) / self.scale.numpy()
+        return found
+
+    def unscaled(self, actions: Tensor) -> np.ndarray:
+        """[..., A] scaled to the control's own units."""
+        found: np.ndarray = (actions.double() * self.scale + self.shift).numpy()
+        return found
+
+
+def encode(demonstrations: Demonstrations, encoder: ObservationEncoder, scaling: ControlScaling) -> Batch:
+    """All demonstrations as one padded batch."""
+    inputs = encoder.inputs(demo.observations for demo in demonstrations)
+    actions = _pad([scaling.scaled(demo.actions) for demo in demonstrations]).float()
+    return Batch(inputs, actions, torch.tensor([len(demo) for demo in demonstrations]))
+
+
+def _pad(sequences: Sequence[np.ndarray]) -> Tensor:
+    """[T_n, ...] arrays to one [N, max T_n, ...] tensor, zeros at the end."""
+    return nn.utils.rnn.pad_sequence([torch.as_tensor(one) for one in sequences], batch_first=True)

@@ -1,0 +1,44 @@
+"""The networks a spec can name; ``build`` makes one, or imports a user's own ``module:Class``."""
+
+from __future__ import annotations
+
+import importlib
+
+from torch import nn
+
+from ddco_pyro.networks.conv import Conv
+from ddco_pyro.networks.inputs import Inputs, InputShape, ShapeError
+from ddco_pyro.networks.mlp import Mlp
+from ddco_pyro.networks.per_timestep import PerTimestep
+from ddco_pyro.spec import NetworkSpec
+
+__all__ = ["InputShape", "Inputs", "ShapeError", "build"]
+
+
+def build(spec: NetworkSpec, shape: InputShape, outputs: int, copies: int) -> nn.Module:
+    """``copies`` independent networks that map :class:`Inputs` to [N, T, copies, outputs].
+
+    A user's ``module:Class`` is called as ``Class(shape, outputs, copies, **options)``.
+
+    :raises ShapeError: where the network cannot read these observations, or cannot be imported.
+    """
+    if spec.network == "linear":
+        return Mlp(shape, outputs, copies, hidden=())
+    if spec.network == "mlp":
+        return Mlp(shape, outputs, copies, spec.hidden, spec.dropout)
+    if spec.network == "per_timestep":
+        return PerTimestep(shape, outputs, copies, spec.hidden, spec.dropout)
+    if spec.network == "conv":
+        return Conv(shape, outputs, copies, spec.hidden, spec.dropout, spec.filters, spec.kernel)
+    return _own(spec.network)(shape, outputs, copies, **spec.options)
+
+
+def _own(name: str) -> type[nn.Module]:
+    module, _, attribute = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ShapeError(f"network {name!r} cannot be imported: {error}") from error
+    if not (isinstance(found, type) and issubclass(found, nn.Module)):
+        raise ShapeError(f"network {name!r} is not a torch.nn.Module class")
+    return found

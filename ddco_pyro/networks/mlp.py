@@ -1,0 +1,31 @@
+"""Linear maps and multi-layer perceptrons of the observation vector (SM 1.1, SM 1.3)."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from ddco_pyro.networks.inputs import Inputs, InputShape, ShapeError
+from ddco_pyro.networks.stacked import stacked_mlp
+
+
+class Mlp(nn.Module):
+    """K perceptrons over the observation vector. Without hidden layers this is the ``linear`` network."""
+
+    def __init__(
+        self, shape: InputShape, outputs: int, copies: int, hidden: tuple[int, ...] = (64,), dropout: float = 0.0
+    ) -> None:
+        super().__init__()
+        refuse_images(shape)
+        self.layers = stacked_mlp(copies, shape.vector, hidden, outputs, dropout)
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        """[N, T, K, outputs]."""
+        found: Tensor = self.layers(inputs.vector.flatten(0, 1).unsqueeze(0))
+        return found.transpose(0, 1).reshape(*inputs.batch, *found.shape[::2])
+
+
+def refuse_images(shape: InputShape) -> None:
+    """:raises ShapeError: where there are images, which only a convolution can read."""
+    if shape.images:
+        names = ", ".join(sorted(shape.images))
+        raise ShapeError(f"reads vectors, but {names} are images: use network: conv, or leave them out")

@@ -1,0 +1,292 @@
+"""A run: everything between a spec and its folder, and a fitted hierarchy read back from there."""
+
+from __future__ import annotations
+
+import csv
+import importlib.metadata
+import io
+import json
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from ddco_pyro import analysis
+from ddco_pyro.controller import Controller
+from ddco_pyro.data import Dimensions, build_hierarchy, demonstrations
+from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.encoding import encode
+from ddco_pyro.files import read_tensors, write_tensors, write_text
+from ddco_pyro.hierarchy import Hierarchy
+from ddco_pyro.inference import Posterior, log_likelihood, posterior, segment
+from ddco_pyro.inference.check import EngineCheck, compare_engines
+from ddco_pyro.spec import BaselineSpec, Spec, dump_spec, load_spec
+from ddco_pyro.training import Trainer, TrainingError, plan
+
+PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
+
+
+class RunError(ValueError):
+    """A folder is not the run it was taken for."""
+
+
+class Watcher(Protocol):
+    """Is told how a fit goes on."""
+
+    def collected(self, done: int, total: int) -> None:
+        """So many of the demonstrations have been collected."""
+
+    def training(self, name: str, epochs: int) -> None:
+        """A model begins to be trained, for at most so many epochs in all."""
+
+    def epoch(self, row: dict[str, Any]) -> None:
+        """An epoch has ended; its row of the history."""
+
+    def trained(self, name: str) -> None:
+        """A model has been trained."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted model and the folder it lives in. ``metrics`` is ``metrics.json``."""
+
+    folder: Path
+    spec: Spec
+    hierarchy: Hierarchy
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """The contents of ``metrics.json``."""
+        found: dict[str, Any] = json.loads((self.folder / "metrics.json").read_text())
+        return found
+
+    @property
+    def name(self) -> str:
+        """What the model is called in tables."""
+        return model_name(self.spec)
+
+    @cached_property
+    def baselines(self) -> dict[str, Fit]:
+        """The baselines that were trained beside it, by name."""
+        folders = [self.folder / "baselines" / baseline.kind for baseline in self.spec.compare_with]
+        return {folder.name: load(folder) for folder in folders if (folder / "model.safetensors").exists()}
+
+    def log_likelihood(self, demos: Demonstrations) -> np.ndarray:
+        """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units."""
+        with torch.no_grad():
+            batch = encode(demos, self.hierarchy.encoder, self.hierarchy.scaling)
+            found: np.ndarray = log_likelihood(self.hierarchy.tabulate(batch), batch.lengths).numpy()
+            return found
+
+    def posterior(self, demos: Demonstrations) -> Posterior:
+        """u, v and w of §4.1 for every level."""
+        with torch.no_grad():
+            batch = encode(demos, self.hierarchy.encoder, self.hierarchy.scaling)
+            return posterior(self.hierarchy.tabulate(batch), batch.lengths)
+
+    def segment(self, demos: Demonstrations) -> tuple[np.ndarray, ...]:
+        """Choices of the most likely path, a [N, T] for each level, lowest first; -1 past a demonstration's end."""
+        with torch.no_grad():
+            batch = encode(demos, self.hierarchy.encoder, self.hierarchy.scaling)
+            return tuple(level.numpy() for level in segment(self.hierarchy.tabulate(batch), batch.lengths))
+
+    def controller(self, seed: int = 0) -> Controller:
+        """The model as a policy that acts, as the spec's ``rollout`` says."""
+        return Controller.from_spec(self.hierarchy, self.spec.rollout, seed)
+
+
+def model_name(spec: Spec) -> str:
+    """``ddco``, or the kind of the baseline."""
+    return spec.baseline.kind if spec.baseline else "ddco"
+
+
+def load(folder: str | Path) -> Fit:
+    """The fit in a run folder.
+
+    :raises RunError: the folder has no finished fit.
+    """
+    folder = Path(folder)
+    if not (folder / "model.safetensors").exists():
+        what = "an unfinished run: continue it with --resume" if (folder / "spec.yaml").exists() else "not a run folder"
+        raise RunError(f"{folder}: {what} (it has no model.safetensors)")
+    spec = load_spec(folder / "spec.yaml")
+    tensors, metadata = read_tensors(folder / "model.safetensors")
+    shapes = {key: tuple(shape) for key, shape in json.loads(metadata["shapes"]).items()}
+    dimensions = Dimensions(shapes, int(metadata["control_size"]), int(metadata["steps"]))
+    hierarchy = build_hierarchy(spec, dimensions)
+    hierarchy.load_state_dict(tensors)
+    return Fit(folder, spec, hierarchy.eval())
+
+
+def fit(spec: Spec, folder: Path, watcher: Watcher) -> Fit:
+    """Collect or read the demonstrations, train the spec's model and its baselines, evaluate, and fill the run folder.
+
+    A folder that already holds part of this run is continued.
+
+    :raises RunError: the folder holds another run.
+    :raises TrainingError: training stopped; nothing that was written before is lost.
+    """
+    _claim(folder, spec)
+    clock = _Clock()
+    with clock("demonstrations"):
+        demos = demonstrations(spec, watcher.collected)
+    return _fit(spec, folder, demos, watcher, clock)
+
+
+def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, clock: _Clock) -> Fit:
+    train, valid = demos.split(spec.demonstrations.valid_fraction, spec.seed)
+    kept, tune = train.split(spec.training.tune_fraction, spec.seed)
+    with clock("training"):
+        hierarchy, check, rows = _train(spec, folder, Dimensions.of(demos), (kept, tune), watcher)
+    _write_history(folder, rows)
+    _write_model(folder, hierarchy, Dimensions.of(demos))
+    found = Fit(folder, spec, hierarchy)
+    with clock("baselines"):
+        for baseline in spec.compare_with:
+            own = folder / "baselines" / baseline.kind
+            _claim(own, baseline_spec(spec, baseline))
+            _fit(baseline_spec(spec, baseline), own, demos, watcher, _Clock())
+    with clock("evaluation"):
+        metrics = _evaluate(found, {"train": train, "valid": valid}, demos)
+    metrics |= {
+        "engine_check": check._asdict(),
+        "demonstrations": {"train": len(kept), "tune": len(tune), "valid": len(valid)} | _supervisor(demos),
+        "parameters": sum(parameter.numel() for parameter in hierarchy.parameters()),
+        "seconds": clock.seconds,
+        "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
+    }
+    write_metrics(folder, metrics)
+    return found
+
+
+def baseline_spec(spec: Spec, baseline: BaselineSpec) -> Spec:
+    """The spec of a baseline trained beside: the same but for the model."""
+    return spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": ()})
+
+
+def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
+    """Write ``metrics.json``."""
+    write_text(folder / "metrics.json", json.dumps(metrics, indent=1) + "\n")
+
+
+def _claim(folder: Path, spec: Spec) -> None:
+    """Make the folder this run's; :raises RunError: where it is another's."""
+    text, path = dump_spec(spec), folder / "spec.yaml"
+    if path.exists():
+        if path.read_text() != text:
+            raise RunError(f"{folder}: holds a run of another spec; choose another --out or remove it")
+        return
+    if folder.exists() and any(folder.iterdir()):
+        raise RunError(f"{folder}: is not empty and not a run; choose another --out")
+    write_text(path, text)
+
+
+def _train(
+    spec: Spec,
+    folder: Path,
+    dimensions: Dimensions,
+    parts: tuple[Demonstrations, Demonstrations],
+    watcher: Watcher,
+) -> tuple[Hierarchy, EngineCheck, list[dict[str, Any]]]:
+    train = parts[0]
+
+    def make() -> Hierarchy:
+        hierarchy = build_hierarchy(spec, dimensions)
+        hierarchy.encoder.fit(train)
+        hierarchy.scaling.fit(train)
+        return hierarchy
+
+    first = make()
+    batches = [encode(part, first.encoder, first.scaling) for part in parts]
+    check = compare_engines(first.tabulate(batches[0]), batches[0].lengths)
+    if not check.agrees:
+        raise TrainingError(
+            f"the engines disagree (value {check.value:.1e}, gradient {check.gradient:.1e}): "
+            "this is a defect; use inference.engine=enumerate and report it"
+        )
+    stages = len(plan(spec, first.depth))
+    watcher.training(model_name(spec), stages * spec.training.epochs * spec.training.restarts)
+    checkpoint = folder / "checkpoints" / "latest.safetensors"
+    trainer = Trainer(spec, make, *batches, checkpoint, list(train.names), watcher.epoch)
+    hierarchy = trainer.run()
+    watcher.trained(model_name(spec))
+    return hierarchy, check, trainer.progress.history
+
+
+def _write_model(folder: Path, hierarchy: Hierarchy, dimensions: Dimensions) -> None:
+    shapes = json.dumps({key: list(shape) for key, shape in hierarchy.encoder.shapes.items()})
+    metadata = {"shapes": shapes, "control_size": str(dimensions.control_size), "steps": str(dimensions.steps)}
+    write_tensors(folder / "model.safetensors", hierarchy.state_dict(), metadata)
+
+
+def _write_history(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, ["restart", "stage", "epoch", "train", "tune"], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(folder / "history.csv", text.getvalue())
+
+
+def _evaluate(found: Fit, parts: dict[str, Demonstrations], demos: Demonstrations) -> dict[str, Any]:
+    values = {name: found.log_likelihood(part) for name, part in parts.items()}
+    valid = parts["valid"]
+    lengths = np.array(valid.lengths, dtype=float)
+    metrics: dict[str, Any] = {
+        "model": found.name,
+        "log_likelihood_per_step": {name: float(v.sum() / sum(parts[name].lengths)) for name, v in values.items()},
+        "valid": [
+            {"name": name, "steps": int(steps), "log_likelihood": float(value)}
+            for name, steps, value in zip(valid.names, lengths, values["valid"], strict=True)
+        ],
+        "comparison": {
+            name: {
+                "log_likelihood_per_step": one.metrics["log_likelihood_per_step"],
+                "difference": analysis.paired(values["valid"], one.log_likelihood(valid), lengths),
+            }
+            for name, one in found.baselines.items()
+        },
+    }
+    if found.hierarchy.depth:
+        metrics["options"] = analysis.as_rows(analysis.option_use(found.posterior(demos)))
+        if found.spec.demonstrations.labels:
+            metrics["agreement"] = _agreement(found, parts)
+    return metrics
+
+
+def _agreement(found: Fit, parts: dict[str, Demonstrations]) -> dict[str, Any]:
+    """NMI of each level's segments with the ground-truth labels."""
+    label = found.spec.demonstrations.labels
+    assert label is not None  # asked only where there are labels
+    scores: dict[str, Any] = {"labels": label}
+    for name, part in parts.items():
+        truth = [demo.labels[label] for demo in part]
+        levels = found.segment(part)
+        scores[name] = [
+            analysis.agreement([row[: len(demo)] for row, demo in zip(level, part, strict=True)], truth)
+            for level in levels
+        ]
+    return scores
+
+
+def _supervisor(demos: Demonstrations) -> dict[str, Any]:
+    said = demos.attributes.get("supervisor")
+    return {"supervisor": json.loads(str(said))} if said else {}
+
+
+class _Clock:
+    """Seconds by phase."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, phase: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[phase] = time.perf_counter() - start

@@ -1,0 +1,288 @@
+"""Expectation-gradient training (paper §4.1) in stages (SM 2.2, SM 2.3), with restarts, early stopping and checkpoints.
+
+The gradient of the marginal log-likelihood *is* the expectation-gradient step: the E-step's posteriors weight the
+networks' gradients. A gradient step sees a minibatch of whole trajectories.
+
+Everything random in an epoch is seeded by (seed, restart, stage, epoch), so a run that was interrupted and resumed from
+the end of any epoch gives the same result, bit for bit, as one that was not.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ddco_pyro.encoding import Batch
+from ddco_pyro.files import read_tensors, write_tensors
+from ddco_pyro.hierarchy import Hierarchy
+from ddco_pyro.inference import log_likelihood, total_log_likelihood
+from ddco_pyro.initialize import Clusters
+from ddco_pyro.spec import OptimizerSpec, Spec
+
+State = dict[str, Tensor]
+
+
+class TrainingError(RuntimeError):
+    """Training cannot go on: the message names the trajectory or the checkpoint and says what to do."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of training.
+
+    :param discovering: train levels 1 to d under a uniform meta-policy; None for the whole hierarchy.
+    :param clamped: the level whose choices are clamped to clusters of the observations; None for no level.
+    :param trained: prefixes of the names of the parameters that are trained.
+    """
+
+    name: str
+    discovering: int | None
+    clamped: int | None
+    trained: tuple[str, ...]
+
+
+def plan(spec: Spec, depth: int) -> list[Stage]:
+    """The stages of training for D levels: vector quantisation, then levels from the lowest up, the meta-policy last."""
+    training = spec.training
+    everything = ("levels.", "meta_policy.")
+    if depth == 0:
+        return [Stage("policy", None, None, everything)]
+    stages: list[Stage] = []
+    for level in range(1, depth + 1):
+        own = f"levels.{level - 1}."
+        if training.initialize == "vq":
+            stages.append(Stage(f"vq-{level}", level, level, (own,)))
+        if training.layerwise:
+            fine_tuned = training.lower_levels == "fine_tuned"
+            discovered = tuple(f"levels.{below}." for below in range(level - 1)) if fine_tuned else ()
+            stages.append(Stage(f"level-{level}", level, None, (*discovered, own)))
+    if training.layerwise:
+        trained = everything if training.lower_levels == "fine_tuned" else ("meta_policy.",)
+        return [*stages, Stage("meta-policy", None, None, trained)]
+    return [*stages, Stage("joint", None, None, everything)]
+
+
+@dataclass
+class Progress:
+    """Where training stands at the end of an epoch; with the tensors of a checkpoint it is all that is needed.
+
+    ``best`` is the tuning log-likelihood per step of the best epoch of this stage, ``winner`` that of the best
+    finished restart.
+    """
+
+    restart: int = 0
+    stage: int = 0
+    epoch: int = 0
+    stale: int = 0
+    best: float = -np.inf
+    winner: float = -np.inf
+    history: list[dict[str, Any]] = field(default_factory=list)
+
+
+OnEpoch = Callable[[dict[str, Any]], None]
+
+
+class Trainer:
+    """Trains a hierarchy on ``train``, stopping and choosing among restarts by ``tune``.
+
+    :param make: a freshly initialised hierarchy; called under a seed of its own for each restart.
+    :param checkpoint: where the state is kept at the end of epochs.
+    :param names: names of the demonstrations in ``train``, for messages.
+    :param on_epoch: called with each new row of the history.
+    """
+
+    def __init__(
+        self,
+        spec: Spec,
+        make: Callable[[], Hierarchy],
+        train: Batch,
+        tune: Batch,
+        checkpoint: Path,
+        names: list[str],
+        on_epoch: OnEpoch,
+    ) -> None:
+        self.spec, self.make, self.train, self.tune = spec, make, train, tune
+        self.checkpoint, self.names, self.on_epoch = checkpoint, names, on_epoch
+        self.progress = Progress()
+        self._saved: dict[str, State] = {}
+
+    def run(self) -> Hierarchy:
+        """The best restart's hierarchy, in evaluation mode.
+
+        :raises TrainingError: where a log-likelihood is not finite.
+        """
+        self._load()
+        model = self._fresh()
+        stages = plan(self.spec, model.depth)
+        while self.progress.restart < self.spec.training.restarts:
+            if self.progress.stage == 0 and self.progress.epoch == 0:
+                model = self._fresh()
+            for self.progress.stage in range(self.progress.stage, len(stages)):
+                self._run_stage(model, stages[self.progress.stage])
+            self._finish_restart(model)
+        model.load_state_dict(self._saved["winner"])
+        return model.eval()
+
+    def _fresh(self) -> Hierarchy:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self._seed(self.progress.restart))
+            return self.make()
+
+    def _seed(self, *where: int) -> int:
+        return int(np.random.SeedSequence([self.spec.seed, *where]).generate_state(1)[0])
+
+    def _run_stage(self, model: Hierarchy, stage: Stage) -> None:
+        now = self.progress
+        objective = _Objective(self, stage)
+        parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
+        optimizer = _optimizer(self.spec.training.optimizer, parameters)
+        if now.epoch > 0:
+            model.load_state_dict(self._saved["model"])
+            _restore_optimizer(optimizer, self._saved["optimizer"])
+        else:
+            now.best, now.stale = objective.tune(model), 0
+            self._saved["best"] = _copy(model)
+        while now.epoch < self.spec.training.epochs and now.stale < (self.spec.training.patience or np.inf):
+            train = self._epoch(model, optimizer, parameters, objective)
+            self._record(stage, train, objective.tune(model), model)
+            self._save(model, optimizer)
+        model.load_state_dict(self._saved["best"])
+        now.epoch = 0
+
+    def _epoch(
+        self, model: Hierarchy, optimizer: torch.optim.Optimizer, parameters: list[nn.Parameter], objective: _Objective
+    ) -> float:
+        """One pass over the training demonstrations; the log-likelihood per step seen on the way."""
+        now, total = self.progress, 0.0
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self._seed(now.restart, now.stage, now.epoch))
+            model.train()
+            for rows in torch.randperm(len(self.train)).split(self.spec.training.batch_size):
+                optimizer.zero_grad(set_to_none=True)
+                value = objective.train(model, rows)
+                (-value / int(self.train.lengths[rows].sum())).backward()
+                if self.spec.training.clip_gradient is not None:
+                    nn.utils.clip_grad_norm_(parameters, self.spec.training.clip_gradient)
+                optimizer.step()
+                total += float(value.detach())
+            model.eval()
+        return total / self.train.steps
+
+    def _record(self, stage: Stage, train: float, tune: float, model: Hierarchy) -> None:
+        now = self.progress
+        now.epoch += 1
+        if tune > now.best:
+            now.best, now.stale = tune, 0
+            self._saved["best"] = _copy(model)
+        else:
+            now.stale += 1
+        row = {"restart": now.restart, "stage": stage.name, "epoch": now.epoch, "train": train, "tune": tune}
+        now.history.append(row)
+        self.on_epoch(row)
+
+    def _finish_restart(self, model: Hierarchy) -> None:
+        now = self.progress
+        with torch.no_grad():
+            value = float(total_log_likelihood(model.tabulate(self.tune), self.tune.lengths)) / self.tune.steps
+        if "winner" not in self._saved or value > now.winner:
+            now.winner = value
+            self._saved["winner"] = _copy(model)
+        now.restart, now.stage, now.epoch = now.restart + 1, 0, 0
+        self._save(model, None)
+
+    def _save(self, model: Hierarchy, optimizer: torch.optim.Optimizer | None) -> None:
+        self._saved["model"] = _copy(model)
+        self._saved["optimizer"] = {} if optimizer is None else _optimizer_state(optimizer)
+        tensors = {f"{part}/{name}": value for part, state in self._saved.items() for name, value in state.items()}
+        write_tensors(self.checkpoint, tensors, {"progress": json.dumps(asdict(self.progress))})
+
+    def _load(self) -> None:
+        if not self.checkpoint.exists():
+            return
+        tensors, metadata = read_tensors(self.checkpoint)
+        self.progress = Progress(**json.loads(metadata["progress"]))
+        self._saved = {"optimizer": {}}
+        for name, value in tensors.items():
+            part, _, rest = name.partition("/")
+            self._saved.setdefault(part, {})[rest] = value
+
+
+class _Objective:
+    """What a stage maximises: the log-likelihood, with the choices of one level clamped where the stage says so."""
+
+    def __init__(self, trainer: Trainer, stage: Stage) -> None:
+        self.trainer, self.stage = trainer, stage
+        self.clusters: tuple[Tensor, Tensor] | None = None
+        if stage.clamped is not None:
+            hierarchy = trainer.spec.hierarchy
+            assert hierarchy is not None  # only levels are clamped
+            seed = trainer._seed(trainer.progress.restart, trainer.progress.stage)
+            found = Clusters(trainer.train, hierarchy.levels[stage.clamped - 1].count, seed)
+            self.clusters = found.choices(trainer.train), found.choices(trainer.tune)
+
+    def train(self, model: Hierarchy, rows: Tensor) -> Tensor:
+        """Total log-likelihood of some training demonstrations, differentiable."""
+        batch = self.trainer.train.select(rows)
+        choices = None if self.clusters is None else self.clusters[0][rows, : batch.inputs.batch[1]]
+        value = self._total(model, batch, choices)
+        if not bool(torch.isfinite(value.detach())):
+            raise self._not_finite(model, batch, rows)
+        return value
+
+    def tune(self, model: Hierarchy) -> float:
+        """Log-likelihood per step of the tuning demonstrations."""
+        with torch.no_grad():
+            choices = None if self.clusters is None else self.clusters[1]
+            return float(self._total(model, self.trainer.tune, choices)) / self.trainer.tune.steps
+
+    def _total(self, model: Hierarchy, batch: Batch, choices: Tensor | None) -> Tensor:
+        tables = model.tabulate(batch, self.stage.discovering)
+        if choices is not None and self.stage.clamped is not None:
+            tables = tables.clamp(self.stage.clamped, choices)
+        return total_log_likelihood(tables, batch.lengths, self.trainer.spec.inference.engine)
+
+    def _not_finite(self, model: Hierarchy, batch: Batch, rows: Tensor) -> TrainingError:
+        with torch.no_grad():
+            values = log_likelihood(model.tabulate(batch, self.stage.discovering), batch.lengths)
+        bad = [self.trainer.names[int(row)] for row, ok in zip(rows, torch.isfinite(values), strict=True) if not ok]
+        where = ", ".join(bad) or "this minibatch (no trajectory alone)"
+        return TrainingError(
+            f"stage {self.stage.name}, epoch {self.trainer.progress.epoch + 1}: the log-likelihood of {where} is not "
+            "finite; look at these demonstrations, raise control.std, or lower training.optimizer.lr"
+        )
+
+
+def _optimizer(spec: OptimizerSpec, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
+    if spec.name == "adam":
+        return torch.optim.Adam(parameters, lr=spec.lr, weight_decay=spec.weight_decay)
+    return torch.optim.SGD(parameters, lr=spec.lr, momentum=spec.momentum, weight_decay=spec.weight_decay)
+
+
+def _copy(model: nn.Module) -> State:
+    return {name: value.detach().clone() for name, value in model.state_dict().items()}
+
+
+def _optimizer_state(optimizer: torch.optim.Optimizer) -> State:
+    """The optimiser's tensors by ``<parameter>.<name>``."""
+    state = optimizer.state_dict()["state"]
+    return {
+        f"{index}.{name}": torch.as_tensor(value).clone()
+        for index, values in state.items()
+        for name, value in values.items()
+        if value is not None
+    }
+
+
+def _restore_optimizer(optimizer: torch.optim.Optimizer, state: State) -> None:
+    nested: dict[int, State] = {}
+    for key, value in state.items():
+        index, _, name = key.partition(".")
+        nested.setdefault(int(index), {})[name] = value
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": nested})
