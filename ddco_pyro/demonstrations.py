@@ -1,7 +1,7 @@
 """Demonstrations in memory and in HDF5 files of robomimic's layout.
 
-A file holds groups ``data/<name>`` with ``actions`` [T, A], ``obs/<key>`` [T, ...] and optionally ``labels/<name>`` [T],
-and optionally ``mask/<name>``, lists of names of demonstrations.
+A file holds groups ``data/<name>`` with ``actions`` [T, A], ``obs/<key>`` [T, ...] and, if it likes, ``labels/<name>``
+[T]; beside them, if it likes, ``mask/<name>``: lists of names of demonstrations.
 """
 
 from __future__ import annotations
@@ -214,9 +214,8 @@ class Demonstrations(Sequence[Demonstration]):
         train = self._without(valid or ()) if train is None else train
         valid = self._without(train) if valid is None else valid
         if not train or not valid:
-            raise DemonstrationsError(
-                f"no demonstration is left to {'validate' if train else 'train'} with; add demonstrations or change the masks"
-            )
+            purpose = "validate" if train else "train"
+            raise DemonstrationsError(f"no demonstration is left to {purpose} with; add some or change the masks")
         both = set(train) & set(valid)
         if both:
             raise DemonstrationsError(f"{min(both)} is in mask/train and in mask/valid; remove it from one")

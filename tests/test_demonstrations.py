@@ -1,0 +1,417 @@
+"""Demonstrations: what is read is what was written, and a file that cannot be used is refused in one clear line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from ddco_pyro.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+
+METAWORLD = Path(__file__).parents[2] / "shared" / "data" / "metaworld_pick_place.hdf5"
+
+
+def demonstration(name: str, steps: int = 4, seed: int = 0) -> Demonstration:
+    random = np.random.default_rng(seed)
+    return Demonstration(
+        name=name,
+        observations={
+            "pose": random.normal(size=(steps, 3)),
+            "camera": random.integers(0, 256, (steps, 6, 5, 3), dtype=np.uint8),
+        },
+        actions=random.normal(size=(steps, 2)),
+        labels={"phase": random.integers(0, 3, steps)},
+        attributes={"seed": seed, "accuracy": 0.5, "success": True, "policy": "supervisor"},
+    )
+
+
+def demonstrations(number: int = 12, masks: dict[str, tuple[str, ...]] | None = None) -> Demonstrations:
+    records = tuple(demonstration(f"demo_{index}", 3 + index % 4, index) for index in range(number))
+    return Demonstrations(records, masks or {}, {"task": "needle", "version": 3})
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "demos.hdf5"
+
+
+def assert_equal(one: Demonstration, other: Demonstration) -> None:
+    assert (one.name, one.attributes) == (other.name, other.attributes)
+    np.testing.assert_array_equal(one.actions, other.actions, strict=True)
+    for ours, theirs in ((one.observations, other.observations), (one.labels, other.labels)):
+        assert set(ours) == set(theirs)
+        for key in ours:
+            np.testing.assert_array_equal(ours[key], theirs[key], strict=True)
+
+
+# --- reading and writing ----------------------------------------------------------------------------------------------
+
+
+def test_what_is_read_is_what_was_written(path: Path) -> None:
+    original = demonstrations(masks={"valid": ("demo_2", "demo_10"), "none": ()})
+    original.write(path)
+    read = Demonstrations.read(path, labels=["phase"])
+    assert read.names == original.names
+    assert (read.masks, read.attributes) == (original.masks, original.attributes)
+    for one, other in zip(read, original, strict=True):
+        assert_equal(one, other)
+
+
+@given(
+    hnp.arrays(
+        np.float64,
+        st.tuples(st.integers(1, 5), st.integers(1, 3)),
+        elements={"allow_nan": False, "allow_infinity": False},
+    )
+)
+def test_numbers_survive_exactly(tmp_path_factory: pytest.TempPathFactory, actions: np.ndarray) -> None:
+    path = tmp_path_factory.mktemp("demos") / "demos.hdf5"
+    Demonstrations((Demonstration("demo_0", {"x": actions}, actions),)).write(path)
+    (read,) = Demonstrations.read(path)
+    np.testing.assert_array_equal(read.actions, actions, strict=True)
+    np.testing.assert_array_equal(read.observations["x"], actions, strict=True)
+
+
+def test_demonstrations_come_in_natural_order(path: Path) -> None:
+    demonstrations(12).write(path)
+    assert Demonstrations.read(path).names == tuple(f"demo_{index}" for index in range(12))
+
+
+def test_only_what_is_asked_for_is_read(path: Path) -> None:
+    demonstrations().write(path)
+    with h5py.File(path, "r+") as file:
+        file["data/demo_3/obs/camera"][...] = 0
+        del file["data/demo_4/obs/camera"]
+    read = Demonstrations.read(path, ["pose"])
+    assert read.observation_shapes == {"pose": (3,)}
+    assert read[0].labels == {}
+    assert Demonstrations.read(path, []).observation_shapes == {}
+
+
+def test_types_in_memory(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        demo = file.create_group("data/demo_0")
+        demo["actions"] = np.ones((3, 2), np.float32)
+        demo["obs/pose"] = np.ones((3, 2), np.int16)
+        demo["obs/camera"] = np.ones((3, 4, 4, 3), np.uint8)
+        demo["labels/phase"] = np.ones(3, np.int8)
+    (read,) = Demonstrations.read(path, labels=["phase"])
+    types = [
+        array.dtype
+        for array in (read.actions, read.observations["pose"], read.observations["camera"], read.labels["phase"])
+    ]
+    assert types == [np.float64, np.float64, np.uint8, np.int64]
+    assert read.attributes == {}
+
+
+def test_keys_may_have_a_slash(path: Path) -> None:
+    Demonstrations((Demonstration("demo_0", {"arm/pose": np.ones((2, 3))}, np.ones((2, 1))),)).write(path)
+    assert Demonstrations.read(path).observation_shapes == {"arm/pose": (3,)}
+    assert Demonstrations.read(path, ["arm/pose"]).observation_shapes == {"arm/pose": (3,)}
+
+
+def test_the_layout_is_robomimics(path: Path) -> None:
+    demonstrations(3, {"train": ("demo_1",)}).write(path)
+    with h5py.File(path) as file:
+        assert sorted(file) == ["data", "mask"]
+        assert file["data"].attrs["total"] == 3 + 4 + 5
+        assert file["data/demo_1"].attrs["num_samples"] == 4
+        assert sorted(file["data/demo_1"]) == ["actions", "labels", "obs"]
+        assert file["mask/train"][()].tolist() == [b"demo_1"]
+
+
+def test_a_write_that_fails_leaves_the_old_file(path: Path) -> None:
+    demonstrations(2).write(path)
+    before = path.read_bytes()
+    broken = Demonstrations((demonstration("demo_0"),), attributes={"task": {"not": "an attribute"}})  # type: ignore[dict-item]
+    with pytest.raises(TypeError):
+        broken.write(path)
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_equal_demonstrations_give_equal_files(path: Path) -> None:
+    demonstrations(2).write(path)
+    other = path.with_name("other.hdf5")
+    demonstrations(2).write(other)
+    assert path.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.skipif(not METAWORLD.exists(), reason="the Meta-World demonstrations are not on this machine")
+def test_a_file_by_somebody_else() -> None:
+    read = Demonstrations.read(METAWORLD, ["hand_pos", "object_pos"], ["phase"])
+    assert (len(read), sum(read.lengths), read.control_size) == (50, 2950, 4)
+    assert read.names[:3] == ("demo_0", "demo_1", "demo_2")
+    assert read.observation_shapes == {"hand_pos": (3,), "object_pos": (3,)}
+    assert set(np.concatenate([demo.labels["phase"] for demo in read])) == {0, 1, 2, 3}
+    train, valid = read.split(0.5, seed=0)
+    assert (train.names, valid.names) == (read.masks["train"], read.masks["valid"])
+    assert (len(train), len(valid)) == (40, 10)
+
+
+# --- as a sequence ----------------------------------------------------------------------------------------------------
+
+
+def test_demonstrations_are_a_sequence() -> None:
+    demos = demonstrations(5)
+    assert len(demos) == 5
+    assert [demo.name for demo in demos] == list(demos.names)
+    assert demos[-1].name == "demo_4"
+    assert [demo.name for demo in demos[1:3]] == ["demo_1", "demo_2"]
+    assert demos.lengths == (3, 4, 5, 6, 3)
+    assert demos.observation_shapes == {"pose": (3,), "camera": (6, 5, 3)}
+    assert demos.control_size == 2
+
+
+def test_select() -> None:
+    demos = demonstrations(5, {"valid": ("demo_0",)})
+    chosen = demos.select(["demo_3", "demo_1"])
+    assert chosen.names == ("demo_3", "demo_1")
+    assert chosen.masks == {}
+    with pytest.raises(DemonstrationsError, match=r"^there is no demonstration 'demo_33' \(did you mean 'demo_3'\?\)$"):
+        demos.select(["demo_33"])
+
+
+# --- splits -----------------------------------------------------------------------------------------------------------
+
+
+@given(st.integers(2, 30), st.floats(0.001, 0.999), st.integers(0, 2**32 - 1))
+def test_a_split_is_a_partition(number: int, fraction: float, seed: int) -> None:
+    records = tuple(Demonstration(f"demo_{index}", {}, np.zeros((1, 1))) for index in range(number))
+    demos = Demonstrations(records)
+    train, valid = demos.split(fraction, seed)
+    assert len(train) >= 1
+    assert abs(len(valid) - fraction * number) <= 1
+    assert set(train.names) | set(valid.names) == set(demos.names)
+    assert len(train) + len(valid) == number
+    again = demos.split(fraction, seed)
+    assert (again[0].names, again[1].names) == (train.names, valid.names)
+
+
+def test_the_seed_decides_a_split() -> None:
+    demos = demonstrations(12)
+    assert len({demos.split(0.3, seed)[1].names for seed in range(8)}) > 1
+
+
+@pytest.mark.parametrize(
+    ("masks", "train", "valid"),
+    [
+        ({"train": ("demo_1",), "valid": ("demo_3", "demo_0")}, ["demo_1"], ["demo_3", "demo_0"]),
+        ({"valid": ("demo_3", "demo_0")}, ["demo_1", "demo_2"], ["demo_3", "demo_0"]),
+        ({"train": ("demo_1", "demo_3")}, ["demo_1", "demo_3"], ["demo_0", "demo_2"]),
+    ],
+)
+def test_masks_decide_a_split(masks: dict[str, tuple[str, ...]], train: list[str], valid: list[str]) -> None:
+    parts = demonstrations(4, masks).split(0.5, seed=0)
+    assert [list(part.names) for part in parts] == [train, valid]
+
+
+@pytest.mark.parametrize(
+    ("number", "masks", "message"),
+    [
+        (1, {}, "no demonstration is left to validate with; add some or change the masks"),
+        (2, {"valid": ("demo_0", "demo_1")}, "no demonstration is left to train with; add some or change the masks"),
+        (2, {"valid": ()}, "no demonstration is left to validate with; add some or change the masks"),
+        (
+            2,
+            {"train": ("demo_1",), "valid": ("demo_1",)},
+            "demo_1 is in mask/train and in mask/valid; remove it from one",
+        ),
+    ],
+)
+def test_splits_that_cannot_be(number: int, masks: dict[str, tuple[str, ...]], message: str) -> None:
+    with pytest.raises(DemonstrationsError, match=f"^{re.escape(message)}$"):
+        demonstrations(number, masks).split(0.5, seed=0)
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+def replace(place: str, data: object) -> Callable[[h5py.File], None]:
+    """A change of a file: what is at ``place`` becomes ``data``."""
+
+    def change(file: h5py.File) -> None:
+        if place in file:
+            del file[place]
+        file[place] = data
+
+    return change
+
+
+def remove(place: str) -> Callable[[h5py.File], None]:
+    def change(file: h5py.File) -> None:
+        del file[place]
+
+    return change
+
+
+def empty(file: h5py.File) -> None:
+    for name in list(file["data"]):
+        del file["data"][name]
+
+
+def claim(file: h5py.File) -> None:
+    del file["data/demo_1/obs/pose"]
+    file.create_dataset("data/demo_1/obs/pose", shape=(10**12, 3), chunks=(1024, 3), dtype="f8")
+
+
+def count_wrongly(file: h5py.File) -> None:
+    file["data/demo_1"].attrs["num_samples"] = 7
+
+
+def group_for_actions(file: h5py.File) -> None:
+    del file["data/demo_1/actions"]
+    file.create_group("data/demo_1/actions")
+
+
+def dangling_link(file: h5py.File) -> None:
+    del file["data/demo_1/actions"]
+    file["data/demo_1/actions"] = h5py.SoftLink("/nowhere")
+
+
+NAN = np.array([[0.0, 1.0], [2.0, np.nan], [0.0, 0.0], [0.0, 0.0]])
+
+REFUSED: list[tuple[str, Callable[[h5py.File], None], str]] = [
+    ("no data", remove("data"), "data is missing; there is: mask"),
+    ("data is an array", replace("data", [1]), "data has to be a group, not a dataset"),
+    ("no demonstrations", empty, "the group 'data' holds no demonstrations; at least one is needed"),
+    (
+        "no actions",
+        remove("data/demo_1/actions"),
+        "demo_1: actions is missing; there is: labels/phase, obs/camera, obs/pose",
+    ),
+    ("group for actions", group_for_actions, "demo_1: actions has to be a dataset, not a group"),
+    ("dangling link", dangling_link, "demo_1: actions is missing; there is: labels/phase, obs/camera, obs/pose"),
+    ("no obs", remove("data/demo_1/obs"), "demo_1: obs is missing; there is: actions, labels"),
+    ("no such key", remove("data/demo_1/obs/pose"), "demo_1: obs/pose is missing; there is: camera"),
+    ("no labels", remove("data/demo_1/labels"), "demo_1: labels is missing; there is: actions, obs"),
+    ("short obs", replace("data/demo_1/obs/pose", np.ones((3, 3))), "demo_1: obs/pose has 3 steps, but actions has 4"),
+    ("scalar obs", replace("data/demo_1/obs/pose", 3.0), "demo_1: obs/pose has no steps; it has to be an array"),
+    (
+        "long labels",
+        replace("data/demo_1/labels/phase", np.ones(5, int)),
+        "demo_1: labels/phase has 5 steps, but actions has 4",
+    ),
+    ("num_samples", count_wrongly, "demo_1: actions has 4 steps, but num_samples is 7"),
+    (
+        "NaN",
+        replace("data/demo_1/actions", NAN),
+        "demo_1: actions is nan at index [1, 1]; repair or remove this demonstration",
+    ),
+    (
+        "infinite",
+        replace("data/demo_1/obs/pose", np.full((4, 3), -np.inf)),
+        "demo_1: obs/pose is -inf at index [0, 0]; repair or remove this demonstration",
+    ),
+    ("text", replace("data/demo_1/actions", [["a"]] * 4), "demo_1: actions holds object, it has to hold real numbers"),
+    (
+        "complex",
+        replace("data/demo_1/actions", np.ones((4, 2), complex)),
+        "demo_1: actions holds complex128, it has to hold real numbers",
+    ),
+    (
+        "flat actions",
+        replace("data/demo_1/actions", np.ones(4)),
+        "demo_1: actions has shape (4,), it has to be [steps, dimensions]",
+    ),
+    (
+        "float labels",
+        replace("data/demo_1/labels/phase", np.ones(4)),
+        "demo_1: labels/phase is float64 of shape (4,), it has to be integers of shape [steps]",
+    ),
+    (
+        "other obs shape",
+        replace("data/demo_1/obs/pose", np.ones((4, 2))),
+        "demo_1: obs/pose has shape (2,) at each step, but (3,) in demo_0; all demonstrations need the same",
+    ),
+    (
+        "other actions shape",
+        replace("data/demo_1/actions", np.ones((4, 3))),
+        "demo_1: actions has shape (3,) at each step, but (2,) in demo_0; all demonstrations need the same",
+    ),
+    (
+        "unknown in mask",
+        replace("mask/valid", [b"demo_11"]),
+        "mask/valid: there is no demonstration 'demo_11' (did you mean 'demo_1'?)",
+    ),
+    ("claimed size", claim, "demo_1: obs/pose claims 24000000000000 bytes, but the file holds 0; write it again"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), [case[1:] for case in REFUSED], ids=[case[0] for case in REFUSED])
+def test_refused_in_one_line(path: Path, change: Callable[[h5py.File], None], message: str) -> None:
+    demonstrations(3, {"valid": ("demo_1",)}).write(path)
+    with h5py.File(path, "r+") as file:
+        change(file)
+    with pytest.raises(DemonstrationsError) as caught:
+        Demonstrations.read(path, ["pose"], ["phase"])
+    assert str(caught.value) == f"{path}: {message}"
+
+
+def test_demonstrations_without_steps_are_refused(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["data/demo_0/actions"] = np.zeros((0, 2))
+        file["data/demo_0/obs/pose"] = np.zeros((0, 3))
+    with pytest.raises(DemonstrationsError, match=r"demo_0: actions has no steps; remove this demonstration$"):
+        Demonstrations.read(path)
+
+
+def test_a_key_that_differs_between_demonstrations_is_refused(path: Path) -> None:
+    demonstrations(3).write(path)
+    with h5py.File(path, "r+") as file:
+        file["data/demo_2/obs/extra"] = np.ones((5, 1))
+    with pytest.raises(DemonstrationsError, match=r"demo_2: extra is only in one of demo_0 and demo_2$"):
+        Demonstrations.read(path)
+
+
+def test_a_misspelt_key_is_refused_with_the_nearest(path: Path) -> None:
+    demonstrations(2).write(path)
+    with pytest.raises(
+        DemonstrationsError, match=r"demo_0: obs/poze is missing \(did you mean 'pose'\?\); there is: camera, pose$"
+    ):
+        Demonstrations.read(path, ["poze"])
+
+
+def test_files_that_are_no_hdf5(tmp_path: Path) -> None:
+    with pytest.raises(DemonstrationsError, match=r"none\.hdf5: there is no such file; check the path$"):
+        Demonstrations.read(tmp_path / "none.hdf5")
+    (tmp_path / "text.hdf5").write_text("these are no demonstrations")
+    with pytest.raises(DemonstrationsError, match=r"text\.hdf5: cannot be read as HDF5"):
+        Demonstrations.read(tmp_path / "text.hdf5")
+
+
+def test_files_that_are_cut_short(path: Path) -> None:
+    demonstrations(3).write(path)
+    whole = path.read_bytes()
+    for length in np.linspace(0, len(whole) - 1, 20, dtype=int):
+        path.write_bytes(whole[:length])
+        with pytest.raises(DemonstrationsError, match=r"demos\.hdf5: "):
+            Demonstrations.read(path)
+
+
+def test_damaged_data_is_refused(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file.create_dataset("data/demo_0/actions", data=np.arange(4000.0).reshape(2000, 2), fletcher32=True)
+    with h5py.File(path) as file:
+        offset = file["data/demo_0/actions"].id.get_chunk_info(0).byte_offset
+    content = bytearray(path.read_bytes())
+    content[offset + 8] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DemonstrationsError, match=r"demo_0: actions cannot be read .* the file may be damaged$"):
+        Demonstrations.read(path, [])
+
+
+def test_what_is_made_in_memory_is_checked_too() -> None:
+    with pytest.raises(DemonstrationsError, match="there are no demonstrations"):
+        Demonstrations(())
+    with pytest.raises(DemonstrationsError, match="demo_0: there are two demonstrations of this name"):
+        Demonstrations((demonstration("demo_0"), demonstration("demo_0")))
+    with pytest.raises(DemonstrationsError, match="'a/b' cannot be the name of a demonstration"):
+        demonstration("a/b")
