@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import pyro
 import torch
@@ -165,7 +165,7 @@ class Tabulated(TorchDistribution):
     respect to a table is the posterior probability of its entries.
     """
 
-    arg_constraints = {"log_probs": constraints.real_vector}
+    arg_constraints: ClassVar = {"log_probs": constraints.real_vector}
     has_enumerate_support = True
 
     def __init__(self, log_probs: Tensor, validate_args: bool | None = None) -> None:

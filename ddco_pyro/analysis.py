@@ -1,5 +1,6 @@
 """What a fitted hierarchy says about demonstrations: who is active when, for how long, and whether it agrees with
-ground truth."""
+ground truth.
+"""
 
 from __future__ import annotations
 

@@ -11,12 +11,13 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from ddco_pyro.ahmm import Tabulated, choose, complete
+from ddco_pyro.errors import BadInput
 from ddco_pyro.hierarchy import Decision, Hierarchy, Outputs
 from ddco_pyro.networks import Inputs
 from ddco_pyro.spec import RolloutSpec
 
 
-class ObservationError(ValueError):
+class ObservationError(BadInput):
     """An observation that is missing, or has another shape than the demonstrations had."""
 
 
@@ -118,5 +119,3 @@ def _checked(observation: Mapping[str, np.ndarray], key: str, shape: tuple[int, 
     if not np.isfinite(value).all():
         raise ObservationError(f"observation {key!r} is not finite")
     return value
-
-

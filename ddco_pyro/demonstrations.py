@@ -16,14 +16,23 @@ from typing import Any, overload
 import h5py
 import numpy as np
 
+from ddco_pyro.errors import BadInput
 from ddco_pyro.files import whole_file
 
 Attribute = float | int | str | bool
 
 LARGEST_INFLATION = 1100  # deflate, the strongest of HDF5's usual filters, stores at most 1032 bytes in one
+_DAMAGE = (
+    OSError,
+    RuntimeError,
+    ValueError,
+    TypeError,
+    KeyError,
+    MemoryError,
+)  # h5py raises any of these for a damaged file
 
 
-class DemonstrationsError(ValueError):
+class DemonstrationsError(BadInput):
     """Demonstrations that cannot be used; one line with the file, the demonstration and the key."""
 
 
@@ -141,8 +150,8 @@ class Demonstrations(Sequence[Demonstration]):
             raise DemonstrationsError(f"{path}: {error}") from None
         except FileNotFoundError:
             raise DemonstrationsError(f"{path}: there is no such file; check the path") from None
-        except OSError as error:
-            raise DemonstrationsError(f"{path}: cannot be read as HDF5, or is cut short: {error}") from error
+        except _DAMAGE as error:
+            raise DemonstrationsError(f"{path}: cannot be read as HDF5, or is damaged: {error}") from error
 
     def write(self, path: str | Path) -> None:
         """Write an HDF5 file, whole or not at all."""
@@ -320,7 +329,7 @@ def _array(group: h5py.Group, key: str, where: str) -> np.ndarray:
         )
     try:
         return np.asarray(dataset[()])
-    except (OSError, MemoryError, ValueError) as error:
+    except _DAMAGE as error:
         raise DemonstrationsError(f"{where}{key} cannot be read ({error}); the file may be damaged") from error
 
 
@@ -346,8 +355,10 @@ def _read_mask(masks: h5py.Group, mask: str) -> tuple[str, ...]:
 
 
 def _attributes(owner: h5py.HLObject) -> dict[str, Attribute]:
-    """The attributes that hold one number or text."""
-    values = {name: value.item() if isinstance(value, np.generic) else value for name, value in owner.attrs.items()}
+    """The attributes that hold one number or text. Arrays are not even read: a damaged one can claim any size."""
+    attributes = owner.attrs
+    single = [name for name in attributes if attributes.get_id(name).shape == ()]
+    values = {name: value.item() if isinstance(value := attributes[name], np.generic) else value for name in single}
     return {name: value for name, value in values.items() if isinstance(value, Attribute)}
 
 

@@ -6,6 +6,7 @@ A baseline is a hierarchy without option levels whose meta-policy emits control.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -30,7 +31,8 @@ Emits = Literal["options", "control"]
 @dataclass(frozen=True)
 class Decision:
     """What the K callers of one level say: ``selection`` log η [N, T, K, 1 + k] and the ``mean`` control [N, T, K, A]
-    with its ``std`` [K, A], both in scaled units; None for what they do not emit."""
+    with its ``std`` [K, A], both in scaled units; None for what they do not emit.
+    """
 
     selection: Tensor | None
     mean: Tensor | None
@@ -161,12 +163,22 @@ class Hierarchy(nn.Module):
         """The number D of option levels."""
         return len(self.levels)
 
+    def _levels(self) -> list[Level]:
+        return [level for level in self.levels if isinstance(level, Level)]
+
+    def named_networks(self) -> Iterator[tuple[str, nn.Module]]:
+        """Every network by its place in the spec."""
+        for number, level in enumerate(self._levels()):
+            yield f"hierarchy.levels.{number}.policy", level.policy
+            yield f"hierarchy.levels.{number}.termination", level.termination
+        yield "hierarchy.meta_policy" if self.depth else "baseline.policy", self.meta_policy
+
     def forward(self, inputs: Inputs, discovering: int | None = None) -> Outputs:
         """What the networks say about these observations.
 
         :param discovering: d gives levels 1 to d alone under a uniform meta-policy (layer-wise training, SM 2.3).
         """
-        levels = list(self.levels[:discovering] if discovering else self.levels)
+        levels = self._levels()[:discovering]
         decisions = [level.policy(inputs) for level in levels]
         top = _uniform(inputs, levels[-1].count, decisions[0].std) if discovering else self.meta_policy(inputs)
         return Outputs((*decisions, top), tuple(level.log_termination(inputs) for level in levels))

@@ -19,7 +19,8 @@ CONFIDENCE = 0.95
 @dataclass(frozen=True)
 class Episode:
     """One episode: the ``record`` of observations and controls, ``outcome`` as the task measures it, the ``choices``
-    of each level at each step [T, D] where a controller acted, and ``frames`` uint8 [T + 1, H, W, 3] where filmed."""
+    of each level at each step [T, D] where a controller acted, and ``frames`` uint8 [T + 1, H, W, 3] where filmed.
+    """
 
     seed: int
     record: Demonstration

@@ -22,6 +22,7 @@ from ddco_pyro.controller import Controller
 from ddco_pyro.data import Dimensions, build_hierarchy, demonstrations
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.encoding import encode
+from ddco_pyro.errors import BadInput
 from ddco_pyro.files import read_tensors, write_tensors, write_text
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference import Posterior, log_likelihood, posterior, segment
@@ -32,7 +33,7 @@ from ddco_pyro.training import Trainer, TrainingError, plan
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
 
 
-class RunError(ValueError):
+class RunError(BadInput):
     """A folder is not the run it was taken for."""
 
 
@@ -127,12 +128,12 @@ def load(folder: str | Path) -> Fit:
 def fit(spec: Spec, folder: Path, watcher: Watcher) -> Fit:
     """Collect or read the demonstrations, train the spec's model and its baselines, evaluate, and fill the run folder.
 
-    A folder that already holds part of this run is continued.
+    A folder that holds part of this run is continued.
 
-    :raises RunError: the folder holds another run.
+    :raises RunError: the folder holds something else.
     :raises TrainingError: training stopped; nothing that was written before is lost.
     """
-    _claim(folder, spec)
+    claim(folder, spec)
     clock = _Clock()
     with clock("demonstrations"):
         demos = demonstrations(spec, watcher.collected)
@@ -150,7 +151,7 @@ def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, cloc
     with clock("baselines"):
         for baseline in spec.compare_with:
             own = folder / "baselines" / baseline.kind
-            _claim(own, baseline_spec(spec, baseline))
+            claim(own, baseline_spec(spec, baseline))
             _fit(baseline_spec(spec, baseline), own, demos, watcher, _Clock())
     with clock("evaluation"):
         metrics = _evaluate(found, {"train": train, "valid": valid}, demos)
@@ -175,12 +176,18 @@ def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
     write_text(folder / "metrics.json", json.dumps(metrics, indent=1) + "\n")
 
 
-def _claim(folder: Path, spec: Spec) -> None:
-    """Make the folder this run's; :raises RunError: where it is another's."""
+def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
+    """Make the folder this spec's run.
+
+    :param resume: whether it may hold (part of) this very run already.
+    :raises RunError: it holds something else, or may not be resumed.
+    """
     text, path = dump_spec(spec), folder / "spec.yaml"
     if path.exists():
         if path.read_text() != text:
             raise RunError(f"{folder}: holds a run of another spec; choose another --out or remove it")
+        if not resume:
+            raise RunError(f"{folder}: holds a run of this spec already; continue it with --resume")
         return
     if folder.exists() and any(folder.iterdir()):
         raise RunError(f"{folder}: is not empty and not a run; choose another --out")
@@ -213,7 +220,7 @@ def _train(
     stages = len(plan(spec, first.depth))
     watcher.training(model_name(spec), stages * spec.training.epochs * spec.training.restarts)
     checkpoint = folder / "checkpoints" / "latest.safetensors"
-    trainer = Trainer(spec, make, *batches, checkpoint, list(train.names), watcher.epoch)
+    trainer = Trainer(spec, make, batches[0], batches[1], checkpoint, list(train.names), watcher.epoch)
     hierarchy = trainer.run()
     watcher.trained(model_name(spec))
     return hierarchy, check, trainer.progress.history

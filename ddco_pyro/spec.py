@@ -28,8 +28,10 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
 
+from ddco_pyro.errors import BadInput
 
-class SpecError(ValueError):
+
+class SpecError(BadInput):
     """A spec that cannot be used. The message has one line for each problem; ``problems`` has them apart."""
 
     def __init__(self, *problems: str) -> None:
@@ -66,10 +68,10 @@ def _problems(*found: tuple[str, str]) -> PydanticCustomError:
 
 CUSTOM = "module:Class"
 NETWORK_KEYS: dict[str, tuple[str, ...]] = {
-    "linear": ("dropout",),
+    "linear": (),
     "mlp": ("hidden", "dropout"),
     "per_timestep": ("hidden", "dropout"),
-    "conv": ("dropout", "filters", "kernel"),
+    "conv": ("hidden", "dropout", "filters", "kernel"),
     CUSTOM: ("options",),
 }
 _SETTINGS = ("hidden", "dropout", "filters", "kernel", "options")
@@ -89,7 +91,7 @@ class NetworkSpec(_Model):
     hidden: Items[Count] = Field(
         default_factory=lambda data: () if "hidden" in _foreign_keys(data.get("network")) else (64,)
     )
-    """Sizes of the hidden layers, first one first (``mlp`` and ``per_timestep``; default [64])."""
+    """Sizes of the hidden layers, first one first (``mlp``, ``per_timestep`` and ``conv``; default [64])."""
     dropout: Share = 0.0
     """Probability with which a unit is dropped while training."""
     filters: Count = 64
@@ -245,7 +247,7 @@ Observation = Annotated[ObservationSpec, _bare("key", str | ObservationSpec)]
 
 
 class LearnedStd(_Model):
-    """A standard deviation that is learned, one for each control dimension."""
+    """A standard deviation that is learned, one for each option and control dimension."""
 
     learn: Literal[True]
     """Always true; for a fixed standard deviation give a number instead of this mapping."""
@@ -298,7 +300,7 @@ class TrainingSpec(_Model):
     """How the model is trained."""
 
     initialize: Literal["vq", "random"] = "vq"
-    """``vq``: by vector quantisation of the controls; ``random``: random weights."""
+    """``vq``: by vector quantisation of the observations (SM 2.2); ``random``: random weights."""
     layerwise: bool = True
     """Discover level after level, lowest first, rather than all at once."""
     lower_levels: Literal["fine_tuned", "frozen"] = "fine_tuned"

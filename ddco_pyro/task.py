@@ -16,6 +16,8 @@ from typing import Any, Protocol
 import dm_env
 import numpy as np
 
+from ddco_pyro.errors import BadInput
+
 ENTRY_POINTS = "ddco_pyro.tasks"
 
 Observation = Mapping[str, np.ndarray]
@@ -53,7 +55,7 @@ class Task:
     sources: tuple[Path, ...] = field(default=())
 
 
-class UnknownTask(ValueError):
+class UnknownTask(BadInput):
     """No task of that name is registered, or ``module:name`` does not lead to a :class:`Task`."""
 
 

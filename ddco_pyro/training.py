@@ -49,7 +49,7 @@ class Stage:
 
 
 def plan(spec: Spec, depth: int) -> list[Stage]:
-    """The stages of training for D levels: vector quantisation, then levels from the lowest up, the meta-policy last."""
+    """The stages of training for D levels: from the lowest level up, the meta-policy last."""
     training = spec.training
     everything = ("levels.", "meta_policy.")
     if depth == 0:
@@ -124,8 +124,9 @@ class Trainer:
         while self.progress.restart < self.spec.training.restarts:
             if self.progress.stage == 0 and self.progress.epoch == 0:
                 model = self._fresh()
-            for self.progress.stage in range(self.progress.stage, len(stages)):
+            while self.progress.stage < len(stages):
                 self._run_stage(model, stages[self.progress.stage])
+                self.progress.stage += 1
             self._finish_restart(model)
         model.load_state_dict(self._saved["winner"])
         return model.eval()

@@ -46,9 +46,7 @@ def _cut(tables: Tables, rows: int, steps: int) -> Tables:
     return Tables(cut(tables.selection), cut(tables.termination), cut(tables.control))
 
 
-def _evaluate(
-    tables: Tables, lengths: Tensor, engine: Callable[[Tables, Tensor], Tensor]
-) -> tuple[Tensor, Tensor]:
+def _evaluate(tables: Tables, lengths: Tensor, engine: Callable[[Tables, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
     leaves = [*tables.selection, *tables.termination, *tables.control]
     value = engine(tables, lengths)
     gradients = torch.autograd.grad(value, leaves, allow_unused=True)

@@ -48,9 +48,7 @@ def segment(tables: Tables, lengths: Tensor) -> tuple[Tensor, ...]:
         fused.log_likelihood(chain, plus=fused.maximum).sum().backward()
     path = _gradients(chain)[2]
     alive = torch.arange(path.shape[1]) < lengths[:, None]
-    return tuple(
-        torch.where(alive, _marginal(path, level).argmax(-1), -1) for level in range(1, tables.depth + 1)
-    )
+    return tuple(torch.where(alive, _marginal(path, level).argmax(-1), -1) for level in range(1, tables.depth + 1))
 
 
 def _leaves(chain: Chain) -> Chain:

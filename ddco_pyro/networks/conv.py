@@ -47,7 +47,7 @@ class Conv(nn.Module):
 
     def _features(self, key: str, image: Tensor) -> Tensor:
         """uint8 [M, H, W, C] to [K, M, filters · POOLED²]."""
-        scaled = image.permute(0, 3, 1, 2).to(self.layers[0].weight.dtype) / 255
+        scaled = image.permute(0, 3, 1, 2).float() / 255
         maps = torch.relu(self.convolutions[key](scaled))
         pooled = nn.functional.adaptive_avg_pool2d(maps, POOLED)
         return pooled.reshape(len(image), self.copies, -1).transpose(0, 1)

@@ -1,0 +1,147 @@
+"""The command line: ``ddco-pyro check | collect | fit | rollout | report``.
+
+Every command ends with 0 (done), 1 (failed) or 2 (bad input), and says in one line what is wrong, where, and what to
+do; ``--debug`` shows the traceback.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ddco_pyro import console
+from ddco_pyro.errors import BadInput
+from ddco_pyro.spec import SpecError, dump_spec, load_spec, spec_schema
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Discovers options in demonstrations: a hierarchy of skills, declared in YAML, fitted by exact inference.",
+)
+
+SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="The spec, a YAML file.", show_default=False)]
+Overrides = Annotated[
+    list[str], typer.Option("--set", metavar="KEY=VALUE", help="Another value for a key of the spec; repeatable.")
+]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a finished fit.", show_default=False)]
+Jobs = Annotated[int, typer.Option(help="Processes that run episodes; -1 is one for each core.")]
+
+
+@app.command(epilog="Example: ddco-pyro check specs/needle.yaml --set hierarchy.levels.0.count=3")
+def check(
+    spec: Annotated[Path | None, typer.Argument(metavar="[SPEC]", help="The spec, a YAML file.")] = None,
+    overrides: Overrides = [],  # noqa: B006 (typer reads the default, nobody changes it)
+    schema: Annotated[bool, typer.Option("--schema", help="Print the JSON Schema of specs instead.")] = False,
+) -> None:
+    """Print the spec with all defaults, the shapes it works on, and the parameters of each network."""
+    from ddco_pyro.data import build_hierarchy, dimensions
+
+    if schema:
+        print(json.dumps(spec_schema(), indent=2))
+        return
+    if spec is None:
+        raise SpecError("name a spec, such as: ddco-pyro check specs/needle.yaml")
+    found = load_spec(spec, overrides)
+    size = dimensions(found)
+    hierarchy = build_hierarchy(found, size)
+    print(dump_spec(found), end="")
+    console.dimensions(found, size, hierarchy)
+
+
+@app.command(epilog="Example: ddco-pyro collect specs/needle.yaml --out needle.hdf5")
+def collect(
+    spec: SpecPath,
+    out: Annotated[Path | None, typer.Option(help="The HDF5 file; by default in the cache, by content.")] = None,
+    overrides: Overrides = [],  # noqa: B006
+) -> None:
+    """Record demonstrations of the task's supervisor, unless they are there already."""
+    from ddco_pyro.collect import collect as record
+
+    found = load_spec(spec, overrides)
+    if found.task is None:
+        raise SpecError(f"{spec}: names no task, so there is no supervisor to record")
+    own = found.demonstrations.path
+    with console.Collecting() as progress:
+        path = record(found.task, found.demonstrations, out or (Path(own) if own else None), progress.collected)
+    print(path)
+
+
+@app.command(epilog="Example: ddco-pyro fit specs/needle.yaml --set training.epochs=50 --out runs/short")
+def fit(
+    spec: SpecPath,
+    out: Annotated[Path | None, typer.Option(help="The run folder; by default runs/SPEC-TIME.")] = None,
+    overrides: Overrides = [],  # noqa: B006
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the unfinished run in --out.")] = False,
+) -> None:
+    """Fit the spec's hierarchy and its baselines; write the run folder with its report."""
+    from ddco_pyro import run
+    from ddco_pyro.data import demonstrations
+    from ddco_pyro.report import write_report
+
+    found = load_spec(spec, overrides)
+    folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
+    run.claim(folder, found, resume)
+    try:
+        with console.Fitting() as watcher:
+            fitted = run.fit(found, folder, watcher)
+    except KeyboardInterrupt:
+        print(f"interrupted; continue with: ddco-pyro fit {spec} --out {folder} --resume", file=sys.stderr)
+        raise typer.Exit(1) from None
+    console.log_likelihoods(fitted.metrics)
+    print(f"report: {write_report(fitted, demonstrations(found))}")
+
+
+@app.command(epilog="Example: ddco-pyro rollout runs/needle --episodes 200 --video")
+def rollout(
+    run: RunPath,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each method; by default the spec's.")] = None,
+    video: Annotated[bool, typer.Option("--video", help="Film the first episodes of each method.")] = False,
+    jobs: Jobs = -1,
+) -> None:
+    """Roll the model, its baselines and the spec's scripted policies out from the same initial states."""
+    from ddco_pyro.data import demonstrations
+    from ddco_pyro.evaluate import policies, roll_out
+    from ddco_pyro.report import write_report
+    from ddco_pyro.run import load
+
+    fitted = load(run)
+    number = episodes or fitted.spec.rollout.episodes
+    with console.Rolling(number * len(policies(fitted))) as progress:
+        results = roll_out(fitted, number, FILMED if video else 0, progress.episode, jobs)
+    console.successes(results)
+    print(f"report: {write_report(fitted, demonstrations(fitted.spec))}")
+
+
+FILMED = 3
+"""Episodes of each method that ``rollout --video`` films."""
+
+
+@app.command(epilog="Example: ddco-pyro report runs/needle")
+def report(run: RunPath) -> None:
+    """Write the report of a run again."""
+    from ddco_pyro.data import demonstrations
+    from ddco_pyro.report import write_report
+    from ddco_pyro.run import load
+
+    fitted = load(run)
+    print(f"report: {write_report(fitted, demonstrations(fitted.spec))}")
+
+
+def main() -> None:
+    """Run the command line; ends the process with 0, 1 or 2."""
+    debug = "--debug" in sys.argv
+    try:
+        app([argument for argument in sys.argv[1:] if argument != "--debug"], prog_name="ddco-pyro")
+    except Exception as error:
+        if debug:
+            raise
+        print(f"ddco-pyro: {error}", file=sys.stderr)
+        if not isinstance(error, BadInput):
+            print("ddco-pyro: this was not expected; --debug shows where it comes from", file=sys.stderr)
+        sys.exit(2 if isinstance(error, BadInput) else 1)

@@ -1,0 +1,155 @@
+"""What the command line shows: progress with the time left on a terminal, plain lines elsewhere, and small tables."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from ddco_pyro.data import Dimensions
+from ddco_pyro.hierarchy import Hierarchy
+from ddco_pyro.spec import Spec
+
+PLAIN_SECONDS = 10.0
+"""Time between two plain lines of progress."""
+
+
+class _Bar:
+    """A progress bar on a terminal; elsewhere a plain line now and then, with the time left."""
+
+    def __init__(self) -> None:
+        self.console = Console(stderr=True)
+        columns = [TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}")]
+        self._progress = Progress(
+            *columns, TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=self.console
+        )
+        self._task: TaskID | None = None
+        self._label, self._total, self._done = "", 0, 0
+        self._start = self._said = 0.0
+
+    def __enter__(self) -> Self:
+        if self.console.is_terminal:
+            self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def begin(self, label: str, total: int) -> None:
+        """Begin to count up to ``total``."""
+        self.end()
+        self._label, self._total, self._done = label, total, 0
+        self._start = self._said = time.monotonic()
+        self._task = self._progress.add_task(label, total=total, note="")
+
+    def advance(self, done: int, note: str = "") -> None:
+        """So much is done."""
+        self._done = done
+        if self._task is not None:
+            self._progress.update(self._task, completed=done, note=note)
+        now = time.monotonic()
+        if not self.console.is_terminal and (now - self._said > PLAIN_SECONDS or done == self._total):
+            self._said = now
+            left = (now - self._start) / max(done, 1) * (self._total - done)
+            self._say(f"{done}/{self._total}, at most {left:.0f} s left  {note}")
+
+    def end(self) -> None:
+        """Whatever was counted is over, however far it came."""
+        if self._task is not None:
+            self._progress.update(self._task, total=max(self._done, 1), completed=max(self._done, 1))
+            if not self.console.is_terminal and self._done < self._total:
+                self._say(f"done after {self._done}, {time.monotonic() - self._start:.0f} s")
+        self._task = None
+
+    def _say(self, text: str) -> None:
+        self.console.print(f"{self._label}: {text}", markup=False, highlight=False, soft_wrap=True)
+
+
+class Collecting(_Bar):
+    """Shows how many demonstrations have been collected."""
+
+    def collected(self, done: int, total: int) -> None:
+        """So many of the demonstrations have been collected."""
+        if self._task is None:
+            self.begin("collecting demonstrations", total)
+        self.advance(done)
+
+
+class Fitting(Collecting):
+    """Shows how a fit goes on (a :class:`ddco_pyro.run.Watcher`)."""
+
+    def training(self, name: str, epochs: int) -> None:
+        """A model begins to be trained, for at most so many epochs in all."""
+        self.begin(f"training {name}", epochs)
+
+    def epoch(self, row: Mapping[str, Any]) -> None:
+        """An epoch has ended; its row of the history."""
+        note = f"{row['stage']}: loss {-row['train']:.3f}, held out {row['tune']:.3f} nats/step"
+        self.advance(self._done + 1, note)
+
+    def trained(self, name: str) -> None:
+        """A model has been trained."""
+        self.end()
+
+
+class Rolling(_Bar):
+    """Shows how many episodes have been rolled out."""
+
+    def __init__(self, total: int) -> None:
+        super().__init__()
+        self._episodes = total
+
+    def episode(self, name: str) -> None:
+        """An episode of the method so named has ended."""
+        if self._task is None:
+            self.begin("rolling out", self._episodes)
+        self.advance(self._done + 1, name)
+
+
+def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy) -> None:
+    """Shapes of observations and control, and the parameters of each network."""
+    table = Table("", "shape or parameters", show_edge=False)
+    for one in spec.observations:
+        table.add_row(f"observation {one.key}", str(list(size.shapes[one.key])))
+    table.add_row("features", str(len(hierarchy.encoder.mean)))
+    table.add_row("control", str([size.control_size]))
+    for name, network in hierarchy.named_networks():
+        table.add_row(name, str(sum(parameter.numel() for parameter in network.parameters())))
+    Console().print(table)
+
+
+def log_likelihoods(metrics: Mapping[str, Any]) -> None:
+    """Held-out log-likelihood of the model and of what it is compared with."""
+    table = Table("model", "train", "held out", "ours - this", title="log-likelihood, nats per step", show_edge=False)
+    rows = {metrics["model"]: metrics, **metrics["comparison"]}
+    for name, row in rows.items():
+        values, difference = row["log_likelihood_per_step"], row.get("difference")
+        shown = f"{difference['nats_per_step']:+.3f} ± {difference['standard_error']:.3f}" if difference else ""
+        table.add_row(name, f"{values['train']:.3f}", f"{values['valid']:.3f}", shown)
+    Console().print(table)
+
+
+def successes(results: Mapping[str, Any]) -> None:
+    """What came of each method's rollouts."""
+    methods: Mapping[str, Any] = results["methods"]
+    measures = list(dict.fromkeys(name for one in methods.values() for name in one["measures"]))
+    table = Table("method", *measures, title=f"{results['episodes']} episodes each", show_edge=False)
+    for name, one in methods.items():
+        table.add_row(name, *(_measure(one["measures"][measure]) for measure in measures))
+    Console().print(table)
+
+
+def _measure(one: Mapping[str, Any]) -> str:
+    if one["trials"] == 0:
+        return "-"
+    if "successes" in one:
+        low, high = one["interval"]
+        return f"{one['successes']}/{one['trials']} [{low:.0%}, {high:.0%}]"
+    return f"{one['mean']:.2f}" + (f" ± {one['std']:.2f}" if one["std"] is not None else "")
