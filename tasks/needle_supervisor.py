@@ -34,9 +34,12 @@ PHASES = {"approach": range(0, 3), "grasp": range(3, 5), "lift": range(5, 7), "o
 JAWS = np.array([JAW_OPEN] * 4 + [JAW_CLOSED] * 11)
 LIFTED = 6  # from this way point on the plan is about the insertion, before it about the grasp
 
-CORRECTED = frozenset({1, 2, 3, 8, 9, 10, 11, 12, 13})
 POSITION_TOLERANCE = 0.0003  # m
 TURN_TOLERANCE = np.deg2rad(1.0)
+# A hand is inexact, the less so the nearer it is to what it aims at: standard deviations of an adjustment.
+HAND_POSITION = 0.12  # m per m that remains to needle or phantom
+HAND_TURN = 3.0  # rad per m that remains
+REMAINING = {1: 0.015, 2: 0.006, 3: 0.0, 8: 0.018, 9: 0.012, 10: 0.010, 11: 0.007, 12: 0.004, 13: 0.0}  # m, by step
 
 CLEARANCE = 0.001  # m, that planned paths keep from mat and phantom
 # The target and the phantom's extent, as the planner knows them (m).
@@ -151,20 +154,27 @@ class Supervisor(OpenLoop):
         self._physics: Physics = environment.physics
 
     def reset(self, seed: int) -> None:
-        """Forget plan and corrections. Nothing here is random."""
+        """Forget plan and corrections; ``seed`` decides how inexact the adjustments are."""
         super().reset(seed)
         self._delta = np.zeros(6)
+        self._hand = np.random.default_rng(seed)
 
     def act(self, observation: Observation) -> np.ndarray:
         """The next set points [7]."""
         action = super().act(observation)
         planned = action[:6].copy()
-        if self._step in CORRECTED and (self._step < LIFTED or self._physics.held()):
-            wanted = self._wanted(psm.forward(planned))
+        if self._step in REMAINING and (self._step < LIFTED or self._physics.held()):
+            wanted = self._by_hand(self._wanted(psm.forward(planned)))
             if differs(psm.forward(psm.true_joints(planned + self._delta)), wanted):
                 self._delta = psm.encoder_readings(psm.inverse(wanted)) - planned
         action[:6] = planned + self._delta
         return action
+
+    def _by_hand(self, wanted: Pose) -> Pose:
+        """The gripper pose that a person achieves who wants another one."""
+        remaining = REMAINING[self._step]
+        turn = psm.rotation(2, HAND_TURN * remaining * self._hand.standard_normal())
+        return Pose(turn @ wanted.rotation, wanted.position + HAND_POSITION * remaining * self._hand.standard_normal(3))
 
     def _wanted(self, believed: Pose) -> Pose:
         """Where the gripper should truly be at a way point that the plan believes to be at ``believed``.
