@@ -83,6 +83,11 @@ class Chain:
     termination: tuple[Tensor, ...]
     emission: Tensor
 
+    @property
+    def depth(self) -> int:
+        """The number D of option levels."""
+        return len(self.selection)
+
     def steps(self) -> list[Step]:
         """The chain's T steps, unbound once: slicing inside a loop over time would make its gradient O(T²)."""
         selection = [table.unbind(1) for table in self.selection]

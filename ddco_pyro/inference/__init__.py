@@ -22,7 +22,7 @@ def log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") ->
     :param lengths: steps of each trajectory, [N]; whatever the tables hold beyond is ignored.
     """
     if engine == "fused":
-        return fused.log_likelihood(complete(tables, lengths))
+        return fused.log_likelihood(complete(tables, lengths), lengths)
     one_by_one = [
         enumeration.total_log_likelihood(complete(tables.trajectory(n, int(length)), lengths[n : n + 1]))
         for n, length in enumerate(lengths)
@@ -33,4 +33,6 @@ def log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") ->
 def total_log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") -> Tensor:
     """Σ_n log p(ξ_n), a scalar; with ``engine="enumerate"`` in one elimination for the whole batch."""
     chain = complete(tables, lengths)
-    return enumeration.total_log_likelihood(chain) if engine == "enumerate" else fused.log_likelihood(chain).sum()
+    if engine == "enumerate":
+        return enumeration.total_log_likelihood(chain)
+    return fused.log_likelihood(chain, lengths).sum()

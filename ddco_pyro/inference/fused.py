@@ -1,75 +1,114 @@
-"""Elimination of the latents in one structured pass, O(D·S) a step for S joint choices.
+"""The fused engine: log-likelihood and posterior in one compiled pass; the posterior *is* the gradient (§4.1).
 
-The transition of DESIGN §4 is a mixture over how far up the terminations reach, so a forward step never builds the
-S × S matrix: going up, each level either keeps its choice or passes its mass on; going down, the mass that was
-passed on is spread by the selections and joins what was kept.
-
-The same pass with the maximum in place of the sum gives the most likely path.
+It works in scaled probability space. What underflows there is lost mass of at most about 1e-300 of a step's total, and
+it matters only if the past and the future of a trajectory hardly overlap, Σ_h α_t(h) β_t(h) ≈ 0. The overlap is
+measured at every step, and a trajectory where it falls below ``LEAST_OVERLAP`` is done again in log space.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
+import numba
+import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from ddco_pyro.ahmm import NEVER, Chain, Step
+from ddco_pyro.ahmm import Chain
+from ddco_pyro.inference import logspace
+from ddco_pyro.inference.kernel import forward_backward
 
-Plus = Callable[[Tensor], Tensor]
-"""Addition of the semiring along the last dimension."""
-
-
-def log_sum(values: Tensor) -> Tensor:
-    """log Σ exp over the last dimension; where nothing is possible the value is -inf and the gradient 0."""
-    possible = (values > NEVER).any(-1)
-    finite = torch.where(possible.unsqueeze(-1), values, 0.0)
-    return torch.where(possible, finite.logsumexp(-1), NEVER)
+LEAST_OVERLAP = 1e-250
 
 
-def maximum(values: Tensor) -> Tensor:
-    """The largest value of the last dimension; a tie's gradient goes to one of its entries alone."""
-    return values.max(-1).values
+def log_likelihood(chain: Chain, lengths: Tensor) -> Tensor:
+    """log p(ξ) of each trajectory, [N], differentiable once in the chain's tables."""
+    if chain.emission.device.type != "cpu":
+        return logspace.log_likelihood(chain)
+    value: Tensor = _Eliminate.apply(lengths, chain.emission, *chain.selection, *chain.termination)
+    return value
 
 
-def log_likelihood(chain: Chain, plus: Plus = log_sum) -> Tensor:
-    """log p(ξ) of each trajectory, [N], differentiable in the chain's tables.
+class _Eliminate(torch.autograd.Function):
+    """Log-likelihoods of a chain; the gradient with respect to a log-table is the posterior of its entries."""
 
-    With ``plus=maximum``: max over ζ of log p(ζ, ξ).
-    """
-    first, *later = chain.steps()
-    message = _select(first.emission.new_zeros(len(first.emission)), first, [], plus) + first.emission
-    for now in later:
-        message = _transition(message, now, plus) + now.emission
-    return plus(message.flatten(1)) if chain.selection else message
+    @staticmethod
+    def forward(ctx: Any, lengths: Tensor, emission: Tensor, *tables: Tensor) -> Tensor:
+        depth = len(tables) // 2
+        chain = Chain(tables[:depth], tables[depth:], emission)
+        value, gradients = evaluate(chain, lengths)
+        ctx.save_for_backward(*gradients)
+        return value
 
-
-def _transition(message: Tensor, now: Step, plus: Plus) -> Tensor:
-    """Mass over the joint choices at t - 1 to mass over those at t, both [N, C_D, ..., C_1]."""
-    kept: list[Tensor] = []
-    for table in now.termination:
-        keep, terminate = _along_last(table[..., 0], message), _along_last(table[..., 1], message)
-        kept.append(message + keep)
-        message = plus(message + terminate)
-    return _select(message, now, kept, plus)
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        return None, *(upstream.reshape(-1, *(1,) * (table.dim() - 1)) * table for table in ctx.saved_tensors)
 
 
-def _select(message: Tensor, now: Step, kept: list[Tensor], plus: Plus) -> Tensor:
-    """Spread what terminated, [N], over the choices of every level from the highest down; add what was kept."""
-    for level in range(len(now.selection), 0, -1):
-        table = now.selection[level - 1]
-        table = table.squeeze(1) if level == len(now.selection) else _along_last_two(table, message)
-        message = message.unsqueeze(-1) + table
-        if kept:
-            message = plus(torch.stack([message, kept[level - 1]], dim=-1))
-    return message
+def evaluate(chain: Chain, lengths: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """Log-likelihoods [N], and posteriors shaped like (emission, *selection, *termination)."""
+    shift = chain.emission.flatten(2).amax(-1, keepdim=True)
+    shift = torch.where(torch.isfinite(shift), shift, 0.0)
+    sizes = [table.shape[-1] for table in chain.selection]
+    joint = (chain.emission.flatten(2) - shift).exp()
+    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    value, overlap, to_select, to_end, to_emission = forward_backward(
+        _rows(chain.selection, joint).numpy(),
+        _rows(chain.termination, joint).numpy(),
+        joint.contiguous().numpy(),
+        lengths.numpy(),
+        np.array(sizes, dtype=np.int64),
+        _message_starts(sizes),
+        _offsets([2 * size for size in sizes]),
+        _offsets([table.shape[2] * table.shape[3] for table in chain.selection]),
+    )
+    alive = torch.arange(joint.shape[1]) < lengths[:, None]
+    total = torch.from_numpy(value) + (shift.squeeze(-1) * alive).sum(1)
+    gradients = (
+        torch.from_numpy(to_emission).reshape(chain.emission.shape),
+        *_unrows(torch.from_numpy(to_select), chain.selection),
+        *_unrows(torch.from_numpy(to_end), chain.termination),
+    )
+    for n in np.flatnonzero(~(overlap > LEAST_OVERLAP)):
+        total[n] = _again(chain, int(n), gradients)
+    return total, gradients
 
 
-def _along_last(table: Tensor, message: Tensor) -> Tensor:
-    """[N, C_d] against [N, C_D, ..., C_d]."""
-    return table.reshape(table.shape[:1] + (1,) * (message.dim() - 2) + table.shape[1:])
+def _rows(tables: Sequence[Tensor], like: Tensor) -> Tensor:
+    """exp of each level's table, flattened and side by side, [N, T, ...]."""
+    flat = [table.flatten(2).exp() for table in tables]
+    return torch.cat([like[..., :0], *flat], dim=-1).contiguous()
 
 
-def _along_last_two(table: Tensor, message: Tensor) -> Tensor:
-    """[N, C_{d+1}, C_d] against [N, C_D, ..., C_{d+1}, 1]."""
-    return table.reshape(table.shape[:1] + (1,) * (message.dim() - 2) + table.shape[1:])
+def _unrows(rows: Tensor, tables: Sequence[Tensor]) -> list[Tensor]:
+    parts = rows.split([table[0, 0].numel() for table in tables], dim=-1) if tables else ()
+    return [part.reshape(table.shape) for part, table in zip(parts, tables, strict=True)]
+
+
+def _offsets(sizes: Sequence[int]) -> np.ndarray:
+    return np.cumsum([0, *sizes])[:-1].astype(np.int64)
+
+
+def _message_starts(sizes: Sequence[int]) -> np.ndarray:
+    """First index of each level's message, lowest level first and that of level D + 1 last."""
+    lengths = [int(np.prod(sizes[level:])) for level in range(len(sizes))]
+    return np.cumsum([0, *lengths]).astype(np.int64)
+
+
+def _again(chain: Chain, n: int, gradients: tuple[Tensor, ...]) -> Tensor:
+    """The log-likelihood of trajectory ``n`` in log space; its posterior is written into ``gradients``."""
+    leaves = [t[n : n + 1].detach().requires_grad_() for t in (chain.emission, *chain.selection, *chain.termination)]
+    depth = chain.depth
+    alone = replace(
+        chain, emission=leaves[0], selection=tuple(leaves[1 : 1 + depth]), termination=tuple(leaves[1 + depth :])
+    )
+    with torch.enable_grad():
+        value = logspace.log_likelihood(alone)
+        found = torch.autograd.grad(value.sum(), leaves, allow_unused=True)
+    for table, gradient in zip(gradients, found, strict=True):
+        table[n] = 0.0 if gradient is None else gradient[0]
+    return value.detach()[0]

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ddco_pyro.ahmm import Chain, Tables, complete
-from ddco_pyro.inference import fused
+from ddco_pyro.ahmm import Tables, complete
+from ddco_pyro.inference import fused, logspace
 
 
 class Posterior(NamedTuple):
@@ -30,44 +30,24 @@ class Posterior(NamedTuple):
 
 def posterior(tables: Tables, lengths: Tensor) -> Posterior:
     """The E-step: u, v and w of every level (§4.1)."""
-    chain = _leaves(complete(tables, lengths))
-    with torch.enable_grad():
-        fused.log_likelihood(chain).sum().backward()
-    selected, terminated, joint = _gradients(chain)
-    alive = torch.arange(joint.shape[1]) < lengths[:, None]
-    u = tuple(_marginal(joint, level) * alive.unsqueeze(-1) for level in range(1, tables.depth + 1))
-    v = tuple(gradient.sum(2) * alive.unsqueeze(-1) for gradient in selected)
+    chain = complete(tables, lengths)
+    _, (joint, *others) = fused.evaluate(chain, lengths)
+    selected, terminated = others[: chain.depth], others[chain.depth :]
+    u = tuple(_marginal(joint, level) for level in range(1, chain.depth + 1))
+    v = tuple(gradient.sum(2) for gradient in selected)
     w = tuple(_not_ending(u_d, gradient[..., 1], lengths) for u_d, gradient in zip(u, terminated, strict=True))
     return Posterior(u, v, w)
 
 
 def segment(tables: Tables, lengths: Tensor) -> tuple[Tensor, ...]:
     """The choices of the most likely path max_ζ p(ζ | ξ), a [N, T] per level, lowest first; -1 past the length."""
-    chain = _leaves(complete(tables, lengths))
+    chain = complete(tables, lengths)
+    emission = chain.emission.detach().requires_grad_()
     with torch.enable_grad():
-        fused.log_likelihood(chain, plus=fused.maximum).sum().backward()
-    path = _gradients(chain)[2]
+        best = logspace.log_likelihood(replace(chain, emission=emission), plus=logspace.maximum)
+        (path,) = torch.autograd.grad(best.sum(), emission)
     alive = torch.arange(path.shape[1]) < lengths[:, None]
-    return tuple(torch.where(alive, _marginal(path, level).argmax(-1), -1) for level in range(1, tables.depth + 1))
-
-
-def _leaves(chain: Chain) -> Chain:
-    def leaf(table: Tensor) -> Tensor:
-        return table.detach().requires_grad_()
-
-    return replace(
-        chain,
-        selection=tuple(map(leaf, chain.selection)),
-        termination=tuple(map(leaf, chain.termination)),
-        emission=leaf(chain.emission),
-    )
-
-
-def _gradients(chain: Chain) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], Tensor]:
-    def gradient(table: Tensor) -> Tensor:
-        return torch.zeros_like(table) if table.grad is None else table.grad
-
-    return tuple(map(gradient, chain.selection)), tuple(map(gradient, chain.termination)), gradient(chain.emission)
+    return tuple(torch.where(alive, _marginal(path, level).argmax(-1), -1) for level in range(1, chain.depth + 1))
 
 
 def _marginal(joint: Tensor, level: int) -> Tensor:
