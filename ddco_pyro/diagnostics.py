@@ -1,0 +1,83 @@
+"""Signs of a degenerate solution (SM 2.1), read from how the options are used."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+UNUSED_SHARE = 0.01
+DOMINATING_SHARE = 0.9
+SHORTEST_DURATION = 1.5
+HIGH_FITTING_SHARE = 0.5
+
+Use = Sequence[Mapping[str, Any]]
+"""How each choice of one level is used, control (0) first: ``choice``, ``share``, ``duration`` of ``metrics.json``."""
+
+Kind = Literal["unused", "dominating", "never_persisting", "high_fitting"]
+
+ADVICE: Mapping[Kind, str] = {
+    "unused": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select), or start "
+    "from clusters with training.initialize: vq and try more restarts.",
+    "dominating": "Start from clusters (training.initialize: vq), train layer by layer (training.layerwise: true), or "
+    "give the options' policies less capacity, so that one of them cannot do all the work.",
+    "never_persisting": "A simpler termination (network: linear), fewer options, or observations that change more "
+    "slowly (differences: false) let options last.",
+    "high_fitting": "Train layer by layer (training.layerwise: true), give the calling policy less capacity, or let it "
+    "emit options only (emits: [options]).",
+}
+"""What usually helps."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sign of a degenerate solution: its ``kind``, the ``level`` (1 is the lowest) and ``choice`` it concerns, and
+    the ``value`` that gave it away: a share of the time, or a duration in steps.
+    """
+
+    kind: Kind
+    level: int
+    choice: int
+    value: float
+
+    @property
+    def advice(self) -> str:
+        """What usually helps."""
+        return ADVICE[self.kind]
+
+
+def diagnose(options: Sequence[Use]) -> list[Finding]:
+    """The signs found in ``metrics["options"]``, levels lowest first.
+
+    An option is unused below 1 % of the time, dominating above 90 % where it is not the only one, and never persisting
+    where it is used but is expected to last less than 1.5 steps. A caller is high-fitting where it emits the control
+    itself in more than half of the time that it acts.
+    """
+    found: list[Finding] = []
+    for level, use in enumerate(options, start=1):
+        for one in use[1:]:
+            found += _of_option(level, one, alone=len(use) == 2)
+        above = options[level] if level < len(options) else None
+        found += _of_caller(level, float(use[0]["share"]), float(above[0]["share"]) if above else 0.0)
+    return found
+
+
+def _of_option(level: int, use: Mapping[str, Any], alone: bool) -> list[Finding]:
+    choice, share, duration = int(use["choice"]), float(use["share"]), use["duration"]
+    if share < UNUSED_SHARE:
+        return [Finding("unused", level, choice, share)]
+    found = []
+    if share > DOMINATING_SHARE and not alone:
+        found.append(Finding("dominating", level, choice, share))
+    if duration is not None and duration < SHORTEST_DURATION:
+        found.append(Finding("never_persisting", level, choice, float(duration)))
+    return found
+
+
+def _of_caller(level: int, control: float, not_acting: float) -> list[Finding]:
+    """The caller of a level acts unless the level above has control already, ``not_acting`` of the time."""
+    acting = 1.0 - not_acting
+    if acting < UNUSED_SHARE:
+        return []
+    own = (control - not_acting) / acting
+    return [Finding("high_fitting", level, 0, own)] if own > HIGH_FITTING_SHARE else []

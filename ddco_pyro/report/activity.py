@@ -1,0 +1,124 @@
+"""What a fitted hierarchy says about demonstrations, as arrays that figures are drawn from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.encoding import encode
+from ddco_pyro.hierarchy import Hierarchy
+from ddco_pyro.inference import posterior, segment
+from ddco_pyro.run import Fit
+
+CHUNK = 2**24
+"""Entries of a table over joint choices that are held at once."""
+
+MOST_BINS = 60
+
+
+@dataclass(frozen=True)
+class LevelActivity:
+    """One level over N demonstrations of at most T steps, C = 1 + k choices, control first.
+
+    :param active: u_t, probability that a choice is active [N, T, C]; 0 past a demonstration's end.
+    :param path: choices of the most likely path [N, T]; -1 past the end.
+    :param termination: ψ_h(s_t) of the k options [N, T, k].
+    """
+
+    name: str
+    active: np.ndarray
+    path: np.ndarray
+    termination: np.ndarray
+
+    @property
+    def choices(self) -> list[int]:
+        """The choices that can occur: control is left out where it is never chosen."""
+        return [choice for choice in range(self.active.shape[2]) if choice or self.active[..., 0].any()]
+
+
+@dataclass(frozen=True)
+class Activity:
+    """All levels, lowest first, over the same demonstrations of ``lengths`` [N] steps."""
+
+    levels: tuple[LevelActivity, ...]
+    lengths: np.ndarray
+
+
+def activity(fit: Fit, demos: Demonstrations) -> Activity:
+    """Posteriors, most likely paths and terminations of a fit with at least one level."""
+    assert fit.spec.hierarchy is not None  # a baseline has no levels
+    specs, steps = fit.spec.hierarchy.levels, max(demos.lengths)
+    size = max(1, CHUNK // (math.prod(1 + level.count for level in specs) * steps))
+    parts = [_chunk(fit.hierarchy, part, steps) for part in _chunks(demos, size)]
+    levels = []
+    for number, level in enumerate(specs):
+        active, path, termination = (np.concatenate([part[what][number] for part in parts]) for what in range(3))
+        levels.append(LevelActivity(level.name, active, path, termination))
+    return Activity(tuple(levels), np.array(demos.lengths))
+
+
+def _chunks(demos: Demonstrations, size: int) -> Iterator[Demonstrations]:
+    for start in range(0, len(demos), size):
+        yield demos.select(demos.names[start : start + size])
+
+
+def _chunk(
+    hierarchy: Hierarchy, demos: Demonstrations, steps: int
+) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    with torch.no_grad():
+        batch = encode(demos, hierarchy.encoder, hierarchy.scaling)
+        outputs = hierarchy(batch.inputs)
+        tables = outputs.tables(batch.actions, hierarchy.scaling.log_volume)
+        active = [_padded(one.float().numpy(), steps, 0.0) for one in posterior(tables, batch.lengths).u]
+        paths = [_padded(one.numpy(), steps, -1) for one in segment(tables, batch.lengths)]
+        termination = [_padded(one[..., 1].exp().numpy(), steps, 0.0) for one in outputs.termination]
+    return active, paths, termination
+
+
+def _padded(array: np.ndarray, steps: int, value: float) -> np.ndarray:
+    """[N, T', ...] to [N, steps, ...]."""
+    missing = [(0, 0), (0, steps - array.shape[1])] + [(0, 0)] * (array.ndim - 2)
+    return np.pad(array, missing, constant_values=value)
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Steps of demonstrations gathered into bins of time.
+
+    :param index: the bin of each step [N, T]; -1 past a demonstration's end.
+    :param edges: where bins begin and end [B + 1], steps or parts of a demonstration.
+    :param axis: what the edges measure.
+    """
+
+    index: np.ndarray
+    edges: np.ndarray
+    axis: str
+
+    def mean(self, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Weighted mean over the steps [N, T] of each bin [B]; NaN where the weights sum to 0."""
+        total, weight = self.total(values * weights), self.total(weights)
+        return np.divide(total, weight, out=np.full(len(total), np.nan), where=weight > 0)
+
+    def total(self, values: np.ndarray) -> np.ndarray:
+        """Sum over the steps [N, T] of each bin [B]."""
+        inside = self.index >= 0
+        return np.bincount(self.index[inside], values[inside], minlength=len(self.edges) - 1)
+
+
+def bins(lengths: np.ndarray) -> Bins:
+    """One bin a step where all demonstrations are equally long and short enough; else bins of normalised time."""
+    steps = np.arange(lengths.max())
+    alive = steps < lengths[:, None]
+    if len(set(lengths)) == 1 and lengths[0] <= MOST_BINS:
+        index = np.broadcast_to(steps, alive.shape)
+        return Bins(index, np.arange(lengths[0] + 1) - 0.5, "step t")
+    count = int(min(MOST_BINS, lengths.min()))
+    index = np.minimum((steps + 0.5) / lengths[:, None] * count, count - 1).astype(int)
+    return Bins(
+        np.where(alive, index, -1), np.linspace(0.0, 1.0, count + 1), "part of the demonstration that has passed"
+    )

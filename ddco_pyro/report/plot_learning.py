@@ -1,0 +1,83 @@
+"""Learning curves."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+from ddco_pyro.report.pictures import INK, blank
+from ddco_pyro.report.words import method
+
+COLUMNS = 4
+TUNE = "#c2410c"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of one model: for each restart an array of (epoch, train, tune) [E, 3], nats per step."""
+
+    title: str
+    restarts: Sequence[np.ndarray]
+
+
+def stages(histories: Mapping[str, Path]) -> list[Stage]:
+    """The stages in ``history.csv`` of each model, in the order in which they were trained."""
+    found = []
+    for model, path in histories.items():
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        for stage in dict.fromkeys(row["stage"] for row in rows):
+            own = [row for row in rows if row["stage"] == stage]
+            restarts = [
+                [row for row in own if row["restart"] == one] for one in dict.fromkeys(r["restart"] for r in own)
+            ]
+            curves = [
+                np.array([[float(row[key]) for key in ("epoch", "train", "tune")] for row in r]) for r in restarts
+            ]
+            found.append(Stage(f"{method(model)}: {stage}", curves))
+    return found
+
+
+def draw(found: Sequence[Stage]) -> Figure:
+    """A panel for each stage, a pair of lines for each restart."""
+    columns = min(COLUMNS, len(found))
+    rows = -(-len(found) // columns)
+    figure = blank(0.4 + 2.1 * rows)
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for axes, stage in zip(panels.flat, found, strict=False):
+        _panel(axes, stage)
+    for axes in panels.flat[len(found) :]:
+        axes.set_visible(False)
+    for axes in panels[:, 0]:
+        axes.set_ylabel("nats per step")
+    lines = [Line2D([], [], color=INK), Line2D([], [], color=TUNE, linestyle=(0, (4, 1.5)))]
+    figure.legend(lines, ["training demonstrations", "tuning demonstrations"], loc="outside lower center", ncols=2)
+    return figure
+
+
+def _panel(axes: Axes, stage: Stage) -> None:
+    faint = 1.0 if len(stage.restarts) == 1 else 0.6
+    for curve in stage.restarts:
+        axes.plot(curve[:, 0], curve[:, 1], color=INK, linewidth=1.1, alpha=faint)
+        axes.plot(curve[:, 0], curve[:, 2], color=TUNE, linewidth=1.1, alpha=faint, linestyle=(0, (4, 1.5)))
+    axes.set(
+        title=stage.title, xlabel="epoch", ylim=_limits(np.concatenate([curve[:, 1:] for curve in stage.restarts]))
+    )
+    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+
+
+def _limits(values: np.ndarray) -> tuple[float, float]:
+    """Cut off the steep rise of the first epochs where it would flatten all the rest."""
+    low, bottom, top = float(values.min()), float(np.percentile(values, 10)), float(values.max())
+    if top - low > 3 * (top - bottom) > 0:
+        low = top - 3 * (top - bottom)
+    margin = 0.05 * (top - low) or 1.0
+    return low - margin, top + margin

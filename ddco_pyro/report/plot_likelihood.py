@@ -1,0 +1,74 @@
+"""Held-out log-likelihood of the methods, and differences on the same demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ddco_pyro.report.pictures import FAINT, INK, blank
+from ddco_pyro.report.words import method
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """One method, in nats per step: on training and held-out demonstrations, and by how much the model is above it.
+
+    :param difference: (mean, standard error); None for the model itself.
+    :param each: the difference on each held-out demonstration.
+    """
+
+    name: str
+    train: float
+    valid: float
+    difference: tuple[float, float] | None = None
+    each: tuple[float, ...] = ()
+
+
+def likelihoods(metrics: Mapping[str, Any], baselines: Mapping[str, Mapping[str, Any]]) -> list[Likelihood]:
+    """The model and what it was compared with, from its ``metrics.json`` and those of its baselines."""
+    own = metrics["log_likelihood_per_step"]
+    found = [Likelihood(metrics["model"], own["train"], own["valid"])]
+    for name, one in metrics["comparison"].items():
+        values, difference = one["log_likelihood_per_step"], one["difference"]
+        each = _each(metrics["valid"], baselines.get(name, {}).get("valid", ()))
+        mean_and_error = (difference["nats_per_step"], difference["standard_error"])
+        found.append(Likelihood(name, values["train"], values["valid"], mean_and_error, each))
+    return found
+
+
+def _each(ours: Sequence[Mapping[str, Any]], theirs: Sequence[Mapping[str, Any]]) -> tuple[float, ...]:
+    other = {one["name"]: one["log_likelihood"] for one in theirs}
+    return tuple((one["log_likelihood"] - other[one["name"]]) / one["steps"] for one in ours if one["name"] in other)
+
+
+def draw(rows: Sequence[Likelihood]) -> Figure:
+    """Two panels of dots: log-likelihood of each method, and the paired differences."""
+    figure = blank(1.15 + 0.42 * len(rows))
+    left, right = figure.subplots(1, 2, sharey=True)
+    places = np.arange(len(rows))
+    left.scatter([row.train for row in rows], places, facecolor="white", edgecolor=INK, label="training", zorder=3)
+    left.scatter([row.valid for row in rows], places, color=INK, label="held out", zorder=3)
+    left.set(xlabel="log-likelihood (nats per step)", title="Each method")
+    left.set_yticks(places, [method(row.name) for row in rows])
+    left.set_ylim(len(rows) - 0.4, -0.6)
+    left.grid(axis="x", color="#e4e4e4")
+    left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.42 * 2.2 / len(rows)), ncols=2)
+    _differences(right, rows, places)
+    return figure
+
+
+def _differences(axes: Axes, rows: Sequence[Likelihood], places: np.ndarray) -> None:
+    axes.axvline(0, color=FAINT, linewidth=0.8)
+    for row, place in zip(rows, places, strict=True):
+        if row.difference is not None:
+            axes.scatter(row.each, np.full(len(row.each), place), s=14, color=FAINT, alpha=0.5, linewidth=0, zorder=2)
+            mean, error = row.difference
+            axes.errorbar(mean, place, xerr=None if np.isnan(error) else error, fmt="D", color=INK, capsize=4, zorder=3)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(axis="x", color="#e4e4e4")
+    axes.set(xlabel="nats per step above that method, held out", title=f"{method(rows[0].name)} minus each baseline")

@@ -1,0 +1,76 @@
+"""The posterior u_t(h) along a few demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+
+from ddco_pyro.colours import option_colour
+from ddco_pyro.report.activity import Activity, LevelActivity
+from ddco_pyro.report.pictures import blank
+from ddco_pyro.report.strips import draw_labels, draw_path, legend
+
+MOST_POINTS = 400
+
+
+@dataclass(frozen=True)
+class Example:
+    """A demonstration to show: its row in the activity, its name, and its labels [T] where there are any."""
+
+    row: int
+    name: str
+    labels: np.ndarray | None = None
+
+
+def draw(found: Activity, examples: Sequence[Example]) -> Figure:
+    """Two demonstrations side by side; for each level u_t stacked, with the most likely path under it."""
+    rows = -(-len(examples) // 2)
+    labelled = examples[0].labels is not None
+    figure = blank(0.35 + rows * (0.55 + 1.25 * len(found.levels) + 0.2 * labelled))
+    parts = figure.subfigures(rows, 2, squeeze=False)
+    for part, example in zip(parts.flat, examples, strict=False):
+        _example(part, found, example)
+    choices = sorted({choice for level in found.levels for choice in level.choices})
+    figure.legend(handles=legend(choices), loc="outside lower center", ncols=min(len(choices), 11), handlelength=1)
+    return figure
+
+
+def _example(figure: SubFigure, found: Activity, example: Example) -> None:
+    length = int(found.lengths[example.row])
+    heights = [*([5, 0.8] * len(found.levels)), *([0.9] if example.labels is not None else [])]
+    panels = figure.subplots(len(heights), 1, height_ratios=heights, gridspec_kw={"hspace": 0.02})
+    for depth, level in enumerate(reversed(found.levels)):
+        stack, strip = panels[2 * depth], panels[2 * depth + 1]
+        _stack(stack, level, example.row, length)
+        stack.set_ylabel(f"{level.name}\nu(h)" if len(found.levels) > 1 else "u(h)")
+        draw_path(strip, level.path[example.row, :length])
+        strip.set_ylabel("path", rotation=0, ha="right", va="center", fontsize=7.5)
+    if example.labels is not None:
+        draw_labels(panels[-1], example.labels)
+        panels[-1].set_ylabel("label", rotation=0, ha="right", va="center", fontsize=7.5)
+    panels[0].set_title(example.name)
+    _time_axis(panels[-1], length)
+
+
+def _stack(axes: Axes, level: LevelActivity, row: int, length: int) -> None:
+    """u_t of every choice, stacked; steps as steps."""
+    size = -(-length // MOST_POINTS)
+    starts = np.arange(0, length, size)
+    active = np.add.reduceat(level.active[row, :length], starts) / np.diff([*starts, length])[:, None]
+    edges = np.array([*starts, length]) - 0.5
+    top = np.cumsum(active, axis=1)
+    for choice in range(active.shape[1]):
+        lower, upper = top[:, choice] - active[:, choice], top[:, choice]
+        axes.stairs(upper, edges, baseline=lower, fill=True, color=option_colour(choice), linewidth=0)
+    axes.set(xlim=(-0.5, length - 0.5), ylim=(0, 1), xticks=[], yticks=[0, 0.5, 1])
+
+
+def _time_axis(axes: Axes, length: int) -> None:
+    last = length - 1
+    ticks = np.unique(np.linspace(0, last, 5).round().astype(int)) if last > 4 else np.arange(length)
+    axes.set_xticks(ticks)
+    axes.set_xlabel("step t", labelpad=1)

@@ -1,0 +1,40 @@
+"""The most likely options of every demonstration, one row of colour for each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from ddco_pyro.report.activity import Activity
+from ddco_pyro.report.pictures import blank
+from ddco_pyro.report.strips import colour_image, label_image, legend
+
+
+def order(found: Activity) -> np.ndarray:
+    """Rows by length, then by when the option of the lowest level first changes."""
+    path = found.levels[0].path
+    changed = np.diff(path, axis=1) != 0
+    first = np.where(changed.any(1), changed.argmax(1), path.shape[1])
+    return np.lexsort((first, found.lengths))
+
+
+def draw(found: Activity, labels: Sequence[np.ndarray] | None) -> Figure:
+    """A panel for each level, the highest first, and one for the labels where there are any."""
+    rows = order(found)
+    images = [(f"level “{level.name}”", colour_image(level.path[rows])) for level in reversed(found.levels)]
+    if labels is not None:
+        images.append(("ground-truth labels", label_image([labels[row] for row in rows], found.lengths.max())))
+    figure = blank(float(np.clip(0.9 + 0.045 * len(rows), 2.2, 7)))
+    panels = figure.subplots(1, len(images), sharey=True, squeeze=False)[0]
+    for axes, (title, image) in zip(panels, images, strict=True):
+        axes.imshow(image, aspect="auto", extent=(-0.5, image.shape[1] - 0.5, len(rows) + 0.5, 0.5))
+        axes.set(title=title, xlabel="step t")
+        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
+    panels[0].set_ylabel("demonstration, shortest first")
+    choices = sorted({choice for level in found.levels for choice in level.choices})
+    figure.legend(handles=legend(choices), loc="outside lower center", ncols=min(len(choices), 11), handlelength=1)
+    return figure

@@ -1,0 +1,82 @@
+"""Trajectories in space, coloured by option (the paper's figure B of SM 1.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+from ddco_pyro.colours import option_colour
+from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.report.activity import Activity
+from ddco_pyro.report.pictures import FAINT, INK, blank
+from ddco_pyro.report.strips import legend
+
+MOST_TRAJECTORIES = 40
+MOST_POINTS = 300
+MOST_STRETCHED = 4.0
+"""Axes whose ranges differ by more than this are not drawn to one scale."""
+
+
+def position_key(demos: Demonstrations) -> str | None:
+    """The first observation that is a vector of at least three numbers; None where there is none."""
+    shapes = demos.observation_shapes
+    return next((key for key, shape in shapes.items() if len(shape) == 1 and shape[0] >= 3), None)
+
+
+def draw(found: Activity, positions: Sequence[np.ndarray], key: str) -> Figure:
+    """The first positions [T_n, 3] of each demonstration, once for each level."""
+    figure = blank(4.9 if len(found.levels) == 1 else 4.2)
+    chosen = np.unique(np.linspace(0, len(positions) - 1, min(len(positions), MOST_TRAJECTORIES)).round().astype(int))
+    points = np.concatenate([positions[row] for row in chosen])
+    for place, level in enumerate(reversed(found.levels), start=1):
+        axes = figure.add_subplot(1, len(found.levels), place, projection="3d")
+        for row in chosen:
+            _trajectory(axes, positions[row], level.path[row])
+        _frame(axes, points, key)
+        axes.set_title(f"level “{level.name}”")
+    choices = sorted({choice for level in found.levels for choice in level.choices})
+    figure.legend(handles=legend(choices), loc="outside lower center", ncols=min(len(choices), 11), handlelength=1)
+    return figure
+
+
+def _trajectory(axes: Axes3D, positions: np.ndarray, path: np.ndarray) -> None:
+    steps = np.arange(0, len(positions), -(-len(positions) // MOST_POINTS))
+    points = positions[steps]
+    colours = [to_rgba(option_colour(int(choice))) for choice in path[steps]]
+    if len(points) > 1:
+        axes.add_collection3d(
+            Line3DCollection(np.stack([points[:-1], points[1:]], axis=1), colors=colours, linewidths=1.3)
+        )
+    axes.scatter(*points[0], color="white", edgecolor=INK, s=12, linewidth=0.7, depthshade=False)
+
+
+def _frame(axes: Axes3D, points: np.ndarray, key: str) -> None:
+    low, high = points.min(0), points.max(0)
+    span = np.where(high > low, high - low, 1.0)
+    axes.set(xlim=(low[0], low[0] + span[0]), ylim=(low[1], low[1] + span[1]), zlim=(low[2], low[2] + span[2]))
+    if span.max() <= MOST_STRETCHED * span.min():
+        axes.set_box_aspect(span / span.max(), zoom=0.95)
+    elevation, azimuth = view(points, span if span.max() > MOST_STRETCHED * span.min() else np.ones(3))
+    axes.view_init(elev=elevation, azim=azimuth)
+    for number, axis in enumerate((axes.xaxis, axes.yaxis, axes.zaxis)):
+        axis.set_pane_color((1, 1, 1, 1))
+        axis.set_label_text(f"{key}[{number}]")
+        axis.line.set_color(FAINT)
+    axes.locator_params(nbins=5)
+    axes.tick_params(labelsize=7)
+
+
+def view(points: np.ndarray, span: np.ndarray) -> tuple[float, float]:
+    """Elevation and azimuth (degrees) from which positions [M, 3] spread the most: along their least spread direction.
+
+    The third axis stays upright, so the elevation lies between 15 and 60 degrees.
+    """
+    normal = np.linalg.eigh(np.cov((points / span).T))[1][:, 0] if len(points) > 1 else np.array([1.0, 1.0, 1.0])
+    normal = -normal if normal[2] < 0 else normal
+    elevation = float(np.clip(np.degrees(np.arcsin(normal[2])), 15, 60))
+    return elevation, float(np.degrees(np.arctan2(normal[1], normal[0])))

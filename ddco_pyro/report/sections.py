@@ -1,0 +1,276 @@
+"""The page's sections, each made of what the run has; None where a section does not apply."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.diagnostics import diagnose
+from ddco_pyro.report import (
+    film,
+    plot_learning,
+    plot_likelihood,
+    plot_posterior,
+    plot_rows,
+    plot_success,
+    plot_timing,
+    plot_trajectories,
+    tables,
+    words,
+)
+from ddco_pyro.report.activity import Activity, activity
+from ddco_pyro.report.pictures import Picture, keep
+from ddco_pyro.run import Fit
+from ddco_pyro.spec import dump_spec
+
+EXAMPLES = 4
+"""Demonstrations whose posterior is shown step by step."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """What was fitted to what, and the verdict."""
+
+    model: str
+    name: str
+    verdict: str
+    success: str
+    facts: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """A section of figures, with a table and a sentence where they apply."""
+
+    pictures: list[Picture]
+    table: tables.Table | None = None
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """Success of the methods in the task."""
+
+    episodes: int
+    seed: int
+    measures: tables.Table
+    against: tables.Table | None
+    picture: Picture | None
+
+
+@dataclass(frozen=True)
+class Warnings:
+    """Signs of a degenerate solution: each in words, with what usually helps."""
+
+    found: list[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Films:
+    """Filmed rollouts."""
+
+    strip: Picture | None
+    films: list[film.Film]
+
+
+@dataclass(frozen=True)
+class Particulars:
+    """How the run was made."""
+
+    spec: str
+    check: Mapping[str, str]
+    seconds: Mapping[str, str]
+    versions: Mapping[str, str]
+
+
+def header(fit: Fit, metrics: Mapping[str, Any]) -> Header:
+    """Model, spec, verdict, demonstrations, supervisor."""
+    counts = metrics["demonstrations"]
+    facts = {
+        "Demonstrations": f"{counts['train']} for training, {counts['tune']} for tuning, {counts['valid']} held out",
+        "Parameters": str(metrics["parameters"]),
+    }
+    own = counts.get("supervisor", {}).get("success")
+    if own and "successes" in own:
+        facts["Supervisor’s own success"] = f"{words.rate(own)} demonstrations, 95 % interval"
+    name = fit.folder.resolve().name
+    return Header(words.method(fit.name), name, words.verdict(metrics), words.success(metrics), facts)
+
+
+def likelihood(fit: Fit, metrics: Mapping[str, Any]) -> Figures:
+    """Held-out log-likelihood."""
+    rows = plot_likelihood.likelihoods(metrics, {name: one.metrics for name, one in fit.baselines.items()})
+    alt = "; ".join(f"{words.method(row.name)}: {words.number(row.valid)} nats per step held out" for row in rows)
+    caption = (
+        "Left: log-likelihood of each method. Right: the model’s minus each baseline’s on the same held-out "
+        "demonstrations; diamond: mean with one standard error, dots: single demonstrations."
+    )
+    picture = keep(plot_likelihood.draw(rows), fit.folder / "figures" / "likelihood.png", alt, caption)
+    return Figures([picture], tables.likelihood(rows))
+
+
+def rollouts(fit: Fit, metrics: Mapping[str, Any]) -> Rollouts | None:
+    """Success in the task."""
+    found = metrics.get("rollouts")
+    if not found:
+        return None
+    methods = found["methods"]
+    success = {name: one["measures"].get("success", {}) for name, one in methods.items()}
+    rates = {name: one for name, one in success.items() if one.get("interval") and "rate" in one}
+    picture = None
+    if rates:
+        alt = "; ".join(f"{words.method(name)}: {words.rate(one)}" for name, one in rates.items())
+        caption = "Success rate of each method with its Wilson 95 % interval."
+        picture = keep(plot_success.draw(rates), fit.folder / "figures" / "success.png", f"Success. {alt}", caption)
+    against = tables.against(methods, metrics["model"])
+    return Rollouts(found["episodes"], found["seed"], tables.measures(methods), against, picture)
+
+
+def learning(fit: Fit) -> Figures | None:
+    """Learning curves of the model and its baselines."""
+    folders = {fit.name: fit.folder} | {name: one.folder for name, one in fit.baselines.items()}
+    paths = {name: folder / "history.csv" for name, folder in folders.items()}
+    stages = plot_learning.stages({name: path for name, path in paths.items() if path.exists()})
+    if not stages:
+        return None
+    caption = (
+        "Log-likelihood per step over epochs, each stage of training in its own panel and on its own scale; a pair of "
+        "lines for each restart. A steep start may be cut off."
+    )
+    alt = "Learning curves of the stages " + ", ".join(stage.title for stage in stages)
+    text = ""
+    if any(": vq-" in stage.title for stage in stages):
+        text = (
+            "Stages named vq-d maximise another quantity: the log-likelihood with level d’s choices clamped to "
+            "clusters of the observations. It can be compared within its panel only. Stages named level-d train under "
+            "a uniform meta-policy."
+        )
+    return Figures([keep(plot_learning.draw(stages), fit.folder / "figures" / "learning.png", alt, caption)], text=text)
+
+
+def options(fit: Fit, demos: Demonstrations, metrics: Mapping[str, Any]) -> Figures | None:
+    """Which option is active when."""
+    if fit.spec.hierarchy is None:
+        return None
+    found = activity(fit, demos)
+    makers = (_posteriors, _rows, _trajectories, _timing)
+    pictures = [picture for make in makers if (picture := make(fit, demos, found, metrics)) is not None]
+    names = [level.name for level in fit.spec.hierarchy.levels]
+    table = tables.option_use(names, metrics["options"], sum(metrics["demonstrations"][part] for part in PARTS))
+    return Figures(pictures, table, _agreement(metrics, names))
+
+
+PARTS = ("train", "tune", "valid")
+
+
+def _posteriors(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture:
+    held_out = [one["name"] for one in metrics["valid"] if one["name"] in demos.names]
+    names = (held_out or list(demos.names))[:EXAMPLES]
+    examples = [
+        plot_posterior.Example(demos.names.index(name), name, _labels(fit, demos[demos.names.index(name)]))
+        for name in names
+    ]
+    caption = (
+        f"Probability u of each choice at each step of {len(names)} {'held-out ' if held_out else ''}demonstrations, "
+        "given the whole demonstration (stacked), and the most likely path under it."
+    )
+    if examples[0].labels is not None:
+        caption += f" Boxes: ground-truth label “{fit.spec.demonstrations.labels}”."
+    path = fit.folder / "figures" / "posterior.png"
+    alt = f"Stacked probabilities of the options over time in {', '.join(names)}"
+    return keep(plot_posterior.draw(found, examples), path, alt, caption)
+
+
+def _rows(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture:
+    del metrics
+    labels = [_labels(fit, demo) for demo in demos]
+    known = [one for one in labels if one is not None]
+    caption = f"Most likely options of all {len(demos)} demonstrations, one row each, sorted by length."
+    if known:
+        caption += " Ground-truth labels in shades of grey."
+    alt = f"Rows of colour: the most likely option at each step of {len(demos)} demonstrations"
+    return keep(plot_rows.draw(found, known or None), fit.folder / "figures" / "segments.png", alt, caption)
+
+
+def _trajectories(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture | None:
+    del metrics
+    key = plot_trajectories.position_key(demos)
+    if key is None:
+        return None
+    figure = plot_trajectories.draw(found, [demo.observations[key][:, :3] for demo in demos], key)
+    shown = min(len(demos), plot_trajectories.MOST_TRAJECTORIES)
+    caption = (
+        f"{shown} demonstrations in space, coloured by the most likely option: first three numbers of observation "
+        f"“{key}”, in its own units. Circles: first steps. Seen from where the trajectories spread the most."
+    )
+    alt = f"Trajectories of {key} in three dimensions, coloured by option"
+    return keep(figure, fit.folder / "figures" / "trajectories.png", alt, caption)
+
+
+def _timing(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture:
+    del metrics
+    caption = (
+        "Left: mean probability of each choice over all demonstrations. Right: mean termination probability of each "
+        "option, weighted by how likely it was active in the step before; left out where it hardly ever is."
+    )
+    if len(found.levels) > 1:
+        caption += " Above the lowest level an option can end only where the one below it ends."
+    alt = f"Share of each option and termination probabilities over time, {len(demos)} demonstrations"
+    return keep(plot_timing.draw(found), fit.folder / "figures" / "timing.png", alt, caption)
+
+
+def _labels(fit: Fit, demo: Demonstration) -> Any:
+    name = fit.spec.demonstrations.labels
+    return demo.labels.get(name) if name else None
+
+
+def _agreement(metrics: Mapping[str, Any], levels: list[str]) -> str:
+    found = metrics.get("agreement")
+    if not found:
+        return ""
+    scores = [
+        f"{words.number(valid)} on held-out and {words.number(train)} on training demonstrations (level “{level}”)"
+        for level, train, valid in zip(levels, found["train"], found["valid"], strict=True)
+    ]
+    return (
+        f"Normalised mutual information with the ground-truth label “{found['labels']}”: {'; '.join(scores)}. "
+        "0 is no agreement, 1 the same segments under other names."
+    )
+
+
+def warnings(fit: Fit, metrics: Mapping[str, Any]) -> Warnings | None:
+    """Signs of a degenerate solution."""
+    if fit.spec.hierarchy is None:
+        return None
+    names = [level.name for level in fit.spec.hierarchy.levels]
+    found = diagnose(metrics["options"])
+    return Warnings([(words.warning(one, names[one.level - 1]), one.advice) for one in found])
+
+
+def films(fit: Fit) -> Films | None:
+    """Filmed rollouts, the model's first."""
+    found = film.films(fit.folder, first=fit.name)
+    if not found:
+        return None
+    strip = None
+    if found[0].method == fit.name:
+        one = found[0]
+        outcome = f" ({one.outcome})" if one.outcome else ""
+        caption = (
+            f"Frames of {words.method(one.method)}, seed {one.seed}{outcome}. The border has the colour of the lowest "
+            "level’s option; h1 is its number."
+        )
+        figure = film.draw_strip(fit.folder / one.link)
+        strip = keep(
+            figure, fit.folder / "figures" / "film.png", f"Film strip of one rollout, seed {one.seed}", caption
+        )
+    return Films(strip, found)
+
+
+def particulars(fit: Fit, metrics: Mapping[str, Any]) -> Particulars:
+    """Spec, engine check, seconds and versions."""
+    check = {name: f"{value:.1e}" for name, value in metrics["engine_check"].items()}
+    seconds = {name: words.number(value, 1) for name, value in metrics["seconds"].items()}
+    return Particulars(dump_spec(fit.spec), check, seconds, metrics["versions"])

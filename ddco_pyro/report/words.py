@@ -1,0 +1,119 @@
+"""Numbers in words: the page's verdict and how its numbers are written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from ddco_pyro.diagnostics import Finding
+
+CLEAR = 2.0
+"""Standard errors beyond which a difference is called one."""
+
+METHODS = {"ddco": "DDCO", "flat": "flat", "per_timestep": "per-timestep", "open_loop": "open loop"}
+
+
+def method(name: str) -> str:
+    """What a method is called in the page."""
+    return METHODS.get(name, name.replace("_", " "))
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """A number with a fixed number of digits after the point and a real minus sign; a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    text = f"{value:.{digits}f}"
+    return (text.lstrip("-") if float(text) == 0 else text).replace("-", "−")
+
+
+def signed(value: float, digits: int = 2) -> str:
+    """The same with a plus sign where it is positive."""
+    text = number(value, digits)
+    return text if text.startswith(("−", "–")) or float(text) == 0 else f"+{text}"
+
+
+def percent(value: float | None, digits: int = 0) -> str:
+    """A share in percent."""
+    return "–" if value is None or not math.isfinite(value) else f"{number(100 * value, digits)} %"
+
+
+def interval(value: list[float] | None, scale: float = 1.0, digits: int = 2) -> str:
+    """``low to high``."""
+    return "–" if value is None else f"{number(scale * value[0], digits)} to {number(scale * value[1], digits)}"
+
+
+def p_value(value: float) -> str:
+    """A p-value with two significant digits."""
+    return "< 0.001" if value < 0.001 else f"{value:.2g}"
+
+
+def rate(found: Mapping[str, Any]) -> str:
+    """``41 of 50 (69 to 90 %)``: successes, trials and the 95 % interval of the rate."""
+    text = f"{found['successes']} of {found['trials']}"
+    return text if found["interval"] is None else f"{text} ({interval(found['interval'], 100, 0)} %)"
+
+
+def measure(name: str) -> str:
+    """``accuracy_mm`` as ``Accuracy (mm)``."""
+    base, _, unit = name.rpartition("_")
+    units = {"mm", "cm", "m", "s", "rad", "deg", "steps"}
+    text = f"{base} ({unit})" if base and unit in units else name
+    return text.replace("_", " ").capitalize() if "(" not in text else _capital(text.replace("_", " "))
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def verdict(metrics: Mapping[str, Any]) -> str:
+    """One sentence on how well the model explains held-out demonstrations, with the error of that."""
+    name, held_out = _capital(method(metrics["model"])), len(metrics["valid"])
+    if not metrics["comparison"]:
+        value = number(metrics["log_likelihood_per_step"]["valid"])
+        return (
+            f"{name} gives held-out demonstrations {value} nats per step; no other model was trained to compare with."
+        )
+    clauses = [_clause(other, one["difference"]) for other, one in metrics["comparison"].items()]
+    text = f"{name} explains held-out demonstrations {_listed(clauses)}"
+    return f"{text} ({held_out} held-out demonstration{'s' * (held_out != 1)}; ± is one standard error)."
+
+
+def _clause(other: str, difference: Mapping[str, float]) -> str:
+    mean, error = difference["nats_per_step"], difference["standard_error"]
+    direction = "better" if mean > 0 else "worse"
+    if not math.isfinite(error):
+        return f"{number(abs(mean))} nats per step {direction} than {method(other)} (error unknown)"
+    if abs(mean) <= CLEAR * error:
+        return f"no differently from {method(other)} within the error ({signed(mean)} ± {number(error)} nats per step)"
+    return f"{number(abs(mean))} ± {number(error)} nats per step {direction} than {method(other)}"
+
+
+def _listed(items: list[str]) -> str:
+    return items[0] if len(items) == 1 else ", ".join(items[:-1]) + " and " + items[-1]
+
+
+def success(metrics: Mapping[str, Any]) -> str:
+    """One sentence on rollouts; empty where there are none."""
+    methods = metrics.get("rollouts", {}).get("methods", {})
+    rates = {name: one["measures"].get("success") for name, one in methods.items()}
+    rates = {name: one for name, one in rates.items() if one and "successes" in one}
+    ours = metrics["model"]
+    if ours not in rates:
+        return ""
+    others = [f"{method(name)} in {rate(one)}" for name, one in rates.items() if name != ours]
+    text = f"In rollouts {method(ours)} succeeds in {rate(rates[ours])} episodes"
+    return f"{text}{'; ' if others else ''}{_listed(others) if others else ''}."
+
+
+def warning(finding: Finding, level: str) -> str:
+    """A sign of a degenerate solution, in words with its number."""
+    option = f"Option {finding.choice} of level “{level}”"
+    share = percent(finding.value, 1)
+    return {
+        "unused": f"{option} is unused: it is active in {share} of all steps.",
+        "dominating": f"{option} dominates: it is active in {share} of all steps.",
+        "never_persisting": f"{option} never persists: it lasts {number(finding.value)} steps on average.",
+        "high_fitting": f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its "
+        "steps, past its options.",
+    }[finding.kind]
