@@ -22,14 +22,8 @@ from ddco_pyro.files import whole_file
 Attribute = float | int | str | bool
 
 LARGEST_INFLATION = 1100  # deflate, the strongest of HDF5's usual filters, stores at most 1032 bytes in one
-_DAMAGE = (
-    OSError,
-    RuntimeError,
-    ValueError,
-    TypeError,
-    KeyError,
-    MemoryError,
-)  # h5py raises any of these for a damaged file
+# What h5py raises for a damaged file.
+_DAMAGE = (OSError, RuntimeError, ValueError, TypeError, KeyError, MemoryError)
 
 
 class DemonstrationsError(BadInput):
@@ -355,11 +349,16 @@ def _read_mask(masks: h5py.Group, mask: str) -> tuple[str, ...]:
 
 
 def _attributes(owner: h5py.HLObject) -> dict[str, Attribute]:
-    """The attributes that hold one number or text. Arrays are not even read: a damaged one can claim any size."""
-    attributes = owner.attrs
-    single = [name for name in attributes if attributes.get_id(name).shape == ()]
-    values = {name: value.item() if isinstance(value := attributes[name], np.generic) else value for name in single}
-    return {name: value for name, value in values.items() if isinstance(value, Attribute)}
+    """The attributes that hold one number or text. Others are not even read: a damaged one can claim any size."""
+    kinds = {name: owner.attrs.get_id(name) for name in owner.attrs}
+    single = [name for name, kind in kinds.items() if kind.shape == () and _is_number_or_text(kind.dtype)]
+    values = {name: owner.attrs[name] for name in single}
+    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
+    return {name: value for name, value in plain.items() if isinstance(value, Attribute)}
+
+
+def _is_number_or_text(dtype: np.dtype) -> bool:
+    return dtype.kind in "iufb" or h5py.check_string_dtype(dtype) is not None
 
 
 def _write(group: h5py.Group, demo: Demonstration) -> None:

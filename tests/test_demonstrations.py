@@ -408,6 +408,15 @@ def test_damaged_data_is_refused(path: Path) -> None:
         Demonstrations.read(path, [])
 
 
+def test_attributes_that_are_neither_number_nor_text_are_left_alone(path: Path) -> None:
+    demonstrations(1).write(path)
+    with h5py.File(path, "r+") as file:
+        file["data/demo_0"].attrs["array"] = np.ones(3)
+        file["data/demo_0"].attrs["nothing"] = h5py.Empty("f8")
+        file["data/demo_0"].attrs["reference"] = file["data"].ref
+    assert Demonstrations.read(path)[0].attributes == demonstration("demo_0").attributes
+
+
 def test_what_is_made_in_memory_is_checked_too() -> None:
     with pytest.raises(DemonstrationsError, match="there are no demonstrations"):
         Demonstrations(())

@@ -410,11 +410,13 @@ values = st.recursive(
     max_leaves=6,
 )
 networks = st.one_of(
-    st.fixed_dictionaries({"network": st.just("linear")}, optional={"dropout": shares}),
+    st.fixed_dictionaries({"network": st.just("linear")}),
     st.fixed_dictionaries(
         {}, optional={"network": st.just("per_timestep"), "hidden": st.lists(counts, max_size=3), "dropout": shares}
     ),
-    st.fixed_dictionaries({"network": st.just("conv")}, optional={"filters": counts, "kernel": counts}),
+    st.fixed_dictionaries(
+        {"network": st.just("conv")}, optional={"filters": counts, "kernel": counts, "hidden": st.lists(counts)}
+    ),
     st.fixed_dictionaries(
         {"network": st.just("a.b:C")}, optional={"options": st.dictionaries(texts, values, max_size=3)}
     ),
@@ -468,7 +470,7 @@ def test_what_is_written_is_read_as_it_was(tmp_path_factory: pytest.TempPathFact
 def test_all_defaults_are_written() -> None:
     written = yaml.safe_load(dump_spec(parse_spec(SMALL)))
     assert written["training"]["optimizer"] == {"name": "adam", "lr": 1e-3, "momentum": 0.9, "weight_decay": 0.0}
-    assert written["hierarchy"]["levels"][0]["termination"] == {"network": "linear", "dropout": 0.0}
+    assert written["hierarchy"]["levels"][0]["termination"] == {"network": "linear"}
     assert set(written) == set(Spec.model_fields)
 
 
