@@ -97,7 +97,7 @@ class Controller:
     def _control(self, decision: Decision, actor: int) -> Tensor:
         assert decision.mean is not None  # a caller that emits no control never selects choice 0
         mean = decision.mean[0, 0, actor]
-        return mean if self.control == "mean" else torch.normal(mean, decision.std[actor])
+        return mean if self.control == "mean" else torch.normal(mean, decision.std)
 
 
 class _MostLikely(Messenger):

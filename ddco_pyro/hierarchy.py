@@ -31,7 +31,7 @@ Emits = Literal["options", "control"]
 @dataclass(frozen=True)
 class Decision:
     """What the K callers of one level say: ``selection`` log η [N, T, K, 1 + k] and the ``mean`` control [N, T, K, A]
-    with its ``std`` [K, A], both in scaled units; None for what they do not emit.
+    with its ``std`` [A], both in scaled units; None for what they do not emit.
     """
 
     selection: Tensor | None
@@ -77,7 +77,7 @@ class Caller(nn.Module):
         logits = options + self.hybrid if self.emits_options else 0
         self.sizes = (logits, control_size if self.emits_control else 0)
         self.network = build(network, shape, sum(self.sizes), copies)
-        self.std = ControlStd(control, copies, control_size)
+        self.std = ControlStd(control, control_size)
 
     def forward(self, inputs: Inputs) -> Decision:
         """Log-probabilities of the choices and mean controls for every step of the inputs."""
@@ -94,21 +94,25 @@ class Caller(nn.Module):
 
 
 class ControlStd(nn.Module):
-    """The standard deviation σ of the Gaussian control, [K, A] in scaled units: fixed, or learned above a floor."""
+    """The standard deviation σ of the Gaussian control, [A] in scaled units: fixed, or learned above a floor.
+
+    The options of a level share it: otherwise one of them collects the steps where the control hardly varies (a
+    saturated actuator), whatever the skill (see docs/decisions.md).
+    """
 
     fixed: Tensor
 
-    def __init__(self, spec: ControlSpec, copies: int, size: int) -> None:
+    def __init__(self, spec: ControlSpec, size: int) -> None:
         super().__init__()
         self.floor = spec.std.floor if isinstance(spec.std, LearnedStd) else None
         if isinstance(spec.std, LearnedStd):
             start = math.log(math.expm1(max(INITIAL_STD - spec.std.floor, 1e-3)))
-            self.raw = nn.Parameter(torch.full((copies, size), start))
+            self.raw = nn.Parameter(torch.full((size,), start))
         else:
-            self.register_buffer("fixed", torch.full((copies, size), float(spec.std)), persistent=False)
+            self.register_buffer("fixed", torch.full((size,), float(spec.std)), persistent=False)
 
     def forward(self) -> Tensor:
-        """σ [K, A]."""
+        """σ [A]."""
         return self.fixed if self.floor is None else self.floor + softplus(self.raw)
 
 
@@ -202,7 +206,7 @@ def _uniform(inputs: Inputs, options: int, like: Tensor) -> Decision:
     """A meta-policy that selects each of the k options with probability 1/k."""
     selection = like.new_full((*inputs.batch, 1, 1 + options), -math.log(options))
     selection[..., 0] = NEVER
-    return Decision(selection, None, like[:1])
+    return Decision(selection, None, like)
 
 
 def _log_density(decision: Decision, actions: Tensor, log_volume: Tensor) -> Tensor:

@@ -247,7 +247,7 @@ Observation = Annotated[ObservationSpec, _bare("key", str | ObservationSpec)]
 
 
 class LearnedStd(_Model):
-    """A standard deviation that is learned, one for each option and control dimension."""
+    """A standard deviation that is learned, one for each level and control dimension."""
 
     learn: Literal[True]
     """Always true; for a fixed standard deviation give a number instead of this mapping."""

@@ -29,7 +29,7 @@ def random_tables(
 
     callers = (*counts[1:], 1)
     selection, control = [], [2 * normal(counts[0])] if counts else []
-    for level, (count, caller) in enumerate(zip(counts, callers, strict=True)):
+    for level, (count, caller) in enumerate(zip(counts, callers, strict=False)):
         logits = normal(caller, 1 + count)
         if not hybrid[level]:
             logits[..., 0] = NEVER

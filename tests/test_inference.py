@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from oracle import brute_force, random_tables
 
-from ddco_pyro.inference import log_likelihood, posterior, segment, total_log_likelihood
+from ddco_pyro.ahmm import NEVER, Tables, complete
+from ddco_pyro.inference import fused, log_likelihood, logspace, posterior, segment, total_log_likelihood
+from ddco_pyro.inference.check import compare_engines
 
 CASES = [
+    ((), (), 5),
     ((1,), (False,), 5),
     ((1,), (True,), 5),
     ((3,), (False,), 4),
@@ -50,6 +56,14 @@ def test_posterior_is_the_marginal_over_paths(counts, hybrid, steps):
 
 
 @pytest.mark.parametrize(("counts", "hybrid", "steps"), CASES)
+def test_engines_have_the_same_gradient(counts, hybrid, steps):
+    tables = random_tables(counts, hybrid, trajectories=3, steps=steps, seed=4)
+    check = compare_engines(tables, torch.tensor([steps, 1, max(steps - 1, 1)]))
+    assert check.value < 1e-12
+    assert check.gradient < 1e-10
+
+
+@pytest.mark.parametrize(("counts", "hybrid", "steps"), CASES[1:])
 def test_segment_is_the_most_likely_path(counts, hybrid, steps):
     tables = random_tables(counts, hybrid, trajectories=2, steps=steps, seed=3)
     lengths = torch.tensor([steps, max(steps - 1, 1)])
@@ -57,3 +71,94 @@ def test_segment_is_the_most_likely_path(counts, hybrid, steps):
     for n, length in enumerate(lengths.tolist()):
         assert tuple(map(tuple, found[n, :length].tolist())) == brute_force(tables, n, length).best
         assert (found[n, length:] == -1).all()
+
+
+def test_the_gradient_with_respect_to_the_tables_is_the_posterior():
+    """Choices without a caller's choice 0 above them: the tables' own gradient is u, v and w of §4.1."""
+    tables = random_tables((3,), (True,), trajectories=2, steps=4, seed=5)
+    leaves = Tables(*(tuple(t.clone().requires_grad_() for t in level) for level in _parts(tables)))
+    lengths = torch.tensor([4, 3])
+    log_likelihood(leaves, lengths).sum().backward()
+    for n, length in enumerate(lengths.tolist()):
+        truth = brute_force(tables, n, length)
+        np.testing.assert_allclose(leaves.selection[0].grad[n, :length, 0], truth.v[0], atol=1e-9)
+        np.testing.assert_allclose(leaves.control[0].grad[n, :length], truth.u[0][:, 1:], atol=1e-9)
+        ended = truth.u[0][:-1, 1:] - truth.w[0][:-1, 1:]
+        np.testing.assert_allclose(leaves.termination[0].grad[n, 1:length, :, 0], truth.w[0][:-1, 1:], atol=1e-9)
+        np.testing.assert_allclose(leaves.termination[0].grad[n, 1:length, :, 1], ended, atol=1e-9)
+
+
+def test_second_derivatives_are_refused():
+    tables = random_tables((2,), (False,), steps=3)
+    leaf = tables.control[0].requires_grad_()
+    value = log_likelihood(tables, torch.tensor([3])).square().sum()
+    (gradient,) = torch.autograd.grad(value, leaf, create_graph=True)
+    with pytest.raises(RuntimeError, match="marked with @once_differentiable"):
+        gradient.sum().backward()
+
+
+def test_padding_changes_nothing():
+    tables = random_tables((2, 2), (True, False), trajectories=2, steps=6, seed=6)
+    lengths = torch.tensor([4, 3])
+    short = Tables(*(tuple(t[:, :4] for t in level) for level in _parts(tables)))
+    torch.testing.assert_close(log_likelihood(tables, lengths), log_likelihood(short, lengths), atol=0, rtol=0)
+
+
+def test_permuting_options_changes_nothing():
+    tables = random_tables((4,), (True,), trajectories=2, steps=6, seed=7)
+    order = torch.tensor([2, 0, 3, 1])
+    permuted = Tables(
+        (tables.selection[0][..., torch.cat([torch.tensor([0]), order + 1])],),
+        (tables.termination[0][:, :, order],),
+        (tables.control[0][..., order], tables.control[1]),
+    )
+    lengths = torch.tensor([6, 5])
+    torch.testing.assert_close(log_likelihood(tables, lengths), log_likelihood(permuted, lengths), atol=1e-12, rtol=0)
+    found, again = posterior(tables, lengths).u[0], posterior(permuted, lengths).u[0]
+    torch.testing.assert_close(found[..., 1 + order], again[..., 1:], atol=1e-12, rtol=0)
+
+
+@settings(deadline=None, max_examples=150, derandomize=True)
+@given(
+    counts=st.sampled_from([(1,), (3,), (2, 2), (2, 1, 2)]),
+    steps=st.integers(1, 40),
+    seed=st.integers(0, 10_000),
+    sharp=st.sampled_from([1.0, 30.0, 1e3, 1e5]),
+    termination=st.sampled_from([0.0, 1e-8, 0.3, 1 - 1e-8, 1.0]),
+    impossible=st.floats(0, 0.4),
+)
+def test_fused_equals_log_space_on_hard_tables(counts, steps, seed, sharp, termination, impossible):
+    """Tiny σ, terminations within 1e-8 of 0 and 1 and at them, options impossible in places."""
+    hybrid = tuple(bool(seed >> level & 1) for level in range(len(counts)))
+    tables = random_tables(counts, hybrid, trajectories=3, steps=steps, seed=seed)
+    generator = torch.Generator().manual_seed(seed)
+    hole = [torch.rand(c.shape, generator=generator) < impossible for c in tables.control]
+    control = tuple(torch.where(h, NEVER, sharp * c) for h, c in zip(hole, tables.control, strict=True))
+    ending = torch.tensor([1 - termination, termination], dtype=torch.float64).log()
+    lowest = torch.where(torch.rand(tables.termination[0][..., :1].shape, generator=generator) < 0.5, ending,
+                         tables.termination[0])  # fmt: skip
+    tables = replace(tables, control=control, termination=(lowest, *tables.termination[1:]))
+    lengths = torch.tensor([steps, 1, (steps + 1) // 2])
+    leaves = [t.requires_grad_() for t in (*tables.control, *tables.selection)]
+    chain = complete(tables, lengths)
+    value, truth = fused.log_likelihood(chain, lengths), logspace.log_likelihood(chain)
+    torch.testing.assert_close(value, truth, rtol=1e-9, atol=1e-9)
+    possible = torch.isfinite(truth)
+    if possible.any():
+        found = torch.autograd.grad(value[possible].sum(), leaves, retain_graph=True, allow_unused=True)
+        expected = torch.autograd.grad(truth[possible].sum(), leaves, allow_unused=True)
+        for ours, theirs in zip(found, expected, strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-9)
+
+
+def test_ten_thousand_steps_stay_finite():
+    tables = random_tables((5,), (True,), steps=10_000, seed=8)
+    tables = replace(tables, control=tuple(100 * c for c in tables.control))
+    lengths = torch.tensor([10_000])
+    chain = complete(tables, lengths)
+    torch.testing.assert_close(fused.log_likelihood(chain, lengths), logspace.log_likelihood(chain), rtol=1e-9, atol=0)
+    assert torch.allclose(posterior(tables, lengths).u[0].sum(-1), torch.ones(1, dtype=torch.float64))
+
+
+def _parts(tables):
+    return tables.selection, tables.termination, tables.control

@@ -51,10 +51,11 @@ class _Eliminate(torch.autograd.Function):
 
 def evaluate(chain: Chain, lengths: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Log-likelihoods [N], and posteriors shaped like (emission, *selection, *termination)."""
-    shift = chain.emission.flatten(2).amax(-1, keepdim=True)
+    flat = chain.emission.reshape(*chain.emission.shape[:2], -1)
+    shift = flat.amax(-1, keepdim=True)
     shift = torch.where(torch.isfinite(shift), shift, 0.0)
     sizes = [table.shape[-1] for table in chain.selection]
-    joint = (chain.emission.flatten(2) - shift).exp()
+    joint = (flat - shift).exp()
     numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
     value, overlap, to_select, to_end, to_emission = forward_backward(
         _rows(chain.selection, joint).numpy(),
