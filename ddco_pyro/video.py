@@ -20,7 +20,15 @@ def write_film(path: Path, episode: Episode) -> None:
     """Write the episode's frames as an mp4 (H.264) that browsers play."""
     frames = [_even(captioned(episode, t)) for t in range(len(episode.frames))]
     with whole_file(path) as temporary:
-        imageio.imwrite(temporary, frames, extension=".mp4", plugin="FFMPEG", fps=FRAMES_PER_SECOND, macro_block_size=1)
+        imageio.imwrite(
+            temporary,
+            frames,
+            extension=".mp4",
+            plugin="FFMPEG",
+            fps=FRAMES_PER_SECOND,
+            macro_block_size=1,
+            output_params=["-f", "mp4"],  # the temporary name does not tell
+        )
 
 
 def captioned(episode: Episode, t: int) -> np.ndarray:
