@@ -9,8 +9,9 @@ TORCH_CPU := https://download.pytorch.org/whl/cpu/torch/
 
 .PHONY: demo test lint format clean .venv
 
+# --resume: an interrupted demo goes on where it stopped, a finished one shows its result again.
 demo: $(STAMP)
-	$(BIN)/ddco-pyro fit specs/needle.yaml --out runs/needle
+	$(BIN)/ddco-pyro fit specs/needle.yaml --out runs/needle --resume
 
 test: lint
 	$(BIN)/pytest -n 2 -q
