@@ -24,7 +24,7 @@ NOMINAL_GRIP = Pose(rotation(2, -np.pi / 2), np.zeros(3))  # the needle in the g
 
 
 def arc_coordinate(point: np.ndarray) -> float:
-    """Position along the wire (m, from the middle towards the tip) that is nearest to a point [3] of the needle's frame."""
+    """Position along the wire (m, from the middle towards the tip) nearest to a point [3] of the needle's frame."""
     angle = np.arctan2(point[0], ARC_RADIUS - point[1])
     return float(ARC_RADIUS * np.clip(angle, -ARC_HALF_ANGLE, ARC_HALF_ANGLE))
 

@@ -41,7 +41,8 @@ class Events:
 
     grasped: bool = False
     entry: np.ndarray | None = None  # [2]: y, z (m) where the tip went into the phantom
-    catch: np.ndarray = field(default_factory=lambda: np.zeros(2))  # offset (m), angle (rad) when the jaws began to close
+    # Where on the wire (m) and at which angle (rad) the jaws were when they began to close.
+    catch: np.ndarray = field(default_factory=lambda: np.zeros(2))
 
 
 class Physics(mujoco.Physics):
@@ -60,7 +61,7 @@ class Physics(mujoco.Physics):
         super().reset(keyframe_id)
 
     def place(self, joints: np.ndarray, jaw: float, needle: psm.Pose) -> None:
-        """Put the arm at true joints [6] and the jaws at an angle (rad), at rest, and the needle at a pose turned about z."""
+        """Put the arm at true joints [6] and the jaws at an angle (rad), at rest, and a needle turned about z at its pose."""
         qpos = self.named.data.qpos
         servo = np.concatenate([joints, [jaw / 2, jaw / 2]])
         qpos[[*psm.JOINTS, "jaw_left", "jaw_right"]] = servo

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import dm_env
 import numpy as np
+
 from ddco_pyro.task import Observation
 
 from . import needle_geometry as geometry
@@ -30,15 +31,23 @@ APPROACH_HEIGHTS = (0.015, 0.006, 0.0, 0.0)  # m, way points 1 to 4; the jaws cl
 LIFT_HEIGHTS = (0.010, 0.022)  # m, way points 5 and 6
 TRANSFER_FRACTIONS = (0.35, 0.7)  # way points 7 and 8, along the path to way point 9
 STANDOFFS = (-0.012, -0.010, -0.007, -0.004, 0.001, 0.006)  # m, way points 9 to 14
-PHASES = {"approach": range(0, 3), "grasp": range(3, 5), "lift": range(5, 7), "orient": range(7, 12), "insert": range(12, 15)}
+PHASES = {
+    "approach": range(0, 3),
+    "grasp": range(3, 5),
+    "lift": range(5, 7),
+    "orient": range(7, 12),
+    "insert": range(12, 15),
+}
 JAWS = np.array([JAW_OPEN] * 4 + [JAW_CLOSED] * 11)
 LIFTED = 6  # from this way point on the plan is about the insertion, before it about the grasp
 
 POSITION_TOLERANCE = 0.0003  # m
 TURN_TOLERANCE = np.deg2rad(1.0)
 # A hand is inexact, the less so the nearer it is to what it aims at: standard deviations of an adjustment.
-HAND_POSITION = 0.12  # m per m that remains to needle or phantom
-HAND_TURN = 3.0  # rad per m that remains
+HAND_POSITION = 0.0004  # m, in each direction
+HAND_TURN = np.deg2rad(1.5)
+HAND_POSITION_AWAY = 0.25  # more, in m per m that remains to needle or phantom
+HAND_TURN_AWAY = 8.0  # rad per m
 REMAINING = {1: 0.015, 2: 0.006, 3: 0.0, 8: 0.018, 9: 0.012, 10: 0.010, 11: 0.007, 12: 0.004, 13: 0.0}  # m, by step
 
 CLEARANCE = 0.001  # m, that planned paths keep from mat and phantom
@@ -48,7 +57,7 @@ PHANTOM = np.array([[0.030, 0.056], [-0.030, 0.030], [0.0, 0.024]])
 
 
 class Plan(NamedTuple):
-    """Way points [15, 7], and the gripper poses at which they take the needle to be grasped and, at the face, inserted."""
+    """Way points [15, 7], and the gripper poses at which they grasp and, at the face, insert."""
 
     way_points: np.ndarray
     grasp: Pose
@@ -144,9 +153,10 @@ class OpenLoop:
 class Supervisor(OpenLoop):
     """The open-loop plan with corrections that are carried through the rest of the trajectory.
 
-    Before a step of the approach or of the insertion it predicts where the next way point would really bring the gripper,
-    and compares with where the plan meant it to be relative to the true needle. If they differ by more than a small
-    tolerance it changes the joint angles by what removes the difference. The jaws are not corrected.
+    Before a step of the approach or of the insertion it predicts where the next way point would really bring the
+    gripper, and compares with where the plan meant it to be relative to the true needle. If they differ by more than a
+    small tolerance it changes the joint angles by what removes the difference. The jaws are not corrected. As with a
+    person, adjustments are coarse far away and fine near the aim, so demonstrations show how to come back.
     """
 
     def __init__(self, environment: dm_env.Environment) -> None:
@@ -173,8 +183,9 @@ class Supervisor(OpenLoop):
     def _by_hand(self, wanted: Pose) -> Pose:
         """The gripper pose that a person achieves who wants another one."""
         remaining = REMAINING[self._step]
-        turn = psm.rotation(2, HAND_TURN * remaining * self._hand.standard_normal())
-        return Pose(turn @ wanted.rotation, wanted.position + HAND_POSITION * remaining * self._hand.standard_normal(3))
+        turn = (HAND_TURN + HAND_TURN_AWAY * remaining) * self._hand.standard_normal()
+        offset = (HAND_POSITION + HAND_POSITION_AWAY * remaining) * self._hand.standard_normal(3)
+        return Pose(psm.rotation(2, turn) @ wanted.rotation, wanted.position + offset)
 
     def _wanted(self, believed: Pose) -> Pose:
         """Where the gripper should truly be at a way point that the plan believes to be at ``believed``.

@@ -15,7 +15,7 @@ from ompl import base, geometric, util
 SEED = 1
 RANGE = 0.3  # rad: the longest step of the tree
 RESOLUTION = 0.01  # of the extent of the joint space, between validity checks
-ITERATIONS = 20_000
+ITERATIONS = 5000
 
 util.setLogLevel(util.LOG_ERROR)
 
@@ -27,11 +27,14 @@ class NoPath(RuntimeError):
 def plan_path(
     start: np.ndarray, goal: np.ndarray, ranges: np.ndarray, is_free: Callable[[np.ndarray], bool]
 ) -> np.ndarray:
-    """The corners [K, J] of a short path from ``start`` [J] to ``goal`` [J] through joint angles where ``is_free`` holds.
+    """The corners [K, J] of a short path from ``start`` [J] to ``goal`` [J] through joints where ``is_free`` holds.
 
     :param ranges: the joints' limits [J, 2].
-    :raises NoPath: when the planner gives up.
+    :raises NoPath: when an end is not free, or the planner gives up.
     """
+    for name, end in (("start", start), ("goal", goal)):
+        if not is_free(end):  # OMPL would wait for other ends until it runs out of iterations
+            raise NoPath(f"the {name} of the path collides: {np.round(end, 3)}")
     joints = len(ranges)
     _restart_random_numbers()
     space = base.RealVectorStateSpace(joints)

@@ -1,0 +1,118 @@
+"""What the library relies on, checked over every registered task."""
+
+from collections.abc import Iterator
+from importlib.metadata import entry_points
+
+import dm_env
+import numpy as np
+import pytest
+
+from ddco_pyro.task import ENTRY_POINTS, Policy, Task, find_task
+
+NAMES = sorted(point.name for point in entry_points(group=ENTRY_POINTS))
+MAX_STEPS = 200  # of an episode that these tests look at
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def task(request: pytest.FixtureRequest) -> Task:
+    """Each registered task in turn."""
+    return find_task(request.param)
+
+
+def make(task: Task, name: str, seed: int) -> tuple[dm_env.Environment, Policy]:
+    """An environment and the named policy in it, both ready to start."""
+    environment = task.load(seed)
+    policy = task.policies[name](environment)
+    policy.reset(seed)
+    return environment, policy
+
+
+def episode(environment: dm_env.Environment, policy: Policy) -> Iterator[tuple[dm_env.TimeStep, np.ndarray]]:
+    """Time steps, each with the action that led to it."""
+    time_step = environment.reset()
+    for _ in range(MAX_STEPS):
+        if time_step.last():
+            return
+        action = policy.act(time_step.observation)
+        time_step = environment.step(action)
+        yield time_step, action
+
+
+@pytest.fixture(scope="module")
+def supervised(task: Task) -> Iterator[tuple[dm_env.Environment, list[dm_env.TimeStep], np.ndarray]]:
+    """An environment after an episode of the supervisor, the time steps, and the actions [T, A]."""
+    environment, policy = make(task, "supervisor", seed=3)
+    steps, actions = zip(*episode(environment, policy), strict=True)
+    yield environment, list(steps), np.array(actions)
+    environment.close()
+
+
+def test_observations_follow_their_spec(supervised) -> None:
+    environment, steps, _ = supervised
+    spec = environment.observation_spec()
+    for step in steps:
+        assert set(step.observation) == set(spec)
+        for key, value in step.observation.items():
+            spec[key].validate(value)
+
+
+def test_observations_are_finite_and_change(supervised) -> None:
+    _, steps, _ = supervised
+    for key in steps[0].observation:
+        values = np.array([step.observation[key] for step in steps], float)
+        assert np.isfinite(values).all(), key
+        assert np.ptp(values, axis=0).max() > 0, key
+
+
+def test_actions_follow_their_spec(supervised) -> None:
+    environment, _, actions = supervised
+    spec = environment.action_spec()
+    for action in actions:
+        spec.validate(action.astype(spec.dtype))
+
+
+def test_outcome_is_named_numbers_with_success(task: Task, supervised) -> None:
+    measures = task.outcome(supervised[0])
+    assert measures["success"] in (0.0, 1.0)
+    assert all(isinstance(name, str) and isinstance(value, float) for name, value in measures.items())
+
+
+def test_frame_is_a_picture_of_something(task: Task, supervised) -> None:
+    picture = task.frame(supervised[0])
+    assert picture.dtype == np.uint8
+    assert picture.ndim == 3
+    assert picture.shape[2] == 3
+    assert picture.std() > 10
+
+
+def test_sources_exist_and_hold_the_task(task: Task) -> None:
+    assert task.sources
+    assert all(source.is_file() for source in task.sources)
+
+
+def test_equal_seeds_give_equal_episodes(task: Task, supervised) -> None:
+    environment, policy = make(task, "supervisor", seed=3)
+    _, steps, actions = supervised
+    for (step, action), first_step, first_action in zip(episode(environment, policy), steps[:5], actions, strict=False):
+        np.testing.assert_array_equal(action, first_action)
+        for key, value in step.observation.items():
+            np.testing.assert_array_equal(value, first_step.observation[key])
+    environment.close()
+
+
+def test_other_seeds_start_elsewhere(task: Task) -> None:
+    starts = []
+    for seed in (0, 1):
+        environment = task.load(seed)
+        starts.append(environment.reset().observation)
+        environment.close()
+    assert any(not np.array_equal(starts[0][key], starts[1][key]) for key in starts[0])
+
+
+def test_annotations_are_integers(task: Task) -> None:
+    environment, policy = make(task, "supervisor", seed=0)
+    policy.act(environment.reset().observation)
+    for name, value in getattr(policy, "annotations", {}).items():
+        assert isinstance(name, str)
+        assert isinstance(value, int)
+    environment.close()
