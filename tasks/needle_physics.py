@@ -61,7 +61,7 @@ class Physics(mujoco.Physics):
         super().reset(keyframe_id)
 
     def place(self, joints: np.ndarray, jaw: float, needle: psm.Pose) -> None:
-        """Put the arm at true joints [6] and the jaws at an angle (rad), at rest, and a needle turned about z at its pose."""
+        """Put the arm at true joints [6] and the jaws at an angle (rad), at rest, and lay the needle at a pose."""
         qpos = self.named.data.qpos
         servo = np.concatenate([joints, [jaw / 2, jaw / 2]])
         qpos[[*psm.JOINTS, "jaw_left", "jaw_right"]] = servo
