@@ -10,6 +10,7 @@ import imageio.v3 as imageio
 import numpy as np
 from matplotlib.figure import Figure
 
+from ddco_pyro.report import words
 from ddco_pyro.report.pictures import blank, data_uri, hide_frame
 
 MOST_BYTES = 4_000_000
@@ -28,6 +29,11 @@ class Film:
     link: str
     uri: str | None
     outcome: str
+
+    @property
+    def name(self) -> str:
+        """What the method is called in the page."""
+        return words.method(self.method)
 
 
 def films(folder: Path, first: str) -> list[Film]:

@@ -42,6 +42,7 @@ STYLE: Any = {  # matplotlib types the keys as literals
     "xtick.labelsize": 8,
     "ytick.labelsize": 8,
     "text.color": INK,
+    "text.parse_math": False,  # a $ in a name is a $
     "legend.frameon": False,
     "legend.fontsize": 8,
     "figure.constrained_layout.use": True,

@@ -48,7 +48,7 @@ def _each(ours: Sequence[Mapping[str, Any]], theirs: Sequence[Mapping[str, Any]]
 
 def draw(rows: Sequence[Likelihood]) -> Figure:
     """Two panels of dots: log-likelihood of each method, and the paired differences."""
-    figure = blank(1.15 + 0.42 * len(rows))
+    figure = blank(1.25 + 0.36 * len(rows))
     left, right = figure.subplots(1, 2, sharey=True)
     places = np.arange(len(rows))
     left.scatter([row.train for row in rows], places, facecolor="white", edgecolor=INK, label="training", zorder=3)
@@ -57,7 +57,7 @@ def draw(rows: Sequence[Likelihood]) -> Figure:
     left.set_yticks(places, [method(row.name) for row in rows])
     left.set_ylim(len(rows) - 0.4, -0.6)
     left.grid(axis="x", color="#e4e4e4")
-    left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.42 * 2.2 / len(rows)), ncols=2)
+    figure.legend(loc="outside lower left", ncols=2)
     _differences(right, rows, places)
     return figure
 

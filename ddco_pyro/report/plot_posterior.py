@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.ticker import MaxNLocator
 
 from ddco_pyro.colours import option_colour
 from ddco_pyro.report.activity import Activity, LevelActivity
@@ -70,7 +71,6 @@ def _stack(axes: Axes, level: LevelActivity, row: int, length: int) -> None:
 
 
 def _time_axis(axes: Axes, length: int) -> None:
-    last = length - 1
-    ticks = np.unique(np.linspace(0, last, 5).round().astype(int)) if last > 4 else np.arange(length)
-    axes.set_xticks(ticks)
+    axes.set_xlim(-0.5, length - 0.5)
+    axes.xaxis.set_major_locator(MaxNLocator(7, integer=True))
     axes.set_xlabel("step t", labelpad=1)

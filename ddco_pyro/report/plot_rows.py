@@ -34,7 +34,7 @@ def draw(found: Activity, labels: Sequence[np.ndarray] | None) -> Figure:
         axes.set(title=title, xlabel="step t")
         axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
-    panels[0].set_ylabel("demonstration, shortest first")
+    panels[0].set_ylabel("demonstration")
     choices = sorted({choice for level in found.levels for choice in level.choices})
     figure.legend(handles=legend(choices), loc="outside lower center", ncols=min(len(choices), 11), handlelength=1)
     return figure

@@ -18,6 +18,10 @@ from ddco_pyro.report.strips import legend
 
 MOST_TRAJECTORIES = 40
 MOST_POINTS = 300
+TURN = 70.0
+LEAST_OBLIQUE = 15.0
+"""Degrees; looking straight along an axis would hide its scale."""
+
 MOST_STRETCHED = 4.0
 """Axes whose ranges differ by more than this are not drawn to one scale."""
 
@@ -29,19 +33,29 @@ def position_key(demos: Demonstrations) -> str | None:
 
 
 def draw(found: Activity, positions: Sequence[np.ndarray], key: str) -> Figure:
-    """The first positions [T_n, 3] of each demonstration, once for each level."""
-    figure = blank(4.9 if len(found.levels) == 1 else 4.2)
+    """The positions [T_n, 3] of each demonstration, once for each level; a single level is seen from two sides."""
+    figure = blank(0.35 + 4.2 * -(-max(2, len(found.levels)) // 2))
+    figure.set_layout_engine("none")  # it does not know how much room labels in space take
+    turns = (0.0, TURN) if len(found.levels) == 1 else (0.0,)
+    panels = [(level, turn) for level in reversed(found.levels) for turn in turns]
     chosen = np.unique(np.linspace(0, len(positions) - 1, min(len(positions), MOST_TRAJECTORIES)).round().astype(int))
     points = np.concatenate([positions[row] for row in chosen])
-    for place, level in enumerate(reversed(found.levels), start=1):
-        axes = figure.add_subplot(1, len(found.levels), place, projection="3d")
+    for place, (level, turn) in zip(_places(len(panels), figure.get_figheight()), panels, strict=True):
+        axes = figure.add_axes(place, projection="3d", proj_type="ortho")
         for row in chosen:
             _trajectory(axes, positions[row], level.path[row])
-        _frame(axes, points, key)
-        axes.set_title(f"level “{level.name}”")
+        _frame(axes, points, key, turn)
+        axes.set_title(f"level “{level.name}”" + (f", turned by {turn:.0f}°" if turn else ""))
     choices = sorted({choice for level in found.levels for choice in level.choices})
-    figure.legend(handles=legend(choices), loc="outside lower center", ncols=min(len(choices), 11), handlelength=1)
+    figure.legend(handles=legend(choices), loc="lower center", ncols=min(len(choices), 11), handlelength=1)
     return figure
+
+
+def _places(count: int, height: float) -> list[tuple[float, float, float, float]]:
+    """Panels two in a row, (left, bottom, width, height) in parts of the figure; room for titles and the legend."""
+    rows = -(-count // 2)
+    bottom, each = 0.35 / height, (1 - 0.35 / height) / rows
+    return [(0.5 * (n % 2), bottom + (rows - 1 - n // 2) * each, 0.5, 0.94 * each) for n in range(count)]
 
 
 def _trajectory(axes: Axes3D, positions: np.ndarray, path: np.ndarray) -> None:
@@ -55,14 +69,14 @@ def _trajectory(axes: Axes3D, positions: np.ndarray, path: np.ndarray) -> None:
     axes.scatter(*points[0], color="white", edgecolor=INK, s=12, linewidth=0.7, depthshade=False)
 
 
-def _frame(axes: Axes3D, points: np.ndarray, key: str) -> None:
+def _frame(axes: Axes3D, points: np.ndarray, key: str, turn: float) -> None:
     low, high = points.min(0), points.max(0)
     span = np.where(high > low, high - low, 1.0)
     axes.set(xlim=(low[0], low[0] + span[0]), ylim=(low[1], low[1] + span[1]), zlim=(low[2], low[2] + span[2]))
     if span.max() <= MOST_STRETCHED * span.min():
-        axes.set_box_aspect(span / span.max(), zoom=0.95)
+        axes.set_box_aspect(span / span.max(), zoom=0.88)
     elevation, azimuth = view(points, span if span.max() > MOST_STRETCHED * span.min() else np.ones(3))
-    axes.view_init(elev=elevation, azim=azimuth)
+    axes.view_init(elev=elevation, azim=azimuth + turn)
     for number, axis in enumerate((axes.xaxis, axes.yaxis, axes.zaxis)):
         axis.set_pane_color((1, 1, 1, 1))
         axis.set_label_text(f"{key}[{number}]")
@@ -74,9 +88,10 @@ def _frame(axes: Axes3D, points: np.ndarray, key: str) -> None:
 def view(points: np.ndarray, span: np.ndarray) -> tuple[float, float]:
     """Elevation and azimuth (degrees) from which positions [M, 3] spread the most: along their least spread direction.
 
-    The third axis stays upright, so the elevation lies between 15 and 60 degrees.
+    The third axis stays upright, so the elevation lies between 15 and 45 degrees, and no axis is looked along.
     """
     normal = np.linalg.eigh(np.cov((points / span).T))[1][:, 0] if len(points) > 1 else np.array([1.0, 1.0, 1.0])
     normal = -normal if normal[2] < 0 else normal
-    elevation = float(np.clip(np.degrees(np.arcsin(normal[2])), 15, 60))
-    return elevation, float(np.degrees(np.arctan2(normal[1], normal[0])))
+    elevation = float(np.clip(np.degrees(np.arcsin(normal[2])), 15, 45))
+    quarter, rest = divmod(float(np.degrees(np.arctan2(normal[1], normal[0]))), 90)
+    return elevation, 90 * quarter + float(np.clip(rest, LEAST_OBLIQUE, 90 - LEAST_OBLIQUE))

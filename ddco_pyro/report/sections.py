@@ -94,7 +94,7 @@ def header(fit: Fit, metrics: Mapping[str, Any]) -> Header:
     }
     own = counts.get("supervisor", {}).get("success")
     if own and "successes" in own:
-        facts["Supervisor’s own success"] = f"{words.rate(own)} demonstrations, 95 % interval"
+        facts["Supervisor’s own success"] = f"{words.rate(own, 'demonstrations')}, 95 % interval"
     name = fit.folder.resolve().name
     return Header(words.method(fit.name), name, words.verdict(metrics), words.success(metrics), facts)
 
@@ -159,7 +159,10 @@ def options(fit: Fit, demos: Demonstrations, metrics: Mapping[str, Any]) -> Figu
     pictures = [picture for make in makers if (picture := make(fit, demos, found, metrics)) is not None]
     names = [level.name for level in fit.spec.hierarchy.levels]
     table = tables.option_use(names, metrics["options"], sum(metrics["demonstrations"][part] for part in PARTS))
-    return Figures(pictures, table, _agreement(metrics, names))
+    text = _agreement(metrics, names)
+    if len(names) > 1:
+        text = f"{text} Each level numbers its own options: equal colours in two levels mean nothing.".strip()
+    return Figures(pictures, table, text)
 
 
 PARTS = ("train", "tune", "valid")
@@ -187,7 +190,10 @@ def _rows(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str
     del metrics
     labels = [_labels(fit, demo) for demo in demos]
     known = [one for one in labels if one is not None]
-    caption = f"Most likely options of all {len(demos)} demonstrations, one row each, sorted by length."
+    caption = (
+        f"Most likely options of all {len(demos)} demonstrations, one row each, sorted by length, then by when the "
+        "option first changes."
+    )
     if known:
         caption += " Ground-truth labels in shades of grey."
     alt = f"Rows of colour: the most likely option at each step of {len(demos)} demonstrations"

@@ -6,10 +6,12 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from scipy import stats
+
 from ddco_pyro.diagnostics import Finding
 
-CLEAR = 2.0
-"""Standard errors beyond which a difference is called one."""
+CONFIDENCE = 0.95
+"""A difference is called one where this interval about it leaves out 0."""
 
 METHODS = {"ddco": "DDCO", "flat": "flat", "per_timestep": "per-timestep", "open_loop": "open loop"}
 
@@ -48,9 +50,9 @@ def p_value(value: float) -> str:
     return "< 0.001" if value < 0.001 else f"{value:.2g}"
 
 
-def rate(found: Mapping[str, Any]) -> str:
-    """``41 of 50 (69 to 90 %)``: successes, trials and the 95 % interval of the rate."""
-    text = f"{found['successes']} of {found['trials']}"
+def rate(found: Mapping[str, Any], of: str = "") -> str:
+    """``41 of 50 (69 to 90 %)``: successes, trials (``of`` what) and the 95 % interval of the rate."""
+    text = f"{found['successes']} of {found['trials']} {of}".rstrip()
     return text if found["interval"] is None else f"{text} ({interval(found['interval'], 100, 0)} %)"
 
 
@@ -74,18 +76,18 @@ def verdict(metrics: Mapping[str, Any]) -> str:
         return (
             f"{name} gives held-out demonstrations {value} nats per step; no other model was trained to compare with."
         )
-    clauses = [_clause(other, one["difference"]) for other, one in metrics["comparison"].items()]
+    clauses = [_clause(other, one["difference"], held_out) for other, one in metrics["comparison"].items()]
     text = f"{name} explains held-out demonstrations {_listed(clauses)}"
     return f"{text} ({held_out} held-out demonstration{'s' * (held_out != 1)}; ± is one standard error)."
 
 
-def _clause(other: str, difference: Mapping[str, float]) -> str:
+def _clause(other: str, difference: Mapping[str, float], held_out: int) -> str:
     mean, error = difference["nats_per_step"], difference["standard_error"]
     direction = "better" if mean > 0 else "worse"
     if not math.isfinite(error):
         return f"{number(abs(mean))} nats per step {direction} than {method(other)} (error unknown)"
-    if abs(mean) <= CLEAR * error:
-        return f"no differently from {method(other)} within the error ({signed(mean)} ± {number(error)} nats per step)"
+    if abs(mean) <= error * stats.t.ppf((1 + CONFIDENCE) / 2, held_out - 1):
+        return f"as well as {method(other)} within the error ({signed(mean)} ± {number(error)} nats per step)"
     return f"{number(abs(mean))} ± {number(error)} nats per step {direction} than {method(other)}"
 
 
@@ -102,7 +104,7 @@ def success(metrics: Mapping[str, Any]) -> str:
     if ours not in rates:
         return ""
     others = [f"{method(name)} in {rate(one)}" for name, one in rates.items() if name != ours]
-    text = f"In rollouts {method(ours)} succeeds in {rate(rates[ours])} episodes"
+    text = f"In rollouts {method(ours)} succeeds in {rate(rates[ours], 'episodes')}"
     return f"{text}{'; ' if others else ''}{_listed(others) if others else ''}."
 
 

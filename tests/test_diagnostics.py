@@ -1,0 +1,62 @@
+import pytest
+
+from ddco_pyro.diagnostics import Finding, diagnose
+
+
+def level(*shares, durations=None):
+    durations = durations or [5.0] * len(shares)
+    return [
+        {"choice": choice, "share": share, "selected": 1.0, "duration": duration}
+        for choice, (share, duration) in enumerate(zip(shares, durations, strict=True))
+    ]
+
+
+def test_a_balanced_solution_has_no_signs():
+    assert diagnose([level(0.0, 0.3, 0.3, 0.4)]) == []
+    assert diagnose([]) == []
+
+
+@pytest.mark.parametrize(("share", "unused"), [(0.0099, True), (0.01, False)])
+def test_unused_below_one_percent(share, unused):
+    found = diagnose([level(0.0, share, 0.5, 0.5 - share)])
+    assert found == ([Finding("unused", 1, 1, share)] if unused else [])
+
+
+@pytest.mark.parametrize(("share", "dominating"), [(0.9, False), (0.901, True)])
+def test_dominating_above_ninety_percent(share, dominating):
+    found = diagnose([level(0.0, 1 - share, share)])
+    assert found == ([Finding("dominating", 1, 2, share)] if dominating else [])
+
+
+def test_a_single_option_cannot_dominate():
+    assert diagnose([level(0.0, 1.0)]) == []
+
+
+@pytest.mark.parametrize(("duration", "short"), [(1.49, True), (1.5, False), (None, False)])
+def test_never_persisting_below_one_and_a_half_steps(duration, short):
+    found = diagnose([level(0.0, 0.5, 0.5, durations=[None, duration, 5.0])])
+    assert found == ([Finding("never_persisting", 1, 1, duration)] if short else [])
+
+
+def test_an_unused_option_is_not_also_said_to_be_short():
+    found = diagnose([level(0.0, 0.001, 0.999 / 2, 0.999 / 2, durations=[None, 1.0, 5.0, 5.0])])
+    assert [one.kind for one in found] == ["unused"]
+
+
+@pytest.mark.parametrize(("control", "high"), [(0.5, False), (0.51, True)])
+def test_high_fitting_where_control_is_chosen_most_of_the_time(control, high):
+    rest = (1 - control) / 2
+    found = diagnose([level(control, rest, rest, durations=[1.0, 5.0, 5.0])])
+    assert found == ([Finding("high_fitting", 1, 0, control)] if high else [])
+
+
+def test_control_by_a_caller_above_does_not_count_for_the_one_below():
+    upper = level(0.6, 0.2, 0.2)
+    lower = level(0.7, 0.15, 0.15)  # the upper options emit control in 0.1 of the 0.4 in which they act
+    assert [(one.kind, one.level) for one in diagnose([lower, upper])] == [("high_fitting", 2)]
+
+
+def test_every_sign_comes_with_advice():
+    found = diagnose([level(0.6, 0.001, 0.399, durations=[1.0, 1.0, 1.2]), level(0.0, 0.95, 0.05)])
+    assert {one.kind for one in found} == {"unused", "dominating", "never_persisting", "high_fitting"}
+    assert all(one.advice for one in found)
