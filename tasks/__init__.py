@@ -14,3 +14,6 @@ def _has_display() -> bool:
 # MuJoCo reads the variable once, when it is first imported, so it has to be set before any task is.
 if not _has_display():
     os.environ.setdefault("MUJOCO_GL", "egl")
+
+# Before any task: dm-control looks for OpenGL when it is imported, and its own error does not say what to install.
+from . import rendering  # noqa: E402, F401
