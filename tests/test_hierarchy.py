@@ -1,0 +1,131 @@
+"""The networks' tables, and the gradient of the likelihood against the paper's own gradient equation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from oracle import brute_force
+from torch.distributions import Normal
+
+from ddco_pyro.encoding import Batch
+from ddco_pyro.hierarchy import TERMINATION_BOUND, Hierarchy
+from ddco_pyro.inference import log_likelihood, total_log_likelihood
+from ddco_pyro.networks import Inputs
+from ddco_pyro.spec import parse_spec
+
+SHAPES = {"state": (3,)}
+
+
+def make_hierarchy(counts=(3,), emits=("options",), network="mlp", seed=0, **control):
+    """A random hierarchy over 3 features and 2 control dimensions; ``counts`` lowest level first."""
+    levels = [{"name": f"level-{d}", "count": k, "policy": {"network": network}} for d, k in enumerate(counts, 1)]
+    for level in levels[1:]:
+        level["policy"]["emits"] = list(emits)
+    spec = parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": ["state"],
+            "control": {"std": 0.7, **control},
+            **(
+                {"hierarchy": {"levels": levels, "meta_policy": {"network": network, "emits": list(emits)}}}
+                if counts
+                else {"baseline": "flat"}
+            ),
+        }
+    )
+    torch.manual_seed(seed)
+    return Hierarchy(spec, SHAPES, 2, steps=4)
+
+
+def make_batch(trajectories=2, steps=4, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    vector = torch.randn(trajectories, steps, 3, generator=generator)
+    actions = torch.randn(trajectories, steps, 2, generator=generator)
+    lengths = torch.tensor([steps, *[steps - 1] * (trajectories - 1)])
+    return Batch(Inputs(vector, {}, torch.arange(steps)), actions, lengths)
+
+
+@pytest.mark.parametrize("emits", [("options",), ("options", "control")])
+def test_gradient_is_the_papers_gradient_equation(emits):
+    """∇L of §4.1 (and its hybrid terms, §4.2) with u, v, w summed over every path, against autograd."""
+    hierarchy, batch = make_hierarchy((3,), emits).double(), make_batch()
+    batch = Batch(Inputs(batch.inputs.vector.double(), {}, batch.inputs.time), batch.actions.double(), batch.lengths)
+    parameters = list(hierarchy.parameters())
+    found = torch.autograd.grad(
+        total_log_likelihood(hierarchy.tabulate(batch), batch.lengths), parameters, retain_graph=True
+    )
+    tables = hierarchy.tabulate(batch)
+    surrogate = torch.zeros((), dtype=torch.float64)
+    for n, length in enumerate(batch.lengths.tolist()):
+        truth = brute_force(tables, n, length)
+        u, v, w = (torch.from_numpy(part[0]) for part in (truth.u, truth.v, truth.w))
+        eta, pi, psi = tables.selection[0][n, :length, 0], tables.control[0][n], tables.termination[0][n]
+        surrogate = surrogate + (v[:, 1:] * eta[:, 1:]).sum() + (u[:, 1:] * pi[:length]).sum()
+        surrogate = (
+            surrogate + ((u - w)[:-1, 1:] * psi[1:length, :, 1]).sum() + (w[:-1, 1:] * psi[1:length, :, 0]).sum()
+        )
+        if "control" in emits:
+            surrogate = surrogate + (v[:, 0] * (eta[:, 0] + tables.control[1][n, :length, 0])).sum()
+    expected = torch.autograd.grad(surrogate, parameters)
+    for ours, paper in zip(found, expected, strict=True):
+        torch.testing.assert_close(ours, paper, atol=1e-9, rtol=1e-7)
+
+
+def test_one_option_that_never_ends_is_flat_behaviour_cloning():
+    """With k = 1 the latents say nothing, so the likelihood is the product of the option's Gaussians."""
+    hierarchy, batch = make_hierarchy((1,)), make_batch()
+    tables = hierarchy.tabulate(batch)
+    mean = hierarchy(batch.inputs).decisions[0].mean[:, :, 0]
+    density = Normal(mean.double(), 0.7).log_prob(batch.actions.double()).sum(-1)
+    alive = torch.arange(4) < batch.lengths[:, None]
+    torch.testing.assert_close(log_likelihood(tables, batch.lengths), (density * alive).sum(1), atol=1e-4, rtol=0)
+
+
+def test_a_baseline_is_the_gaussian_of_its_policy():
+    hierarchy, batch = make_hierarchy(()), make_batch()
+    mean = hierarchy(batch.inputs).decisions[0].mean[:, :, 0]
+    density = Normal(mean.double(), 0.7).log_prob(batch.actions.double()).sum(-1)
+    alive = torch.arange(4) < batch.lengths[:, None]
+    found = log_likelihood(hierarchy.tabulate(batch), batch.lengths)
+    torch.testing.assert_close(found, (density * alive).sum(1), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("counts", [(3,), (3, 2), (2, 3, 2)])
+@pytest.mark.parametrize("emits", [("options",), ("options", "control"), ("control",)])
+def test_tables_are_normalised(counts, emits):
+    tables = make_hierarchy(counts, emits).tabulate(make_batch())
+    for level, (selection, termination) in enumerate(zip(tables.selection, tables.termination, strict=True)):
+        callers = counts[level + 1] if level + 1 < len(counts) else 1
+        assert selection.shape == (2, 4, callers, 1 + counts[level])
+        np.testing.assert_allclose(selection.exp().sum(-1).detach(), 1, rtol=1e-5)
+        np.testing.assert_allclose(termination.exp().sum(-1).detach(), 1, rtol=1e-5)
+        assert bool((selection[..., 0].exp() > 0).all()) == ("control" in emits)
+        assert bool((selection[..., 1:].exp() > 0).all()) == ("options" in emits)
+    assert tables.control[-1].isfinite().all() == ("control" in emits)
+
+
+def test_terminations_keep_their_bound():
+    hierarchy, batch = make_hierarchy((2,)), make_batch()
+    level = hierarchy.levels[0]
+    with torch.no_grad():
+        level.termination.layers[-1].bias[:] = torch.tensor([1e6, -1e6]).reshape(2, 1, 1)
+    psi = level.log_termination(batch.inputs).exp()[..., 1]
+    bound = torch.tensor(TERMINATION_BOUND)
+    np.testing.assert_allclose(psi[..., 0].detach(), bound.sigmoid(), rtol=1e-5)
+    np.testing.assert_allclose(psi[..., 1].detach(), (-bound).sigmoid(), rtol=1e-3)
+
+
+def test_discovery_sees_a_uniform_meta_policy():
+    hierarchy, batch = make_hierarchy((3, 2)), make_batch()
+    tables = hierarchy.tabulate(batch, discovering=1)
+    assert tables.depth == 1
+    np.testing.assert_allclose(tables.selection[0][..., 1:].exp(), 1 / 3, rtol=1e-6)
+    assert (tables.selection[0][..., 0] == -torch.inf).all()
+
+
+def test_a_learned_deviation_keeps_its_floor_and_is_shared_by_the_level():
+    hierarchy = make_hierarchy((3,), std={"learn": True, "floor": 0.2})
+    with torch.no_grad():
+        hierarchy.levels[0].policy.std.raw[:] = -100.0
+    np.testing.assert_allclose(hierarchy.levels[0].policy.std().detach(), [0.2, 0.2], rtol=1e-6)
