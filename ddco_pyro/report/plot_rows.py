@@ -30,7 +30,9 @@ def draw(found: Activity, labels: Sequence[np.ndarray] | None) -> Figure:
     figure = blank(float(np.clip(0.9 + 0.045 * len(rows), 2.2, 7)))
     panels = figure.subplots(1, len(images), sharey=True, squeeze=False)[0]
     for axes, (title, image) in zip(panels, images, strict=True):
-        axes.imshow(image, aspect="auto", extent=(-0.5, image.shape[1] - 0.5, len(rows) + 0.5, 0.5))
+        axes.imshow(
+            image, aspect="auto", interpolation="nearest", extent=(-0.5, image.shape[1] - 0.5, len(rows) + 0.5, 0.5)
+        )
         axes.set(title=title, xlabel="step t")
         axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))

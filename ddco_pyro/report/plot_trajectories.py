@@ -34,7 +34,7 @@ def position_key(demos: Demonstrations) -> str | None:
 
 def draw(found: Activity, positions: Sequence[np.ndarray], key: str) -> Figure:
     """The positions [T_n, 3] of each demonstration, once for each level; a single level is seen from two sides."""
-    figure = blank(0.35 + 4.2 * -(-max(2, len(found.levels)) // 2))
+    figure = blank(0.55 + 4.2 * -(-max(2, len(found.levels)) // 2))
     figure.set_layout_engine("none")  # it does not know how much room labels in space take
     turns = (0.0, TURN) if len(found.levels) == 1 else (0.0,)
     panels = [(level, turn) for level in reversed(found.levels) for turn in turns]
@@ -54,8 +54,8 @@ def draw(found: Activity, positions: Sequence[np.ndarray], key: str) -> Figure:
 def _places(count: int, height: float) -> list[tuple[float, float, float, float]]:
     """Panels two in a row, (left, bottom, width, height) in parts of the figure; room for titles and the legend."""
     rows = -(-count // 2)
-    bottom, each = 0.35 / height, (1 - 0.35 / height) / rows
-    return [(0.5 * (n % 2), bottom + (rows - 1 - n // 2) * each, 0.5, 0.94 * each) for n in range(count)]
+    bottom, each = 0.55 / height, (1 - 0.55 / height) / rows
+    return [(0.5 * (n % 2), bottom + (rows - 1 - n // 2) * each, 0.5, 0.93 * each) for n in range(count)]
 
 
 def _trajectory(axes: Axes3D, positions: np.ndarray, path: np.ndarray) -> None:

@@ -36,7 +36,7 @@ def label_image(labels: Sequence[np.ndarray], steps: int) -> np.ndarray:
 
 def draw_path(axes: Axes, path: np.ndarray) -> None:
     """One demonstration's choices [T] as a strip."""
-    axes.imshow(colour_image(path[None]), aspect="auto", extent=(-0.5, len(path) - 0.5, 0, 1))
+    axes.imshow(colour_image(path[None]), aspect="auto", interpolation="nearest", extent=(-0.5, len(path) - 0.5, 0, 1))
     hide_frame(axes)
 
 
