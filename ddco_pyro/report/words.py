@@ -87,7 +87,7 @@ def _clause(other: str, difference: Mapping[str, float], held_out: int) -> str:
     if not math.isfinite(error):
         return f"{number(abs(mean))} nats per step {direction} than {method(other)} (error unknown)"
     if abs(mean) <= error * stats.t.ppf((1 + CONFIDENCE) / 2, held_out - 1):
-        return f"as well as {method(other)} within the error ({signed(mean)} ± {number(error)} nats per step)"
+        return f"with no clear difference from {method(other)} ({signed(mean)} ± {number(error)} nats per step)"
     return f"{number(abs(mean))} ± {number(error)} nats per step {direction} than {method(other)}"
 
 
