@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,7 +17,7 @@ from torch.nn.functional import logsigmoid, softplus
 
 from ddco_pyro.ahmm import NEVER, Tables
 from ddco_pyro.encoding import Batch, ControlScaling, ObservationEncoder, Shapes
-from ddco_pyro.networks import Inputs, InputShape, build
+from ddco_pyro.networks import Inputs, InputShape, ShapeError, build
 from ddco_pyro.spec import ControlSpec, LearnedStd, LevelSpec, NetworkSpec, Spec
 
 TERMINATION_BOUND = 12.0
@@ -120,20 +121,37 @@ class Level(nn.Module):
     """The k options of one level: their policies π (or, above the lowest level, η) and terminations ψ."""
 
     def __init__(
-        self, spec: LevelSpec, options_below: int, shape: InputShape, control: ControlSpec, control_size: int
+        self,
+        place: str,
+        spec: LevelSpec,
+        options_below: int,
+        shape: InputShape,
+        control: ControlSpec,
+        control_size: int,
     ) -> None:
         super().__init__()
         self.count = spec.count
-        self.policy = Caller(
-            spec.policy, spec.policy.emits or _default(options_below), options_below, shape, control, control_size,
-            spec.count,
-        )  # fmt: skip
-        self.termination = build(spec.termination, shape, 1, spec.count)
+        with _named(f"{place}.policy"):
+            self.policy = Caller(
+                spec.policy, spec.policy.emits or _default(options_below), options_below, shape, control, control_size,
+                spec.count,
+            )  # fmt: skip
+        with _named(f"{place}.termination"):
+            self.termination = build(spec.termination, shape, 1, spec.count)
 
     def log_termination(self, inputs: Inputs) -> Tensor:
         """(log(1 - ψ), log ψ), [N, T, k, 2]."""
         logit = TERMINATION_BOUND * torch.tanh(self.termination(inputs).squeeze(-1) / TERMINATION_BOUND)
         return torch.stack([logsigmoid(-logit), logsigmoid(logit)], dim=-1)
+
+
+@contextmanager
+def _named(place: str) -> Iterator[None]:
+    """Errors about a network say where in the spec it stands."""
+    try:
+        yield
+    except ShapeError as error:
+        raise ShapeError(f"{place}: {error}") from error
 
 
 def _default(options_below: int) -> tuple[Emits, ...]:
@@ -155,12 +173,13 @@ class Hierarchy(nn.Module):
         self.scaling = ControlScaling(spec.control, control_size)
         shape = self.encoder.shape(steps)
         levels, below = [], 0
-        for level in spec.hierarchy.levels if spec.hierarchy else ():
-            levels.append(Level(level, below, shape, spec.control, control_size))
+        for number, level in enumerate(spec.hierarchy.levels if spec.hierarchy else ()):
+            levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, spec.control, control_size))
             below = level.count
         self.levels = nn.ModuleList(levels)
         network, emits = _meta_policy(spec)
-        self.meta_policy = Caller(network, emits, below, shape, spec.control, control_size, copies=1)
+        with _named("hierarchy.meta_policy" if levels else "baseline.policy"):
+            self.meta_policy = Caller(network, emits, below, shape, spec.control, control_size, copies=1)
 
     @property
     def depth(self) -> int:

@@ -20,7 +20,7 @@ def build(spec: NetworkSpec, shape: InputShape, outputs: int, copies: int) -> nn
 
     A user's ``module:Class`` is called as ``Class(shape, outputs, copies, **options)``.
 
-    :raises ShapeError: where the network cannot read these observations, or cannot be imported.
+    :raises ShapeError: where the network cannot read these observations, or cannot be imported or made.
     """
     if spec.network == "linear":
         return Mlp(shape, outputs, copies, hidden=())
@@ -30,14 +30,18 @@ def build(spec: NetworkSpec, shape: InputShape, outputs: int, copies: int) -> nn
         return PerTimestep(shape, outputs, copies, spec.hidden, spec.dropout)
     if spec.network == "conv":
         return Conv(shape, outputs, copies, spec.hidden, spec.dropout, spec.filters, spec.kernel)
-    return _own(spec.network)(shape, outputs, copies, **spec.options)
+    own = _own(spec.network)
+    try:
+        return own(shape, outputs, copies, **spec.options)
+    except Exception as error:  # whatever the user's code raises
+        raise ShapeError(f"network {spec.network!r} cannot be made with options {spec.options}: {error}") from error
 
 
 def _own(name: str) -> type[nn.Module]:
     module, _, attribute = name.partition(":")
     try:
         found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
+    except Exception as error:  # whatever the user's code raises
         raise ShapeError(f"network {name!r} cannot be imported: {error}") from error
     if not (isinstance(found, type) and issubclass(found, nn.Module)):
         raise ShapeError(f"network {name!r} is not a torch.nn.Module class")

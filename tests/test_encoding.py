@@ -1,0 +1,176 @@
+"""Features, scaled controls and batches against numpy and scipy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.encoding import ControlScaling, ObservationEncoder, encode
+from ddco_pyro.hierarchy import Hierarchy
+from ddco_pyro.inference import log_likelihood
+from ddco_pyro.spec import ControlSpec, ObservationSpec, parse_spec
+
+LENGTHS = (5, 3, 4)
+SHAPES = {"pose": (3,), "grid": (2, 2), "camera": (6, 4, 3)}
+
+
+def make_demonstrations():
+    """Three demonstrations far from mean 0 and standard deviation 1; ``pose[1]`` never changes."""
+    random = np.random.default_rng(0)
+    records = []
+    for number, steps in enumerate(LENGTHS):
+        pose = random.normal([100, 0, -3], [7, 0, 0.01], (steps, 3))
+        pose[:, 1] = 0.3
+        observations = {
+            "pose": pose,
+            "grid": random.normal(2, 5, (steps, 2, 2)),
+            "camera": random.integers(0, 256, (steps, 6, 4, 3), dtype=np.uint8),
+        }
+        actions = np.column_stack([random.normal(40, 9, steps), np.full(steps, 2.5), random.normal(0, 1e-3, steps)])
+        records.append(Demonstration(f"demo_{number}", observations, actions))
+    return Demonstrations(tuple(records))
+
+
+DEMOS = make_demonstrations()
+
+
+def fitted(*specs):
+    encoder = ObservationEncoder(specs, SHAPES)
+    encoder.fit(DEMOS)
+    return encoder
+
+
+def rows(key):
+    return np.concatenate([demo.observations[key].reshape(len(demo), -1) for demo in DEMOS])
+
+
+def alive(vector):
+    """The steps that are not padding, one after another."""
+    return np.concatenate([vector[n, :length].numpy() for n, length in enumerate(LENGTHS)])
+
+
+def test_standardised_over_all_steps():
+    found = alive(fitted(ObservationSpec(key="grid")).inputs(demo.observations for demo in DEMOS).vector)
+    raw = rows("grid")
+    np.testing.assert_allclose(found, (raw - raw.mean(0)) / raw.std(0), atol=1e-5)
+
+
+def test_a_dimension_that_never_changes_is_only_centred():
+    encoder = fitted(ObservationSpec(key="pose"))
+    found = alive(encoder.inputs(demo.observations for demo in DEMOS).vector)
+    np.testing.assert_allclose(found.std(0), [1, 0, 1], atol=1e-5)
+    np.testing.assert_allclose(found[:, 1], 0, atol=1e-12)
+    other = {"pose": np.array([[100.0, 0.8, -3.0]])}
+    np.testing.assert_allclose(encoder.inputs([other]).vector[0, 0, 1], 0.5, rtol=1e-6)
+
+
+def test_differences_stand_behind_their_observation_and_begin_with_zero():
+    specs = ObservationSpec(key="pose", differences=True, standardize=False), ObservationSpec(key="grid")
+    found = fitted(*specs).inputs(demo.observations for demo in DEMOS).vector
+    assert found.shape == (3, 5, 3 + 3 + 4)
+    for n, demo in enumerate(DEMOS):
+        pose = demo.observations["pose"]
+        np.testing.assert_allclose(found[n, : len(demo), :3], pose, rtol=1e-6)
+        np.testing.assert_allclose(found[n, 0, 3:6], 0)
+        np.testing.assert_allclose(found[n, 1 : len(demo), 3:6], pose[1:] - pose[:-1], atol=1e-5)
+
+
+def test_differences_are_standardised_apart_from_their_observation():
+    encoder = fitted(ObservationSpec(key="grid", differences=True))
+    differences = [np.diff(d.observations["grid"].reshape(len(d), -1), axis=0) for d in DEMOS]
+    raw = np.concatenate([np.vstack([np.zeros(4), one]) for one in differences])
+    np.testing.assert_allclose(encoder.mean[4:], raw.mean(0))
+    np.testing.assert_allclose(encoder.std[4:], raw.std(0))
+
+
+def test_what_is_not_to_be_standardised_stays_as_it_is():
+    encoder = fitted(ObservationSpec(key="pose", standardize=False))
+    found = alive(encoder.inputs(demo.observations for demo in DEMOS).vector)
+    np.testing.assert_array_equal(found, rows("pose").astype(np.float32))
+
+
+def test_images_stay_bytes():
+    found = fitted(ObservationSpec(key="camera"), ObservationSpec(key="pose")).inputs(d.observations for d in DEMOS)
+    assert found.vector.shape == (3, 5, 3)
+    assert found.images["camera"].dtype == torch.uint8
+    for n, demo in enumerate(DEMOS):
+        np.testing.assert_array_equal(found.images["camera"][n, : len(demo)], demo.observations["camera"])
+
+
+def batch():
+    encoder = fitted(ObservationSpec(key="pose"), ObservationSpec(key="camera"))
+    scaling = ControlScaling(ControlSpec(scale="none"), 3)
+    return encode(DEMOS, encoder, scaling)
+
+
+def test_batches_are_padded_with_zeros():
+    found = batch()
+    assert (len(found), found.steps, found.lengths.tolist()) == (3, 12, [5, 3, 4])
+    assert found.inputs.time.tolist() == [0, 1, 2, 3, 4]
+    for n, demo in enumerate(DEMOS):
+        np.testing.assert_allclose(found.actions[n, : len(demo)], demo.actions, rtol=1e-6)
+        for padded in (found.inputs.vector, found.inputs.images["camera"], found.actions):
+            assert padded.shape[:2] == (3, 5)
+            assert not padded[n, len(demo) :].any()
+
+
+def test_select_trims_to_the_longest():
+    whole = batch()
+    found = whole.select(torch.tensor([2, 1]))
+    assert (found.lengths.tolist(), found.inputs.time.tolist(), found.steps) == ([4, 3], [0, 1, 2, 3], 7)
+    assert torch.equal(found.actions, whole.actions[[2, 1], :4])
+    assert torch.equal(found.inputs.vector, whole.inputs.vector[[2, 1], :4])
+    assert torch.equal(found.inputs.images["camera"], whole.inputs.images["camera"][[2, 1], :4])
+
+
+# --- controls ---------------------------------------------------------------------------------------------------------
+
+ACTIONS = np.concatenate([demo.actions for demo in DEMOS])
+
+
+def scaling(scale):
+    found = ControlScaling(ControlSpec(scale=scale), 3)
+    found.fit(DEMOS)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift", "unit"),
+    [
+        ("standardize", ACTIONS.mean(0), [ACTIONS[:, 0].std(), 1.0, ACTIONS[:, 2].std()]),
+        ("none", np.zeros(3), np.ones(3)),
+        ((2.0, 0.5, 4.0), np.zeros(3), [2.0, 0.5, 4.0]),
+    ],
+)
+def test_controls_in_units_of_their_spread(scale, shift, unit):
+    found = scaling(scale)
+    np.testing.assert_allclose(found.scaled(ACTIONS), (ACTIONS - shift) / unit, atol=1e-12)
+    np.testing.assert_allclose(found.unscaled(torch.from_numpy(found.scaled(ACTIONS))), ACTIONS, atol=1e-12)
+    np.testing.assert_allclose(found.log_volume, np.log(unit).sum())
+
+
+@pytest.mark.parametrize("scale", ["standardize", "none", [2.0, 0.5, 4.0]])
+def test_the_density_is_in_the_controls_own_units(scale):
+    """log p(a) of a flat policy against scipy's Gaussian of a with the mean and deviation carried over to a's units."""
+    spec = parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": ["pose"],
+            "control": {"std": 0.2, "scale": scale},
+            "baseline": {"kind": "flat", "policy": {"network": "linear"}},
+        }
+    )
+    torch.manual_seed(0)
+    hierarchy = Hierarchy(spec, SHAPES, 3, steps=5)
+    hierarchy.encoder.fit(DEMOS)
+    hierarchy.scaling.fit(DEMOS)
+    encoded = encode(DEMOS, hierarchy.encoder, hierarchy.scaling)
+    with torch.no_grad():
+        found = log_likelihood(hierarchy.tabulate(encoded), encoded.lengths)
+        mean = hierarchy.scaling.unscaled(hierarchy(encoded.inputs).decisions[0].mean[:, :, 0])
+    std = 0.2 * hierarchy.scaling.scale.numpy()
+    expected = [stats.norm.logpdf(demo.actions, mean[n, : len(demo)], std).sum() for n, demo in enumerate(DEMOS)]
+    np.testing.assert_allclose(found, expected, rtol=1e-4)

@@ -1,0 +1,203 @@
+"""The stacked networks against one separate torch network for each option and step."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from ddco_pyro.networks import Inputs, InputShape, ShapeError, build
+from ddco_pyro.networks.conv import POOLED
+from ddco_pyro.networks.stacked import StackedLinear
+from ddco_pyro.spec import NetworkSpec
+
+FEATURES, OUTPUTS, COPIES, LONGEST = 3, 2, 4, 5
+SHAPE = InputShape(FEATURES, {}, LONGEST)
+PIXELS = (14, 18, 3)
+
+
+def make(shape=SHAPE, **settings):
+    torch.manual_seed(0)
+    return build(NetworkSpec(**settings), shape, OUTPUTS, COPIES).eval()
+
+
+def make_inputs(trajectories=2, steps=LONGEST, start=0, images=()):
+    generator = torch.Generator().manual_seed(1)
+    vector = torch.randn(trajectories, steps, FEATURES, generator=generator)
+    pictures = {
+        key: torch.randint(0, 256, (trajectories, steps, *PIXELS), generator=generator, dtype=torch.uint8)
+        for key in images
+    }
+    return Inputs(vector, pictures, torch.arange(start, start + steps))
+
+
+def separate(layers, k):
+    """The k-th of the stacked perceptrons as an ordinary torch network with the same weights."""
+    found = []
+    for layer in layers:
+        if isinstance(layer, StackedLinear):
+            linear = nn.Linear(*layer.weight.shape[1:])
+            with torch.no_grad():
+                linear.weight.copy_(layer.weight[k].T)
+                linear.bias.copy_(layer.bias[k, 0])
+            found.append(linear)
+        elif isinstance(layer, nn.ReLU):
+            found.append(nn.ReLU())
+    return nn.Sequential(*found)
+
+
+def assert_close(found, expected):
+    assert found.shape == expected.shape
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("settings", [{"network": "linear"}, {"hidden": [8]}, {"hidden": [8, 6], "dropout": 0.5}])
+def test_stacked_networks_are_separate_networks(settings):
+    network, inputs = make(**settings), make_inputs()
+    expected = torch.stack([separate(network.layers, k)(inputs.vector) for k in range(COPIES)], dim=2)
+    assert_close(network(inputs), expected)
+
+
+def test_a_linear_network_is_affine():
+    network, one, other = make(network="linear"), make_inputs(), make_inputs()
+    other.vector[:] = torch.randn(other.vector.shape, generator=torch.Generator().manual_seed(2))
+    between = Inputs(0.3 * one.vector + 0.7 * other.vector, {}, one.time)
+    assert_close(network(between), 0.3 * network(one) + 0.7 * network(other))
+
+
+def test_an_mlp_is_not_affine():
+    network, one = make(hidden=[8]), make_inputs()
+    twice = Inputs(2 * one.vector, {}, one.time)
+    nothing = Inputs(0 * one.vector, {}, one.time)
+    assert not torch.allclose(network(twice) + network(nothing), 2 * network(one), atol=1e-3)
+
+
+def test_dropout_drops_only_while_training():
+    network, inputs = make(hidden=[64], dropout=0.5), make_inputs()
+    quiet = network(inputs)
+    assert torch.equal(network(inputs), quiet)
+    assert not torch.equal(network.train()(inputs), quiet)
+
+
+@pytest.mark.parametrize("settings", [{"network": "linear"}, {"hidden": [8]}, {"network": "per_timestep"}])
+def test_no_option_is_trained_by_another_options_output(settings):
+    network = make(**settings)
+    network(make_inputs())[:, :, 1].sum().backward()
+    for parameter in network.parameters():
+        per_option = parameter.grad.reshape(-1, COPIES, *parameter.shape[1:]).abs().flatten(2).sum((0, 2))
+        assert per_option[1] > 0
+        assert per_option[[0, 2, 3]].tolist() == [0, 0, 0]
+
+
+def test_no_option_is_trained_by_another_options_images():
+    network = make(InputShape(FEATURES, {"camera": PIXELS}), network="conv", filters=3, hidden=[8])
+    network(make_inputs(images=("camera",)))[:, :, 1].sum().backward()
+    for parameter in network.parameters():
+        per_option = parameter.grad.reshape(COPIES, -1).abs().sum(1)
+        assert per_option[1] > 0
+        assert per_option[[0, 2, 3]].tolist() == [0, 0, 0]
+
+
+# --- per-timestep -----------------------------------------------------------------------------------------------------
+
+
+def one_at_a_time(network, inputs):
+    """Each step by the separate network of its own time."""
+    steps = []
+    for position, time in enumerate(inputs.time.tolist()):
+        own = min(time, LONGEST - 1)
+        nets = [separate(network.layers, own * COPIES + k) for k in range(COPIES)]
+        steps.append(torch.stack([net(inputs.vector[:, position]) for net in nets], dim=1))
+    return torch.stack(steps, dim=1)
+
+
+@pytest.mark.parametrize(
+    ("steps", "start"),
+    [(LONGEST, 0), (3, 0), (1, 0), (1, 2), (1, LONGEST - 1), (2, 2), (1, 40), (4, 3), (LONGEST, 1), (8, 0)],
+)
+def test_every_step_has_its_own_network(steps, start):
+    network, inputs = make(network="per_timestep", hidden=[6]), make_inputs(steps=steps, start=start)
+    assert_close(network(inputs), one_at_a_time(network, inputs))
+
+
+def test_networks_of_different_steps_differ():
+    network = make(network="per_timestep", hidden=[])
+    inputs = make_inputs()
+    inputs.vector[:] = inputs.vector[:, :1]
+    found = network(inputs)
+    assert all(not torch.allclose(found[:, t], found[:, 0]) for t in range(1, LONGEST))
+
+
+# --- images -----------------------------------------------------------------------------------------------------------
+
+
+def separate_conv(network, k, inputs, filters):
+    """The k-th convolutional network, image by image, with ordinary torch layers."""
+    columns = [inputs.vector.flatten(0, 1)]
+    for key, image in inputs.images.items():
+        stacked = network.convolutions[key]
+        own = slice(k * filters, (k + 1) * filters)
+        pixels = torch.stack([frame.permute(2, 0, 1) for frame in image.flatten(0, 1)]) / 255
+        maps = nn.functional.conv2d(pixels, stacked.weight[own], stacked.bias[own], stride=2, padding=2)
+        columns.append(nn.functional.adaptive_avg_pool2d(maps.clamp(min=0), POOLED).flatten(1))
+    return separate(network.layers, k)(torch.cat(columns, 1)).unflatten(0, inputs.batch)
+
+
+@pytest.mark.parametrize("images", [("camera",), ("camera", "wrist")])
+def test_conv_networks_are_separate_networks(images):
+    shape, filters = InputShape(FEATURES, dict.fromkeys(images, PIXELS), LONGEST), 3
+    network = make(shape, network="conv", filters=filters, hidden=[8])
+    inputs = make_inputs(images=images)
+    expected = torch.stack([separate_conv(network, k, inputs, filters) for k in range(COPIES)], dim=2)
+    assert_close(network(inputs), expected)
+
+
+def test_conv_reads_images_without_any_vector():
+    network = make(InputShape(0, {"camera": PIXELS}), network="conv", filters=2)
+    inputs = make_inputs(images=("camera",))
+    alone = Inputs(inputs.vector[..., :0], inputs.images, inputs.time)
+    assert network(alone).shape == (2, LONGEST, COPIES, OUTPUTS)
+    assert not torch.allclose(network(alone)[0, 0], network(alone)[0, 1])
+
+
+# --- a user's own -----------------------------------------------------------------------------------------------------
+
+
+class Own(nn.Module):
+    """A network as a user might write it."""
+
+    def __init__(self, shape, outputs, copies, gain=1.0):
+        super().__init__()
+        if gain <= 0:
+            raise ValueError("the gain has to be positive")
+        self.size, self.gain = (copies, outputs), nn.Parameter(torch.tensor(gain))
+
+    def forward(self, inputs):
+        return (self.gain * inputs.vector.sum(-1))[..., None, None].expand(*inputs.batch, *self.size)
+
+
+class NotANetwork:
+    pass
+
+
+def test_a_network_of_ones_own():
+    network, inputs = make(network="test_networks:Own", options={"gain": 2.0}), make_inputs()
+    assert_close(network(inputs)[:, :, 3, 1], 2 * inputs.vector.sum(-1))
+
+
+@pytest.mark.parametrize(
+    ("shape", "settings", "message"),
+    [
+        (InputShape(3, {"camera": PIXELS}), {"network": "linear"}, "reads vectors, but camera are images"),
+        (InputShape(3, {"camera": PIXELS}), {"network": "per_timestep"}, "reads vectors, but camera are images"),
+        (SHAPE, {"network": "conv"}, "needs an image among the observations"),
+        (SHAPE, {"network": "no_such_module:Net"}, "'no_such_module:Net' cannot be imported: No module named"),
+        (SHAPE, {"network": "test_networks:Missing"}, "'test_networks:Missing' cannot be imported: .*no attribute"),
+        (SHAPE, {"network": "test_networks:NotANetwork"}, "is not a torch.nn.Module class"),
+        (SHAPE, {"network": "test_networks:Own", "options": {"gian": 1}}, "'test_networks:Own' .* argument 'gian'"),
+        (SHAPE, {"network": "test_networks:Own", "options": {"gain": -1}}, "the gain has to be positive"),
+    ],
+)
+def test_a_network_that_cannot_be_built_says_why(shape, settings, message):
+    with pytest.raises(ShapeError, match=message):
+        make(shape, **settings)
