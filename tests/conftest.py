@@ -1,4 +1,4 @@
-"""Fixtures that several test files share: one thread, a cache of their own, and a run of the toy task."""
+"""Fixtures that several test files share: one thread, a cache of their own, and a fitted run of the toy task."""
 
 from __future__ import annotations
 
@@ -6,11 +6,54 @@ import os
 
 import pytest
 import torch
+import toy_task
+import yaml
+
+from ddco_pyro.run import fit
+from ddco_pyro.spec import parse_spec
 
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that run episodes
 torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _own_cache(tmp_path_factory):
-    os.environ["DDCO_PYRO_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+def cache(tmp_path_factory):
+    """The folder where these tests, and the processes they start, keep collected demonstrations."""
+    folder = tmp_path_factory.mktemp("cache")
+    os.environ["DDCO_PYRO_CACHE"] = str(folder)
+    return folder
+
+
+class Watched:
+    """What a fit told its watcher."""
+
+    def __init__(self):
+        self.demonstrations, self.models, self.rows = [], [], []
+
+    def collected(self, done, total):
+        self.demonstrations.append((done, total))
+
+    def training(self, name, epochs):
+        self.models.append((name, epochs))
+
+    def epoch(self, row):
+        self.rows.append(row)
+
+    def trained(self, name):
+        self.models.append(name)
+
+
+@pytest.fixture(scope="session")
+def toy_spec():
+    return parse_spec(yaml.safe_load(toy_task.SPEC))
+
+
+@pytest.fixture(scope="session")
+def watched():
+    return Watched()
+
+
+@pytest.fixture(scope="session")
+def toy_run(cache, tmp_path_factory, toy_spec, watched):
+    """A fit of the toy task with both baselines beside it; nobody changes its folder."""
+    return fit(toy_spec, tmp_path_factory.mktemp("runs") / "toy", watched)

@@ -101,3 +101,17 @@ def frame(environment: Point) -> np.ndarray:
 
 
 task = Task("toy", Point, {"supervisor": Supervisor, "open_loop": OpenLoop}, outcome, frame, (Path(__file__),))
+
+SPEC = """
+task: toy_task:task
+demonstrations: {count: 12, labels: phase, valid_fraction: 0.25}
+observations: [offsets, visited]
+control: {std: 0.5}
+hierarchy:
+  levels:
+    - {count: 2, policy: {hidden: [8]}}
+  meta_policy: {hidden: [8]}
+compare_with: [flat, per_timestep]
+training: {epochs: 6, batch_size: 3, optimizer: {lr: 0.01}}
+rollout: {episodes: 4, policies: [open_loop, supervisor]}
+"""

@@ -1,0 +1,262 @@
+"""The controller against hand-set weights, the model's own means, and the latents' marginals by enumeration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from oracle import brute_force
+from scipy import stats
+
+from ddco_pyro.controller import Controller, ObservationError
+from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.encoding import encode
+from ddco_pyro.hierarchy import Hierarchy
+from ddco_pyro.spec import parse_spec
+
+STATE = {"state": np.array([0.5, -1.0, 2.0])}
+STD = 0.3
+ALWAYS, SELDOM = 100.0, -100.0  # logits, which the hierarchy bounds
+P_VALUE = 1e-3
+
+
+def make(counts=(3,), emits=("options",), network="linear", observation="state", seed=0):
+    """A hierarchy over 3 features and 2 control dimensions, whose callers above the lowest level all emit ``emits``."""
+    levels = [
+        {"name": f"level-{d}", "count": k, "policy": {"network": network} | ({"emits": list(emits)} if d else {})}
+        for d, k in enumerate(counts)
+    ]
+    spec = parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": [observation],
+            "control": {"std": STD},
+            "hierarchy": {"levels": levels, "meta_policy": {"network": network, "emits": list(emits)}},
+        }
+    )
+    torch.manual_seed(seed)
+    return Hierarchy(spec, {"state": (3,)}, 2, steps=4)
+
+
+def fix(network, values):
+    """Make a linear network say ``values`` [K, outputs] whatever it sees."""
+    with torch.no_grad():
+        network.layers[0].weight.zero_()
+        network.layers[0].bias.copy_(torch.tensor(np.array(values), dtype=torch.float32).unsqueeze(1))
+
+
+def by_hand(means, psi, eta, emits=("options",)):
+    """One level: option means, termination logits and the meta-policy's outputs, the same in every state."""
+    hierarchy = make((len(means),), emits)
+    fix(hierarchy.levels[0].policy.network, means)
+    fix(hierarchy.levels[0].termination, [[value] for value in psi])
+    fix(hierarchy.meta_policy.network, [eta])
+    return hierarchy
+
+
+def logit(probability):
+    return float(np.log(probability / (1 - probability)))
+
+
+MEANS = [[1.0, -1.0], [2.0, -2.0], [3.0, -3.0]]
+
+
+def play(controller, steps):
+    """Choices of the lowest level and controls over some steps in one state."""
+    played = [(controller.act(STATE), controller.choices[0]) for _ in range(steps)]
+    return [choice for _, choice in played], np.array([control for control, _ in played])
+
+
+# --- terminations and selections --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_option_that_does_not_end_stays(seed):
+    choices, controls = play(Controller(by_hand(MEANS, [SELDOM] * 3, [0, 0, 0]), seed=seed), 30)
+    assert len(set(choices)) == 1
+    np.testing.assert_allclose(controls, [MEANS[choices[0] - 1]] * 30)
+
+
+def test_an_option_that_always_ends_is_followed_by_a_draw_from_eta():
+    eta = np.array([0.6, 0.3, 0.1])
+    choices, _ = play(Controller(by_hand(MEANS, [ALWAYS] * 3, np.log(eta))), 500)
+    observed = np.bincount(choices, minlength=4)[1:]
+    assert stats.chisquare(observed, 500 * eta).pvalue > P_VALUE
+
+
+def test_the_first_choice_is_drawn_from_eta_by_the_seed():
+    eta = np.array([0.6, 0.3, 0.1])
+    controller = Controller(by_hand(MEANS, [SELDOM] * 3, np.log(eta)))
+    first = []
+    for seed in range(500):
+        controller.reset(seed)
+        first += play(controller, 1)[0]
+    assert stats.chisquare(np.bincount(first, minlength=4)[1:], 500 * eta).pvalue > P_VALUE
+
+
+def test_options_end_as_often_as_psi_says():
+    """Among four equally likely options an ending shows as a change in three cases of four."""
+    means = [[0.0, float(k)] for k in range(4)]
+    choices = np.array(play(Controller(by_hand(means, [logit(0.4)] * 4, [0] * 4)), 500)[0])
+    changes = int((np.diff(choices) != 0).sum())
+    assert stats.binomtest(changes, 499, 0.4 * 3 / 4).pvalue > P_VALUE
+
+
+def test_most_likely_takes_the_mode_of_every_choice():
+    """η prefers option 2 in the beginning; an option ends where ψ is above one half."""
+    staying = by_hand(MEANS, [logit(0.49)] * 3, [0.0, 0.1, 0.05])
+    assert set(play(Controller(staying, options="most_likely"), 20)[0]) == {2}
+    controller = Controller(staying, options="most_likely")
+    play(controller, 1)
+    fix(staying.meta_policy.network, [[1.0, 0.0, 0.0]])
+    assert play(controller, 2)[0] == [2, 2]
+    fix(staying.levels[0].termination, [[logit(0.51)]] * 3)
+    assert play(controller, 2)[0] == [1, 1]
+
+
+@pytest.mark.parametrize(("counts", "emits"), [((2,), ("options",)), ((2, 2), ("options", "control"))])
+def test_choices_follow_the_models_latents(counts, emits):
+    """Over many episodes of three different states, p(h_t) is that of the AHMM without any control seen."""
+    hierarchy = make(counts, emits, seed=3)
+    states = torch.randn(3, 3, generator=torch.Generator().manual_seed(1)).numpy()
+    with torch.no_grad():
+        tables = hierarchy.tabulate(encode(demonstrations([states]), hierarchy.encoder, hierarchy.scaling))
+    unseen = tuple(torch.where(one.isfinite(), 0.0, one) for one in tables.control)
+    truth = brute_force(replace(tables, control=unseen), 0, 3)
+    controller, episodes = Controller(hierarchy), 300
+    last = []
+    for seed in range(episodes):
+        controller.reset(seed)
+        for state in states:
+            controller.act({"state": state})
+        last.append(controller.choices)
+    for level, row in enumerate(truth.u):
+        possible = row[2] > 0
+        observed = np.bincount([choices[level] for choices in last], minlength=len(possible))
+        assert not observed[~possible].any()
+        assert stats.chisquare(observed[possible], episodes * row[2][possible]).pvalue > P_VALUE
+
+
+# --- who acts ---------------------------------------------------------------------------------------------------------
+
+
+def test_choice_0_executes_the_meta_policys_mean():
+    hierarchy = by_hand(MEANS, [SELDOM] * 3, [100.0, 0, 0, 0, 7.0, 8.0], emits=("options", "control"))
+    controller = Controller(hierarchy)
+    choices, controls = play(controller, 10)
+    assert set(choices) == {0}
+    np.testing.assert_allclose(controls, [[7.0, 8.0]] * 10)
+    fix(hierarchy.meta_policy.network, [[-100.0, 0, 0, 100, 7.0, 8.0]])  # control lasts one step
+    choices, controls = play(controller, 2)
+    assert choices == [3, 3]
+    np.testing.assert_allclose(controls, [MEANS[2]] * 2)
+
+
+@pytest.mark.parametrize(
+    ("top", "middle", "choices", "control"),
+    [
+        ([-100, 0, 100, 50, 50], [-100, 100, 0, 40, 40], (1, 2), [1, -1]),
+        ([-100, 0, 100, 50, 50], [100, 0, 0, 40, 40], (0, 2), [40, 40]),
+        ([100, 0, 0, 50, 50], [-100, 100, 0, 40, 40], (0, 0), [50, 50]),
+    ],
+)
+def test_the_lowest_option_acts(top, middle, choices, control):
+    hierarchy = make((2, 2), ("options", "control"))
+    fix(hierarchy.levels[0].policy.network, MEANS[:2])
+    fix(hierarchy.levels[1].policy.network, [[100, 0, 0, 30, 30], middle])
+    fix(hierarchy.meta_policy.network, [top])
+    controller = Controller(hierarchy)
+    np.testing.assert_allclose(controller.act(STATE), control)
+    assert controller.choices == choices
+
+
+@pytest.mark.parametrize("network", ["mlp", "per_timestep"])
+@pytest.mark.parametrize("differences", [False, True])
+def test_the_control_is_the_active_options_mean_in_the_controls_own_units(network, differences):
+    """Step by step against the whole demonstration at once; differences are those to the observation before."""
+    hierarchy = make(network=network, observation={"key": "state", "differences": differences})
+    random = np.random.default_rng(0)
+    demos = demonstrations(random.normal(5, 2, (2, 4, 3)), random.normal(40, 9, (2, 4, 2)))
+    hierarchy.encoder.fit(demos)
+    hierarchy.scaling.fit(demos)
+    with torch.no_grad():
+        outputs = hierarchy(encode(demos, hierarchy.encoder, hierarchy.scaling).inputs)
+    means = hierarchy.scaling.unscaled(outputs.decisions[0].mean)
+    controller = Controller(hierarchy)
+    for n, demo in enumerate(demos):
+        controller.reset(n)
+        for t in range(len(demo)):
+            control = controller.act({"state": demo.observations["state"][t]})
+            np.testing.assert_allclose(control, means[n, t, controller.choices[0] - 1], rtol=1e-5)
+
+
+def test_a_sample_has_the_models_deviation():
+    hierarchy = by_hand([[1.0, -1.0]], [SELDOM], [0])
+    hierarchy.scaling.scale.copy_(torch.tensor([10.0, 0.1]))
+    _, controls = play(Controller(hierarchy, control="sample"), 400)
+    standard = (controls / [10.0, 0.1] - [1.0, -1.0]) / STD
+    for dimension in standard.T:
+        assert stats.kstest(dimension, "norm").pvalue > P_VALUE
+    assert abs(np.corrcoef(standard.T)[0, 1]) < 0.2
+
+
+# --- seeds ------------------------------------------------------------------------------------------------------------
+
+
+def test_equal_seeds_give_equal_episodes():
+    hierarchy = by_hand(MEANS, [0.0] * 3, [0, 0, 0])
+    controller = Controller(hierarchy, control="sample", seed=4)
+    choices, controls = play(controller, 15)
+    controller.reset(5)
+    assert not np.array_equal(play(controller, 15)[1], controls)
+    controller.reset(4)
+    again = play(controller, 15)
+    assert again[0] == choices
+    np.testing.assert_array_equal(again[1], controls)
+
+
+def test_acting_leaves_the_global_randomness_alone():
+    controller = Controller(make(), control="sample")
+    torch.manual_seed(0)
+    before = torch.get_rng_state()
+    controller.act(STATE)
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.manual_seed(1)
+    controller.reset(0)
+    one = controller.act(STATE)
+    torch.manual_seed(2)
+    controller.reset(0)
+    np.testing.assert_array_equal(controller.act(STATE), one)
+
+
+# --- observations -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("observation", "message"),
+    [
+        ({"pose": np.zeros(3), "jaw": np.zeros(1)}, r"^the observation has no 'state' \(it has: jaw, pose\)$"),
+        ({"state": np.zeros(4)}, r"^observation 'state' has shape \(4,\), the demonstrations had \(3,\)$"),
+        ({"state": np.zeros((1, 3))}, r"^observation 'state' has shape \(1, 3\), the demonstrations had \(3,\)$"),
+        ({"state": np.array([0, np.nan, 0])}, r"^observation 'state' is not finite$"),
+    ],
+)
+def test_an_observation_that_cannot_be_used_is_refused(observation, message):
+    with pytest.raises(ObservationError, match=message):
+        Controller(make()).act(observation)
+
+
+def test_what_the_networks_do_not_see_is_ignored():
+    one, other = Controller(make()), Controller(make())
+    np.testing.assert_array_equal(one.act(STATE), other.act(STATE | {"noise": np.array([np.nan])}))
+
+
+def demonstrations(states, actions=None):
+    actions = np.zeros((*np.shape(states)[:2], 2)) if actions is None else actions
+    records = [
+        Demonstration(f"demo_{n}", {"state": state}, action)
+        for n, (state, action) in enumerate(zip(states, actions, strict=True))
+    ]
+    return Demonstrations(tuple(records))
