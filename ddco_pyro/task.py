@@ -71,7 +71,7 @@ def find_task(name: str) -> Task:
         module, _, attribute = name.partition(":")
         try:
             found = getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError) as error:
+        except Exception as error:  # whatever the user's code raises
             raise UnknownTask(f"task {name!r} cannot be loaded: {error}") from error
     else:
         known = ", ".join(sorted(registered)) or "none"
