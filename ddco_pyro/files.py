@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -9,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 
@@ -37,9 +38,20 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write named tensors and text metadata as safetensors, whole or not at all."""
+    """Write named tensors and text metadata as safetensors, whole or not at all; equal contents give equal bytes."""
+    content = save({name: value.contiguous() for name, value in tensors.items()}, dict(metadata))
     with whole_file(path) as temporary:
-        save_file({name: value.contiguous() for name, value in tensors.items()}, temporary, dict(metadata))
+        temporary.write_bytes(_metadata_in_order(content))
+
+
+def _metadata_in_order(content: bytes) -> bytes:
+    """The library writes metadata in random order. The header is JSON after its own length, padded to 8 bytes."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + content[end:]
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

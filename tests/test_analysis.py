@@ -1,0 +1,97 @@
+"""Use of options, agreement with labels and paired differences, against counts made by hand."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+from oracle import brute_force, random_tables
+
+from ddco_pyro.analysis import agreement, as_rows, option_use, paired
+from ddco_pyro.inference import Posterior, posterior
+
+
+def test_use_of_options_by_sums_over_every_path():
+    tables = random_tables((2,), (True,), trajectories=2, steps=4, seed=1)
+    lengths = [4, 3]
+    truths = [brute_force(tables, n, length) for n, length in enumerate(lengths)]
+    (found,) = option_use(posterior(tables, torch.tensor(lengths)))
+    u = sum(truth.u[0].sum(0) for truth in truths)
+    v = sum(truth.v[0].sum(0) for truth in truths)
+    for choice, one in enumerate(found):
+        assert one.choice == choice
+        assert one.share == pytest.approx(u[choice] / 7)
+        assert one.selected == pytest.approx(v[choice])
+        assert one.duration == pytest.approx(u[choice] / v[choice])
+    assert found[0].duration == pytest.approx(1)  # control lasts one step
+
+
+def test_an_option_that_is_never_selected_has_no_duration():
+    """Active for the steps 1 1 2 2 2 of one trajectory, selected at 0 and 2; then padding."""
+    active = torch.tensor([[[0, 1, 0, 0]] * 2 + [[0, 0, 1, 0]] * 3 + [[0, 0, 0, 0]]], dtype=torch.float64)
+    chosen = active.clone()
+    chosen[0, [1, 3, 4]] = 0
+    (found,) = as_rows(option_use(Posterior((active,), (chosen,), (active,))))
+    assert found == [
+        {"choice": 0, "share": 0.0, "selected": 0.0, "duration": None},
+        {"choice": 1, "share": 0.4, "selected": 1.0, "duration": 2.0},
+        {"choice": 2, "share": 0.6, "selected": 1.0, "duration": 3.0},
+        {"choice": 3, "share": 0.0, "selected": 0.0, "duration": None},
+    ]
+
+
+def nmi(ours, theirs):
+    """2 I(X; Y) / (H(X) + H(Y)) from counts."""
+    n, joint, x, y = len(ours), Counter(zip(ours, theirs, strict=True)), Counter(ours), Counter(theirs)
+    information = sum(c / n * math.log(c * n / (x[a] * y[b])) for (a, b), c in joint.items())
+    entropy = [-sum(c / n * math.log(c / n) for c in counts.values()) for counts in (x, y)]
+    return 2 * information / sum(entropy)
+
+
+def test_agreement_is_the_normalised_mutual_information():
+    random = np.random.default_rng(0)
+    labels = [random.integers(0, 3, 20), random.integers(0, 3, 15)]
+    segments = [np.where(random.random(len(one)) < 0.7, one + 1, 2) for one in labels]
+    expected = nmi(np.concatenate(segments).tolist(), np.concatenate(labels).tolist())
+    assert 0.1 < expected < 0.9
+    assert agreement(segments, labels) == pytest.approx(expected)
+
+
+def test_planted_labels_agree_whatever_their_names():
+    labels = [np.array([0, 0, 1, 2]), np.array([2, 1, 1])]
+    assert agreement([np.array([7, 4, 9])[one] for one in labels], labels) == pytest.approx(1)
+    assert agreement([np.ones(4), np.ones(3)], labels) == pytest.approx(0)
+
+
+def test_a_paired_difference_is_the_ratio_of_sums():
+    ours, theirs, lengths = np.array([10.0, 4.0, 6.0]), np.array([8.0, 5.0, 3.0]), np.array([5.0, 2.0, 3.0])
+    found = paired(ours, theirs, lengths)
+    assert found["nats_per_step"] == pytest.approx(4 / 10)
+
+
+def test_with_equal_lengths_its_error_is_that_of_the_mean():
+    random = np.random.default_rng(1)
+    difference = random.normal(3, 2, 40)
+    found = paired(difference, np.zeros(40), np.full(40, 7.0))
+    assert found["nats_per_step"] == pytest.approx(difference.mean() / 7)
+    assert found["standard_error"] == pytest.approx(difference.std(ddof=1) / math.sqrt(40) / 7)
+
+
+def test_its_error_covers_the_truth_as_often_as_it_says():
+    """Repeated draws of demonstrations of unequal length: the spread of the estimate is the standard error."""
+    random = np.random.default_rng(2)
+    found = []
+    for _ in range(400):
+        lengths = random.integers(5, 40, 60).astype(float)
+        found.append(paired(0.5 * lengths + random.normal(0, np.sqrt(lengths)), np.zeros(60), lengths))
+    means = np.array([one["nats_per_step"] for one in found])
+    errors = np.array([one["standard_error"] for one in found])
+    assert means.std(ddof=1) == pytest.approx(errors.mean(), rel=0.1)
+    assert abs(means.mean() - 0.5) < 4 * means.std() / math.sqrt(400)
+
+
+def test_one_demonstration_alone_has_no_error():
+    assert math.isnan(paired(np.array([2.0]), np.array([1.0]), np.array([4.0]))["standard_error"])

@@ -1,0 +1,91 @@
+"""Which demonstrations a spec means, what is known of their shapes, and specs that do not fit them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ddco_pyro.data import Dimensions, build_hierarchy, demonstrations, dimensions
+from ddco_pyro.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.spec import SpecError, parse_spec
+
+TASK = "toy_task:task"
+SIZE = Dimensions({"offsets": (4,), "camera": (8, 8, 3)}, control_size=2, steps=12)
+
+
+def spec(**changes):
+    given = {"task": TASK, "observations": ["offsets"], "baseline": "flat", "demonstrations": {"count": 3}}
+    return parse_spec(given | changes)
+
+
+@pytest.fixture
+def path(tmp_path):
+    records = [Demonstration(f"demo_{n}", {"offsets": np.zeros((n, 7))}, np.zeros((n, 3))) for n in (4, 9)]
+    Demonstrations(tuple(records)).write(tmp_path / "demos.hdf5")
+    return tmp_path / "demos.hdf5"
+
+
+def test_dimensions_come_from_the_file(path):
+    for given in (spec(demonstrations={"path": str(path)}), spec(task=None, demonstrations={"path": str(path)})):
+        assert dimensions(given) == Dimensions({"offsets": (7,)}, 3, 9)
+
+
+def test_dimensions_come_from_the_task_where_there_is_no_file_yet(tmp_path):
+    absent = {"path": str(tmp_path / "later.hdf5")}
+    for given in (spec(), spec(demonstrations=absent)):
+        assert dimensions(given) == Dimensions({"offsets": (4,), "visited": (1,)}, 2, 1)
+    assert not any(tmp_path.iterdir())
+
+
+def test_demonstrations_are_read_from_the_file(path):
+    assert demonstrations(spec(demonstrations={"path": str(path)})).names == ("demo_4", "demo_9")
+
+
+def test_demonstrations_are_collected_where_there_is_no_file_yet(tmp_path):
+    path, told = tmp_path / "later.hdf5", []
+    given = spec(demonstrations={"path": str(path), "count": 3, "labels": "phase"})
+    found = demonstrations(given, lambda *progress: told.append(progress))
+    assert (found.names, told[-1]) == (("demo_0", "demo_1", "demo_2"), (3, 3))
+    assert (set(found[0].observations), set(found[0].labels)) == ({"offsets"}, {"phase"})
+    assert path.exists()
+
+
+def test_a_file_that_is_not_there_and_cannot_be_collected_is_an_error(tmp_path):
+    missing = {"path": str(tmp_path / "none.hdf5")}
+    for read in (demonstrations, dimensions):
+        with pytest.raises(DemonstrationsError, match=r"none\.hdf5: there is no such file; check the path$"):
+            read(spec(task=None, demonstrations=missing))
+
+
+def test_labels_that_are_not_there_are_an_error(path):
+    with pytest.raises(DemonstrationsError, match=r"demos\.hdf5: demo_4: labels is missing"):
+        demonstrations(spec(demonstrations={"path": str(path), "labels": "phase"}))
+
+
+LEVEL = {"count": 2, "policy": {"network": "linear"}}
+CONV = {"network": "conv"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"observations": ["offsets", "pose", "jaw"]}, r"^observations: there is no pose, jaw \(there are: camera, of"),
+        ({"control": {"scale": [1.0]}}, r"^control\.scale: has 1 numbers, but the control has 2 dimensions$"),
+        ({"observations": ["camera"]}, r"^baseline\.policy: reads vectors, but camera are images"),
+        (
+            {"baseline": None, "hierarchy": {"levels": [LEVEL | {"policy": CONV}]}},
+            r"^hierarchy\.levels\.0\.policy: needs an image",
+        ),
+        (
+            {"baseline": None, "hierarchy": {"levels": [LEVEL, LEVEL | {"name": "task", "termination": CONV}]}},
+            r"^hierarchy\.levels\.1\.termination: needs an image",
+        ),
+        (
+            {"baseline": None, "hierarchy": {"levels": [LEVEL], "meta_policy": {"network": "nowhere:Net"}}},
+            r"^hierarchy\.meta_policy: network 'nowhere:Net' cannot be imported",
+        ),
+    ],
+)
+def test_a_spec_that_does_not_fit_says_where(changes, message):
+    with pytest.raises(SpecError, match=message):
+        build_hierarchy(spec(**changes), SIZE)
