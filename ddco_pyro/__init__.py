@@ -1,8 +1,38 @@
 """Discovery of deep continuous options (DDCO) as a Pyro model."""
 
-from ddco_pyro.controller import Controller
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.run import Fit, load
-from ddco_pyro.spec import Spec, load_spec
+from __future__ import annotations
 
-__all__ = ["Controller", "Demonstration", "Demonstrations", "Fit", "Spec", "load", "load_spec"]
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ddco_pyro import inference
+    from ddco_pyro.controller import Controller
+    from ddco_pyro.demonstrations import Demonstration, Demonstrations
+    from ddco_pyro.run import Fit, load
+    from ddco_pyro.spec import Spec, load_spec
+
+__all__ = ["Controller", "Demonstration", "Demonstrations", "Fit", "Spec", "inference", "load", "load_spec"]
+
+_MODULES = {
+    "Controller": "controller",
+    "Demonstration": "demonstrations",
+    "Demonstrations": "demonstrations",
+    "Fit": "run",
+    "Spec": "spec",
+    "load": "run",
+    "load_spec": "spec",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Imports what is asked for when it is asked for: torch takes seconds, and ``--help`` needs none of it."""
+    if name == "inference":
+        return importlib.import_module("ddco_pyro.inference")
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"ddco_pyro.{_MODULES[name]}"), name)
+    raise AttributeError(f"module 'ddco_pyro' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -9,20 +9,21 @@ from __future__ import annotations
 import json
 import sys
 import time
+import traceback
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from ddco_pyro import console
-from ddco_pyro.errors import BadInput
+from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.spec import SpecError, dump_spec, load_spec, spec_schema
 
 app = typer.Typer(
     add_completion=False,
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Discovers options in demonstrations: a hierarchy of skills, declared in YAML, fitted by exact inference.",
+    epilog="--debug, anywhere on the line, shows the traceback of an error.",
 )
 
 SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="The spec, a YAML file.", show_default=False)]
@@ -40,14 +41,14 @@ def check(
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON Schema of specs instead.")] = False,
 ) -> None:
     """Print the spec with all defaults, the shapes it works on, and the parameters of each network."""
-    from ddco_pyro.data import build_hierarchy, dimensions
-
     if schema:
         print(json.dumps(spec_schema(), indent=2))
         return
     if spec is None:
         raise SpecError("name a spec, such as: ddco-pyro check specs/needle.yaml")
     found = load_spec(spec, overrides)
+    from ddco_pyro.data import build_hierarchy, dimensions
+
     size = dimensions(found)
     hierarchy = build_hierarchy(found, size)
     print(dump_spec(found), end="")
@@ -61,11 +62,11 @@ def collect(
     overrides: Overrides = [],  # noqa: B006
 ) -> None:
     """Record demonstrations of the task's supervisor, unless they are there already."""
-    from ddco_pyro.collect import collect as record
-
     found = load_spec(spec, overrides)
     if found.task is None:
         raise SpecError(f"{spec}: names no task, so there is no supervisor to record")
+    from ddco_pyro.collect import collect as record
+
     own = found.demonstrations.path
     with console.Collecting() as progress:
         path = record(found.task, found.demonstrations, out or (Path(own) if own else None), progress.collected)
@@ -80,18 +81,19 @@ def fit(
     resume: Annotated[bool, typer.Option("--resume", help="Continue the unfinished run in --out.")] = False,
 ) -> None:
     """Fit the spec's hierarchy and its baselines; write the run folder with its report."""
+    found = load_spec(spec, overrides)
     from ddco_pyro import run
     from ddco_pyro.data import demonstrations
     from ddco_pyro.report import write_report
 
-    found = load_spec(spec, overrides)
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     run.claim(folder, found, resume)
     try:
         with console.Fitting() as watcher:
             fitted = run.fit(found, folder, watcher)
     except KeyboardInterrupt:
-        print(f"interrupted; continue with: ddco-pyro fit {spec} --out {folder} --resume", file=sys.stderr)
+        resolved = folder / "spec.yaml"
+        print(f"interrupted; continue with: ddco-pyro fit {resolved} --out {folder} --resume", file=sys.stderr)
         raise typer.Exit(1) from None
     console.log_likelihoods(fitted.metrics)
     print(f"report: {write_report(fitted, demonstrations(found))}")
@@ -135,13 +137,36 @@ def report(run: RunPath) -> None:
 
 def main() -> None:
     """Run the command line; ends the process with 0, 1 or 2."""
-    debug = "--debug" in sys.argv
+    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     try:
-        app([argument for argument in sys.argv[1:] if argument != "--debug"], prog_name="ddco-pyro")
+        status = app(arguments or ["--help"], prog_name="ddco-pyro", standalone_mode=False)
     except Exception as error:
-        if debug:
-            raise
-        print(f"ddco-pyro: {error}", file=sys.stderr)
-        if not isinstance(error, BadInput):
-            print("ddco-pyro: this was not expected; --debug shows where it comes from", file=sys.stderr)
-        sys.exit(2 if isinstance(error, BadInput) else 1)
+        status, lines = _explain(error)
+        if "--debug" in sys.argv:
+            traceback.print_exc()
+        else:
+            print(*(f"ddco-pyro: {line}" for line in lines), sep="\n", file=sys.stderr)
+    if status == INTERRUPTED:
+        print("ddco-pyro: interrupted", file=sys.stderr)
+        status = 1
+    sys.exit(status or 0)
+
+
+INTERRUPTED = 130
+"""What typer makes of Ctrl-C."""
+
+UsageError: Any = typer.BadParameter.__base__
+"""A wrong argument or option: click's own error, which typer does not name."""
+
+
+def _explain(error: Exception) -> tuple[int, list[str]]:
+    """The exit status, and a line for each thing that is wrong."""
+    if isinstance(error, UsageError):
+        command = error.ctx.command_path if error.ctx else "ddco-pyro"
+        return 2, [f"{error.format_message().rstrip('.')}; see {command} --help"]
+    if isinstance(error, BadInput):
+        return 2, str(error).splitlines()
+    message = " ".join(str(error).split())
+    if isinstance(error, Failed | OSError):
+        return 1, [message]
+    return 1, [f"unexpected {type(error).__name__}: {message}; --debug shows where it comes from"]

@@ -5,15 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from ddco_pyro.data import Dimensions
-from ddco_pyro.hierarchy import Hierarchy
-from ddco_pyro.spec import Spec
+if TYPE_CHECKING:
+    from ddco_pyro.data import Dimensions
+    from ddco_pyro.hierarchy import Hierarchy
+    from ddco_pyro.spec import Spec
 
 PLAIN_SECONDS = 10.0
 """Time between two plain lines of progress."""

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
 
 from ddco_pyro import analysis
 from ddco_pyro.controller import Controller
@@ -76,7 +77,7 @@ class Fit:
     def baselines(self) -> dict[str, Fit]:
         """The baselines that were trained beside it, by name."""
         folders = [self.folder / "baselines" / baseline.kind for baseline in self.spec.compare_with]
-        return {folder.name: load(folder) for folder in folders if (folder / "model.safetensors").exists()}
+        return {folder.name: load(folder) for folder in folders if _finished(folder)}
 
     def log_likelihood(self, demos: Demonstrations) -> np.ndarray:
         """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units."""
@@ -110,30 +111,42 @@ def model_name(spec: Spec) -> str:
 def load(folder: str | Path) -> Fit:
     """The fit in a run folder.
 
-    :raises RunError: the folder has no finished fit.
+    :raises RunError: the folder has no finished fit, or a damaged one.
     """
     folder = Path(folder)
-    if not (folder / "model.safetensors").exists():
-        what = "an unfinished run: continue it with --resume" if (folder / "spec.yaml").exists() else "not a run folder"
-        raise RunError(f"{folder}: {what} (it has no model.safetensors)")
+    missing = [name for name in ("spec.yaml", "model.safetensors", "metrics.json") if not (folder / name).exists()]
+    if missing:
+        what = "not a run folder" if "spec.yaml" in missing else "an unfinished run: continue it with --resume"
+        raise RunError(f"{folder}: {what} (it has no {missing[0]})")
     spec = load_spec(folder / "spec.yaml")
-    tensors, metadata = read_tensors(folder / "model.safetensors")
+    try:
+        return Fit(folder, spec, _read_model(spec, folder / "model.safetensors").eval())
+    except BadInput:
+        raise
+    except (SafetensorError, KeyError, ValueError, RuntimeError) as error:
+        raise RunError(f"{folder}: model.safetensors is damaged, or of another spec than spec.yaml") from error
+
+
+def _read_model(spec: Spec, path: Path) -> Hierarchy:
+    tensors, metadata = read_tensors(path)
     shapes = {key: tuple(shape) for key, shape in json.loads(metadata["shapes"]).items()}
     dimensions = Dimensions(shapes, int(metadata["control_size"]), int(metadata["steps"]))
     hierarchy = build_hierarchy(spec, dimensions)
     hierarchy.load_state_dict(tensors)
-    return Fit(folder, spec, hierarchy.eval())
+    return hierarchy
 
 
 def fit(spec: Spec, folder: Path, watcher: Watcher) -> Fit:
     """Collect or read the demonstrations, train the spec's model and its baselines, evaluate, and fill the run folder.
 
-    A folder that holds part of this run is continued.
+    A folder that holds part of this run is continued; one that holds all of it is left as it is.
 
     :raises RunError: the folder holds something else.
     :raises TrainingError: training stopped; nothing that was written before is lost.
     """
     claim(folder, spec)
+    if _finished(folder):
+        return load(folder)
     clock = _Clock()
     with clock("demonstrations"):
         demos = demonstrations(spec, watcher.collected)
@@ -152,7 +165,8 @@ def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, cloc
         for baseline in spec.compare_with:
             own = folder / "baselines" / baseline.kind
             claim(own, baseline_spec(spec, baseline))
-            _fit(baseline_spec(spec, baseline), own, demos, watcher, _Clock())
+            if not _finished(own):
+                _fit(baseline_spec(spec, baseline), own, demos, watcher, _Clock())
     with clock("evaluation"):
         metrics = _evaluate(found, {"train": train, "valid": valid}, demos)
     metrics |= {
@@ -164,6 +178,11 @@ def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, cloc
     }
     write_metrics(folder, metrics)
     return found
+
+
+def _finished(folder: Path) -> bool:
+    """Whether the run is complete: its metrics are written last."""
+    return (folder / "metrics.json").exists()
 
 
 def baseline_spec(spec: Spec, baseline: BaselineSpec) -> Spec:
@@ -183,6 +202,8 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     :raises RunError: it holds something else, or may not be resumed.
     """
     text, path = dump_spec(spec), folder / "spec.yaml"
+    if folder.exists() and not folder.is_dir():
+        raise RunError(f"{folder}: is a file; choose another --out")
     if path.exists():
         if path.read_text() != text:
             raise RunError(f"{folder}: holds a run of another spec; choose another --out or remove it")

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.encoding import Batch
+from ddco_pyro.errors import Failed
 from ddco_pyro.files import read_tensors, write_tensors
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
@@ -29,7 +30,7 @@ from ddco_pyro.spec import OptimizerSpec, Spec
 State = dict[str, Tensor]
 
 
-class TrainingError(RuntimeError):
+class TrainingError(Failed):
     """Training cannot go on: the message names the trajectory or the checkpoint and says what to do."""
 
 

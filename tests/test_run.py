@@ -1,0 +1,263 @@
+"""The run folder: what is in it, that its numbers can be computed again from it, and that it comes back bit for bit."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+
+import numpy as np
+import pytest
+from sklearn.metrics import normalized_mutual_info_score
+
+import ddco_pyro
+from ddco_pyro.data import demonstrations
+from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.run import RunError, claim, fit
+from ddco_pyro.spec import dump_spec, load_spec, with_overrides
+
+
+@pytest.fixture(scope="module")
+def demos(toy_spec, cache):
+    return demonstrations(toy_spec)
+
+
+@pytest.fixture(scope="module")
+def parts(toy_spec, demos):
+    train, valid = demos.split(toy_spec.demonstrations.valid_fraction, toy_spec.seed)
+    return {"train": train, "valid": valid}
+
+
+@pytest.fixture
+def copied(toy_run, tmp_path):
+    return shutil.copytree(toy_run.folder, tmp_path / "run")
+
+
+class Silent:
+    def collected(self, done, total):
+        pass
+
+    def training(self, name, epochs):
+        pass
+
+    def epoch(self, row):
+        pass
+
+    def trained(self, name):
+        pass
+
+
+class Interrupting(Silent):
+    """Ctrl-C at the end of some epoch."""
+
+    def __init__(self, epochs):
+        self.left = epochs
+
+    def epoch(self, row):
+        self.left -= 1
+        if self.left == 0:
+            raise KeyboardInterrupt
+
+
+# --- contents ---------------------------------------------------------------------------------------------------------
+
+FILES = {"spec.yaml", "model.safetensors", "metrics.json", "history.csv", "checkpoints/latest.safetensors"}
+
+
+def test_the_folder_holds_what_it_promises(toy_run):
+    files = {str(path.relative_to(toy_run.folder)) for path in toy_run.folder.rglob("*") if path.is_file()}
+    beside = {f"baselines/{kind}/{name}" for kind in ("flat", "per_timestep") for name in FILES}
+    assert files == FILES | beside
+
+
+def test_the_spec_in_the_folder_is_the_whole_spec(toy_run, toy_spec):
+    assert load_spec(toy_run.folder / "spec.yaml") == toy_spec
+    assert "patience: 20" in (toy_run.folder / "spec.yaml").read_text()
+
+
+def test_the_history_has_every_epoch(toy_run, watched):
+    rows = list(csv.DictReader((toy_run.folder / "history.csv").open()))
+    told = [row for row in watched.rows if row["stage"] != "policy"]
+    assert [{**row, "restart": str(row["restart"]), "epoch": str(row["epoch"])} for row in told] == [
+        {**row, "train": float(row["train"]), "tune": float(row["tune"])} for row in rows
+    ]
+    assert [row["stage"] for row in rows] == ["vq-1"] * 6 + ["level-1"] * 6 + ["meta-policy"] * 6
+
+
+def test_the_watcher_is_told_what_goes_on(watched):
+    assert watched.models == [("ddco", 18), "ddco", ("flat", 6), "flat", ("per_timestep", 6), "per_timestep"]
+    assert watched.demonstrations in ([(n, 12) for n in range(1, 13)], [])  # nothing where they are in the cache
+
+
+def test_versions_and_seconds_are_kept(toy_run):
+    metrics = toy_run.metrics
+    assert set(metrics["seconds"]) == {"demonstrations", "training", "baselines", "evaluation"}
+    assert metrics["versions"]["ddco-pyro"] == "0.1.0"
+    assert metrics["engine_check"]["value"] < 1e-9
+    assert metrics["engine_check"]["gradient"] < 1e-9
+
+
+# --- the numbers again ------------------------------------------------------------------------------------------------
+
+
+def test_what_is_loaded_is_what_was_fitted(toy_run, demos):
+    loaded = ddco_pyro.load(toy_run.folder)
+    np.testing.assert_array_equal(loaded.log_likelihood(demos), toy_run.log_likelihood(demos))
+    for one, other in zip(loaded.segment(demos), toy_run.segment(demos), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert loaded.metrics == toy_run.metrics
+
+
+def test_log_likelihoods_can_be_computed_again(toy_run, parts):
+    metrics, loaded = toy_run.metrics, ddco_pyro.load(toy_run.folder)
+    for name, part in parts.items():
+        value = loaded.log_likelihood(part).sum() / sum(part.lengths)
+        assert metrics["log_likelihood_per_step"][name] == pytest.approx(value, rel=1e-12)
+    assert metrics["valid"] == [
+        {"name": demo.name, "steps": len(demo), "log_likelihood": pytest.approx(value)}
+        for demo, value in zip(parts["valid"], loaded.log_likelihood(parts["valid"]), strict=True)
+    ]
+
+
+def test_comparisons_can_be_computed_again(toy_run, parts):
+    loaded, valid = ddco_pyro.load(toy_run.folder), parts["valid"]
+    steps = sum(valid.lengths)
+    assert list(loaded.metrics["comparison"]) == list(loaded.baselines) == ["flat", "per_timestep"]
+    for name, baseline in loaded.baselines.items():
+        assert (baseline.name, loaded.name) == (name, "ddco")
+        difference = (loaded.log_likelihood(valid) - baseline.log_likelihood(valid)).sum() / steps
+        found = loaded.metrics["comparison"][name]
+        assert found["difference"]["nats_per_step"] == pytest.approx(difference)
+        assert found["log_likelihood_per_step"]["valid"] == pytest.approx(baseline.log_likelihood(valid).sum() / steps)
+
+
+def test_baselines_are_trained_on_the_same_split(toy_run):
+    metrics = toy_run.metrics
+    assert metrics["demonstrations"] | {"supervisor": ...} == {"train": 8, "tune": 1, "valid": 3, "supervisor": ...}
+    for baseline in toy_run.baselines.values():
+        for key in ("name", "steps"):
+            assert [one[key] for one in baseline.metrics["valid"]] == [one[key] for one in metrics["valid"]]
+        assert baseline.metrics["demonstrations"] == metrics["demonstrations"]
+        for name in ("mean", "std"):
+            ours, theirs = (getattr(one.hierarchy.encoder, name) for one in (toy_run, baseline))
+            np.testing.assert_array_equal(ours, theirs)
+
+
+def test_only_the_training_demonstrations_standardise(toy_run, parts, toy_spec):
+    kept, _ = parts["train"].split(toy_spec.training.tune_fraction, toy_spec.seed)
+    rows = np.concatenate([demo.observations["offsets"] for demo in kept])
+    np.testing.assert_allclose(toy_run.hierarchy.encoder.mean[:4], rows.mean(0))
+    controls = np.concatenate([demo.actions for demo in kept])
+    np.testing.assert_allclose(toy_run.hierarchy.scaling.scale, controls.std(0))
+
+
+def test_agreement_with_the_labels_can_be_computed_again(toy_run, parts):
+    for name, part in parts.items():
+        (segments,) = toy_run.segment(part)
+        found = np.concatenate([row[: len(demo)] for row, demo in zip(segments, part, strict=True)])
+        truth = np.concatenate([demo.labels["phase"] for demo in part])
+        assert toy_run.metrics["agreement"][name] == [pytest.approx(normalized_mutual_info_score(truth, found))]
+
+
+def test_the_use_of_options_can_be_computed_again(toy_run, demos):
+    u = toy_run.posterior(demos).u[0].sum((0, 1))
+    assert [one["share"] for one in toy_run.metrics["options"][0]] == pytest.approx((u / u.sum()).tolist())
+
+
+@pytest.fixture(scope="module")
+def planted(tmp_path_factory):
+    """Demonstrations of two skills that the observation tells apart: label 5 goes up, label 2 goes down."""
+    random = np.random.default_rng(0)
+    records = []
+    for number in range(12):
+        labels = np.repeat([5, 2, 5], [4, 5, 4])
+        side = np.where(labels == 5, 1.0, -1.0)
+        observations = {"side": (side + 0.1 * random.normal(size=13))[:, None]}
+        actions = side[:, None] + 0.1 * random.normal(size=(13, 1))
+        records.append(Demonstration(f"demo_{number}", observations, actions, {"skill": labels}))
+    path = tmp_path_factory.mktemp("planted") / "demos.hdf5"
+    Demonstrations(tuple(records)).write(path)
+    return path
+
+
+def test_planted_skills_are_found(planted, tmp_path, toy_spec):
+    given = {"task": None, "demonstrations": {"path": str(planted), "labels": "skill"}, "observations": ["side"]}
+    spec = with_overrides(toy_spec, given | {"compare_with": [], "training.epochs": 20})
+    found = fit(spec, tmp_path / "run", Silent())
+    assert found.metrics["agreement"]["valid"] == [pytest.approx(1)]
+    assert "supervisor" not in found.metrics["demonstrations"]
+
+
+# --- going on ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("epochs", [1, 6, 7, 17, 20, 29])
+def test_an_interrupted_run_goes_on_to_the_same_bytes(toy_run, toy_spec, tmp_path, epochs):
+    """In the first stage, at its end, in later ones, in a baseline."""
+    folder = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        fit(toy_spec, folder, Interrupting(epochs))
+    with pytest.raises(RunError, match=r"run: an unfinished run: continue it with --resume"):
+        ddco_pyro.load(folder)
+    fit(toy_spec, folder, Silent())
+    for name in ("model.safetensors", "history.csv", "baselines/flat/model.safetensors", "spec.yaml"):
+        assert (folder / name).read_bytes() == (toy_run.folder / name).read_bytes()
+    assert not list(folder.rglob("*.tmp"))
+
+
+def test_a_finished_run_is_left_as_it_is(copied, toy_spec):
+    metrics = copied / "metrics.json"
+    metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"rollouts": "kept"}))
+    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in copied.rglob("*") if path.is_file()}
+    assert fit(toy_spec, copied, Interrupting(1)).metrics["rollouts"] == "kept"
+    assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in before} == before
+
+
+def test_a_run_of_another_spec_is_refused(copied, toy_spec):
+    other = with_overrides(toy_spec, {"seed": 1})
+    with pytest.raises(RunError, match=r"run: holds a run of another spec; choose another --out or remove it$"):
+        fit(other, copied, Silent())
+    assert load_spec(copied / "spec.yaml") == toy_spec
+
+
+def test_claiming_a_folder(tmp_path, toy_spec):
+    folder = tmp_path / "run"
+    claim(folder, toy_spec, resume=False)
+    assert (folder / "spec.yaml").read_text() == dump_spec(toy_spec)
+    claim(folder, toy_spec, resume=True)
+    with pytest.raises(RunError, match=r"run: holds a run of this spec already; continue it with --resume$"):
+        claim(folder, toy_spec, resume=False)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match=r": is not empty and not a run; choose another --out$"):
+        claim(tmp_path, toy_spec)
+    with pytest.raises(RunError, match=r"file: is a file; choose another --out$"):
+        claim(tmp_path / "file", toy_spec)
+
+
+@pytest.mark.parametrize(
+    ("removed", "message"),
+    [
+        ("spec.yaml", r"run: not a run folder \(it has no spec\.yaml\)$"),
+        ("model.safetensors", r"run: an unfinished run: continue it with --resume \(it has no model\.safetensors\)$"),
+        ("metrics.json", r"run: an unfinished run: continue it with --resume \(it has no metrics\.json\)$"),
+    ],
+)
+def test_what_is_not_a_finished_run_is_not_loaded(copied, removed, message):
+    (copied / removed).unlink()
+    with pytest.raises(RunError, match=message):
+        ddco_pyro.load(copied)
+
+
+def test_a_damaged_model_is_not_loaded(copied):
+    model = copied / "model.safetensors"
+    content = model.read_bytes()
+    for damaged in (b"", content[:40], content[:-8], b"\xff" * 100):
+        model.write_bytes(damaged)
+        with pytest.raises(RunError, match=r"run: model\.safetensors is damaged, or of another spec than spec\.yaml$"):
+            ddco_pyro.load(copied)
+
+
+def test_a_model_of_another_spec_is_not_loaded(copied, toy_spec):
+    (copied / "spec.yaml").write_text(dump_spec(with_overrides(toy_spec, {"hierarchy.levels.0.count": 3})))
+    with pytest.raises(RunError, match=r"of another spec than spec\.yaml$"):
+        ddco_pyro.load(copied)
