@@ -41,7 +41,8 @@ class _Bar:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._progress.stop()
+        if self.console.is_terminal:
+            self._progress.stop()
 
     def begin(self, label: str, total: int) -> None:
         """Begin to count up to ``total``."""
@@ -59,7 +60,7 @@ class _Bar:
         if not self.console.is_terminal and (now - self._said > PLAIN_SECONDS or done == self._total):
             self._said = now
             left = (now - self._start) / max(done, 1) * (self._total - done)
-            self._say(f"{done}/{self._total}, at most {left:.0f} s left  {note}")
+            self._say(f"{done}/{self._total}, at most {left:.0f} s left  {note}".rstrip())
 
     def end(self) -> None:
         """Whatever was counted is over, however far it came."""

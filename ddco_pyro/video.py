@@ -36,7 +36,7 @@ def captioned(episode: Episode, t: int) -> np.ndarray:
 
     The last frame shows the end, where nothing is active any more.
     """
-    frame = np.ascontiguousarray(episode.frames[t])
+    frame = np.array(episode.frames[t], order="C")
     active = episode.choices[t] if t < len(episode.choices) else episode.choices[:0].reshape(-1)
     if len(active):
         cv2.rectangle(frame, (0, 0), (frame.shape[1] - 1, frame.shape[0] - 1), option_rgb(active[0]), 2 * BORDER)

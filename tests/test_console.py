@@ -1,0 +1,71 @@
+"""Progress where there is no terminal: plain lines, seldom, with the time left; and the tables."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from ddco_pyro import console
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Every look at the clock finds it four seconds later."""
+    ticks = itertools.count(0, 4)
+    monkeypatch.setattr("ddco_pyro.console.time.monotonic", lambda: float(next(ticks)))
+
+
+def test_plain_lines_come_now_and_then_and_at_the_end(clock, capsys):
+    with console.Collecting() as progress:
+        for done in range(1, 8):
+            progress.collected(done, 7)
+    assert capsys.readouterr().err.splitlines() == [
+        "collecting demonstrations: 3/7, at most 16 s left",
+        "collecting demonstrations: 6/7, at most 4 s left",
+        "collecting demonstrations: 7/7, at most 0 s left",
+    ]
+
+
+def test_a_fit_that_stops_early_says_so(clock, capsys):
+    row = {"stage": "level-1", "train": 1.25, "tune": -0.5}
+    with console.Fitting() as progress:
+        progress.training("ddco", 100)
+        for _ in range(3):
+            progress.epoch(row)
+        progress.trained("ddco")
+    assert capsys.readouterr().err.splitlines() == [
+        "training ddco: 3/100, at most 388 s left  level-1: loss -1.250, held out -0.500 nats/step",
+        "training ddco: done after 3, 16 s",
+    ]
+
+
+def test_markup_in_names_is_text(clock, capsys):
+    with console.Rolling(1) as progress:
+        progress.episode("[bold]own[/bold]")
+    assert "[bold]own[/bold]" in capsys.readouterr().err
+
+
+def test_log_likelihoods(capsys):
+    values = {"train": 1.0, "valid": 0.5}
+    other = {"log_likelihood_per_step": values, "difference": {"nats_per_step": -0.25, "standard_error": 0.125}}
+    console.log_likelihoods({"model": "ddco", "log_likelihood_per_step": values, "comparison": {"flat": other}})
+    *_, ours, theirs = capsys.readouterr().out.splitlines()
+    assert ours.split("│")[0].split() + ours.split("│")[1].split() == ["ddco", "1.000"]
+    assert "-0.250 ± 0.125" in theirs
+
+
+def test_successes(capsys):
+    rate = {"successes": 3, "trials": 4, "rate": 0.75, "interval": [0.3, 0.95]}
+    mean = {"mean": 1.5, "std": None, "trials": 1, "interval": None}
+    nothing = {"successes": 0, "trials": 0, "rate": None, "interval": None}
+    methods = {
+        "ddco": {"measures": {"success": rate, "error": mean}},
+        "flat": {"measures": {"success": rate, "error": nothing}},
+    }
+    console.successes({"episodes": 4, "methods": methods})
+    printed = capsys.readouterr().out
+    assert "4 episodes each" in printed
+    ddco, flat = printed.splitlines()[-2:]
+    assert [cell.strip() for cell in ddco.split("│")] == ["ddco", "3/4 [30%, 95%]", "1.50"]
+    assert [cell.strip() for cell in flat.split("│")] == ["flat", "3/4 [30%, 95%]", "-"]
