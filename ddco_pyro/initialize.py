@@ -21,26 +21,37 @@ POOLED = 8
 class Clusters:
     """k-means clusters of the observations of every step of a batch, named as the options 1 to k.
 
+    :param controls: cluster observations and controls together, with as much weight on the controls as on the
+        observations: steps that look alike but are acted on differently are then told apart.
+
     Fewer than ``options`` clusters are found where there are fewer distinct observations.
     """
 
-    def __init__(self, batch: Batch, options: int, seed: int) -> None:
-        rows = _rows(batch)
+    def __init__(self, batch: Batch, options: int, seed: int, controls: bool = False) -> None:
+        self._controls = controls
+        rows = self._rows(batch)
         distinct = len(np.unique(rows, axis=0))
         self._kmeans = KMeans(min(options, distinct), n_init=10, random_state=seed).fit(rows)
 
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
         found = torch.zeros(batch.inputs.batch, dtype=torch.long)
-        found[_alive(batch)] = torch.as_tensor(self._kmeans.predict(_rows(batch)), dtype=torch.long) + 1
+        found[_alive(batch)] = torch.as_tensor(self._kmeans.predict(self._rows(batch)), dtype=torch.long) + 1
         return found
+
+    def _rows(self, batch: Batch) -> np.ndarray:
+        seen = _observations(batch)
+        if not self._controls:
+            return seen
+        actions = batch.actions[_alive(batch)].double().numpy()
+        return np.concatenate([seen, np.sqrt(seen.shape[1] / actions.shape[1]) * actions], axis=1)
 
 
 def _alive(batch: Batch) -> Tensor:
     return batch.inputs.time < batch.lengths[:, None]
 
 
-def _rows(batch: Batch) -> np.ndarray:
+def _observations(batch: Batch) -> np.ndarray:
     """Observations of every step, [steps, features]."""
     columns = [batch.inputs.vector]
     for image in batch.inputs.images.values():

@@ -299,8 +299,9 @@ class OptimizerSpec(_Model):
 class TrainingSpec(_Model):
     """How the model is trained."""
 
-    initialize: Literal["vq", "random"] = "vq"
-    """``vq``: by vector quantisation of the observations (SM 2.2); ``random``: random weights."""
+    initialize: Literal["vq", "vq_controls", "random"] = "vq"
+    """``vq``: by vector quantisation of the observations (SM 2.2); ``vq_controls``: of observations and controls together;
+    ``random``: random weights."""
     layerwise: bool = True
     """Discover level after level, lowest first, rather than all at once."""
     lower_levels: Literal["fine_tuned", "frozen"] = "fine_tuned"
