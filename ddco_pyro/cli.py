@@ -7,6 +7,7 @@ do; ``--debug`` shows the traceback.
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 import traceback
@@ -138,6 +139,7 @@ def report(run: RunPath) -> None:
 def main() -> None:
     """Run the command line; ends the process with 0, 1 or 2."""
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
+    sys.path.append(os.getcwd())  # where a user's own module:name lies
     try:
         status = app(arguments or ["--help"], prog_name="ddco-pyro", standalone_mode=False)
     except Exception as error:

@@ -1,0 +1,304 @@
+"""The command line as a user runs it: what it prints, how it ends, and what it says of bad input."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+from unittest import mock
+
+import h5py
+import pytest
+import toy_task
+import yaml
+
+import ddco_pyro
+from ddco_pyro.cli import main
+from ddco_pyro.spec import dump_spec, load_spec
+
+HERE = Path(__file__).parent
+COMMAND = Path(sys.executable).with_name("ddco-pyro")
+
+
+class Ended(NamedTuple):
+    status: int
+    out: str
+    err: str
+
+
+def call(*arguments):
+    """The command line in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        mock.patch.object(sys, "argv", ["ddco-pyro", *map(str, arguments)]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        pytest.raises(SystemExit) as ended,
+    ):
+        main()
+    return Ended(ended.value.code, out.getvalue(), err.getvalue())
+
+
+def start(*arguments):
+    """The command line in a process of its own, in the folder of the toy task."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    return subprocess.Popen([COMMAND, *map(str, arguments)], cwd=HERE, env=environment, **pipes)
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory):
+    path = tmp_path_factory.mktemp("specs") / "toy.yaml"
+    path.write_text(toy_task.SPEC)
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(spec, tmp_path_factory):
+    """A run that ``fit`` made, and how ``fit`` ended."""
+    folder = tmp_path_factory.mktemp("runs") / "toy"
+    short = ["--set", "training.epochs=2", "--set", "compare_with=[flat]"]
+    return folder, call("fit", spec, "--out", folder, *short)
+
+
+# --- what works -------------------------------------------------------------------------------------------------------
+
+
+def test_check_shows_defaults_shapes_and_parameters(spec):
+    ended = call("check", spec, "--set", "hierarchy.levels.0.count=3")
+    assert (ended.status, ended.err) == (0, "")
+    resolved = load_spec(spec, ["hierarchy.levels.0.count=3"])
+    assert ended.out.startswith(dump_spec(resolved))
+    assert "patience: 20" in ended.out
+    table = [[cell.strip() for cell in line.split("│")] for line in ended.out.splitlines() if "│" in line]
+    assert table == [
+        ["observation offsets", "[4]"],
+        ["observation visited", "[1]"],
+        ["features", "5"],
+        ["control", "[2]"],
+        ["hierarchy.levels.0.policy", str(3 * (5 * 8 + 8 + 8 * 2 + 2))],
+        ["hierarchy.levels.0.termination", str(3 * (5 + 1))],
+        ["hierarchy.meta_policy", str(5 * 8 + 8 + 8 * 3 + 3)],
+    ]
+
+
+def test_check_prints_the_schema():
+    ended = call("check", "--schema")
+    schema = json.loads(ended.out)
+    assert (ended.status, ended.err, schema["type"]) == (0, "", "object")
+    assert set(schema["properties"]) >= {"task", "hierarchy", "training"}
+
+
+def test_collect_prints_the_file(spec, tmp_path):
+    path = tmp_path / "own.hdf5"
+    ended = call("collect", spec, "--out", path, "--set", "demonstrations.count=3")
+    assert (ended.status, ended.out) == (0, f"{path}\n")
+    assert "3/3" in ended.err
+    with h5py.File(path) as file:
+        assert list(file["data"]) == ["demo_0", "demo_1", "demo_2"]
+    assert call("collect", spec, "--out", path, "--set", "demonstrations.count=3") == (0, f"{path}\n", "")
+
+
+def test_fit_writes_a_run_and_its_report(run):
+    folder, ended = run
+    assert ended.status == 0
+    loaded = ddco_pyro.load(folder)
+    assert loaded.spec.training.epochs == 2
+    assert list(loaded.baselines) == ["flat"]
+    assert (folder / "report.html").stat().st_size > 1000
+    assert ended.out.splitlines()[-1] == f"report: {folder / 'report.html'}"
+    for name, row in {"ddco": loaded.metrics, **loaded.metrics["comparison"]}.items():
+        values = row["log_likelihood_per_step"]
+        assert re.search(rf"^ *{name} +│ +{values['train']:.3f} +│ +{values['valid']:.3f}", ended.out, re.MULTILINE)
+
+
+def test_rollout_and_report(run):
+    folder, _ = run
+    ended = call("rollout", folder, "--episodes", 2, "--video", "--jobs", 1)
+    assert ended.status == 0
+    methods = ddco_pyro.load(folder).metrics["rollouts"]["methods"]
+    assert list(methods) == ["open_loop", "supervisor", "flat", "ddco"]
+    for name, one in methods.items():
+        assert re.search(rf"^ *{name} +│ +{one['measures']['success']['successes']}/2 \[", ended.out, re.MULTILINE)
+    assert len(list((folder / "videos").glob("*.mp4"))) == 8
+    (folder / "report.html").unlink()
+    assert call("report", folder) == (0, f"report: {folder / 'report.html'}\n", "")
+    assert "open_loop" in (folder / "report.html").read_text()
+
+
+def test_help_has_examples():
+    for command in ("check", "collect", "fit", "rollout", "report"):
+        ended = call(command, "--help")
+        assert (ended.status, ended.err) == (0, "")
+        assert f"Example: ddco-pyro {command}" in ended.out
+    assert call() == call("--help")
+
+
+# --- what does not ----------------------------------------------------------------------------------------------------
+
+OWN = "hierarchy.levels.0.policy.network=test_networks:Own"
+
+
+def with_set(*overrides):
+    return [argument for override in overrides for argument in ("--set", override)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["check", "nowhere.yaml"], "nowhere.yaml: cannot be read: No such file or directory; check the path"),
+        (["check"], "name a spec, such as: ddco-pyro check specs/needle.yaml"),
+        (["check", "SPEC", *with_set("training.epochs=many")], "training.epochs: must be a whole number"),
+        (["check", "SPEC", *with_set("training.epoch=3")], "training.epoch: .*did you mean training.epochs"),
+        (["check", "SPEC", *with_set("seed")], "override 'seed': write it as key.path=value"),
+        (["check", "SPEC", *with_set("observations=[pose]")], r"observations: there is no pose \(there are: offsets, "),
+        (["check", "SPEC", *with_set("task=toi")], "no task is registered as 'toi'"),
+        (
+            ["check", "SPEC", *with_set(OWN, "hierarchy.levels.0.policy.options={gian: 1}")],
+            r"hierarchy\.levels\.0\.policy: network 'test_networks:Own' .*unexpected keyword argument 'gian'",
+        ),
+        (
+            ["check", "SPEC", *with_set("control.scale=[1, 2, 3]")],
+            "control.scale: has 3 numbers, but the control has 2",
+        ),
+        (["check", "--foo"], "No such option: --foo; see ddco-pyro check --help"),
+        (["fit"], "Missing argument 'SPEC'; see ddco-pyro fit --help"),
+        (["chekc"], "No such command 'chekc'.*; see ddco-pyro --help"),
+        (["rollout", "RUN", "--episodes", "0"], "Invalid value for '--episodes': .*; see ddco-pyro rollout --help"),
+        (
+            ["collect", "SPEC", *with_set("demonstrations.supervisor=expert")],
+            "task 'toy' has no policy 'expert' to rec",
+        ),
+        (
+            ["collect", "SPEC", *with_set("task=null", "demonstrations.path=x")],
+            r"toy\.yaml: names no task, so there is no supervisor to record",
+        ),
+        (["fit", "SPEC", "--out", "RUN"], "holds a run of another spec; choose another --out or remove it"),
+        (["fit", "RUN/spec.yaml", "--out", "RUN"], "holds a run of this spec already; continue it with --resume"),
+        (["fit", "SPEC", "--out", "SPEC"], r"toy\.yaml: is a file; choose another --out"),
+        (["rollout", "nowhere"], r"nowhere: not a run folder \(it has no spec\.yaml\)"),
+        (["report", "nowhere"], r"nowhere: not a run folder \(it has no spec\.yaml\)"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bad_input_is_refused_in_one_line(arguments, message, spec, run):
+    names = {"SPEC": str(spec), "RUN": str(run[0]), "RUN/spec.yaml": str(run[0] / "spec.yaml")}
+    ended = call(*(names.get(argument, argument) for argument in arguments))
+    assert (ended.status, ended.out) == (2, "")
+    assert re.fullmatch(f"ddco-pyro: .*{message}.*\n", ended.err)
+
+
+def test_every_problem_of_a_spec_has_its_line(spec):
+    ended = call("check", spec, *with_set("seed=-1", "training.epochs=0"))
+    assert ended.status == 2
+    assert [line.partition(": ")[0] for line in ended.err.splitlines()] == ["ddco-pyro"] * 2
+    assert {re.search(r"toy\.yaml: ([\w.]+):", line)[1] for line in ended.err.splitlines()} == {
+        "seed",
+        "training.epochs",
+    }
+
+
+def test_training_that_fails_says_why(spec, tmp_path):
+    diverging = with_set("training.optimizer.lr=1e30", "compare_with=[]", "training.patience=null")
+    ended = call("fit", spec, "--out", tmp_path / "run", *diverging)
+    assert ended.status == 1
+    *_, last = ended.err.splitlines()
+    assert re.match(r"ddco-pyro: stage vq-1, epoch \d+: the log-likelihood of demo_\d+.* is not finite; look at", last)
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (ZeroDivisionError("two\nlines"), "unexpected ZeroDivisionError: two lines; --debug shows where it comes from"),
+        (OSError(28, "No space left on device"), "[Errno 28] No space left on device"),
+        (KeyboardInterrupt(), "interrupted"),
+    ],
+)
+def test_what_fails_otherwise_has_one_line_too(monkeypatch, spec, error, message):
+    monkeypatch.setattr("ddco_pyro.data.dimensions", mock.Mock(side_effect=error))
+    assert call("check", spec) == (1, "", f"ddco-pyro: {message}\n")
+
+
+def test_debug_shows_the_traceback():
+    for arguments in (["--debug", "check", "nowhere.yaml"], ["check", "nowhere.yaml", "--debug"]):
+        ended = call(*arguments)
+        assert ended.status == 2
+        assert ended.err.startswith("Traceback (most recent call last):")
+        assert ended.err.splitlines()[-1].startswith("ddco_pyro.spec.SpecError: nowhere.yaml: cannot be read")
+
+
+# --- in a process of its own ------------------------------------------------------------------------------------------
+
+
+def test_a_command_ends_with_its_status_and_finds_tasks_beside_it(spec):
+    """The toy task is found in the working folder."""
+    process = start("check", spec)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, "")
+    assert "hierarchy.meta_policy" in out
+    process = start("check", spec, "--set", "training.epoch=3")
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err.count("\n")) == (2, "", 1)
+
+
+def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
+    longer = with_set("compare_with=[]", "training.epochs=30", "training.patience=null")
+    folder = tmp_path / "cut"
+    process = start("fit", spec, "--out", folder, *longer)
+    checkpoint = folder / "checkpoints" / "latest.safetensors"
+    while not checkpoint.exists() and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert not (folder / "model.safetensors").exists()
+    said, _, command = err.splitlines()[-1].partition("; continue with: ddco-pyro ")
+    assert said == "interrupted"
+    assert call(*shlex.split(command)).status == 0
+    assert call("fit", spec, "--out", tmp_path / "whole", *longer).status == 0
+    for name in ("model.safetensors", "history.csv", "spec.yaml"):
+        assert (folder / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    rows = (folder / "history.csv").read_text().splitlines()
+    assert len(rows) == 1 + 3 * 30
+
+
+LIGHT = """
+import sys
+sys.argv = {arguments!r}
+from ddco_pyro.cli import main
+try:
+    main()
+except SystemExit:
+    print(sorted(name for name in ("h5py", "pyro", "sklearn", "torch") if name in sys.modules))
+"""
+
+
+@pytest.mark.parametrize("arguments", [["ddco-pyro", "--help"], ["ddco-pyro", "check", "nowhere.yaml"]])
+def test_help_and_refusals_load_nothing_heavy(arguments):
+    """Loading torch, pyro and scikit-learn takes seconds."""
+    ended = subprocess.run([sys.executable, "-c", LIGHT.format(arguments=arguments)], capture_output=True, text=True)
+    assert ended.stdout.splitlines()[-1] == "[]"
+
+
+def test_the_packages_names_are_there_when_asked_for():
+    for name in ddco_pyro.__all__:
+        assert name in dir(ddco_pyro)
+        assert getattr(ddco_pyro, name) is not None
+    assert ddco_pyro.load_spec is load_spec
+    with pytest.raises(AttributeError, match="module 'ddco_pyro' has no attribute 'nothing'"):
+        _ = ddco_pyro.nothing
+
+
+def test_the_resolved_spec_is_yaml(spec):
+    ended = call("check", spec)
+    printed = ended.out[: ended.out.index("shape or parameters")].rpartition("\n")[0]
+    assert yaml.safe_load(printed)["training"]["batch_size"] == 3
