@@ -300,7 +300,7 @@ class TrainingSpec(_Model):
     """How the model is trained."""
 
     initialize: Literal["vq", "vq_controls", "random"] = "vq"
-    """``vq``: by vector quantisation of the observations (SM 2.2); ``vq_controls``: of observations and controls together;
+    """``vq``: by vector quantisation of the observations (SM 2.2); ``vq_controls``: of observations and controls;
     ``random``: random weights."""
     layerwise: bool = True
     """Discover level after level, lowest first, rather than all at once."""

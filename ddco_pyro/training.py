@@ -58,7 +58,7 @@ def plan(spec: Spec, depth: int) -> list[Stage]:
     stages: list[Stage] = []
     for level in range(1, depth + 1):
         own = f"levels.{level - 1}."
-        if training.initialize == "vq":
+        if training.initialize != "random":
             stages.append(Stage(f"vq-{level}", level, level, (own,)))
         if training.layerwise:
             fine_tuned = training.lower_levels == "fine_tuned"
@@ -226,7 +226,8 @@ class _Objective:
             hierarchy = trainer.spec.hierarchy
             assert hierarchy is not None  # only levels are clamped
             seed = trainer._seed(trainer.progress.restart, trainer.progress.stage)
-            found = Clusters(trainer.train, hierarchy.levels[stage.clamped - 1].count, seed)
+            options = hierarchy.levels[stage.clamped - 1].count
+            found = Clusters(trainer.train, options, seed, trainer.spec.training.initialize == "vq_controls")
             self.clusters = found.choices(trainer.train), found.choices(trainer.tune)
 
     def train(self, model: Hierarchy, rows: Tensor) -> Tensor:
