@@ -8,6 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
@@ -87,6 +88,11 @@ def test_the_history_has_every_epoch(toy_run, watched):
 def test_the_watcher_is_told_what_goes_on(watched):
     assert watched.models == [("ddco", 18), "ddco", ("flat", 6), "flat", ("per_timestep", 6), "per_timestep"]
     assert watched.demonstrations in ([(n, 12) for n in range(1, 13)], [])  # nothing where they are in the cache
+
+
+def test_a_fit_leaves_the_number_of_threads_as_it_was(toy_run):
+    """The compiled engine's own threads once made torch use every core, tenfold slower on a busy machine."""
+    assert torch.get_num_threads() == 1
 
 
 def test_versions_and_seconds_are_kept(toy_run):

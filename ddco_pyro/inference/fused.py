@@ -56,7 +56,9 @@ def evaluate(chain: Chain, lengths: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]
     shift = torch.where(torch.isfinite(shift), shift, 0.0)
     sizes = [table.shape[-1] for table in chain.selection]
     joint = (flat - shift).exp()
-    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    threads = torch.get_num_threads()
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    torch.set_num_threads(threads)  # numba's first call has set OpenMP's number for the whole process, torch included
     value, overlap, to_select, to_end, to_emission = forward_backward(
         _rows(chain.selection, joint).numpy(),
         _rows(chain.termination, joint).numpy(),
