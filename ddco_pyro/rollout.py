@@ -18,7 +18,7 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode: the ``record`` of observations and controls, ``outcome`` as the task measures it, the ``choices``
+    """One episode: the ``record`` of observations and (intended) controls, the task's ``outcome``, the ``choices``
     of each level at each step [T, D] where a controller acted, and ``frames`` uint8 [T + 1, H, W, 3] where filmed.
     """
 
@@ -41,10 +41,11 @@ def run_episode(task: Task, policy: Policy | str, seed: int, film: bool = False)
         while not step.last():
             frames += [task.frame(environment)] if film else []
             seen.append({key: np.array(value) for key, value in step.observation.items()})
-            controls.append(np.array(actor.act(step.observation), dtype=np.float64))
+            control = np.array(actor.act(step.observation), dtype=np.float64)
+            controls.append(np.array(getattr(actor, "intended", control), dtype=np.float64))
             choices.append(getattr(actor, "choices", ()))
             labels.append(dict(getattr(actor, "annotations", {})))
-            step = environment.step(controls[-1])
+            step = environment.step(control)
         frames += [task.frame(environment)] if film else []
         outcome = {name: float(value) for name, value in task.outcome(environment).items()}
     finally:

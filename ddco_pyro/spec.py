@@ -305,7 +305,7 @@ class TrainingSpec(_Model):
     layerwise: bool = True
     """Discover level after level, lowest first, rather than all at once."""
     lower_levels: Literal["fine_tuned", "frozen"] = "fine_tuned"
-    """What happens to the levels already discovered in later stages of layer-wise training."""
+    """Layer-wise training: whether a last stage trains all levels together, or what was discovered stays as it is."""
     optimizer: OptimizerSpec = OptimizerSpec()
     """The optimiser."""
     epochs: Count = 200

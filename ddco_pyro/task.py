@@ -40,7 +40,9 @@ class Task:
     :param load: ``load(seed)`` gives a fresh environment; its first ``reset()`` depends on the seed alone.
     :param policies: name to ``make(environment)``; a scripted policy may look at the environment's true state.
         ``"supervisor"`` is the one whose demonstrations are collected. A policy may have an attribute
-        ``annotations`` (name to integer, for the step just decided): they are stored as ground-truth labels.
+        ``annotations`` (name to integer, for the step just decided): they are stored as ground-truth labels. One
+        whose moves are disturbed may have an attribute ``intended`` [A], the control without the disturbance: it is
+        recorded in place of the one that was executed (noise while collecting, clean labels).
     :param outcome: measures of the episode that just ended, such as ``{"success": 1.0, "accuracy_mm": 2.1}``;
         a measure that does not apply (the accuracy of an insertion that never happened) is NaN.
     :param frame: a picture of the scene as it is now, uint8 [H, W, 3].

@@ -57,17 +57,16 @@ def plan(spec: Spec, depth: int) -> list[Stage]:
         return [Stage("policy", None, None, everything)]
     stages: list[Stage] = []
     for level in range(1, depth + 1):
-        own = f"levels.{level - 1}."
+        own = (f"levels.{level - 1}.",)
         if training.initialize != "random":
-            stages.append(Stage(f"vq-{level}", level, level, (own,)))
+            stages.append(Stage(f"vq-{level}", level, level, own))
         if training.layerwise:
-            fine_tuned = training.lower_levels == "fine_tuned"
-            discovered = tuple(f"levels.{below}." for below in range(level - 1)) if fine_tuned else ()
-            stages.append(Stage(f"level-{level}", level, None, (*discovered, own)))
+            stages.append(Stage(f"level-{level}", level, None, own))
     if training.layerwise:
-        trained = everything if training.lower_levels == "fine_tuned" else ("meta_policy.",)
-        return [*stages, Stage("meta-policy", None, None, trained)]
-    return [*stages, Stage("joint", None, None, everything)]
+        stages.append(Stage("meta-policy", None, None, ("meta_policy.",)))
+    if not training.layerwise or training.lower_levels == "fine_tuned":
+        stages.append(Stage("joint", None, None, everything))
+    return stages
 
 
 @dataclass

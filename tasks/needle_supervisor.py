@@ -43,7 +43,7 @@ LIFTED = 6  # from this way point on the plan is about the insertion, before it 
 
 POSITION_TOLERANCE = 0.0003  # m
 TURN_TOLERANCE = np.deg2rad(1.0)
-# A hand is inexact, the less so the nearer it is to what it aims at: standard deviations of an adjustment.
+# A hand is inexact, the less so the nearer it is to what it aims at: standard deviations of a move.
 HAND_POSITION = 0.0004  # m, in each direction
 HAND_TURN = np.deg2rad(1.5)
 HAND_POSITION_AWAY = 0.25  # more, in m per m that remains to needle or phantom
@@ -155,8 +155,11 @@ class Supervisor(OpenLoop):
 
     Before a step of the approach or of the insertion it predicts where the next way point would really bring the
     gripper, and compares with where the plan meant it to be relative to the true needle. If they differ by more than a
-    small tolerance it changes the joint angles by what removes the difference. The jaws are not corrected. As with a
-    person, adjustments are coarse far away and fine near the aim, so demonstrations show how to come back.
+    small tolerance it changes the joint angles by what removes the difference. The jaws are not corrected.
+
+    As with a person, what it does is coarser than what it means to do, far away more so than near the aim. ``intended``
+    is the control it meant, and is what is recorded: demonstrations show how to come back from an inexact move without
+    teaching the inexactness (noise while executing with clean labels).
     """
 
     def __init__(self, environment: dm_env.Environment) -> None:
@@ -164,20 +167,25 @@ class Supervisor(OpenLoop):
         self._physics: Physics = environment.physics
 
     def reset(self, seed: int) -> None:
-        """Forget plan and corrections; ``seed`` decides how inexact the adjustments are."""
+        """Forget plan and corrections; ``seed`` decides how inexact the moves are."""
         super().reset(seed)
         self._delta = np.zeros(6)
+        self.intended = np.zeros(7)
         self._hand = np.random.default_rng(seed)
 
     def act(self, observation: Observation) -> np.ndarray:
         """The next set points [7]."""
         action = super().act(observation)
         planned = action[:6].copy()
+        self.intended = action.copy()
         if self._step in REMAINING and (self._step < LIFTED or self._physics.held()):
-            wanted = self._by_hand(self._wanted(psm.forward(planned)))
+            wanted = self._wanted(psm.forward(planned))
             if differs(psm.forward(psm.true_joints(planned + self._delta)), wanted):
                 self._delta = psm.encoder_readings(psm.inverse(wanted)) - planned
-        action[:6] = planned + self._delta
+            action[:6] = psm.encoder_readings(psm.inverse(self._by_hand(wanted)))
+        else:
+            action[:6] = planned + self._delta
+        self.intended[:6] = planned + self._delta
         return action
 
     def _by_hand(self, wanted: Pose) -> Pose:

@@ -53,6 +53,9 @@ class Truth:
 
 def brute_force(tables: Tables, n: int, length: int) -> Truth:
     """p(ξ_n) and the marginals of §4.1 by summing over all (b, h) paths."""
+    tables = Tables(
+        *(tuple(t.detach() for t in part) for part in (tables.selection, tables.termination, tables.control))
+    )
     sizes = [table.shape[-1] for table in tables.selection]
     shape = [(length, size) for size in sizes]
     u, v, w = ([np.zeros(s) for s in shape] for _ in range(3))
