@@ -51,16 +51,17 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
 def dimensions(spec: Spec) -> Dimensions:
     """The dimensions of what the spec names, without collecting anything: from its file, or else from its task.
 
-    The task does not say how long a demonstration is; one step stands for it.
+    A task that does not say how long its episodes are counts as having one step.
     """
     path = spec.demonstrations.path
     if spec.task is None or (path is not None and Path(path).exists()):
         assert path is not None  # a spec has a task or a file
         return Dimensions.of(Demonstrations.read(path))
-    environment = find_task(spec.task).load(spec.demonstrations.seed)
+    task = find_task(spec.task)
+    environment = task.load(spec.demonstrations.seed)
     try:
         shapes = {name: tuple(one.shape) for name, one in environment.observation_spec().items()}
-        return Dimensions(shapes, environment.action_spec().shape[0], steps=1)
+        return Dimensions(shapes, environment.action_spec().shape[0], task.steps)
     finally:
         environment.close()
 

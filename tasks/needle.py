@@ -147,5 +147,6 @@ task = Task(
     policies={"open_loop": needle_supervisor.OpenLoop, "supervisor": needle_supervisor.Supervisor},
     outcome=outcome,
     frame=frame,
+    steps=STEPS,
     sources=(HERE / "needle.xml", *sorted(HERE.glob("needle*.py")), *(HERE / name for name in SHARED_SOURCES)),
 )

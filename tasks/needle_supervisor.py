@@ -46,8 +46,8 @@ TURN_TOLERANCE = np.deg2rad(1.0)
 # A hand is inexact, the less so the nearer it is to what it aims at: standard deviations of a move.
 HAND_POSITION = 0.0004  # m, in each direction
 HAND_TURN = np.deg2rad(1.5)
-HAND_POSITION_AWAY = 0.25  # more, in m per m that remains to needle or phantom
-HAND_TURN_AWAY = 8.0  # rad per m
+HAND_POSITION_AWAY = 0.12  # more, in m per m that remains to needle or phantom
+HAND_TURN_AWAY = 4.0  # rad per m
 REMAINING = {1: 0.015, 2: 0.006, 3: 0.0, 8: 0.018, 9: 0.012, 10: 0.010, 11: 0.007, 12: 0.004, 13: 0.0}  # m, by step
 
 CLEARANCE = 0.001  # m, that planned paths keep from mat and phantom
