@@ -12,6 +12,7 @@ TORCH_CPU := https://download.pytorch.org/whl/cpu/torch/
 # --resume: an interrupted demo goes on where it stopped, a finished one shows its result again.
 demo: $(STAMP)
 	$(BIN)/ddco-pyro fit specs/needle.yaml --out runs/needle --resume
+	$(BIN)/ddco-pyro rollout runs/needle --episodes 50 --video
 
 test: lint
 	$(BIN)/pytest -n 2 -q

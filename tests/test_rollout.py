@@ -59,6 +59,19 @@ def test_an_episode_records_what_was_seen_before_each_control():
     np.testing.assert_allclose(steps, toy_task.SPEED * CONTROLS[:-1])
 
 
+def test_a_disturbed_policy_is_recorded_as_it_meant_to_act():
+    class Disturbed(Noted):
+        def act(self, observation):
+            self.intended = super().act(observation)
+            return self.intended + 0.5
+
+    controls = np.zeros((toy_task.STEPS, 2))
+    meant = run_episode(task, Disturbed(controls), seed=3).record
+    done = run_episode(task, Noted(controls + 0.5), seed=3).record
+    np.testing.assert_array_equal(meant.actions, 0.0)
+    np.testing.assert_array_equal(meant.observations["offsets"], done.observations["offsets"])
+
+
 def test_an_episode_ends_with_its_outcome():
     made = []
     episode = run_episode(kept(made), "supervisor", 3)
