@@ -90,6 +90,29 @@ def _adjoint(
 
 
 @jit
+def _arrive(
+    t: int,
+    alpha: Array,
+    message: Array,
+    spread: Array,
+    select: Array,
+    end: Array,
+    sizes: Array,
+    starts: Array,
+    ends: Array,
+    selects: Array,
+) -> None:
+    """Fill ``spread`` with what is expected at t, before its control is seen, given ``alpha`` at t - 1."""
+    if t == 0:  # everything is selected: all mass has terminated, none is kept
+        message[:] = 0.0
+        message[starts[-1]] = 1.0
+    else:
+        message[: alpha.shape[1]] = alpha[t - 1]
+        _up(message, end, sizes, starts, ends)
+    _down(message, spread, select, end, sizes, starts, ends, selects)
+
+
+@jit
 def _forward(
     select: Array, end: Array, emission: Array, alpha: Array, sizes: Array, starts: Array, ends: Array, selects: Array
 ) -> float:
@@ -98,13 +121,7 @@ def _forward(
     message, spread = np.zeros(starts[-1] + 1), np.zeros(starts[-1] + 1)
     value = 0.0
     for t in range(len(emission)):
-        if t == 0:  # everything is selected: all mass has terminated, none is kept
-            message[:] = 0.0
-            message[starts[-1]] = 1.0
-        else:
-            message[:joint] = alpha[t - 1]
-            _up(message, end[t], sizes, starts, ends)
-        _down(message, spread, select[t], end[t], sizes, starts, ends, selects)
+        _arrive(t, alpha, message, spread, select[t], end[t], sizes, starts, ends, selects)
         total = 0.0
         for s in range(joint):
             alpha[t, s] = spread[s] * emission[t, s]
@@ -143,13 +160,7 @@ def _backward(
             overlap += to_emission[t, s]
         to_emission[t] /= overlap
         least = min(least, overlap)
-        if t == 0:
-            message[:] = 0.0
-            message[starts[-1]] = 1.0
-        else:
-            message[:joint] = alpha[t - 1]
-            _up(message, end[t], sizes, starts, ends)
-        _down(message, spread, select[t], end[t], sizes, starts, ends, selects)
+        _arrive(t, alpha, message, spread, select[t], end[t], sizes, starts, ends, selects)
         total = 0.0
         for s in range(joint):
             back[s] = beta[s] * emission[t, s]
