@@ -2,7 +2,7 @@
 
     python benchmarks/needle_success.py [--seeds 5] [--episodes 200] [--jobs 2] [--set KEY=VALUE]... [--out DIR]
 
-Every seed is a fit of ``specs/needle.yaml`` with its baselines and a rollout of all methods from the same initial states.
+Every seed is a fit of ``specs/needle.yaml`` with its baselines and a rollout of all methods from the same starts.
 Seeds that are done (``seed-N.json``) are not done again. Writes ``summary.json``, ``summary.md`` and ``success.png``.
 """
 
@@ -96,7 +96,8 @@ def over_seeds(values: list[float]) -> dict[str, Any]:
     if len(values) < 2:
         return {"mean": values[0] if values else None, "interval": None, "seeds": len(values)}
     half = stats.sem(values) * stats.t.ppf(0.975, len(values) - 1)
-    return {"mean": float(np.mean(values)), "interval": [float(np.mean(values) + s * half) for s in (-1, 1)], "seeds": len(values)}  # fmt: skip # noqa: E501
+    mean = float(np.mean(values))
+    return {"mean": mean, "interval": [mean - half, mean + half], "seeds": len(values)}
 
 
 def table(summary: dict[str, Any], command: str) -> str:
@@ -130,7 +131,7 @@ def draw(summary: dict[str, Any], path: Path) -> None:
     figure = Figure(figsize=(7, 3), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    for place, (name, one) in enumerate(summary.items()):
+    for place, one in enumerate(summary.values()):
         low, high = one["success"]["interval"]
         axes.plot([low, high], [place, place], lw=6, alpha=0.35, color="#3f6fb0", solid_capstyle="butt")
         axes.plot(one["success"]["rate"], place, "|", ms=16, mew=2, color="#1f3f70")
