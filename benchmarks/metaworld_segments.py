@@ -2,7 +2,7 @@
 
     python benchmarks/metaworld_segments.py [--seeds 5] [--set KEY=VALUE]...
 
-Fits ``specs/metaworld_pick_place.yaml`` with each way to initialise; writes ``metaworld.json`` and ``.md`` in docs/results.
+Fits ``specs/metaworld_pick_place.yaml`` with each way to initialise; writes ``docs/results/metaworld.json`` and ``.md``
 """
 
 from __future__ import annotations
