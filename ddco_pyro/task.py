@@ -46,8 +46,8 @@ class Task:
     :param outcome: measures of the episode that just ended, such as ``{"success": 1.0, "accuracy_mm": 2.1}``;
         a measure that does not apply (the accuracy of an insertion that never happened) is NaN.
     :param frame: a picture of the scene as it is now, uint8 [H, W, 3].
-    :param steps: the most control steps that an episode can have, where that is known; 1 otherwise.
     :param sources: the files whose contents decide what a demonstration looks like, for caching.
+    :param steps: the most control steps that an episode can have, where that is known; 1 otherwise.
     """
 
     name: str
@@ -55,8 +55,8 @@ class Task:
     policies: Mapping[str, Callable[[dm_env.Environment], Policy]]
     outcome: Callable[[dm_env.Environment], dict[str, float]]
     frame: Callable[[dm_env.Environment], np.ndarray]
-    steps: int = 1
     sources: tuple[Path, ...] = field(default=())
+    steps: int = 1
 
 
 class UnknownTask(BadInput):
