@@ -268,7 +268,7 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
     for name in ("model.safetensors", "history.csv", "spec.yaml"):
         assert (folder / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     rows = (folder / "history.csv").read_text().splitlines()
-    assert len(rows) == 1 + 3 * 30
+    assert len(rows) == 1 + 4 * 30
 
 
 LIGHT = """

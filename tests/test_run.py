@@ -85,11 +85,11 @@ def test_the_history_has_every_epoch(toy_run, watched):
     assert [{**row, "restart": str(row["restart"]), "epoch": str(row["epoch"])} for row in told] == [
         {**row, "train": float(row["train"]), "tune": float(row["tune"])} for row in rows
     ]
-    assert [row["stage"] for row in rows] == ["vq-1"] * 6 + ["level-1"] * 6 + ["meta-policy"] * 6
+    assert [row["stage"] for row in rows] == ["vq-1"] * 6 + ["level-1"] * 6 + ["meta-policy"] * 6 + ["joint"] * 6
 
 
-def test_the_watcher_is_told_what_goes_on(watched):
-    assert watched.models == [("ddco", 18), "ddco", ("flat", 6), "flat", ("per_timestep", 6), "per_timestep"]
+def test_the_watcher_is_told_what_goes_on(toy_run, watched):
+    assert watched.models == [("ddco", 24), "ddco", ("flat", 6), "flat", ("per_timestep", 6), "per_timestep"]
     assert watched.demonstrations in ([(n, 12) for n in range(1, 13)], [])  # nothing where they are in the cache
 
 
@@ -187,23 +187,34 @@ def test_the_use_of_options_can_be_computed_again(toy_run, demos):
 
 @pytest.fixture(scope="module")
 def planted(tmp_path_factory):
-    """Demonstrations of two skills that the observation tells apart: label 5 goes up, label 2 goes down."""
+    """Demonstrations of two skills that ``side`` tells apart: label 5 follows ``place``, label 2 flees from it.
+
+    No single linear policy does both.
+    """
     random = np.random.default_rng(0)
     records = []
     for number in range(12):
         labels = np.repeat([5, 2, 5], [4, 5, 4])
         side = np.where(labels == 5, 1.0, -1.0)
-        observations = {"side": (side + 0.1 * random.normal(size=13))[:, None]}
-        actions = side[:, None] + 0.1 * random.normal(size=(13, 1))
+        place = random.normal(size=13)
+        observations = {"side": (side + 0.1 * random.normal(size=13))[:, None], "place": place[:, None]}
+        actions = (side * place)[:, None] + 0.1 * random.normal(size=(13, 1))
         records.append(Demonstration(f"demo_{number}", observations, actions, {"skill": labels}))
     path = tmp_path_factory.mktemp("planted") / "demos.hdf5"
     Demonstrations(tuple(records)).write(path)
     return path
 
 
+LINEAR = {"hierarchy.levels.0.policy.network": "linear", "hierarchy.levels.0.termination.network": "linear"}
+
+
 def test_planted_skills_are_found(planted, tmp_path, toy_spec):
-    given = {"task": None, "demonstrations": {"path": str(planted), "labels": "skill"}, "observations": ["side"]}
-    spec = with_overrides(toy_spec, given | {"compare_with": [], "training.epochs": 20})
+    given = {
+        "task": None,
+        "demonstrations": {"path": str(planted), "labels": "skill"},
+        "observations": ["side", "place"],
+    }
+    spec = with_overrides(toy_spec, given | {"compare_with": [], "training.epochs": 60} | LINEAR)
     found = fit(spec, tmp_path / "run", Silent())
     assert found.metrics["agreement"]["valid"] == [pytest.approx(1)]
     assert "supervisor" not in found.metrics["demonstrations"]
