@@ -251,7 +251,7 @@ def test_a_command_ends_with_its_status_and_finds_tasks_beside_it(spec):
 
 
 def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
-    longer = with_set("compare_with=[]", "training.epochs=300", "training.patience=null")
+    longer = with_set("compare_with=[]", "training.epochs=60", "training.patience=null")
     folder = tmp_path / "cut"
     process = start("fit", spec, "--out", folder, *longer)
     checkpoint = folder / "checkpoints" / "latest.safetensors"
@@ -268,7 +268,7 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
     for name in ("model.safetensors", "history.csv", "spec.yaml"):
         assert (folder / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     rows = (folder / "history.csv").read_text().splitlines()
-    assert len(rows) == 1 + 4 * 300
+    assert len(rows) == 1 + 4 * 60
 
 
 LIGHT = """
