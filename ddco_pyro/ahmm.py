@@ -51,6 +51,28 @@ class Tables:
         """The number D of option levels; 0 is a flat policy."""
         return len(self.selection)
 
+    @classmethod
+    def of(cls, depth: int, leaves: Sequence[Tensor | None]) -> Tables:
+        """The tables of a hierarchy of so many levels from their :meth:`leaves`."""
+        selection, termination = leaves[:depth], leaves[depth : 2 * depth]
+        control, evidence = leaves[2 * depth : 3 * depth + 1], leaves[3 * depth + 1 :]
+        return cls(_present(selection), _present(termination), _present(control), tuple(evidence))
+
+    def leaves(self) -> tuple[Tensor | None, ...]:
+        """Every table: selections, terminations, controls and, where there is any, the evidence."""
+        return (*self.selection, *self.termination, *self.control, *self.evidence)
+
+    def joint_evidence(self) -> Tensor | None:
+        """The evidence of every joint choice, float64 [N, T, C_D, ..., C_1]; None where there is none."""
+        total: Tensor | None = None
+        sizes = [table.shape[-1] for table in self.selection]
+        for level, evidence in enumerate(self.evidence, start=1):
+            if evidence is not None:
+                shape = evidence.shape[:2] + (1,) * (self.depth - level) + evidence.shape[2:] + (1,) * (level - 1)
+                own = evidence.double().reshape(shape)
+                total = own if total is None else total + own
+        return None if total is None else total.expand(*total.shape[:2], *reversed(sizes))
+
     def clamp(self, level: int, choices: Tensor) -> Tables:
         """These tables where the choices of one level (1 is the lowest) are known to be ``choices``, [N, T]."""
         evidence = list(self.evidence or (None,) * self.depth)
@@ -151,12 +173,13 @@ def _emission(tables: Tables) -> Tensor:
         if level < tables.depth:  # below a choice 0 nothing but choice 0 is possible
             own = torch.cat([torch.full_like(own[..., :1, :], NEVER), own[..., 1:, :]], dim=-2)
         emission = torch.cat([emission.unsqueeze(-1), own], dim=-1)
-    for level, evidence in enumerate(tables.evidence, start=1):
-        if evidence is not None:
-            above, below = tables.depth - level, level - 1
-            shape = evidence.shape[:2] + (1,) * above + evidence.shape[2:] + (1,) * below
-            emission = emission + evidence.double().reshape(shape)
-    return emission
+    evidence = tables.joint_evidence()
+    return emission if evidence is None else emission + evidence
+
+
+def _present(tables: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
+    """Tables of which none is missing."""
+    return tuple(table for table in tables if table is not None)
 
 
 def _like(mask: Tensor, table: Tensor) -> Tensor:
