@@ -20,7 +20,7 @@ from safetensors import SafetensorError
 
 from ddco_pyro import analysis
 from ddco_pyro.controller import Controller
-from ddco_pyro.data import Dimensions, build_hierarchy, demonstrations
+from ddco_pyro.data import Dimensions, baseline_spec, build_hierarchy, demonstrations
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.encoding import encode
 from ddco_pyro.errors import BadInput
@@ -28,7 +28,7 @@ from ddco_pyro.files import read_tensors, write_tensors, write_text
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference import Posterior, log_likelihood, posterior, segment
 from ddco_pyro.inference.check import EngineCheck, compare_engines
-from ddco_pyro.spec import BaselineSpec, Spec, dump_spec, load_spec
+from ddco_pyro.spec import Spec, dump_spec, load_spec
 from ddco_pyro.training import Trainer, TrainingError, plan
 
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
@@ -183,11 +183,6 @@ def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, cloc
 def _finished(folder: Path) -> bool:
     """Whether the run is complete: its metrics are written last."""
     return (folder / "metrics.json").exists()
-
-
-def baseline_spec(spec: Spec, baseline: BaselineSpec) -> Spec:
-    """The spec of a baseline trained beside: the same but for the model."""
-    return spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": ()})
 
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:

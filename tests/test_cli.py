@@ -197,6 +197,29 @@ def test_bad_input_is_refused_in_one_line(arguments, message, spec, run):
     assert re.fullmatch(f"ddco-pyro: .*{message}.*\n", ended.err)
 
 
+WRONG = "{network: 'test_networks:Wrong', options: {how: joined}}"
+
+
+@pytest.mark.parametrize(
+    ("override", "place", "shapes"),
+    [
+        (f"hierarchy.levels.0.policy={WRONG}", "hierarchy.levels.0.policy", ("[1, 2, 4]", "[1, 2, 2, 2]")),
+        (f"compare_with=[{{kind: flat, policy: {WRONG}}}]", "compare_with.0.policy", ("[1, 2, 2]", "[1, 2, 1, 2]")),
+    ],
+)
+def test_an_own_network_of_another_shape_is_refused_before_any_work(spec, tmp_path, cache, override, place, shapes):
+    line = (
+        f"ddco-pyro: {place}: network 'test_networks:Wrong' gives shape {shapes[0]}; "
+        f"it has to be a tensor [N, T, copies, outputs], here {shapes[1]}\n"
+    )
+    kept = sorted(cache.rglob("*"))
+    changed = with_set(override, "demonstrations.seed=77")
+    assert call("check", spec, *changed) == (2, "", line)
+    assert call("fit", spec, "--out", tmp_path / "run", *changed) == (2, "", line)
+    assert not (tmp_path / "run").exists()
+    assert sorted(cache.rglob("*")) == kept
+
+
 def test_every_problem_of_a_spec_has_its_line(spec):
     ended = call("check", spec, *with_set("seed=-1", "training.epochs=0"))
     assert ended.status == 2
