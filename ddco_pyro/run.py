@@ -28,6 +28,7 @@ from ddco_pyro.files import read_tensors, write_tensors, write_text
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference import Posterior, log_likelihood, posterior, segment
 from ddco_pyro.inference.check import EngineCheck, compare_engines
+from ddco_pyro.monitor import Monitor
 from ddco_pyro.spec import Spec, dump_spec, load_spec
 from ddco_pyro.training import Trainer, TrainingError, plan
 
@@ -101,6 +102,10 @@ class Fit:
     def controller(self, seed: int = 0) -> Controller:
         """The model as a policy that acts, as the spec's ``rollout`` says."""
         return Controller.from_spec(self.hierarchy, self.spec.rollout, seed)
+
+    def monitor(self) -> Monitor:
+        """A live monitor of the active options, for somebody else's acting."""
+        return Monitor(self.hierarchy)
 
 
 def model_name(spec: Spec) -> str:
