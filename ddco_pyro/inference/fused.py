@@ -68,7 +68,7 @@ class _Eliminate(torch.autograd.Function):
 def eliminate(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elimination:
     """Log-likelihoods and posteriors of tables on the CPU with at least one option level."""
     structure = structure_of(tables)
-    control = torch.cat([table.double() for table in tables.control], dim=-1)
+    control = torch.cat([table.detach() for table in tables.control], dim=-1).double()
     shift = control.amax(-1, keepdim=True)
     shift = torch.where(torch.isfinite(shift), shift, 0.0)
     rows = _rows(tables.selection), _rows(tables.termination), (control - shift).exp_()
@@ -102,8 +102,8 @@ def _arrays(*tables: Tensor) -> list[Any]:
 
 def _rows(tables: Sequence[Tensor]) -> Tensor:
     """exp of each level's table, flattened and side by side, [N, T, ...]."""
-    flat = [table.detach().flatten(2).double() for table in tables]
-    return torch.cat(flat, dim=-1).exp_() if len(flat) > 1 else flat[0].exp().contiguous()
+    flat = [table.detach().flatten(2) for table in tables]
+    return torch.cat(flat, dim=-1).to(torch.float64, copy=True).exp_()
 
 
 def _unrows(rows: Tensor, tables: Sequence[Tensor]) -> tuple[Tensor, ...]:
