@@ -10,12 +10,15 @@ from torch import Tensor
 
 from ddco_pyro.ahmm import Chain
 
+NEVER = -1e3
+"""The others' gradients are NaN where a logarithm is -inf; this is as good as never here."""
+
 
 def transitions(chain: Chain) -> Tensor:
     """log p(h_t | h_{t-1}) of a chain with one level, ready for an HMM, [N, T, S, S]; row t leads to step t."""
-    keep, end = chain.termination[0].unbind(-1)
-    kept = torch.where(torch.eye(keep.shape[-1], dtype=torch.bool), keep.unsqueeze(-1), -torch.inf)
-    return torch.logaddexp(end.unsqueeze(-1) + chain.selection[0], kept)
+    keep, end = chain.termination[0].clamp(min=NEVER).unbind(-1)
+    kept = torch.where(torch.eye(keep.shape[-1], dtype=torch.bool), keep.unsqueeze(-1), NEVER)
+    return torch.logaddexp(end.unsqueeze(-1) + chain.selection[0].clamp(min=NEVER), kept)
 
 
 def dynamax_smoother(chain: Chain) -> Callable[[], float]:
@@ -40,11 +43,11 @@ def discrete_hmm(chain: Chain) -> Callable[[], float]:
     """Pyro's ``DiscreteHMM`` with ready transition matrices: value and gradient."""
     import pyro.distributions as dist
 
-    initial = chain.selection[0][:, 0, 0].clamp(min=-1e3)  # it needs finite numbers
-    matrices = transitions(chain).clamp(min=-1e3).requires_grad_()
+    initial = chain.selection[0][:, 0, 0].clamp(min=NEVER)
+    matrices = transitions(chain).clamp(min=NEVER).requires_grad_()
     # A Normal whose log-density is the table's: N(0; m, 1) = -m²/2 - log sqrt(2π).
     offset = chain.emission.amax() + 1.0
-    means = (2 * (offset - chain.emission.clamp(min=-1e3))).sqrt().requires_grad_()
+    means = (2 * (offset - chain.emission.clamp(min=NEVER))).sqrt().requires_grad_()
     steps = chain.emission.shape[1]
     shift = steps * (offset + 0.5 * np.log(2 * np.pi))
     # DiscreteHMM makes a transition before its first observation: from a state that leads everywhere as the start does.
@@ -70,7 +73,7 @@ def funsor_elimination(chain: Chain) -> Tensor:
     funsor.util._JAX_COMPILED_FUNCTION_TYPE = ()  # funsor 0.4.8 fails where a recent jax is imported too
     factors = transitions(chain) + chain.emission.unsqueeze(2)
     first = (chain.selection[0][:, 0] + chain.emission[:, 0].unsqueeze(1)).expand(-1, chain.emission.shape[-1], -1)
-    factors = torch.cat([(first - np.log(first.shape[1])).unsqueeze(1), factors[:, 1:]], 1).clamp(min=-1e3)
+    factors = torch.cat([(first - np.log(first.shape[1])).unsqueeze(1), factors[:, 1:]], 1).clamp(min=NEVER)
     sizes = factors.shape
     inputs = {
         "n": funsor.Bint[sizes[0]],
