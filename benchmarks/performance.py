@@ -22,6 +22,7 @@ from ddco_pyro.ahmm import Tables, complete
 from ddco_pyro.encoding import Batch
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference import fused, total_log_likelihood
+from ddco_pyro.inference.structure import structure_of
 from ddco_pyro.networks import Inputs
 from ddco_pyro.spec import parse_spec
 
@@ -103,8 +104,13 @@ def funsor_step(hierarchy: Hierarchy, batch: Batch) -> Callable[[], None]:
 
 
 def kernel(tables: Tables, lengths: torch.Tensor) -> Callable[[], float]:
-    """Our forward-backward with posteriors, from ready tables."""
-    return lambda: float(fused.eliminate(tables, lengths).value.sum())
+    """Our forward-backward with posteriors, from ready tables; log-likelihoods of scaled densities come out."""
+    rows = tuple(
+        torch.cat([table.flatten(2).double() for table in group], -1).exp()
+        for group in (tables.selection, tables.termination, tables.control)
+    )
+    nothing, structure = torch.empty(*rows[0].shape[:2], 0, dtype=torch.float64), structure_of(tables)
+    return lambda: float(fused.run(structure, rows, nothing, lengths)[0].sum())
 
 
 def enumeration(tables: Tables, lengths: torch.Tensor) -> Callable[[], None]:
@@ -157,6 +163,8 @@ def measured() -> Iterator[tuple[str, float]]:
         tables, lengths = tables_of(number, steps)
         own = kernel(tables, lengths)
         yield f"enumeration_alone_over_kernel {size}", ratio(enumeration(tables, lengths), own, few, warm=few > 1)
+        whole = ratio(lambda t=tables, n=lengths: fused.eliminate(t, n), own)
+        yield f"log_tables_to_posterior_over_kernel {size}", whole
         chain = complete(tables, lengths)
         same(own(), float(peers.funsor_elimination(chain)))
         for name, peer in (("dynamax", peers.dynamax_smoother(chain)), ("discretehmm", peers.discrete_hmm(chain))):

@@ -12,7 +12,6 @@ from oracle import random_tables
 
 from ddco_pyro.ahmm import NEVER, Tables, complete
 from ddco_pyro.inference import fused, logspace, posterior
-from ddco_pyro.inference.kernel import forward_backward
 from ddco_pyro.inference.structure import structure_of
 
 SHAPES = [(1,), (3,), (20,), (1, 1), (2, 2), (4, 1), (2, 1, 2)]
@@ -104,15 +103,11 @@ def test_underflow_is_seen_and_mended():
 
 def exact(tables):
     """Whether the scaled pass alone trusts itself."""
-    shapes, rows = structure_of(tables), []
-    for group in (tables.selection, tables.termination, tables.control):
-        rows.append(torch.cat([table.flatten(2) for table in group], -1).exp())
-    results = [torch.empty_like(row).numpy() for row in rows]
+    rows = tuple(
+        torch.cat([table.flatten(2) for table in group], -1).exp()
+        for group in (tables.selection, tables.termination, tables.control)
+    )
     number, steps = tables.control[-1].shape[:2]
-    nothing = torch.empty(number, steps, 0, dtype=torch.float64).numpy()
-    value, found = torch.empty(number, dtype=torch.float64).numpy(), torch.empty(number, dtype=torch.bool).numpy()
-    forward_backward(
-        *(row.numpy() for row in rows), nothing, torch.tensor([steps] * number).numpy(), value, found, *results,
-        nothing.copy(), shapes.sizes, shapes.starts, shapes.selects, shapes.ends, shapes.actors, shapes.choices,
-    )  # fmt: skip
+    nothing = torch.empty(number, steps, 0, dtype=torch.float64)
+    _, found, _, _ = fused.run(structure_of(tables), rows, nothing, torch.full((number,), steps))
     return bool(found.all())
