@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import typer
 
 from ddco_pyro import console
+from ddco_pyro.commands import incoming
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.spec import SpecError, dump_spec, load_spec, spec_schema
 
@@ -135,6 +136,11 @@ def report(run: RunPath) -> None:
 
     fitted = load(run)
     print(f"report: {write_report(fitted, demonstrations(fitted.spec))}")
+
+
+app.command(epilog="Example: ddco-pyro inspect mine.hdf5")(incoming.inspect)
+app.command(epilog="Example: ddco-pyro init mine.hdf5 --out mine.yaml")(incoming.init)
+app.command("import", epilog="Example: ddco-pyro import pusht --out demos.hdf5")(incoming.import_)
 
 
 def main() -> None:
