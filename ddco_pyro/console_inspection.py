@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from ddco_pyro.hdf5 import printable
 from ddco_pyro.inspection import Field, Inspection
 
 WIDTH = 160
@@ -21,13 +22,17 @@ def show(found: Inspection) -> None:
     lines = [f"{found.path}: {found.format}, {_lengths(found)}", f"control frequency: {_frequency(found)}"]
     lines += [f"mask/{name}: {len(names)} demonstrations" for name, names in found.masks.items()]
     for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
     table = Table("", "a step", "type", "range", "notes", show_edge=False)
     for one in found.fields.values():
-        table.add_row(*map(escape, (one.place, str(list(one.shape)), one.dtype, _range(one), _notes(one))))
+        table.add_row(*map(_plain, (one.place, str(list(one.shape)), one.dtype, _range(one), _notes(one))))
     console.print(table)
     for problem in found.problems:
-        console.print(f"problem: {problem}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"problem: {printable(problem)}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _plain(text: str) -> str:
+    return escape(printable(text))
 
 
 def _lengths(found: Inspection) -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import glob
 import json
 import os
+import platform
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -42,7 +44,9 @@ def whole_file(path: Path) -> Iterator[Path]:
     """
     with _explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}-", suffix=_TEMPORARY, dir=path.parent)
+        _remove_stale(path)
+        prefix = f".{path.name}-{platform.node()}-{os.getpid()}-"
+        handle, name = tempfile.mkstemp(prefix=prefix, suffix=_TEMPORARY, dir=path.parent)
         os.close(handle)
         temporary = Path(name)
         try:
@@ -56,6 +60,15 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 _TEMPORARY = ".tmp"
+
+
+def _remove_stale(path: Path) -> None:
+    """Remove what a process of this machine, killed while it wrote this very file, has left."""
+    prefix = f".{path.name}-{platform.node()}-"
+    for old in path.parent.glob(f"{glob.escape(prefix)}*{_TEMPORARY}"):
+        process = old.name.removeprefix(prefix).partition("-")[0]
+        if process.isdecimal() and not Path(f"/proc/{process}").exists():
+            old.unlink(missing_ok=True)
 
 
 def leftovers(folder: Path) -> list[Path]:

@@ -24,6 +24,14 @@ DAMAGE = (OSError, RuntimeError, ValueError, TypeError, KeyError, MemoryError)
 class DemonstrationsError(BadInput):
     """Demonstrations that cannot be used; one line with the file, the demonstration and the key."""
 
+    def __str__(self) -> str:
+        return printable(super().__str__())
+
+
+def printable(text: str) -> str:
+    """A text as one line that does nothing to a terminal: names in a file can hold anything."""
+    return "".join(one if one.isprintable() else repr(one)[1:-1] for one in text)
+
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[h5py.File]:

@@ -49,6 +49,7 @@ def make(network="mlp", counts=(3,), emits=("options",), camera=False, **rollout
     hierarchy = Hierarchy(spec, SHAPES, 2, steps=7)
     hierarchy.encoder.mean.uniform_(-3, 3)
     hierarchy.encoder.std.uniform_(0.5, 2)
+    hierarchy.encoder.mean[3:6] = 0  # of the differences: it goes to and fro
     hierarchy.scaling.scale.copy_(torch.tensor([10.0, 0.3]))
     hierarchy.scaling.shift.copy_(torch.tensor([-4.0, 1.0]))
     return Fit(Path("run"), spec, hierarchy.eval())

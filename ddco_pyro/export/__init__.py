@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -111,24 +113,32 @@ def _write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
 def _write_programs(hierarchy: Hierarchy, folder: Path, onnx: bool) -> None:
     program, inputs = StepProgram(hierarchy).eval(), example(hierarchy.encoder)
     try:
-        exported = torch.export.export(program, inputs)
-        with whole_file(folder / "controller.pt2") as temporary:
-            content = io.BytesIO()
-            torch.export.save(exported, content)
-            temporary.write_bytes(content.getvalue())
-        if onnx:
-            found = torch.onnx.export(
-                exported, inputs, input_names=input_names(hierarchy.encoder), output_names=program.names, dynamo=True,
-                verbose=False,
-            )  # fmt: skip
-            assert found is not None
-            with whole_file(folder / "controller.onnx") as temporary:
-                temporary.write_bytes(found.model_proto.SerializeToString())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # of torch about itself
+            logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, which nothing here needs
+            _write_both(program, inputs, hierarchy.encoder, folder, onnx)
     except ImportError as error:
         raise ExportError(f"--onnx needs {error.name}; install it with: pip install 'ddco-pyro[export]'") from error
     except Exception as error:  # whatever torch makes of a network of one's own
         text = " ".join(str(error).split())[:300]
         raise ExportError(f"{folder}: the networks cannot be exported: {type(error).__name__}: {text}") from error
+
+
+def _write_both(
+    program: StepProgram, inputs: tuple[torch.Tensor, ...], encoder: ObservationEncoder, folder: Path, onnx: bool
+) -> None:
+    exported = torch.export.export(program, inputs)
+    content = io.BytesIO()
+    torch.export.save(exported, content)
+    with whole_file(folder / "controller.pt2") as temporary:
+        temporary.write_bytes(content.getvalue())
+    if onnx:
+        found = torch.onnx.export(
+            exported, inputs, input_names=input_names(encoder), output_names=program.names, dynamo=True, verbose=False
+        )
+        assert found is not None
+        with whole_file(folder / "controller.onnx") as temporary:
+            temporary.write_bytes(found.model_proto.SerializeToString())
 
 
 def record(controller: Controller, encoder: ObservationEncoder) -> dict[str, np.ndarray]:
@@ -139,24 +149,33 @@ def record(controller: Controller, encoder: ObservationEncoder) -> dict[str, np.
     random = np.random.default_rng(0)
     found: dict[str, np.ndarray] = {"seeds": np.arange(EPISODES)}
     for episode in range(EPISODES):
-        seen = [_observation(encoder, random) for _ in range(STEPS)]
+        seen = _episode(encoder, random)
         controller.reset(episode)
-        acted = [(controller.act(one), controller.choices) for one in seen]
-        found |= {f"observation_{episode}_{key}": np.stack([one[key] for one in seen]) for key in seen[0]}
+        acted = [
+            (controller.act({key: one[step] for key, one in seen.items()}), controller.choices) for step in range(STEPS)
+        ]
+        found |= {f"observation_{episode}_{key}": one for key, one in seen.items()}
         found[f"controls_{episode}"] = np.stack([control for control, _ in acted])
         found[f"choices_{episode}"] = np.array([choices for _, choices in acted], dtype=int).reshape(STEPS, -1)
     return found
 
 
-def _observation(encoder: ObservationEncoder, random: np.random.Generator) -> dict[str, np.ndarray]:
+def _episode(encoder: ObservationEncoder, random: np.random.Generator) -> dict[str, np.ndarray]:
+    """Observations with the mean and spread that were fitted to, and with steps as long where those matter."""
     found: dict[str, np.ndarray] = {}
     at = 0
     for spec, size in zip(encoder.specs, encoder.sizes, strict=True):
         shape = encoder.shapes[spec.key]
+        mean, std = (one[at : at + size].numpy() for one in (encoder.mean, encoder.std))
         length = int(np.prod(shape))
-        mean, std = (one[at : at + length].numpy() for one in (encoder.mean, encoder.std))
-        found[spec.key] = (mean + std * random.normal(size=length)).reshape(shape)
+        if spec.differences:
+            start = mean[:length] + std[:length] * random.normal(size=length)
+            steps = mean[length:] + std[length:] * random.normal(size=(STEPS, length))
+            values = start + np.cumsum(steps, axis=0)
+        else:
+            values = mean + std * random.normal(size=(STEPS, length))
+        found[spec.key] = values.reshape(STEPS, *shape)
         at += size
-    for key, shape in encoder.images.items():
-        found[key] = random.integers(0, 256, shape, dtype=np.uint8)
-    return found
+    return found | {
+        key: random.integers(0, 256, (STEPS, *shape), dtype=np.uint8) for key, shape in encoder.images.items()
+    }
