@@ -26,6 +26,7 @@ from ddco_pyro.hdf5 import (
     natural,
     nearest,
     opened,
+    written,
 )
 from ddco_pyro.sources.recording import Recording, of_array
 
@@ -142,7 +143,7 @@ class Demonstrations(Sequence[Demonstration]):
 
     def write(self, path: str | Path) -> None:
         """Write an HDF5 file, whole or not at all."""
-        with whole_file(Path(path)) as temporary, h5py.File(temporary, "w") as file:
+        with whole_file(Path(path)) as temporary, written(temporary) as file:
             file.attrs.update(self.attributes)
             data = file.create_group("data")
             data.attrs["total"] = sum(self.lengths)

@@ -20,7 +20,7 @@ from torch import Tensor
 from ddco_pyro.errors import BadInput, Failed
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-_FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR}
+_FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR}
 
 
 class NoSpace(Failed):
@@ -78,17 +78,14 @@ def leftovers(folder: Path) -> list[Path]:
 
 @contextmanager
 def _explained(path: Path) -> Iterator[None]:
-    """What the system says of a place, in words. HDF5 wraps it in errors of its own that carry its number as text."""
+    """What the system says of a place, in words."""
     try:
         yield
-    except (OSError, RuntimeError) as error:
-        number = getattr(error, "errno", None)
-        said = {code for code in _FULL | _FORBIDDEN if f"errno = {code}," in str(error)}
-        known = {number, *said} - {None}
-        if known & _FULL:
+    except OSError as error:
+        if error.errno in _FULL:
             raise NoSpace(f"{path}: there is no room to write it; free some space, then do the same again") from error
-        if number in _FORBIDDEN:
-            text = os.strerror(number)
+        if error.errno in _FORBIDDEN:
+            text = os.strerror(error.errno)
             raise NotWritable(f"{path}: cannot be written: {text}; choose another place or change this one") from error
         raise
 

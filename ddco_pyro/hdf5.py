@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import difflib
+import io
 import re
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
 
-from ddco_pyro.errors import BadInput
+from ddco_pyro.errors import BadInput, Failed
 
 Attribute = float | int | str | bool
 
@@ -44,13 +45,79 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
             yield file
     except DemonstrationsError as error:
         raise DemonstrationsError(f"{path}: {error}") from None
-    except BadInput:
+    except (BadInput, Failed):
         raise
     except FileNotFoundError:
         raise DemonstrationsError(f"{path}: there is no such file; check the path") from None
     except DAMAGE as error:
         text = " ".join(str(error).split())
         raise DemonstrationsError(f"{path}: cannot be read as HDF5, or is damaged: {text}") from error
+
+
+class _Disk(io.RawIOBase):
+    """A file that keeps the first error of writing to itself: HDF5 can crash the process where a write fails.
+
+    From then on nothing is written any more, and ``error`` says why.
+    """
+
+    def __init__(self, path: Path, mode: Literal["w+", "r+"]) -> None:
+        super().__init__()
+        self._file = io.FileIO(path, mode)
+        self.error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        """Write all of it."""
+        rest = memoryview(data).cast("B")
+        size = len(rest)
+        while rest and self.error is None:
+            try:
+                rest = rest[self._file.write(rest) :]
+            except OSError as error:
+                self.error = error
+        return size
+
+    def readinto(self, buffer: Any) -> int:
+        """Read what is there, and zeros for what could not be written."""
+        view = memoryview(buffer).cast("B")
+        done = self._file.readinto(view) or 0
+        view[done:] = bytes(len(view) - done)
+        return len(view)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Go to a place."""
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        """Where it is."""
+        return self._file.tell()
+
+    def truncate(self, size: int | None = None) -> int:
+        """Cut it, or make it longer."""
+        try:
+            return self._file.truncate(size) if self.error is None else 0
+        except OSError as error:
+            self.error = error
+            return 0
+
+    def close(self) -> None:
+        """Close it."""
+        self._file.close()
+        super().close()
+
+
+@contextmanager
+def written(path: Path, mode: Literal["w", "r+"] = "w") -> Iterator[h5py.File]:
+    """An HDF5 file, open for writing; where a write fails, that is raised when all has been closed.
+
+    :param mode: ``w`` for a new file, ``r+`` for changing one.
+    """
+    with closing(_Disk(path, "w+" if mode == "w" else "r+")) as disk:
+        try:
+            with h5py.File(disk, mode) as file:
+                yield file
+        finally:
+            if disk.error is not None:
+                raise disk.error
 
 
 def natural(name: str) -> list[tuple[int, str]]:

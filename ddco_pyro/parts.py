@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from ddco_pyro.files import leftovers, only_one, whole_file, write_text
-from ddco_pyro.hdf5 import Attribute, attributes_of, natural, opened
+from ddco_pyro.hdf5 import Attribute, attributes_of, natural, opened, written
 from ddco_pyro.sources.recording import Column, Recording
 
 PART_BYTES = 64 * 2**20
@@ -53,7 +53,7 @@ class Parts:
         if not self._open:
             return
         part = self.folder / f"{len(self._files()):06d}.hdf5"
-        with whole_file(part) as temporary, h5py.File(temporary, "w") as file:
+        with whole_file(part) as temporary, written(temporary) as file:
             for recording in self._open:
                 write_recording(file.create_group(recording.name, track_order=True), recording)
         self.done += [recording.name for recording in self._open]
@@ -76,7 +76,7 @@ class Parts:
         :param data: of its group ``data``.
         """
         self.close()
-        with whole_file(self.path) as temporary, h5py.File(temporary, "w") as file:
+        with whole_file(self.path) as temporary, written(temporary) as file:
             file.attrs.update(attributes)
             group = file.create_group("data")
             total = 0

@@ -5,12 +5,11 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from ddco_pyro.errors import BadInput
 from ddco_pyro.files import whole_file
-from ddco_pyro.hdf5 import opened
+from ddco_pyro.hdf5 import opened, written
 from ddco_pyro.segmenting import Segmented, Segments
 
 BOUNDARY = "_boundary"
@@ -41,7 +40,7 @@ def write_labels(path: Path, out: Path, found: Segmented) -> None:
     _refuse_others(path, found)
     with whole_file(out) as temporary:
         shutil.copyfile(path, temporary)
-        with h5py.File(temporary, "r+") as file:
+        with written(temporary, "r+") as file:
             for one in found.segments:
                 group = file["data"][one.name].require_group("labels")
                 for name, values in labels_of(one).items():
