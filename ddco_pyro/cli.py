@@ -85,7 +85,7 @@ def fit(
     found = load_spec(spec, overrides)
     from ddco_pyro import run
     from ddco_pyro.data import check_networks, demonstrations, dimensions
-    from ddco_pyro.report import write_report
+    from ddco_pyro.report import degeneracies, write_report
 
     check_networks(found, dimensions(found))  # before anything is collected, trained or written
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -98,6 +98,7 @@ def fit(
         print(f"interrupted; continue with: ddco-pyro fit {resolved} --out {folder} --resume", file=sys.stderr)
         raise typer.Exit(1) from None
     console.log_likelihoods(fitted.metrics)
+    console.warnings(degeneracies(fitted.spec, fitted.metrics))
     print(f"report: {write_report(fitted, demonstrations(found))}")
 
 

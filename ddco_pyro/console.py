@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 if TYPE_CHECKING:
     from ddco_pyro.data import Dimensions
@@ -134,8 +135,19 @@ def log_likelihoods(metrics: Mapping[str, Any]) -> None:
     for name, row in rows.items():
         values, difference = row["log_likelihood_per_step"], row.get("difference")
         shown = f"{difference['nats_per_step']:+.3f} ± {difference['standard_error']:.3f}" if difference else ""
-        table.add_row(name, f"{values['train']:.3f}", f"{values['valid']:.3f}", shown)
+        table.add_row(name, *(_number(values[part]) for part in ("train", "valid")), shown)
     Console().print(table)
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def warnings(found: Sequence[tuple[str, str]]) -> None:
+    """Signs of a degenerate solution, each in words and with what usually helps."""
+    console = Console()
+    for what, advice in found:
+        console.print(Text(f"warning: {what} {advice}"), soft_wrap=True)
 
 
 def successes(results: Mapping[str, Any]) -> None:
