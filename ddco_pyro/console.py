@@ -15,6 +15,7 @@ from rich.text import Text
 if TYPE_CHECKING:
     from ddco_pyro.data import Dimensions
     from ddco_pyro.hierarchy import Hierarchy
+    from ddco_pyro.selection import Choice
     from ddco_pyro.spec import Spec
 
 PLAIN_SECONDS = 10.0
@@ -102,6 +103,26 @@ class Fitting(Collecting):
         self.end()
 
 
+class Selecting(Fitting):
+    """Shows how a cross-validation goes on (a :class:`ddco_pyro.selection.Watcher`), and the fit that follows."""
+
+    def selecting(self, total: int, kept: int) -> None:
+        """So many (candidate, fold) are to be scored in all, of which some were kept from before."""
+        note = f" ({kept} of {total} kept from before)" if kept else ""
+        self.begin(f"cross-validation{note}", total - kept)
+
+    def scored(self, candidate: str, fold: int, failed: str) -> None:
+        """One has been scored, or has failed."""
+        if failed:
+            self._say(f"{candidate}, fold {fold} failed: {failed}")
+        self.advance(self._done + 1, f"{candidate}, fold {fold}")
+
+    def given_up(self, candidate: str, folds: int) -> None:
+        """A candidate has been stopped early: so many of its folds need not be scored."""
+        self._say(f"{candidate}: stopped early, {folds} folds less")
+        self.advance(self._done + folds)
+
+
 class Rolling(_Bar):
     """Shows how many episodes have been rolled out."""
 
@@ -137,6 +158,16 @@ def log_likelihoods(metrics: Mapping[str, Any]) -> None:
         shown = f"{difference['nats_per_step']:+.3f} ± {difference['standard_error']:.3f}" if difference else ""
         table.add_row(name, *(_number(values[part]) for part in ("train", "valid")), shown)
     Console().print(table)
+
+
+def selection(choice: Choice, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """The candidates of a selection, with what has to be known to read the numbers."""
+    table = Table(*head, title="held-out log-likelihood by cross-validation, nats per step", show_edge=False)
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    Console().print(table)
+    for note in choice.notes:
+        Console().print(Text(f"note: {note}"), soft_wrap=True)
 
 
 def _number(value: float | None) -> str:

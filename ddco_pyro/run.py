@@ -81,10 +81,7 @@ class Fit:
 
     def log_likelihood(self, demos: Demonstrations) -> np.ndarray:
         """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units."""
-        with torch.no_grad():
-            batch = encode(demos, self.hierarchy.encoder, self.hierarchy.scaling)
-            found: np.ndarray = log_likelihood(self.hierarchy.tabulate(batch), batch.lengths).numpy()
-            return found
+        return log_likelihoods(self.hierarchy, demos)
 
     def posterior(self, demos: Demonstrations) -> Posterior:
         """u, v and w of §4.1 for every level."""
@@ -107,6 +104,14 @@ class Fit:
     def controller(self, seed: int = 0) -> Controller:
         """The model as a policy that acts, as the spec's ``rollout`` says."""
         return Controller.from_spec(self.hierarchy, self.spec.rollout, seed)
+
+
+def log_likelihoods(hierarchy: Hierarchy, demos: Demonstrations) -> np.ndarray:
+    """log p(ξ) of each demonstration under a trained hierarchy, nats, [N]."""
+    with torch.no_grad():
+        batch = encode(demos, hierarchy.encoder, hierarchy.scaling)
+        found: np.ndarray = log_likelihood(hierarchy.tabulate(batch), batch.lengths).numpy()
+        return found
 
 
 def model_name(spec: Spec) -> str:
@@ -241,7 +246,7 @@ def train(
     :raises TrainingError: a log-likelihood is not finite, or the engines disagree.
     """
     kept, tune = demos.split(spec.training.tune_fraction, spec.seed)
-    with _one_thread():
+    with one_thread():
         return _train(spec, dimensions, (kept, tune), watcher, checkpoint)
 
 
@@ -346,8 +351,8 @@ def _supervisor(demos: Demonstrations) -> dict[str, Any]:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Gradient steps of small networks on one thread: faster than on several, and the same on every machine."""
+def one_thread() -> Iterator[None]:
+    """Inside, torch works on one thread: faster than on several where networks are small, and the same everywhere."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
