@@ -1,4 +1,4 @@
-"""The command line: ``ddco-pyro check | collect | fit | rollout | report``.
+"""The command line: ``ddco-pyro check | collect | fit | select | compare | rollout | report``.
 
 Every command ends with 0 (done), 1 (failed) or 2 (bad input), and says in one line what is wrong, where, and what to
 do; ``--debug`` shows the traceback.
@@ -156,6 +156,24 @@ def select(
     console.warnings(degeneracies(fitted.spec, fitted.metrics))
     print(f"selection: {folder / 'selection.json'}")
     print(f"report: {write_report(fitted, demonstrations(fitted.spec))}")
+
+
+@app.command(epilog="Example: ddco-pyro compare runs/needle runs/needle/baselines/flat runs/other")
+def compare(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN RUN...", help="Run folders; a run's baselines are some too.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="The folder to write to; by default runs/compare-TIME.")] = None,
+) -> None:
+    """Compare runs on the demonstrations that all of them held out, and on rollouts from the same initial states."""
+    from ddco_pyro import comparison
+    from ddco_pyro.comparison import page
+
+    found = comparison.compare(runs)
+    console.comparison(page.HEAD, [page.cells(row) for row in found.rows])
+    if found.rollouts:
+        console.comparison(page.ROLLOUT_HEAD, page.rollout_cells(found))
+    print(f"comparison: {comparison.write(found, out or Path('runs') / time.strftime('compare-%Y%m%d-%H%M%S'))}")
 
 
 @app.command(epilog="Example: ddco-pyro rollout runs/needle --episodes 200 --video")

@@ -170,6 +170,14 @@ def selection(choice: Choice, head: Sequence[str], rows: Sequence[Sequence[str]]
         Console().print(Text(f"note: {note}"), soft_wrap=True)
 
 
+def comparison(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Runs, the best first."""
+    table = Table(*head, show_edge=False)
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    Console().print(table)
+
+
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
