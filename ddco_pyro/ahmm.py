@@ -193,37 +193,35 @@ class Tabulated(TorchDistribution):
     respect to a table is the posterior probability of its entries.
     """
 
-    arg_constraints: ClassVar = {"log_probs": constraints.real_vector}
+    arg_constraints: ClassVar = {"logits": constraints.real_vector}
     has_enumerate_support = True
 
-    def __init__(self, log_probs: Tensor, validate_args: bool | None = None) -> None:
-        self.log_probs = log_probs
-        super().__init__(log_probs.shape[:-1], validate_args=validate_args)
+    def __init__(self, logits: Tensor, validate_args: bool | None = None) -> None:
+        self.logits = logits
+        super().__init__(logits.shape[:-1], validate_args=validate_args)
 
     @property
     def support(self) -> constraints.Constraint:
         """The choices 0 to C - 1."""
-        return constraints.integer_interval(0, self.log_probs.shape[-1] - 1)
+        return constraints.integer_interval(0, self.logits.shape[-1] - 1)
 
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Tabulated:
         """The same choice for a larger batch."""
-        return Tabulated(self.log_probs.expand(*batch_shape, -1), validate_args=False)
+        return Tabulated(self.logits.expand(*batch_shape, -1), validate_args=False)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """The table's entries at ``value``."""
-        return Vindex(self.log_probs)[..., value.long()]
+        return Vindex(self.logits)[..., value.long()]
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
         """Every choice, along a new first dimension."""
-        values = torch.arange(self.log_probs.shape[-1], device=self.log_probs.device)
+        values = torch.arange(self.logits.shape[-1], device=self.logits.device)
         values = values.reshape((-1,) + (1,) * len(self.batch_shape))
         return values.expand((-1, *self.batch_shape)) if expand else values
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
         """A draw from the choices."""
-        return torch.distributions.Categorical(logits=self.log_probs, validate_args=False).sample(
-            torch.Size(sample_shape)
-        )
+        return torch.distributions.Categorical(logits=self.logits, validate_args=False).sample(torch.Size(sample_shape))
 
 
 def choose(t: int, now: Step, previous: tuple[Tensor, ...] | None) -> tuple[Tensor, ...]:
@@ -271,3 +269,12 @@ def ahmm(chain: Chain) -> None:
         for t in pyro.markov(range(len(steps))):
             choices = choose(t, steps[t], choices)
             pyro.factor(f"a_{t}", Vindex(steps[t].emission)[(rows, *reversed(choices))])
+
+
+def draw(chain: Chain) -> tuple[Tensor, ...]:
+    """Choices of every level drawn from the chain run forward, whatever its emissions, each [N, T], lowest first."""
+    found: list[tuple[Tensor, ...]] = []
+    with pyro.poutine.block():
+        for t, now in enumerate(chain.steps()):
+            found.append(choose(t, now, found[-1] if found else None))
+    return tuple(torch.stack(level, dim=1) for level in zip(*found, strict=True))

@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from ddco_pyro.ahmm import Tables, complete
 from ddco_pyro.inference import logspace
 from ddco_pyro.inference.kernel import forward_backward
-from ddco_pyro.inference.structure import structure_of
+from ddco_pyro.inference.structure import Structure, structure_of
 from ddco_pyro.inference.threads import as_many_threads_as_torch
 
 
@@ -67,43 +67,60 @@ class _Eliminate(torch.autograd.Function):
 
 def eliminate(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elimination:
     """Log-likelihoods and posteriors of tables on the CPU with at least one option level."""
-    structure = structure_of(tables)
-    control = torch.cat([table.double() for table in tables.control], dim=-1)
+    control = torch.cat([table.detach() for table in tables.control], dim=-1).double()
     shift = control.amax(-1, keepdim=True)
     shift = torch.where(torch.isfinite(shift), shift, 0.0)
     rows = _rows(tables.selection), _rows(tables.termination), (control - shift).exp_()
-    results = [torch.empty_like(table) for table in rows]
-    number, steps = control.shape[:2]
-    choices = torch.empty(number, steps, sum(structure.sizes) if marginals else 0, dtype=torch.float64)
-    value, exact = np.empty(number), np.empty(number, dtype=np.bool_)
-    with as_many_threads_as_torch():
-        forward_backward(  # type: ignore[call-arg]
-            *_arrays(*rows), _weight(tables), lengths.numpy(), value, exact, *_arrays(*results, choices),
-            structure.sizes, structure.starts, structure.selects, structure.ends, structure.actors, structure.choices,
-        )  # fmt: skip
-    alive = torch.arange(steps) < lengths[:, None]
+    value, exact, results, choices = run(structure_of(tables), rows, _weight(tables), lengths, marginals)
+    alive = torch.arange(control.shape[1]) < lengths[:, None]
     found = Elimination(
-        torch.from_numpy(value).add_((shift.squeeze(-1) * alive).sum(1)),
+        value + (shift.squeeze(-1) * alive).sum(1),
         Tables(
             _unrows(results[0], tables.selection),
             _unrows(results[1], tables.termination),
             _unrows(results[2], tables.control),
         ),
-        choices.split(structure.sizes, dim=-1) if marginals else (),
+        choices.split([table.shape[-1] for table in tables.selection], dim=-1) if marginals else (),
     )
-    for n in np.flatnonzero(~exact):
+    for n in torch.nonzero(~exact).flatten():
         _again(tables, int(n), int(lengths[n]), found)
     return found
 
 
-def _arrays(*tables: Tensor) -> list[Any]:
+Rows = tuple[Tensor, Tensor, Tensor]
+"""Probabilities of selections and terminations and scaled densities of the controls, float64 [N, T, ...]: the levels'
+tables side by side, as :class:`ddco_pyro.inference.structure.Structure` orders them.
+"""
+
+
+def run(
+    structure: Structure, rows: Rows, weight: Tensor, lengths: Tensor, marginals: bool = False
+) -> tuple[Tensor, Tensor, Rows, Tensor]:
+    """The compiled pass: log-likelihoods [N], whether they are exact [N], posteriors of the rows, choices' marginals.
+
+    :param weight: factors of the joint choices, float64 [N, T, S], or [N, T, 0] where there are none.
+    """
+    select, end, emission = rows
+    results = torch.empty_like(select), torch.empty_like(end), torch.empty_like(emission)
+    number, steps = emission.shape[:2]
+    choices = emission.new_empty(number, steps, sum(structure.sizes) if marginals else 0)
+    value, exact = emission.new_empty(number), torch.empty(number, dtype=torch.bool)
+    with as_many_threads_as_torch():
+        forward_backward(  # type: ignore[call-arg]
+            *_arrays(*rows, weight, lengths, value, exact, *results, choices),  # type: ignore[arg-type]
+            structure.sizes, structure.starts, structure.selects, structure.ends, structure.actors, structure.choices,
+        )  # fmt: skip
+    return value, exact, results, choices
+
+
+def _arrays(*tables: Tensor) -> list[np.ndarray]:
     return [table.numpy() for table in tables]
 
 
 def _rows(tables: Sequence[Tensor]) -> Tensor:
     """exp of each level's table, flattened and side by side, [N, T, ...]."""
-    flat = [table.detach().flatten(2).double() for table in tables]
-    return torch.cat(flat, dim=-1).exp_() if len(flat) > 1 else flat[0].exp().contiguous()
+    flat = [table.detach().flatten(2) for table in tables]
+    return torch.cat(flat, dim=-1).to(torch.float64, copy=True).exp_()
 
 
 def _unrows(rows: Tensor, tables: Sequence[Tensor]) -> tuple[Tensor, ...]:
@@ -111,13 +128,12 @@ def _unrows(rows: Tensor, tables: Sequence[Tensor]) -> tuple[Tensor, ...]:
     return tuple(part.reshape(table.shape) for part, table in zip(parts, tables, strict=True))
 
 
-def _weight(tables: Tables) -> np.ndarray:
+def _weight(tables: Tables) -> Tensor:
     """exp of the evidence of every joint choice, [N, T, S]; [N, T, 0] without evidence."""
     joint = tables.joint_evidence()
     if joint is None:
-        return np.empty((*tables.control[-1].shape[:2], 0))
-    found: np.ndarray = joint.detach().exp().flatten(2).numpy()
-    return found
+        return torch.empty(*tables.control[-1].shape[:2], 0, dtype=torch.float64)
+    return joint.detach().exp().flatten(2)
 
 
 def _again(tables: Tables, n: int, length: int, found: Elimination) -> None:

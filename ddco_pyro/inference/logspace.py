@@ -7,6 +7,8 @@ passed on is spread by the selections and joins what was kept.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -22,32 +24,43 @@ def log_sum(values: Tensor) -> Tensor:
 
 def log_likelihood(chain: Chain) -> Tensor:
     """log p(ξ) of each trajectory, [N], differentiable in the chain's tables."""
-    first, *later = chain.steps()
-    message = _select(first.emission.new_zeros(len(first.emission)), first, []) + first.emission
-    for now in later:
-        message = _transition(message, now) + now.emission
+    message: Tensor | None = None
+    for now in chain.steps():
+        message = arrive(message, now).message + now.emission
+    assert message is not None  # there is a step
     return log_sum(message.flatten(1)) if chain.selection else message
 
 
-def _transition(message: Tensor, now: Step) -> Tensor:
-    """Mass over the joint choices at t - 1 to mass over those at t, both [N, C_D, ..., C_1]."""
+class Arrival(NamedTuple):
+    """What is expected at a step, before its control is seen.
+
+    :param message: log-mass over the joint choices, [N, C_D, ..., C_1].
+    :param kept: the part that kept its choice at level d, having terminated below it, [N, C_D, ..., C_d] for each.
+    :param selected: the part that selected a choice at level d, shapes likewise.
+    """
+
+    message: Tensor
+    kept: list[Tensor]
+    selected: list[Tensor]
+
+
+def arrive(message: Tensor | None, now: Step) -> Arrival:
+    """From the log-mass over the joint choices at t - 1 to what is expected at t; None: t = 0."""
     kept: list[Tensor] = []
-    for table in now.termination:
-        keep, terminate = _along_last(table[..., 0], message), _along_last(table[..., 1], message)
-        kept.append(message + keep)
-        message = log_sum(message + terminate)
-    return _select(message, now, kept)
-
-
-def _select(message: Tensor, now: Step, kept: list[Tensor]) -> Tensor:
-    """Spread what terminated, [N], over the choices of every level from the highest down; add what was kept."""
+    if message is None:
+        message = now.emission.new_zeros(len(now.emission))  # everything is selected
+    else:
+        for table in now.termination:
+            keep, terminate = _along_last(table[..., 0], message), _along_last(table[..., 1], message)
+            kept.append(message + keep)
+            message = log_sum(message + terminate)
+    selected: list[Tensor] = []
     for level in range(len(now.selection), 0, -1):
         table = now.selection[level - 1]
         table = table.squeeze(1) if level == len(now.selection) else _along_last_two(table, message)
-        message = message.unsqueeze(-1) + table
-        if kept:
-            message = log_sum(torch.stack([message, kept[level - 1]], dim=-1))
-    return message
+        selected.insert(0, message.unsqueeze(-1) + table)
+        message = log_sum(torch.stack([selected[0], kept[level - 1]], dim=-1)) if kept else selected[0]
+    return Arrival(message, kept, selected)
 
 
 def _along_last(table: Tensor, message: Tensor) -> Tensor:
