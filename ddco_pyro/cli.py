@@ -138,12 +138,13 @@ def select(
     from ddco_pyro.report import degeneracies, write_report
     from ddco_pyro.selection.table import HEAD, cells
 
-    selection.check(found)  # before anything is collected, trained or written
+    workers = selection.Workers(jobs, scheduler)
+    selection.check(found, workers)  # before anything is collected, trained or written
     folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"
     run.claim(folder, found, resume)
     try:
         with console.Selecting() as watcher:
-            made = selection.select(found, folder, watcher, selection.Workers(jobs, scheduler), stop_early)
+            made = selection.select(found, folder, watcher, workers, stop_early)
             watcher.end()
             assert made.choice.chosen is not None  # or it would have failed
             final = selection.final_spec(found, made.choice.chosen.candidate)

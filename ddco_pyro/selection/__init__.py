@@ -60,11 +60,12 @@ class Selection:
     folds: Folds
 
 
-def check(spec: Spec) -> list[Candidate]:
+def check(spec: Spec, workers: Workers = HERE) -> list[Candidate]:
     """The candidates, all of them valid, without collecting or training anything.
 
     :raises SpecError: a candidate is not valid, or the grid is empty.
     :raises FoldError: there are fewer demonstrations than folds.
+    :raises BackendError: the workers cannot be reached.
     """
     found = grid.candidates(spec, dimensions(grid.wide(spec)))
     own = spec.demonstrations
@@ -72,6 +73,7 @@ def check(spec: Spec) -> list[Candidate]:
         dividing.assign(own.count, spec.selection.folds, spec.seed)
     else:
         dividing.divide(demonstrations(grid.wide(spec)), spec.selection.folds, spec.seed)
+    workers.check()
     return found
 
 

@@ -26,17 +26,33 @@ class BackendError(BadInput):
 
 @dataclass(frozen=True)
 class Workers:
-    """Who runs the folds: ``jobs`` processes here (-1: one for each core), or the workers of a dask ``scheduler``."""
+    """Who runs the folds: ``jobs`` processes here (-1: one for each core), or the workers of a dask ``scheduler``.
+
+    :raises BackendError: no process at all.
+    """
 
     jobs: int = -1
     scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.jobs != -1 and self.jobs < 1:
+            raise BackendError(f"--jobs {self.jobs}: give a number of processes, or -1 for one on each core")
+
+    def check(self) -> None:
+        """See that they are there.
+
+        :raises BackendError: dask is not installed, no scheduler answers, or it has no workers.
+        """
+        if self.scheduler is not None:
+            with _client(self.scheduler):
+                pass
 
 
 @contextmanager
 def pool(workers: Workers) -> Iterator[Parallel]:
     """Processes for as many calls of :func:`scores` as are needed.
 
-    :raises BackendError: dask is not installed, or no scheduler answers.
+    :raises BackendError: dask is not installed, no scheduler answers, or it has no workers.
     """
     # One task at a time: a fold takes long, and whatever has been scored shall be kept at once.
     settings = {"n_jobs": workers.jobs, "return_as": "generator_unordered", "batch_size": 1}
