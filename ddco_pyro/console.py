@@ -146,7 +146,7 @@ def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy) -> None:
     table.add_row("control", str([size.control_size]))
     for name, network in hierarchy.named_networks():
         table.add_row(name, str(sum(parameter.numel() for parameter in network.parameters())))
-    Console().print(table)
+    _show(table)
 
 
 def log_likelihoods(metrics: Mapping[str, Any]) -> None:
@@ -157,7 +157,7 @@ def log_likelihoods(metrics: Mapping[str, Any]) -> None:
         values, difference = row["log_likelihood_per_step"], row.get("difference")
         shown = f"{difference['nats_per_step']:+.3f} ± {difference['standard_error']:.3f}" if difference else ""
         table.add_row(name, *(_number(values[part]) for part in ("train", "valid")), shown)
-    Console().print(table)
+    _show(table)
 
 
 def selection(choice: Choice, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -165,7 +165,7 @@ def selection(choice: Choice, head: Sequence[str], rows: Sequence[Sequence[str]]
     table = Table(*head, title="held-out log-likelihood by cross-validation, nats per step", show_edge=False)
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
-    Console().print(table)
+    _show(table)
     for note in choice.notes:
         Console().print(Text(f"note: {note}"), soft_wrap=True)
 
@@ -175,7 +175,18 @@ def comparison(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     table = Table(*head, show_edge=False)
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
-    Console().print(table)
+    _show(table)
+
+
+WIDE = 200
+"""Columns of a file or a pipe, which have no width of their own."""
+
+
+def _show(table: Table) -> None:
+    """Nothing is cut: what is too long for a terminal goes on in the next line."""
+    for column in table.columns:
+        column.overflow = "fold"
+    Console(width=None if Console().is_terminal else WIDE).print(table)
 
 
 def _number(value: float | None) -> str:
@@ -196,7 +207,7 @@ def successes(results: Mapping[str, Any]) -> None:
     table = Table("method", *measures, title=f"{results['episodes']} episodes each", show_edge=False)
     for name, one in methods.items():
         table.add_row(name, *(_measure(one["measures"][measure]) for measure in measures))
-    Console().print(table)
+    _show(table)
 
 
 def _measure(one: Mapping[str, Any]) -> str:
