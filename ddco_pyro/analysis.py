@@ -14,8 +14,8 @@ import torch
 from sklearn.metrics import normalized_mutual_info_score
 from torch import Tensor
 
-from ddco_pyro.hierarchy import Decision, Outputs
 from ddco_pyro.inference import Posterior
+from ddco_pyro.outputs import Decision, Outputs
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,9 @@ import pytest
 import torch
 from oracle import brute_force, random_tables
 
-from ddco_pyro.ahmm import NEVER
 from ddco_pyro.analysis import agreement, as_rows, divergences, option_use, paired
-from ddco_pyro.hierarchy import Decision, Outputs
 from ddco_pyro.inference import Posterior, posterior
+from ddco_pyro.outputs import Decision, Outputs
 
 
 def test_use_of_options_by_sums_over_every_path():
@@ -49,10 +48,10 @@ def test_an_option_that_is_never_selected_has_no_duration():
 def hybrid():
     """Three callers that choose among control and two options below, in two trajectories of four steps."""
     random = torch.Generator().manual_seed(0)
-    selection = torch.randn(2, 4, 3, 3, generator=random, dtype=torch.float64).log_softmax(-1)
+    logits = torch.randn(2, 4, 3, 3, generator=random, dtype=torch.float64)
     mean = torch.randn(2, 4, 3, 2, generator=random, dtype=torch.float64)
     u = torch.rand(2, 4, 4, generator=random, dtype=torch.float64)
-    return Decision(selection, mean, torch.tensor([0.5, 2.0], dtype=torch.float64)), u
+    return Decision(2, logits, mean, torch.tensor([0.5, 2.0], dtype=torch.float64)), u
 
 
 def act(decision, n, t, i):
@@ -83,11 +82,11 @@ def test_divergences_of_policies_that_emit_one_kind_of_thing(hybrid):
     same = Posterior((u,), (u,), (u,))
     apart = (decision.mean[:, :, 0] - decision.mean[:, :, 1]) / decision.std
     weight = u[..., 1] + u[..., 2]
-    (found,) = divergences(Outputs((Decision(None, decision.mean, decision.std), decision), ()), same)
+    (found,) = divergences(Outputs((Decision(0, None, decision.mean, decision.std), decision), ()), same)
     assert found[0]["divergence"] == pytest.approx(float((weight * apart.square().sum(-1) / 2).sum() / weight.sum()))
-    options = torch.cat([torch.full((2, 4, 3, 1), NEVER), decision.selection[..., 1:].log_softmax(-1)], -1)
-    (found,) = divergences(Outputs((Decision(options, None, decision.std), decision), ()), same)
-    p, q = options[:, :, 0, 1:], options[:, :, 1, 1:]
+    options = decision.logits[..., 1:]
+    (found,) = divergences(Outputs((Decision(2, options, None, decision.std), decision), ()), same)
+    p, q = (options[:, :, i].log_softmax(-1) for i in (0, 1))
     both = ((p.exp() - q.exp()) * (p - q)).sum(-1) / 2
     assert found[0]["divergence"] == pytest.approx(float((weight * both).sum() / weight.sum()))
     never = torch.zeros_like(u)
