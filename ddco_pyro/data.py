@@ -84,6 +84,14 @@ def dimensions(spec: Spec) -> Dimensions:
         environment.close()
 
 
+def parts(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
+    """The demonstrations to train with, ``train``, and those held out, ``valid``, left out where there are none."""
+    if spec.demonstrations.valid_fraction == 0 and not demos.masks.keys() & {"train", "valid"}:
+        return {"train": demos}
+    train, valid = demos.split(spec.demonstrations.valid_fraction, spec.seed)
+    return {"train": train, "valid": valid}
+
+
 def demonstrations(spec: Spec, on_demonstration: OnDemonstration | None = None) -> Demonstrations:
     """The spec's demonstrations: read from its file, collected from its task's supervisor where there is none.
 

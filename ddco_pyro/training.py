@@ -97,7 +97,7 @@ class Trainer:
     """Trains a hierarchy on ``train``, stopping and choosing among restarts by ``tune``.
 
     :param make: a freshly initialised hierarchy; called under a seed of its own for each restart.
-    :param checkpoint: where the state is kept at the end of epochs.
+    :param checkpoint: where the state is kept at the end of epochs; None for a training too short to be continued.
     :param names: names of the demonstrations in ``train``, for messages.
     :param on_epoch: called with each new row of the history.
     """
@@ -108,7 +108,7 @@ class Trainer:
         make: Callable[[], Hierarchy],
         train: Batch,
         tune: Batch,
-        checkpoint: Path,
+        checkpoint: Path | None,
         names: list[str],
         on_epoch: OnEpoch,
     ) -> None:
@@ -200,13 +200,15 @@ class Trainer:
         self._save(model, None)
 
     def _save(self, model: Hierarchy, optimizer: torch.optim.Optimizer | None) -> None:
+        if self.checkpoint is None:
+            return
         self._saved["model"] = _copy(model)
         self._saved["optimizer"] = {} if optimizer is None else _optimizer_state(optimizer)
         tensors = {f"{part}/{name}": value for part, state in self._saved.items() for name, value in state.items()}
         write_tensors(self.checkpoint, tensors, {"progress": json.dumps(asdict(self.progress))})
 
     def _load(self) -> None:
-        if not self.checkpoint.exists():
+        if self.checkpoint is None or not self.checkpoint.exists():
             return
         tensors, metadata = read_tensors(self.checkpoint)
         self.progress = Progress(**json.loads(metadata["progress"]))

@@ -21,8 +21,8 @@ class DemonstrationsSpec(Model):
     """Seed of the first collected episode."""
     supervisor: Text = "supervisor"
     """Which of the task's scripted policies is recorded."""
-    valid_fraction: Fraction = 0.1
-    """Part of the demonstrations held out for validation, where the file has no ``mask/valid``."""
+    valid_fraction: Share = 0.1
+    """Part of the demonstrations held out for validation, where the file has no ``mask/valid``; 0 for none."""
     labels: Text | None = None
     """Name of ground-truth labels in the file; the discovered options are compared with them (NMI)."""
 

@@ -52,7 +52,7 @@ class Spec(Model):
 
     @model_validator(mode="after")
     def _consistent(self) -> Spec:
-        problems = [*self._choices(), *self._repeated_observations()]
+        problems = [*self._choices(), *self._repeated_observations(), *self._nothing_held_out()]
         if problems:
             raise invalid(*problems)
         if self.selection.grid:
@@ -68,6 +68,10 @@ class Spec(Model):
             yield "hierarchy", "missing; declare a hierarchy, or a baseline in its place"
         if self.hierarchy is not None and self.baseline is not None:
             yield "baseline", "stands beside hierarchy; keep one of them (compare_with takes baselines to train beside)"
+
+    def _nothing_held_out(self) -> Iterator[tuple[str, str]]:
+        if self.compare_with and self.demonstrations.valid_fraction == 0:
+            yield "compare_with", "needs demonstrations held out to compare on; raise demonstrations.valid_fraction"
 
     def _repeated_observations(self) -> Iterator[tuple[str, str]]:
         keys = [observation.key for observation in self.observations]
