@@ -38,7 +38,7 @@ def one_seed(seed: int) -> dict[str, Any]:
     demos, _ = plant(truth, DEMONSTRATIONS, STEPS, seed=1000 + seed)
     held_out, choices = plant(truth, HELD_OUT, STEPS, seed=2000 + seed)
     for way, lower in WAYS.items():
-        spec = make_spec(COUNTS, seed, CONTROL, **{**TRAINING, "restarts": 1, "lower_levels": lower})
+        spec = make_spec(COUNTS, seed, CONTROL, **{**TRAINING, "lower_levels": lower})
         with tempfile.TemporaryDirectory() as folder:
             found[way] = recovered(make_trainer(spec, demos, Path(folder)).run(), truth, held_out, choices)
     print(seed, found, flush=True)
