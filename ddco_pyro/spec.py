@@ -220,6 +220,8 @@ class DemonstrationsSpec(_Model):
 
     path: Text | None = None
     """HDF5 file in robomimic's layout; without it they are collected in the task."""
+    task: Text | None = None
+    """Task in which they are collected, such as one whose episodes are single demonstrations; null: the spec's own."""
     count: int = Field(default=100, ge=2)
     """Number of demonstrations to collect."""
     seed: Seed = 0
@@ -381,6 +383,11 @@ class Spec(_Model):
     seed: Seed = 0
     """Seed of everything random that has no seed of its own."""
 
+    @property
+    def demonstrated_task(self) -> str | None:
+        """Name of the task in which demonstrations are collected; None where there is only a file."""
+        return self.demonstrations.task or self.task
+
     @model_validator(mode="after")
     def _consistent(self) -> Spec:
         problems = [*self._choices(), *self._repeated_observations()]
@@ -393,7 +400,7 @@ class Spec(_Model):
         return self
 
     def _choices(self) -> Iterator[tuple[str, str]]:
-        if self.task is None and self.demonstrations.path is None:
+        if self.demonstrated_task is None and self.demonstrations.path is None:
             yield "task", "missing; name a task, or give a file in demonstrations.path"
         if self.hierarchy is None and self.baseline is None:
             yield "hierarchy", "missing; declare a hierarchy, or a baseline in its place"
