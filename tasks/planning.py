@@ -55,6 +55,8 @@ def plan_path(
     :raises NoPath: when an end is not free, or the planner gives up.
     """
     for name, end in (("start", start), ("goal", goal)):
+        if np.any(end < ranges[:, 0]) or np.any(end > ranges[:, 1]):
+            raise NoPath(f"the {name} of the path is beyond the joints' limits: {np.round(end, 3)}")
         if not is_free(end):  # OMPL would wait for other ends until it runs out of iterations
             raise NoPath(f"the {name} of the path collides: {np.round(end, 3)}")
     joints = len(ranges)

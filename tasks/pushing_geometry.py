@@ -6,6 +6,7 @@ Angles are those of the model: all 0 is an arm that hangs straight down, positiv
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -20,10 +21,10 @@ BOX_HALF_WIDTH = 0.1  # m
 BOX_HEIGHT = 0.3  # m
 CONTACT = BOX_HALF_WIDTH + RADIUS  # m: from the box's centre to a tip that touches its side
 
-# How far from the shoulder the wrist can be with the elbow's range.
+# How far from the shoulder the wrist can be, nearest and farthest, with the elbow a little within its range.
 _REACH = tuple(
     math.sqrt(LINKS[0] ** 2 + LINKS[1] ** 2 + 2 * LINKS[0] * LINKS[1] * math.cos(elbow))
-    for elbow in JOINT_RANGES[1, ::-1]
+    for elbow in JOINT_RANGES[1, ::-1] + [-0.01, 0.01]
 )
 
 Point = tuple[float, float]
@@ -67,10 +68,7 @@ def is_clear(angles: np.ndarray, box_x: float, margin: float) -> bool:
     if min(z for _, z in points[1:]) < RADIUS:
         return False
     half, top = CONTACT + margin, BOX_HEIGHT + RADIUS + margin
-    return not any(
-        _meets((a[0] - box_x, a[1]), (b[0] - box_x, b[1]), half, top)
-        for a, b in zip(points[:-1], points[1:], strict=True)
-    )
+    return not any(_meets((a[0] - box_x, a[1]), (b[0] - box_x, b[1]), half, top) for a, b in itertools.pairwise(points))
 
 
 def _meets(a: Point, b: Point, half: float, top: float) -> bool:

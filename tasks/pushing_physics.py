@@ -7,7 +7,7 @@ import numpy as np
 from .pushing_geometry import BOX_HEIGHT
 from .rendering import mujoco
 
-RAMP = 0.02  # s: from one set of joint velocities to the next. Servos of unequal inertia that were given a step would
+RAMP = 0.05  # s: from one set of joint velocities to the next. Servos of unequal inertia that were given a step would
 # for a moment send the tip somewhere else, fast enough to kick the box away.
 
 JOINTS = ["shoulder", "elbow", "wrist"]
@@ -52,7 +52,8 @@ class Physics(mujoco.Physics):
 
     def box(self) -> np.ndarray:
         """The box: x and z of its centre (m), and its tilt (rad), positive when its top leans towards -x."""
-        return np.array(self.named.data.qpos[BOX]) + [0.0, BOX_HEIGHT / 2, 0.0]
+        x, raised, tilt = self.named.data.qpos[BOX]
+        return np.array([x, BOX_HEIGHT / 2 + raised, tilt])
 
     def box_speed(self) -> float:
         """How fast the box's centre moves (m/s)."""

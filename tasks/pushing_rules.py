@@ -17,10 +17,11 @@ from .pushing_geometry import CONTACT, MAX_SPEED
 PUSH_HEIGHT = 0.10  # m: a push above half width / friction = 0.25 m would topple the box
 PUSH_PITCH = 0.3  # rad: the hand leans so that the tip leads
 BEHIND = CONTACT + 0.08  # m: from the box's centre to where the tip comes down
-# The box is pushed to its goal without coming to a halt before it. Once it passes, the goal is on the other side: the tip
-# turns back, and friction stops the box at once.
+# The box is pushed to its goal without coming to a halt before it. Once it passes, the goal is on the other side: the
+# tip turns back, and friction stops the box at once.
 FOLLOW_THROUGH = 0.02  # m: how far ahead of itself the tip aims when the box is at its goal
 SLOW_DOWN = 0.6  # more, per m that remains
+FULL_ADVANCE = 0.1  # m: at most
 GAIN = 5.0  # 1/s: joint velocity per angle that is missing
 MAX_COMMAND = 0.8 * MAX_SPEED  # rad/s: leaves room for corrections
 
@@ -47,7 +48,7 @@ def scene(observation: Observation) -> Scene:
 
 def advance(scene: Scene) -> float:
     """How far ahead of itself the tip aims while it pushes (m)."""
-    return SLOW_DOWN * abs(scene.goal - scene.box) + FOLLOW_THROUGH
+    return min(FULL_ADVANCE, SLOW_DOWN * abs(scene.goal - scene.box) + FOLLOW_THROUGH)
 
 
 def towards(angles: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -16,12 +16,13 @@ from ddco_pyro.task import Observation, Policy
 
 from . import pushing_geometry as geometry
 from . import pushing_rules as rules
+from .pushing_planner import Planner
 from .pushing_rules import Scene
 
 HAND = 0.2  # rad/s: standard deviation of what a disturbed hand adds to the velocity of each joint
 HAND_MEMORY = 0.8  # of that, from one step to the next: white noise of the same reach would kick the box about
 
-STEP = 0.08  # m: how far ahead of the tip its next way point is
+STEP = rules.FULL_ADVANCE  # how far ahead of itself the tip aims
 OVER = geometry.BOX_HEIGHT + geometry.RADIUS + 0.08  # m: tip height to cross the box
 BESIDE = geometry.BOX_HEIGHT + geometry.RADIUS  # m: a tip below this is beside the box or touches it
 LAG = 0.02  # m: how far below the height to cross the tip already crosses at full speed
@@ -33,9 +34,11 @@ TURN_DISTANCE = 0.15  # m: the hand's pitch changes from one side of the box to 
 class Decider(Protocol):
     """A supervisor's mind: joint velocities for a scene."""
 
-    phase: int
+    @property
+    def phase(self) -> int:
+        """Of the velocities just decided: 0 approach, 1 push."""
 
-    def reset(self) -> None:
+    def reset(self, seed: int) -> None:
         """Forget the last episode."""
 
     def decide(self, scene: Scene) -> np.ndarray:
@@ -47,8 +50,8 @@ class WayPoints:
 
     phase = 0
 
-    def reset(self) -> None:
-        """Nothing to forget."""
+    def reset(self, seed: int) -> None:
+        """Nothing to forget, and nothing random."""
 
     def decide(self, scene: Scene) -> np.ndarray:
         """Joint velocities [3] (rad/s) towards the next way point."""
@@ -93,7 +96,7 @@ class Supervisor:
 
     def reset(self, seed: int) -> None:
         """Forget the last episode; ``seed`` decides how inexact the moves are."""
-        self._decider.reset()
+        self._decider.reset(seed)
         self._random = np.random.default_rng(seed)
         self._disturbance = self._noise * self._random.standard_normal(3)
         self.intended = np.zeros(3)
@@ -101,9 +104,7 @@ class Supervisor:
 
     @property
     def annotations(self) -> dict[str, int]:
-        """For the step just decided, ``side``: 0 to push left, 1 right; ``phase``: 0 approach, 1 push; ``skill``: 0 to 3,
-        both of them.
-        """
+        """Of the step just decided: ``side`` (0 left, 1 right), ``phase`` (0 approach, 1 push), and ``skill``: both."""
         side, phase = int(self._side > 0), self._decider.phase
         return {"side": side, "phase": phase, "skill": 2 * side + phase}
 
@@ -122,7 +123,15 @@ def policy(make: Callable[[], Decider], noise: float = 0.0) -> Callable[[dm_env.
     return lambda environment: Supervisor(make(), noise)
 
 
+def _every_step() -> Planner:
+    return Planner("every_step")
+
+
 POLICIES = {
+    "supervisor": policy(Planner),
+    "supervisor_noisy": policy(Planner, HAND),
+    "supervisor_every_step": policy(_every_step),
+    "supervisor_every_step_noisy": policy(_every_step, HAND),
     "scripted": policy(WayPoints),
     "scripted_noisy": policy(WayPoints, HAND),
 }
