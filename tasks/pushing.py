@@ -83,7 +83,7 @@ class Pushing(base.Task):
         physics.place_arm(RAISED)
         self._draw_box_and_goal(physics)
         physics.place_arm(self._clear_angles(physics.box()[0]))
-        super().initialize_episode(physics)
+        # The base class would call after_step, for colours that are not used here; this one's counts.
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
         """Joint velocities [3] (rad/s); the servos saturate at the limits."""
@@ -94,11 +94,11 @@ class Pushing(base.Task):
         """Send the joint velocities to the servos, which saturate at their limits."""
         spec = self.action_spec(physics)
         physics.set_velocities(np.clip(np.asarray(action, float), spec.minimum, spec.maximum))
-        self._steps += 1
 
     def after_step(self, physics: Physics) -> None:
         """See what became of the box, and put box and goal where the next steps need them."""
         before = self.counts.goals
+        self._steps += 1
         self._since += 1
         if is_reached(physics):
             self.counts.goals += 1

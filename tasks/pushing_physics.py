@@ -7,8 +7,7 @@ import numpy as np
 from .pushing_geometry import BOX_HEIGHT
 from .rendering import mujoco
 
-RAMP = 0.05  # s: from one set of joint velocities to the next. Servos of unequal inertia that were given a step would
-# for a moment send the tip somewhere else, fast enough to kick the box away.
+RAMP = 5  # parts of a control step in which the servos' velocities change
 
 JOINTS = ["shoulder", "elbow", "wrist"]
 BOX = ["box_x", "box_z", "box_tilt"]
@@ -31,12 +30,14 @@ class Physics(mujoco.Physics):
         self._from, self._to = self._to, np.array(velocities, float)
 
     def step(self, nstep: int = 1) -> None:
-        """One control step of ``nstep`` time steps: a ramp to the velocities that were set, which are then kept."""
-        ramp = min(nstep, round(RAMP / self.timestep()))
-        for number in range(1, ramp + 1):
-            self.set_control(self._from + number / ramp * (self._to - self._from))
-            super().step()
-        super().step(nstep - ramp)
+        """One control step of ``nstep`` time steps (a multiple of 5): the servos' velocities ramp to the ones that were set.
+
+        Servos of unequal inertia that were given a step would for a moment send the tip somewhere else, fast enough to
+        kick the box away.
+        """
+        for number in range(1, RAMP + 1):
+            self.set_control(self._from + number / RAMP * (self._to - self._from))
+            super().step(nstep // RAMP)
 
     def joint_angles(self) -> np.ndarray:
         """[3], rad."""
