@@ -2,8 +2,8 @@
 
 After the paper's simulation (§5.1, SM 1.1), in MuJoCo instead of Box2D: links of 5, 5 and 3 units (0.1 m each) in the
 vertical plane, controlled by joint velocities; a box with friction and gravity; as many goals as possible in 2000 steps
-of 50 ms. The box is 0.2 m wide and 0.3 m high; a push higher than half its width over the friction coefficient, 0.25 m,
-topples it.
+of 50 ms. The box is 0.16 m wide and 0.25 m high; a push higher than half its width over the friction coefficient,
+0.2 m, topples it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ OUT_OF_REACH = 0.55  # m: the arm cannot get behind a box that is further out
 RAISED = geometry.inverse(np.array([0.0, 0.6]), 0.0)  # rad: an arm that is in no box's way
 START_CLEARANCE = 0.02  # m, between arm and box
 START_PITCH = 0.4  # rad: half width of the uniform distribution of the hand's first pitch
-START_HEIGHT = (0.08, 0.6)  # m, of the tip
+START_X, START_HEIGHT = (-0.6, 0.6), (0.08, 0.6)  # m: where the tip is at first
 
 POSITION_TOLERANCE = 0.03  # m
 TILT_TOLERANCE = 0.1  # rad
@@ -179,9 +179,9 @@ class Pushing(base.Task):
         return float(place)
 
     def _clear_angles(self, box: float) -> np.ndarray:
-        """Joint angles with the tip anywhere near the box that is clear of it."""
+        """Joint angles with the tip anywhere that is clear of the box."""
         while True:
-            tip = np.array([box + self.random.uniform(-0.35, 0.35), self.random.uniform(*START_HEIGHT)])
+            tip = np.array([self.random.uniform(*START_X), self.random.uniform(*START_HEIGHT)])
             pitch = START_PITCH * self.random.uniform(-1.0, 1.0)
             angles = geometry.inverse(tip, pitch)
             if geometry.is_clear(angles, box, START_CLEARANCE):

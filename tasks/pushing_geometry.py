@@ -17,8 +17,8 @@ RADIUS = 0.03  # m, of the links
 JOINT_RANGES = np.array([[-2.6, 2.6], [0.05, 2.8], [-2.6, 2.6]])  # rad; the elbow bends one way
 MAX_SPEED = 3.0  # rad/s, of each joint
 
-BOX_HALF_WIDTH = 0.1  # m
-BOX_HEIGHT = 0.3  # m
+BOX_HALF_WIDTH = 0.08  # m
+BOX_HEIGHT = 0.25  # m
 CONTACT = BOX_HALF_WIDTH + RADIUS  # m: from the box's centre to a tip that touches its side
 
 # How far from the shoulder the wrist can be, nearest and farthest, with the elbow a little within its range.

@@ -14,7 +14,7 @@ from ddco_pyro.task import Observation
 
 from .pushing_geometry import CONTACT, MAX_SPEED
 
-PUSH_HEIGHT = 0.10  # m: a push above half width / friction = 0.25 m would topple the box
+PUSH_HEIGHT = 0.10  # m: a push above half width / friction = 0.2 m would topple the box
 PUSH_PITCH = 0.3  # rad: the hand leans so that the tip leads
 BEHIND = CONTACT + 0.08  # m: from the box's centre to where the tip comes down
 # The box is pushed to its goal without coming to a halt before it. Once it passes, the goal is on the other side: the

@@ -23,8 +23,9 @@ HAND = 0.2  # rad/s: standard deviation of what a disturbed hand adds to the vel
 HAND_MEMORY = 0.8  # of that, from one step to the next: white noise of the same reach would kick the box about
 
 STEP = rules.FULL_ADVANCE  # how far ahead of itself the tip aims
-OVER = geometry.BOX_HEIGHT + geometry.RADIUS + 0.08  # m: tip height to cross the box
+OVER = geometry.BOX_HEIGHT + geometry.RADIUS + 0.13  # m: tip height to cross the box
 BESIDE = geometry.BOX_HEIGHT + geometry.RADIUS  # m: a tip below this is beside the box or touches it
+CROSS_FROM = BESIDE + 0.03  # m: tip height from which on it crosses, the faster the higher
 LAG = 0.02  # m: how far below the height to cross the tip already crosses at full speed
 COLUMN = 0.04  # m: half width of the column behind the box in which the tip comes down
 BAND = 0.05  # m: half height of the band in which the tip pushes
@@ -79,8 +80,8 @@ def way_point(tip: np.ndarray, scene: Scene) -> np.ndarray:
     if along < -geometry.BOX_HALF_WIDTH and (tip[1] < BESIDE or along < COLUMN - rules.BEHIND):
         return np.array([column, rules.PUSH_HEIGHT])
     # Up first, then across: gradually, because a switch between the two would make the tip dither at its threshold.
-    beside = scene.box + side * (max(along, rules.BEHIND) if tip[1] < geometry.BOX_HEIGHT else along)
-    across = float(np.clip((tip[1] - geometry.BOX_HEIGHT) / (OVER - geometry.BOX_HEIGHT - LAG), 0.0, 1.0))
+    beside = scene.box + side * (max(along, rules.BEHIND) if tip[1] < BESIDE else along)
+    across = float(np.clip((tip[1] - CROSS_FROM) / (OVER - LAG - CROSS_FROM), 0.0, 1.0))
     return np.array([beside + across * (column - beside), OVER])
 
 
