@@ -1,13 +1,14 @@
 # The environment is made once and remade when what it is made from changes.
 #   make demo     fit the needle spec on this machine's CPU and write its report
 #   make test     lint, then the tests
+#   make bench    what exact inference costs, beside other tools
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 STAMP := .venv/.installed
 # A torch wheel without the several GB of CUDA packages. Where this page cannot be reached pip takes torch from its usual index.
 TORCH_CPU := https://download.pytorch.org/whl/cpu/torch/
 
-.PHONY: demo test lint format clean .venv
+.PHONY: demo test bench lint format clean .venv
 
 # --resume: an interrupted demo goes on where it stopped, a finished one shows its result again.
 demo: $(STAMP)
@@ -16,6 +17,11 @@ demo: $(STAMP)
 
 test: lint
 	$(BIN)/pytest -n 2 -q
+
+# Ratios against other tools, measured side by side; writes benchmarks/latest.json and docs/performance.md.
+bench: $(STAMP)
+	$(BIN)/pip install -q -c constraints.txt -e '.[bench]'
+	$(BIN)/python benchmarks/performance.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -51,6 +51,28 @@ class Tables:
         """The number D of option levels; 0 is a flat policy."""
         return len(self.selection)
 
+    @classmethod
+    def of(cls, depth: int, leaves: Sequence[Tensor | None]) -> Tables:
+        """The tables of a hierarchy of so many levels from their :meth:`leaves`."""
+        selection, termination = leaves[:depth], leaves[depth : 2 * depth]
+        control, evidence = leaves[2 * depth : 3 * depth + 1], leaves[3 * depth + 1 :]
+        return cls(_present(selection), _present(termination), _present(control), tuple(evidence))
+
+    def leaves(self) -> tuple[Tensor | None, ...]:
+        """Every table: selections, terminations, controls and, where there is any, the evidence."""
+        return (*self.selection, *self.termination, *self.control, *self.evidence)
+
+    def joint_evidence(self) -> Tensor | None:
+        """The evidence of every joint choice, float64 [N, T, C_D, ..., C_1]; None where there is none."""
+        total: Tensor | None = None
+        sizes = [table.shape[-1] for table in self.selection]
+        for level, evidence in enumerate(self.evidence, start=1):
+            if evidence is not None:
+                shape = evidence.shape[:2] + (1,) * (self.depth - level) + evidence.shape[2:] + (1,) * (level - 1)
+                own = evidence.double().reshape(shape)
+                total = own if total is None else total + own
+        return None if total is None else total.expand(*total.shape[:2], *reversed(sizes))
+
     def clamp(self, level: int, choices: Tensor) -> Tables:
         """These tables where the choices of one level (1 is the lowest) are known to be ``choices``, [N, T]."""
         evidence = list(self.evidence or (None,) * self.depth)
@@ -151,12 +173,13 @@ def _emission(tables: Tables) -> Tensor:
         if level < tables.depth:  # below a choice 0 nothing but choice 0 is possible
             own = torch.cat([torch.full_like(own[..., :1, :], NEVER), own[..., 1:, :]], dim=-2)
         emission = torch.cat([emission.unsqueeze(-1), own], dim=-1)
-    for level, evidence in enumerate(tables.evidence, start=1):
-        if evidence is not None:
-            above, below = tables.depth - level, level - 1
-            shape = evidence.shape[:2] + (1,) * above + evidence.shape[2:] + (1,) * below
-            emission = emission + evidence.double().reshape(shape)
-    return emission
+    evidence = tables.joint_evidence()
+    return emission if evidence is None else emission + evidence
+
+
+def _present(tables: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
+    """Tables of which none is missing."""
+    return tuple(table for table in tables if table is not None)
 
 
 def _like(mask: Tensor, table: Tensor) -> Tensor:
@@ -170,37 +193,35 @@ class Tabulated(TorchDistribution):
     respect to a table is the posterior probability of its entries.
     """
 
-    arg_constraints: ClassVar = {"log_probs": constraints.real_vector}
+    arg_constraints: ClassVar = {"logits": constraints.real_vector}
     has_enumerate_support = True
 
-    def __init__(self, log_probs: Tensor, validate_args: bool | None = None) -> None:
-        self.log_probs = log_probs
-        super().__init__(log_probs.shape[:-1], validate_args=validate_args)
+    def __init__(self, logits: Tensor, validate_args: bool | None = None) -> None:
+        self.logits = logits
+        super().__init__(logits.shape[:-1], validate_args=validate_args)
 
     @property
     def support(self) -> constraints.Constraint:
         """The choices 0 to C - 1."""
-        return constraints.integer_interval(0, self.log_probs.shape[-1] - 1)
+        return constraints.integer_interval(0, self.logits.shape[-1] - 1)
 
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Tabulated:
         """The same choice for a larger batch."""
-        return Tabulated(self.log_probs.expand(*batch_shape, -1), validate_args=False)
+        return Tabulated(self.logits.expand(*batch_shape, -1), validate_args=False)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """The table's entries at ``value``."""
-        return Vindex(self.log_probs)[..., value.long()]
+        return Vindex(self.logits)[..., value.long()]
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
         """Every choice, along a new first dimension."""
-        values = torch.arange(self.log_probs.shape[-1], device=self.log_probs.device)
+        values = torch.arange(self.logits.shape[-1], device=self.logits.device)
         values = values.reshape((-1,) + (1,) * len(self.batch_shape))
         return values.expand((-1, *self.batch_shape)) if expand else values
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
         """A draw from the choices."""
-        return torch.distributions.Categorical(logits=self.log_probs, validate_args=False).sample(
-            torch.Size(sample_shape)
-        )
+        return torch.distributions.Categorical(logits=self.logits, validate_args=False).sample(torch.Size(sample_shape))
 
 
 def choose(t: int, now: Step, previous: tuple[Tensor, ...] | None) -> tuple[Tensor, ...]:
@@ -248,3 +269,12 @@ def ahmm(chain: Chain) -> None:
         for t in pyro.markov(range(len(steps))):
             choices = choose(t, steps[t], choices)
             pyro.factor(f"a_{t}", Vindex(steps[t].emission)[(rows, *reversed(choices))])
+
+
+def draw(chain: Chain) -> tuple[Tensor, ...]:
+    """Choices of every level drawn from the chain run forward, whatever its emissions, each [N, T], lowest first."""
+    found: list[tuple[Tensor, ...]] = []
+    with pyro.poutine.block():
+        for t, now in enumerate(chain.steps()):
+            found.append(choose(t, now, found[-1] if found else None))
+    return tuple(torch.stack(level, dim=1) for level in zip(*found, strict=True))

@@ -48,10 +48,10 @@ def check(
     if spec is None:
         raise SpecError("name a spec, such as: ddco-pyro check specs/needle.yaml")
     found = load_spec(spec, overrides)
-    from ddco_pyro.data import build_hierarchy, dimensions
+    from ddco_pyro.data import check_networks, dimensions
 
     size = dimensions(found)
-    hierarchy = build_hierarchy(found, size)
+    hierarchy = check_networks(found, size)
     print(dump_spec(found), end="")
     console.dimensions(found, size, hierarchy)
 
@@ -86,9 +86,10 @@ def fit(
     """Fit the spec's hierarchy and its baselines; write the run folder with its report."""
     found = load_spec(spec, overrides)
     from ddco_pyro import run
-    from ddco_pyro.data import demonstrations
+    from ddco_pyro.data import check_networks, demonstrations, dimensions
     from ddco_pyro.report import write_report
 
+    check_networks(found, dimensions(found))  # before anything is collected, trained or written
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     run.claim(folder, found, resume)
     try:

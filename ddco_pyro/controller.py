@@ -11,14 +11,9 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from ddco_pyro.ahmm import Tabulated, choose, complete
-from ddco_pyro.errors import BadInput
 from ddco_pyro.hierarchy import Decision, Hierarchy, Outputs
-from ddco_pyro.networks import Inputs
+from ddco_pyro.observing import Window
 from ddco_pyro.spec import RolloutSpec
-
-
-class ObservationError(BadInput):
-    """An observation that is missing, or has another shape than the demonstrations had."""
 
 
 class Controller:
@@ -49,8 +44,8 @@ class Controller:
     def reset(self, seed: int = 0) -> None:
         """Begin an episode. Equal seeds and observations give equal controls."""
         self.seed, self.time = seed, 0
+        self._window = Window(self.hierarchy.encoder)
         self._choices: tuple[Tensor, ...] | None = None
-        self._last: dict[str, np.ndarray] | None = None
 
     @property
     def choices(self) -> tuple[int, ...]:
@@ -64,19 +59,11 @@ class Controller:
         """
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(np.random.SeedSequence([self.seed, self.time]).generate_state(1)[0]))
-            outputs = self.hierarchy(self._inputs(observation))
+            outputs = self.hierarchy(self._window.inputs(observation))
             self._choices = self._choose(outputs)
             scaled = self._control(*self._actor(outputs))
         self.time += 1
         return self.hierarchy.scaling.unscaled(scaled)
-
-    def _inputs(self, observation: Mapping[str, np.ndarray]) -> Inputs:
-        now = {key: _checked(observation, key, shape) for key, shape in self.hierarchy.encoder.shapes.items()}
-        before = self._last or now
-        self._last = now
-        both = self.hierarchy.encoder.inputs([{key: np.stack([before[key], now[key]]) for key in now}])
-        images = {key: image[:, 1:] for key, image in both.images.items()}
-        return Inputs(both.vector[:, 1:], images, torch.tensor([self.time]))
 
     def _choose(self, outputs: Outputs) -> tuple[Tensor, ...]:
         actions = torch.zeros(1, 1, len(self.hierarchy.scaling.scale))
@@ -105,17 +92,5 @@ class _MostLikely(Messenger):
 
     def _pyro_sample(self, message: dict[str, Any]) -> None:
         distribution: Tabulated = message["fn"]
-        message["value"] = distribution.log_probs.argmax(-1)
+        message["value"] = distribution.logits.argmax(-1)
         message["done"] = True
-
-
-def _checked(observation: Mapping[str, np.ndarray], key: str, shape: tuple[int, ...]) -> np.ndarray:
-    if key not in observation:
-        known = ", ".join(sorted(observation))
-        raise ObservationError(f"the observation has no {key!r} (it has: {known})")
-    value = np.asarray(observation[key])
-    if value.shape != tuple(shape):
-        raise ObservationError(f"observation {key!r} has shape {value.shape}, the demonstrations had {tuple(shape)}")
-    if not np.isfinite(value).all():
-        raise ObservationError(f"observation {key!r} is not finite")
-    return value

@@ -10,7 +10,7 @@ from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.encoding import Shapes
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.networks import ShapeError
-from ddco_pyro.spec import Spec, SpecError
+from ddco_pyro.spec import BaselineSpec, Spec, SpecError
 from ddco_pyro.task import find_task
 
 
@@ -48,6 +48,25 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
         raise SpecError(str(error)) from error
 
 
+def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
+    """The spec's networks, after those of its baselines were made too.
+
+    :raises SpecError: something in the spec does not fit the observations or the control.
+    """
+    hierarchy = build_hierarchy(spec, dimensions)
+    for number, baseline in enumerate(spec.compare_with):
+        try:
+            build_hierarchy(baseline_spec(spec, baseline), dimensions)
+        except SpecError as error:  # what it shares with the spec is in order: it is about its own network
+            raise SpecError(f"compare_with.{number}.{str(error).removeprefix('baseline.')}") from error
+    return hierarchy
+
+
+def baseline_spec(spec: Spec, baseline: BaselineSpec) -> Spec:
+    """The spec of a baseline trained beside: the same but for the model."""
+    return spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": ()})
+
+
 def dimensions(spec: Spec) -> Dimensions:
     """The dimensions of what the spec names, without collecting anything: from its file, or else from its task.
 
@@ -55,8 +74,7 @@ def dimensions(spec: Spec) -> Dimensions:
     """
     path = spec.demonstrations.path
     if spec.demonstrated_task is None or (path is not None and Path(path).exists()):
-        assert path is not None  # a spec has a task or a file
-        return Dimensions.of(Demonstrations.read(path))
+        return Dimensions.of(demonstrations(spec))
     task = find_task(spec.demonstrated_task)
     environment = task.load(spec.demonstrations.seed)
     try:

@@ -234,6 +234,6 @@ def _log_density(decision: Decision, actions: Tensor, log_volume: Tensor) -> Ten
         selection = decision.selection
         assert selection is not None  # a caller emits something
         return selection.new_full(selection.shape[:-1], NEVER)
-    error = (actions.unsqueeze(2) - decision.mean) / decision.std
+    error = actions.unsqueeze(2) - decision.mean
     normaliser = decision.std.log().sum(-1) + 0.5 * math.log(2 * math.pi) * actions.shape[-1] + log_volume
-    return -0.5 * error.square().sum(-1) - normaliser
+    return error.square() @ (-0.5 / decision.std.square()).to(error.dtype) - normaliser

@@ -49,6 +49,10 @@ class Stage:
     trained: tuple[str, ...]
 
 
+WHOLE = Stage("whole", None, None, ())
+"""The whole hierarchy, as it is."""
+
+
 def plan(spec: Spec, depth: int) -> list[Stage]:
     """The stages of training for D levels: from the lowest level up, the meta-policy last."""
     training = spec.training
@@ -167,12 +171,10 @@ class Trainer:
             model.train()
             for rows in torch.randperm(len(self.train)).split(self.spec.training.batch_size):
                 optimizer.zero_grad(set_to_none=True)
-                value = objective.train(model, rows)
-                (-value / int(self.train.lengths[rows].sum())).backward()
+                total += objective.ascend(model, rows)
                 if self.spec.training.clip_gradient is not None:
                     nn.utils.clip_grad_norm_(parameters, self.spec.training.clip_gradient)
                 optimizer.step()
-                total += float(value.detach())
             model.eval()
         return total / self.train.steps
 
@@ -190,8 +192,7 @@ class Trainer:
 
     def _finish_restart(self, model: Hierarchy) -> None:
         now = self.progress
-        with torch.no_grad():
-            value = float(total_log_likelihood(model.tabulate(self.tune), self.tune.lengths)) / self.tune.steps
+        value = _Objective(self, WHOLE).tune(model)
         if "winner" not in self._saved or value > now.winner:
             now.winner = value
             self._saved["winner"] = _copy(model)
@@ -229,25 +230,34 @@ class _Objective:
             found = Clusters(trainer.train, options, seed, trainer.spec.training.initialize == "vq_controls")
             self.clusters = found.choices(trainer.train), found.choices(trainer.tune)
 
-    def train(self, model: Hierarchy, rows: Tensor) -> Tensor:
-        """Total log-likelihood of some training demonstrations, differentiable."""
-        batch = self.trainer.train.select(rows)
-        choices = None if self.clusters is None else self.clusters[0][rows, : batch.inputs.batch[1]]
-        value = self._total(model, batch, choices)
-        if not bool(torch.isfinite(value.detach())):
-            raise self._not_finite(model, batch, rows)
-        return value
+    def ascend(self, model: Hierarchy, rows: Tensor) -> float:
+        """Add the gradient of the loss of some training demonstrations to the parameters'; their log-likelihood.
+
+        The loss is minus the log-likelihood per step. A batch that is long is processed in parts.
+        """
+        batch, total = self.trainer.train.select(rows), 0.0
+        for part, piece in batch.pieces():
+            value = self._total(model, piece, None if self.clusters is None else self.clusters[0][rows[part]])
+            if not bool(torch.isfinite(value.detach())):
+                raise self._not_finite(model, piece, rows[part])
+            (-value / batch.steps).backward()
+            total += float(value.detach())
+        return total
 
     def tune(self, model: Hierarchy) -> float:
         """Log-likelihood per step of the tuning demonstrations."""
+        choices = None if self.clusters is None else self.clusters[1]
         with torch.no_grad():
-            choices = None if self.clusters is None else self.clusters[1]
-            return float(self._total(model, self.trainer.tune, choices)) / self.trainer.tune.steps
+            values = [
+                float(self._total(model, piece, None if choices is None else choices[part]))
+                for part, piece in self.trainer.tune.pieces()
+            ]
+        return sum(values) / self.trainer.tune.steps
 
     def _total(self, model: Hierarchy, batch: Batch, choices: Tensor | None) -> Tensor:
         tables = model.tabulate(batch, self.stage.discovering)
         if choices is not None and self.stage.clamped is not None:
-            tables = tables.clamp(self.stage.clamped, choices)
+            tables = tables.clamp(self.stage.clamped, choices[:, : batch.inputs.batch[1]])
         return total_log_likelihood(tables, batch.lengths, self.trainer.spec.inference.engine)
 
     def _not_finite(self, model: Hierarchy, batch: Batch, rows: Tensor) -> TrainingError:

@@ -60,7 +60,7 @@ def brute_force(tables: Tables, n: int, length: int) -> Truth:
     shape = [(length, size) for size in sizes]
     u, v, w = ([np.zeros(s) for s in shape] for _ in range(3))
     total, by_path = 0.0, {}
-    for path, ends, probability in _paths(tables, n, length, sizes):
+    for path, ends, probability in paths(tables, n, length, sizes):
         total += probability
         by_path[path] = by_path.get(path, 0.0) + probability
         for t in range(length):
@@ -70,7 +70,7 @@ def brute_force(tables: Tables, n: int, length: int) -> Truth:
                 if t + 1 < length:
                     w[d][t, h] += probability * (1 - ends[t + 1][d])
     one_path = max(
-        ((probability, path) for path, _, probability in _paths(tables, n, length, sizes)), key=lambda item: item[0]
+        ((probability, path) for path, _, probability in paths(tables, n, length, sizes)), key=lambda item: item[0]
     )
     for table in (*u, *v, *w):
         table /= total
@@ -80,7 +80,7 @@ def brute_force(tables: Tables, n: int, length: int) -> Truth:
 Path = tuple[tuple[int, ...], ...]
 
 
-def _paths(tables: Tables, n: int, length: int, sizes: list[int]) -> Iterator[tuple[Path, Path, float]]:
+def paths(tables: Tables, n: int, length: int, sizes: list[int]) -> Iterator[tuple[Path, Path, float]]:
     joint = list(itertools.product(*map(range, sizes)))
     ends = list(itertools.product((0, 1), repeat=len(sizes)))
     first = tuple(1 for _ in sizes)

@@ -197,6 +197,29 @@ def test_bad_input_is_refused_in_one_line(arguments, message, spec, run):
     assert re.fullmatch(f"ddco-pyro: .*{message}.*\n", ended.err)
 
 
+WRONG = "{network: 'test_networks:Wrong', options: {how: joined}}"
+
+
+@pytest.mark.parametrize(
+    ("override", "place", "shapes"),
+    [
+        (f"hierarchy.levels.0.policy={WRONG}", "hierarchy.levels.0.policy", ("[1, 2, 4]", "[1, 2, 2, 2]")),
+        (f"compare_with=[{{kind: flat, policy: {WRONG}}}]", "compare_with.0.policy", ("[1, 2, 2]", "[1, 2, 1, 2]")),
+    ],
+)
+def test_an_own_network_of_another_shape_is_refused_before_any_work(spec, tmp_path, cache, override, place, shapes):
+    line = (
+        f"ddco-pyro: {place}: network 'test_networks:Wrong' gives shape {shapes[0]}; "
+        f"it has to be a tensor [N, T, copies, outputs], here {shapes[1]}\n"
+    )
+    kept = sorted(cache.rglob("*"))
+    changed = with_set(override, "demonstrations.seed=77")
+    assert call("check", spec, *changed) == (2, "", line)
+    assert call("fit", spec, "--out", tmp_path / "run", *changed) == (2, "", line)
+    assert not (tmp_path / "run").exists()
+    assert sorted(cache.rglob("*")) == kept
+
+
 def test_every_problem_of_a_spec_has_its_line(spec):
     ended = call("check", spec, *with_set("seed=-1", "training.epochs=0"))
     assert ended.status == 2
@@ -251,12 +274,12 @@ def test_a_command_ends_with_its_status_and_finds_tasks_beside_it(spec):
 
 
 def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
-    longer = with_set("compare_with=[]", "training.epochs=30", "training.patience=null")
+    longer = with_set("compare_with=[]", "training.epochs=60", "training.patience=null")
     folder = tmp_path / "cut"
     process = start("fit", spec, "--out", folder, *longer)
     checkpoint = folder / "checkpoints" / "latest.safetensors"
     while not checkpoint.exists() and process.poll() is None:
-        time.sleep(0.05)
+        time.sleep(0.01)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 1
@@ -268,7 +291,7 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
     for name in ("model.safetensors", "history.csv", "spec.yaml"):
         assert (folder / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     rows = (folder / "history.csv").read_text().splitlines()
-    assert len(rows) == 1 + 4 * 30
+    assert len(rows) == 1 + 4 * 60
 
 
 LIGHT = """

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import h5py
 import numpy as np
 import pytest
 
-from ddco_pyro.data import Dimensions, build_hierarchy, demonstrations, dimensions
+from ddco_pyro.data import Dimensions, build_hierarchy, check_networks, demonstrations, dimensions
 from ddco_pyro.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.spec import SpecError, parse_spec
 
@@ -72,6 +73,7 @@ def test_labels_that_are_not_there_are_an_error(path):
 
 LEVEL = {"count": 2, "policy": {"network": "linear"}}
 CONV = {"network": "conv"}
+WRONG = {"network": "test_networks:Wrong", "options": {"how": "swapped"}}
 
 
 @pytest.mark.parametrize(
@@ -92,8 +94,27 @@ CONV = {"network": "conv"}
             {"baseline": None, "hierarchy": {"levels": [LEVEL], "meta_policy": {"network": "nowhere:Net"}}},
             r"^hierarchy\.meta_policy: network 'nowhere:Net' cannot be imported",
         ),
+        (
+            {"baseline": None, "hierarchy": {"levels": [LEVEL | {"termination": WRONG}]}},
+            r"^hierarchy\.levels\.0\.termination: network 'test_networks:Wrong' gives shape \[1, 2, 1, 2\]; .*, "
+            r"here \[1, 2, 2, 1\]$",
+        ),
     ],
 )
 def test_a_spec_that_does_not_fit_says_where(changes, message):
     with pytest.raises(SpecError, match=message):
         build_hierarchy(spec(**changes), SIZE)
+
+
+def test_the_networks_of_baselines_are_checked_too():
+    fits = {"kind": "flat", "policy": {"network": "test_networks:Own"}}
+    assert check_networks(spec(compare_with=["per_timestep", fits]), SIZE).depth == 0
+    refused = spec(compare_with=["per_timestep", {"kind": "flat", "policy": WRONG}])
+    with pytest.raises(SpecError, match=r"^compare_with\.1\.policy: network 'test_networks:Wrong' gives shape"):
+        check_networks(refused, SIZE)
+
+
+def test_only_what_the_spec_names_has_to_be_in_order(path):
+    with h5py.File(path, "r+") as file:
+        file["data/demo_9/obs/unused"] = np.full((9, 1), np.nan)
+    assert dimensions(spec(demonstrations={"path": str(path)})) == Dimensions({"offsets": (7,)}, 3, 9)

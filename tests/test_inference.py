@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from oracle import brute_force, random_tables
 
-from ddco_pyro.ahmm import NEVER, Tables, complete
-from ddco_pyro.inference import fused, log_likelihood, logspace, posterior, segment, total_log_likelihood
+from ddco_pyro.ahmm import Tables
+from ddco_pyro.inference import log_likelihood, posterior, segment, total_log_likelihood
 from ddco_pyro.inference.check import compare_engines
 
 CASES = [
@@ -116,48 +113,6 @@ def test_permuting_options_changes_nothing():
     torch.testing.assert_close(log_likelihood(tables, lengths), log_likelihood(permuted, lengths), atol=1e-12, rtol=0)
     found, again = posterior(tables, lengths).u[0], posterior(permuted, lengths).u[0]
     torch.testing.assert_close(found[..., 1 + order], again[..., 1:], atol=1e-12, rtol=0)
-
-
-@settings(deadline=None, max_examples=150, derandomize=True)
-@given(
-    counts=st.sampled_from([(1,), (3,), (2, 2), (2, 1, 2)]),
-    steps=st.integers(1, 40),
-    seed=st.integers(0, 10_000),
-    sharp=st.sampled_from([1.0, 30.0, 1e3, 1e5]),
-    termination=st.sampled_from([0.0, 1e-8, 0.3, 1 - 1e-8, 1.0]),
-    impossible=st.floats(0, 0.4),
-)
-def test_fused_equals_log_space_on_hard_tables(counts, steps, seed, sharp, termination, impossible):
-    """Tiny σ, terminations within 1e-8 of 0 and 1 and at them, options impossible in places."""
-    hybrid = tuple(bool(seed >> level & 1) for level in range(len(counts)))
-    tables = random_tables(counts, hybrid, trajectories=3, steps=steps, seed=seed)
-    generator = torch.Generator().manual_seed(seed)
-    hole = [torch.rand(c.shape, generator=generator) < impossible for c in tables.control]
-    control = tuple(torch.where(h, NEVER, sharp * c) for h, c in zip(hole, tables.control, strict=True))
-    ending = torch.tensor([1 - termination, termination], dtype=torch.float64).log()
-    lowest = torch.where(torch.rand(tables.termination[0][..., :1].shape, generator=generator) < 0.5, ending,
-                         tables.termination[0])  # fmt: skip
-    tables = replace(tables, control=control, termination=(lowest, *tables.termination[1:]))
-    lengths = torch.tensor([steps, 1, (steps + 1) // 2])
-    leaves = [t.requires_grad_() for t in (*tables.control, *tables.selection)]
-    chain = complete(tables, lengths)
-    value, truth = fused.log_likelihood(chain, lengths), logspace.log_likelihood(chain)
-    torch.testing.assert_close(value, truth, rtol=1e-9, atol=1e-9)
-    possible = torch.isfinite(truth)
-    if possible.any():
-        found = torch.autograd.grad(value[possible].sum(), leaves, retain_graph=True, allow_unused=True)
-        expected = torch.autograd.grad(truth[possible].sum(), leaves, allow_unused=True)
-        for ours, theirs in zip(found, expected, strict=True):
-            torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-9)
-
-
-def test_ten_thousand_steps_stay_finite():
-    tables = random_tables((5,), (True,), steps=10_000, seed=8)
-    tables = replace(tables, control=tuple(100 * c for c in tables.control))
-    lengths = torch.tensor([10_000])
-    chain = complete(tables, lengths)
-    torch.testing.assert_close(fused.log_likelihood(chain, lengths), logspace.log_likelihood(chain), rtol=1e-9, atol=0)
-    assert torch.allclose(posterior(tables, lengths).u[0].sum(-1), torch.ones(1, dtype=torch.float64))
 
 
 def _parts(tables):

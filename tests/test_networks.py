@@ -176,6 +176,43 @@ class Own(nn.Module):
         return (self.gain * inputs.vector.sum(-1))[..., None, None].expand(*inputs.batch, *self.size)
 
 
+class Wrong(Own):
+    """A network of one's own that can be made, but whose output is not what it has to be."""
+
+    def __init__(self, shape, outputs, copies, how):
+        super().__init__(shape, outputs, copies)
+        self.how = how
+
+    def forward(self, inputs):
+        found = super().forward(inputs)
+        if self.how == "list":
+            return found.tolist()
+        return {
+            "joined": lambda: found.flatten(2),
+            "swapped": lambda: found.transpose(2, 3),
+            "one": lambda: found[:, :, :1],
+            "squeezed": lambda: found.squeeze(0),
+            "time first": lambda: found.transpose(0, 1),
+            "fails": lambda: found @ torch.ones(7),
+        }[self.how]()
+
+
+class Stateful(Own):
+    """Normalises by what it has seen, and has a table of the steps that there are."""
+
+    def __init__(self, shape, outputs, copies):
+        super().__init__(shape, outputs, copies)
+        self.norm = nn.BatchNorm1d(shape.vector)
+        self.bias = nn.Parameter(torch.zeros(shape.steps))
+        self.pictures = shape.images
+
+    def forward(self, inputs):
+        assert {key: image.shape[2:] for key, image in inputs.images.items()} == self.pictures
+        assert all(image.dtype == torch.uint8 for image in inputs.images.values())
+        seen = self.norm(inputs.vector.flatten(0, 1)).unflatten(0, inputs.batch)
+        return super().forward(Inputs(seen + self.bias[inputs.time, None], {}, inputs.time))
+
+
 class NotANetwork:
     pass
 
@@ -183,6 +220,33 @@ class NotANetwork:
 def test_a_network_of_ones_own():
     network, inputs = make(network="test_networks:Own", options={"gain": 2.0}), make_inputs()
     assert_close(network(inputs)[:, :, 3, 1], 2 * inputs.vector.sum(-1))
+
+
+def test_trying_a_network_of_ones_own_leaves_no_trace():
+    spec = NetworkSpec(network="test_networks:Stateful")
+    network = build(spec, InputShape(FEATURES, {"camera": PIXELS}, steps=1), OUTPUTS, COPIES)
+    assert network.training
+    assert int(network.norm.num_batches_tracked) == 0
+    assert all(parameter.grad is None for parameter in network.parameters())
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("joined", "gives shape [1, 2, 8]; it has to be a tensor [N, T, copies, outputs], here [1, 2, 4, 2]"),
+        ("swapped", "gives shape [1, 2, 2, 4]; it has to be a tensor [N, T, copies, outputs], here [1, 2, 4, 2]"),
+        ("one", "gives shape [1, 2, 1, 2]; it has to be a tensor [N, T, copies, outputs], here [1, 2, 4, 2]"),
+        ("squeezed", "gives shape [2, 4, 2]; it has to be a tensor [N, T, copies, outputs], here [1, 2, 4, 2]"),
+        ("time first", "gives shape [2, 1, 4, 2]; it has to be a tensor [N, T, copies, outputs], here [1, 2, 4, 2]"),
+        ("list", "gives a list; it has to be a tensor [N, T, copies, outputs], here [1, 2, 4, 2]"),
+        ("fails", "fails for observations that are 0, N = 1, T = 2: "),
+    ],
+)
+def test_an_output_of_another_shape_is_refused_when_the_network_is_made(how, message):
+    with pytest.raises(ShapeError) as caught:
+        make(network="test_networks:Wrong", options={"how": how})
+    assert str(caught.value).startswith(f"network 'test_networks:Wrong' {message}")
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

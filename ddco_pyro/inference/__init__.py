@@ -9,9 +9,20 @@ from torch import Tensor
 
 from ddco_pyro.ahmm import Tables, complete
 from ddco_pyro.inference import enumeration, fused
-from ddco_pyro.inference.posteriors import Posterior, posterior, segment
+from ddco_pyro.inference.paths import Path, most_likely_path, sample_paths, segment
+from ddco_pyro.inference.posteriors import Posterior, posterior
 
-__all__ = ["Engine", "Posterior", "log_likelihood", "posterior", "segment", "total_log_likelihood"]
+__all__ = [
+    "Engine",
+    "Path",
+    "Posterior",
+    "log_likelihood",
+    "most_likely_path",
+    "posterior",
+    "sample_paths",
+    "segment",
+    "total_log_likelihood",
+]
 
 Engine = Literal["fused", "enumerate"]
 
@@ -22,7 +33,7 @@ def log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") ->
     :param lengths: steps of each trajectory, [N]; whatever the tables hold beyond is ignored.
     """
     if engine == "fused":
-        return fused.log_likelihood(complete(tables, lengths), lengths)
+        return fused.log_likelihood(tables, lengths)
     one_by_one = [
         enumeration.total_log_likelihood(complete(tables.trajectory(n, int(length)), lengths[n : n + 1]))
         for n, length in enumerate(lengths)
@@ -32,7 +43,6 @@ def log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") ->
 
 def total_log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") -> Tensor:
     """Σ_n log p(ξ_n), a scalar; with ``engine="enumerate"`` in one elimination for the whole batch."""
-    chain = complete(tables, lengths)
     if engine == "enumerate":
-        return enumeration.total_log_likelihood(chain)
-    return fused.log_likelihood(chain, lengths).sum()
+        return enumeration.total_log_likelihood(complete(tables, lengths))
+    return fused.log_likelihood(tables, lengths).sum()

@@ -1,117 +1,156 @@
 """The fused engine: log-likelihood and posterior in one compiled pass; the posterior *is* the gradient (§4.1).
 
-It works in scaled probability space. What underflows there is lost mass of at most about 1e-300 of a step's total, and
-it matters only if the past and the future of a trajectory hardly overlap, Σ_h α_t(h) β_t(h) ≈ 0. The overlap is
-measured at every step, and a trajectory where it falls below ``LEAST_OVERLAP`` is done again in log space.
+It works in scaled probability space. What underflows there matters only where the past of a trajectory makes next to
+impossible what its future demands; then the product of past and future, Σ_h α_t(h) β_t(h), is no longer 1. It is
+measured at every step, and a trajectory where it is off is done again in log space.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ddco_pyro.ahmm import Chain
+from ddco_pyro.ahmm import Tables, complete
 from ddco_pyro.inference import logspace
 from ddco_pyro.inference.kernel import forward_backward
+from ddco_pyro.inference.structure import Structure, structure_of
+from ddco_pyro.inference.threads import as_many_threads_as_torch
 
-LEAST_OVERLAP = 1e-250
+
+@dataclass(frozen=True)
+class Elimination:
+    """What one pass finds, float64; every table of posteriors has the shape of the table it belongs to.
+
+    :param value: log p(ξ), [N].
+    :param tables: posterior probabilities of the tables' entries (evidence left out).
+    :param marginals: p(h^d_t = h | ξ) of each level, [N, T, C_d]; empty where they were not asked for.
+    """
+
+    value: Tensor
+    tables: Tables
+    marginals: tuple[Tensor, ...]
 
 
-def log_likelihood(chain: Chain, lengths: Tensor) -> Tensor:
-    """log p(ξ) of each trajectory, [N], differentiable once in the chain's tables."""
-    if chain.emission.device.type != "cpu":
-        return logspace.log_likelihood(chain)
-    value: Tensor = _Eliminate.apply(lengths, chain.emission, *chain.selection, *chain.termination)
+def log_likelihood(tables: Tables, lengths: Tensor) -> Tensor:
+    """log p(ξ) of each trajectory, [N], differentiable once in the tables."""
+    if tables.control[-1].device.type != "cpu" or not tables.depth:
+        return logspace.log_likelihood(complete(tables, lengths))
+    value: Tensor = _Eliminate.apply(lengths, tables.depth, *tables.leaves())
     return value
 
 
 class _Eliminate(torch.autograd.Function):
-    """Log-likelihoods of a chain; the gradient with respect to a log-table is the posterior of its entries."""
+    """Log-likelihoods of tables; the gradient with respect to a log-table is the posterior of its entries."""
 
     @staticmethod
-    def forward(ctx: Any, lengths: Tensor, emission: Tensor, *tables: Tensor) -> Tensor:
-        depth = len(tables) // 2
-        chain = Chain(tables[:depth], tables[depth:], emission)
-        value, gradients = evaluate(chain, lengths)
-        ctx.save_for_backward(*gradients)
-        return value
+    def forward(ctx: Any, lengths: Tensor, depth: int, *leaves: Tensor | None) -> Tensor:
+        tables = Tables.of(depth, leaves)
+        ctx.evidence = ctx.needs_input_grad[3 + 3 * depth :]
+        found = eliminate(tables, lengths, marginals=any(ctx.evidence))
+        ctx.save_for_backward(*found.tables.leaves(), *found.marginals)
+        return found.value
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        return None, *(upstream.reshape(-1, *(1,) * (table.dim() - 1)) * table for table in ctx.saved_tensors)
+        gradients = [upstream.reshape(-1, *(1,) * (table.dim() - 1)) * table for table in ctx.saved_tensors]
+        networks = len(ctx.needs_input_grad) - 2 - len(ctx.evidence)
+        evidence = gradients[networks:] or [None] * len(ctx.evidence)
+        return None, None, *gradients[:networks], *evidence
 
 
-def evaluate(chain: Chain, lengths: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """Log-likelihoods [N], and posteriors shaped like (emission, *selection, *termination)."""
-    flat = chain.emission.reshape(*chain.emission.shape[:2], -1)
-    shift = flat.amax(-1, keepdim=True)
+def eliminate(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elimination:
+    """Log-likelihoods and posteriors of tables on the CPU with at least one option level."""
+    control = torch.cat([table.detach() for table in tables.control], dim=-1).double()
+    shift = control.amax(-1, keepdim=True)
     shift = torch.where(torch.isfinite(shift), shift, 0.0)
-    sizes = [table.shape[-1] for table in chain.selection]
-    joint = (flat - shift).exp()
-    threads = torch.get_num_threads()
-    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
-    torch.set_num_threads(threads)  # numba's first call has set OpenMP's number for the whole process, torch included
-    value, overlap, to_select, to_end, to_emission = forward_backward(
-        _rows(chain.selection, joint).numpy(),
-        _rows(chain.termination, joint).numpy(),
-        joint.contiguous().numpy(),
-        lengths.numpy(),
-        np.array(sizes, dtype=np.int64),
-        _message_starts(sizes),
-        _offsets([2 * size for size in sizes]),
-        _offsets([table.shape[2] * table.shape[3] for table in chain.selection]),
+    rows = _rows(tables.selection), _rows(tables.termination), (control - shift).exp_()
+    value, exact, results, choices = run(structure_of(tables), rows, _weight(tables), lengths, marginals)
+    alive = torch.arange(control.shape[1]) < lengths[:, None]
+    found = Elimination(
+        value + (shift.squeeze(-1) * alive).sum(1),
+        Tables(
+            _unrows(results[0], tables.selection),
+            _unrows(results[1], tables.termination),
+            _unrows(results[2], tables.control),
+        ),
+        choices.split([table.shape[-1] for table in tables.selection], dim=-1) if marginals else (),
     )
-    alive = torch.arange(joint.shape[1]) < lengths[:, None]
-    total = torch.from_numpy(value) + (shift.squeeze(-1) * alive).sum(1)
-    gradients = (
-        torch.from_numpy(to_emission).reshape(chain.emission.shape),
-        *_unrows(torch.from_numpy(to_select), chain.selection),
-        *_unrows(torch.from_numpy(to_end), chain.termination),
-    )
-    for n in np.flatnonzero(~(overlap > LEAST_OVERLAP)):
-        total[n] = _again(chain, int(n), gradients)
-    return total, gradients
+    for n in torch.nonzero(~exact).flatten():
+        _again(tables, int(n), int(lengths[n]), found)
+    return found
 
 
-def _rows(tables: Sequence[Tensor], like: Tensor) -> Tensor:
+Rows = tuple[Tensor, Tensor, Tensor]
+"""Probabilities of selections and terminations and scaled densities of the controls, float64 [N, T, ...]: the levels'
+tables side by side, as :class:`ddco_pyro.inference.structure.Structure` orders them.
+"""
+
+
+def run(
+    structure: Structure, rows: Rows, weight: Tensor, lengths: Tensor, marginals: bool = False
+) -> tuple[Tensor, Tensor, Rows, Tensor]:
+    """The compiled pass: log-likelihoods [N], whether they are exact [N], posteriors of the rows, choices' marginals.
+
+    :param weight: factors of the joint choices, float64 [N, T, S], or [N, T, 0] where there are none.
+    """
+    select, end, emission = rows
+    results = torch.empty_like(select), torch.empty_like(end), torch.empty_like(emission)
+    number, steps = emission.shape[:2]
+    choices = emission.new_empty(number, steps, sum(structure.sizes) if marginals else 0)
+    value, exact = emission.new_empty(number), torch.empty(number, dtype=torch.bool)
+    with as_many_threads_as_torch():
+        forward_backward(  # type: ignore[call-arg]
+            *_arrays(*rows, weight, lengths, value, exact, *results, choices),  # type: ignore[arg-type]
+            structure.sizes, structure.starts, structure.selects, structure.ends, structure.actors, structure.choices,
+        )  # fmt: skip
+    return value, exact, results, choices
+
+
+def _arrays(*tables: Tensor) -> list[np.ndarray]:
+    return [table.numpy() for table in tables]
+
+
+def _rows(tables: Sequence[Tensor]) -> Tensor:
     """exp of each level's table, flattened and side by side, [N, T, ...]."""
-    flat = [table.flatten(2).exp() for table in tables]
-    return torch.cat([like[..., :0], *flat], dim=-1).contiguous()
+    flat = [table.detach().flatten(2) for table in tables]
+    return torch.cat(flat, dim=-1).to(torch.float64, copy=True).exp_()
 
 
-def _unrows(rows: Tensor, tables: Sequence[Tensor]) -> list[Tensor]:
-    parts = rows.split([table[0, 0].numel() for table in tables], dim=-1) if tables else ()
-    return [part.reshape(table.shape) for part, table in zip(parts, tables, strict=True)]
+def _unrows(rows: Tensor, tables: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    parts = rows.split([table[0, 0].numel() for table in tables], dim=-1)
+    return tuple(part.reshape(table.shape) for part, table in zip(parts, tables, strict=True))
 
 
-def _offsets(sizes: Sequence[int]) -> np.ndarray:
-    return np.cumsum([0, *sizes])[:-1].astype(np.int64)
+def _weight(tables: Tables) -> Tensor:
+    """exp of the evidence of every joint choice, [N, T, S]; [N, T, 0] without evidence."""
+    joint = tables.joint_evidence()
+    if joint is None:
+        return torch.empty(*tables.control[-1].shape[:2], 0, dtype=torch.float64)
+    return joint.detach().exp().flatten(2)
 
 
-def _message_starts(sizes: Sequence[int]) -> np.ndarray:
-    """First index of each level's message, lowest level first and that of level D + 1 last."""
-    lengths = [int(np.prod(sizes[level:])) for level in range(len(sizes))]
-    return np.cumsum([0, *lengths]).astype(np.int64)
-
-
-def _again(chain: Chain, n: int, gradients: tuple[Tensor, ...]) -> Tensor:
-    """The log-likelihood of trajectory ``n`` in log space; its posterior is written into ``gradients``."""
-    leaves = [t[n : n + 1].detach().requires_grad_() for t in (chain.emission, *chain.selection, *chain.termination)]
-    depth = chain.depth
-    alone = replace(
-        chain, emission=leaves[0], selection=tuple(leaves[1 : 1 + depth]), termination=tuple(leaves[1 + depth :])
-    )
+def _again(tables: Tables, n: int, length: int, found: Elimination) -> None:
+    """Do trajectory ``n`` in log space, and write what it gives into ``found``."""
+    alone = tables.trajectory(n, length)
+    leaves = [None if leaf is None else leaf.detach().double().requires_grad_() for leaf in alone.leaves()]
+    ends = torch.tensor([length])
     with torch.enable_grad():
-        value = logspace.log_likelihood(alone)
-        found = torch.autograd.grad(value.sum(), leaves, allow_unused=True)
-    for table, gradient in zip(gradients, found, strict=True):
-        table[n] = 0.0 if gradient is None else gradient[0]
-    return value.detach()[0]
+        chain = complete(Tables.of(tables.depth, leaves), ends)
+        value = logspace.log_likelihood(chain)
+        present = [leaf for leaf in leaves if leaf is not None]
+        gradients = torch.autograd.grad(value.sum(), [*present, chain.emission], allow_unused=True)
+    *own, joint = gradients
+    found.value[n] = value.detach()[0]
+    for table, gradient in zip(found.tables.leaves(), own, strict=False):
+        assert table is not None
+        table[n, :length] = 0.0 if gradient is None else gradient[0]
+    for level, marginal in enumerate(found.marginals, start=1):
+        assert joint is not None
+        marginal[n, :length] = logspace.marginal(joint, level)[0]

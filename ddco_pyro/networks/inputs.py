@@ -32,4 +32,4 @@ class Inputs:
 
 
 class ShapeError(ValueError):
-    """A network cannot read the observations it was given, or lacks an option."""
+    """A network cannot read the observations it was given, lacks an option, or gives another shape than it has to."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -10,13 +9,13 @@ import numpy as np
 import torch
 
 from ddco_pyro.demonstrations import Demonstrations
-from ddco_pyro.encoding import encode
+from ddco_pyro.encoding import STEPS_AT_ONCE, encode
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference import posterior, segment
 from ddco_pyro.run import Fit
 
-CHUNK = 2**24
-"""Entries of a table over joint choices that are held at once."""
+CHUNK = STEPS_AT_ONCE
+"""Steps that are looked at together."""
 
 MOST_BINS = 60
 
@@ -53,7 +52,7 @@ def activity(fit: Fit, demos: Demonstrations) -> Activity:
     """Posteriors, most likely paths and terminations of a fit with at least one level."""
     assert fit.spec.hierarchy is not None  # a baseline has no levels
     specs, steps = fit.spec.hierarchy.levels, max(demos.lengths)
-    size = max(1, CHUNK // (math.prod(1 + level.count for level in specs) * steps))
+    size = max(1, CHUNK // steps)
     parts = [_chunk(fit.hierarchy, part, steps) for part in _chunks(demos, size)]
     levels = []
     for number, level in enumerate(specs):

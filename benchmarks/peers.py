@@ -1,0 +1,89 @@
+"""The same inference with other tools: what ``make bench`` compares with (``pip install -e '.[bench]'``)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ddco_pyro.ahmm import Chain
+
+NEVER = -1e3
+"""The others' gradients are NaN where a logarithm is -inf; this is as good as never here."""
+
+
+def transitions(chain: Chain) -> Tensor:
+    """log p(h_t | h_{t-1}) of a chain with one level, ready for an HMM, [N, T, S, S]; row t leads to step t."""
+    keep, end = chain.termination[0].clamp(min=NEVER).unbind(-1)
+    kept = torch.where(torch.eye(keep.shape[-1], dtype=torch.bool), keep.unsqueeze(-1), NEVER)
+    return torch.logaddexp(end.unsqueeze(-1) + chain.selection[0].clamp(min=NEVER), kept)
+
+
+def dynamax_smoother(chain: Chain) -> Callable[[], float]:
+    """dynamax's jitted ``hmm_smoother`` with ready transition matrices: the sum of log-likelihoods, and posteriors."""
+    import jax
+    from dynamax.hidden_markov_model import hmm_smoother
+
+    jax.config.update("jax_enable_x64", True)
+    initial = jax.numpy.asarray(chain.selection[0][:, 0, 0].exp().numpy())
+    matrices = jax.numpy.asarray(transitions(chain)[:, 1:].exp().numpy())
+    emission = jax.numpy.asarray(chain.emission.numpy())
+
+    def smooth(first, matrix, likelihood):  # the posteriors that our pass gives too: of choices and of transitions
+        found = hmm_smoother(first, matrix, likelihood)
+        return found.marginal_loglik, found.smoothed_probs, found.trans_probs
+
+    batched = jax.jit(jax.vmap(smooth))
+    return lambda: float(np.sum(jax.block_until_ready(batched(initial, matrices, emission))[0]))
+
+
+def discrete_hmm(chain: Chain) -> Callable[[], float]:
+    """Pyro's ``DiscreteHMM`` with ready transition matrices: value and gradient."""
+    import pyro.distributions as dist
+
+    initial = chain.selection[0][:, 0, 0].clamp(min=NEVER)
+    matrices = transitions(chain).clamp(min=NEVER).requires_grad_()
+    # A Normal whose log-density is the table's: N(0; m, 1) = -m²/2 - log sqrt(2π).
+    offset = chain.emission.amax() + 1.0
+    means = (2 * (offset - chain.emission.clamp(min=NEVER))).sqrt().requires_grad_()
+    steps = chain.emission.shape[1]
+    shift = steps * (offset + 0.5 * np.log(2 * np.pi))
+    # DiscreteHMM makes a transition before its first observation: from a state that leads everywhere as the start does.
+    arriving = torch.cat([initial[:, None, None].expand(-1, 1, initial.shape[-1], -1), matrices[:, 1:]], 1)
+
+    def value_and_gradient() -> float:
+        model = dist.DiscreteHMM(
+            torch.zeros_like(initial), arriving, dist.Normal(means, 1.0), validate_args=False, duration=steps
+        )
+        value = model.log_prob(torch.zeros(steps, dtype=torch.float64)).sum()
+        torch.autograd.grad(value, [matrices, means], retain_graph=True)
+        return float(value.detach() + shift * len(initial))
+
+    return value_and_gradient
+
+
+def funsor_elimination(chain: Chain) -> Tensor:
+    """Σ_n log p(ξ_n) by the parallel scan behind ``pyro.vectorized_markov``, differentiable."""
+    import funsor
+    from funsor.sum_product import sequential_sum_product
+
+    funsor.set_backend("torch")
+    funsor.util._JAX_COMPILED_FUNCTION_TYPE = ()  # funsor 0.4.8 fails where a recent jax is imported too
+    factors = transitions(chain) + chain.emission.unsqueeze(2)
+    first = (chain.selection[0][:, 0] + chain.emission[:, 0].unsqueeze(1)).expand(-1, chain.emission.shape[-1], -1)
+    factors = torch.cat([(first - np.log(first.shape[1])).unsqueeze(1), factors[:, 1:]], 1).clamp(min=NEVER)
+    sizes = factors.shape
+    inputs = {
+        "n": funsor.Bint[sizes[0]],
+        "time": funsor.Bint[sizes[1]],
+        "before": funsor.Bint[sizes[2]],
+        "now": funsor.Bint[sizes[3]],
+    }
+    tensor = funsor.Tensor(factors, inputs)
+    whole = sequential_sum_product(
+        funsor.ops.logaddexp, funsor.ops.add, tensor, funsor.Variable("time", funsor.Bint[sizes[1]]), {"before": "now"}
+    )
+    total = whole.reduce(funsor.ops.logaddexp, frozenset({"before", "now"})).reduce(funsor.ops.add, "n")
+    return total.data

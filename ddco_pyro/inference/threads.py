@@ -1,0 +1,18 @@
+"""The number of threads of the compiled engines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numba
+import torch
+
+
+@contextmanager
+def as_many_threads_as_torch() -> Iterator[None]:
+    """Inside, compiled loops run on ``torch.get_num_threads()`` threads; torch's own number stays what it is."""
+    threads = torch.get_num_threads()
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    torch.set_num_threads(threads)  # numba's first call has set OpenMP's number for the whole process, torch's too
+    yield

@@ -1,0 +1,46 @@
+"""The declarative spec: YAML in, one frozen and fully validated :class:`Spec` out. Nothing else reads YAML.
+
+An unknown key, a wrong type or a value out of range is a :class:`SpecError` with one line for each problem.
+"""
+
+from ddco_pyro.spec.hierarchy import BaselineSpec, HierarchySpec, LevelSpec
+from ddco_pyro.spec.messages import SpecError
+from ddco_pyro.spec.networks import MetaPolicySpec, NetworkSpec, PolicySpec
+from ddco_pyro.spec.reading import dump_spec, load_spec, spec_schema
+from ddco_pyro.spec.settings import (
+    ControlSpec,
+    DemonstrationsSpec,
+    InferenceSpec,
+    LearnedStd,
+    ObservationSpec,
+    OptimizerSpec,
+    RolloutSpec,
+    SelectionSpec,
+    TrainingSpec,
+)
+from ddco_pyro.spec.whole import Spec, parse_spec, with_overrides
+
+__all__ = [
+    "BaselineSpec",
+    "ControlSpec",
+    "DemonstrationsSpec",
+    "HierarchySpec",
+    "InferenceSpec",
+    "LearnedStd",
+    "LevelSpec",
+    "MetaPolicySpec",
+    "NetworkSpec",
+    "ObservationSpec",
+    "OptimizerSpec",
+    "PolicySpec",
+    "RolloutSpec",
+    "SelectionSpec",
+    "Spec",
+    "SpecError",
+    "TrainingSpec",
+    "dump_spec",
+    "load_spec",
+    "parse_spec",
+    "spec_schema",
+    "with_overrides",
+]

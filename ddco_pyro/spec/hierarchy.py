@@ -1,0 +1,69 @@
+"""The model that a spec declares: levels of options below a meta-policy, or a policy without options."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator
+
+from ddco_pyro.spec.messages import invalid
+from ddco_pyro.spec.networks import MetaPolicySpec, NetworkSpec, PolicySpec
+from ddco_pyro.spec.types import Count, Emission, Items, Model, bare
+
+
+class LevelSpec(Model):
+    """One level of options."""
+
+    name: str = Field(default="option", pattern=r"^[A-Za-z][\w-]*$")
+    """Name of the level in reports and files; letters, digits, ``_`` and ``-``, a letter first."""
+    count: Count
+    """Number of options, k."""
+    policy: PolicySpec = PolicySpec()
+    """The options' policies, π: one network for each option."""
+    termination: NetworkSpec = NetworkSpec(network="linear")
+    """The options' termination conditions, ψ: one network for each option."""
+
+
+class HierarchySpec(Model):
+    """Levels of options below a meta-policy."""
+
+    levels: Items[LevelSpec] = Field(min_length=1)
+    """The levels, lowest first."""
+    meta_policy: MetaPolicySpec = MetaPolicySpec()
+    """The policy that selects from the highest level, η."""
+
+    @field_validator("levels")
+    @classmethod
+    def _consistent(cls, levels: tuple[LevelSpec, ...]) -> tuple[LevelSpec, ...]:
+        problems = []
+        first: dict[str, int] = {}
+        for index, level in enumerate(levels):
+            if level.name in first:
+                text = f"{level.name!r} is also the name of level {first[level.name]}; give each level its own"
+                problems.append((f"{index}.name", text))
+            first.setdefault(level.name, index)
+        if levels[0].policy.emits not in ((), ("control",)):
+            problems.append(("0.policy.emits", "the lowest level emits the control and nothing else; leave it out"))
+        if problems:
+            raise invalid(*problems)
+        return tuple(_with_emission(level, "options" if index else "control") for index, level in enumerate(levels))
+
+
+def _with_emission(level: LevelSpec, default: Emission) -> LevelSpec:
+    emits = level.policy.emits or (default,)
+    return level.model_copy(update={"policy": level.policy.model_copy(update={"emits": emits})})
+
+
+Kind = Literal["flat", "per_timestep"]
+
+
+class BaselineSpec(Model):
+    """A policy without options, trained by behaviour cloning."""
+
+    kind: Kind
+    """``flat``: one policy for all times; ``per_timestep``: one policy for each time step."""
+    policy: NetworkSpec = NetworkSpec()
+    """The policy's network, π."""
+
+
+Baseline = Annotated[BaselineSpec, bare("kind", Kind | BaselineSpec)]

@@ -1,0 +1,147 @@
+"""What a spec says beside the model: data, control, training, evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, Tag
+
+from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Seed, Share, Text, bare
+
+
+class DemonstrationsSpec(Model):
+    """Where the demonstrations come from: a file, or the task's supervisor."""
+
+    path: Text | None = None
+    """HDF5 file in robomimic's layout; without it they are collected in the task."""
+    task: Text | None = None
+    """Task in which they are collected, such as one whose episodes are single demonstrations; null: the spec's own."""
+    count: int = Field(default=100, ge=2)
+    """Number of demonstrations to collect."""
+    seed: Seed = 0
+    """Seed of the first collected episode."""
+    supervisor: Text = "supervisor"
+    """Which of the task's scripted policies is recorded."""
+    valid_fraction: Fraction = 0.1
+    """Part of the demonstrations held out for validation, where the file has no ``mask/valid``."""
+    labels: Text | None = None
+    """Name of ground-truth labels in the file; the discovered options are compared with them (NMI)."""
+
+
+class ObservationSpec(Model):
+    """One observation that the networks see."""
+
+    key: Text
+    """Name of the observation in the demonstrations."""
+    differences: bool = False
+    """Append x_t − x_{t−1}."""
+    standardize: bool = True
+    """Shift and scale to mean 0 and standard deviation 1 over the training demonstrations."""
+
+
+Observation = Annotated[ObservationSpec, bare("key", str | ObservationSpec)]
+
+
+class LearnedStd(Model):
+    """A standard deviation that is learned, one for each level and control dimension."""
+
+    learn: Literal[True]
+    """Always true; for a fixed standard deviation give a number instead of this mapping."""
+    floor: Positive = 0.01
+    """Lower bound, in scaled units."""
+
+
+_STD = "<a positive number or {learn: true}>"
+_STD_LEARNED = "<>"
+_SCALE_NAME = "<standardize, none, or a list of positive numbers>"
+_SCALE_SIZES = "<>"
+
+
+class ControlSpec(Model):
+    """The distribution of the control, a_t ~ N(π(s_t), σ²)."""
+
+    std: Annotated[
+        Annotated[Positive, Tag(_STD)] | Annotated[LearnedStd, Tag(_STD_LEARNED)],
+        Discriminator(lambda value: _STD_LEARNED if isinstance(value, Mapping | LearnedStd) else _STD),
+    ] = 0.1
+    """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``."""
+    scale: Annotated[
+        Annotated[Literal["standardize", "none"], Tag(_SCALE_NAME)]
+        | Annotated[Items[Positive], Field(min_length=1), Tag(_SCALE_SIZES)],
+        Discriminator(
+            lambda value: _SCALE_SIZES if isinstance(value, Sequence) and not isinstance(value, str) else _SCALE_NAME
+        ),
+    ] = "standardize"
+    """``standardize`` (by the training demonstrations), ``none``, or one positive number for each control dimension,
+    by which it is divided."""
+
+
+class OptimizerSpec(Model):
+    """The optimiser of the expectation-gradient steps."""
+
+    name: Literal["adam", "momentum"] = "adam"
+    """``adam``, or ``momentum`` for gradient descent with momentum."""
+    lr: Positive = 1e-3
+    """Learning rate."""
+    momentum: Share = 0.9
+    """Momentum (``momentum`` only)."""
+    weight_decay: float = Field(default=0.0, ge=0)
+    """L2 penalty."""
+
+
+class TrainingSpec(Model):
+    """How the model is trained."""
+
+    initialize: Literal["vq", "vq_controls", "random"] = "vq"
+    """``vq``: by vector quantisation of the observations (SM 2.2); ``vq_controls``: of observations and controls;
+    ``random``: random weights."""
+    layerwise: bool = True
+    """Discover level after level, lowest first, rather than all at once."""
+    lower_levels: Literal["fine_tuned", "frozen"] = "fine_tuned"
+    """Layer-wise training: whether a last stage trains all levels together, or what was discovered stays as it is."""
+    optimizer: OptimizerSpec = OptimizerSpec()
+    """The optimiser."""
+    epochs: Count = 200
+    """Passes over the training demonstrations in each stage, at most."""
+    batch_size: Count = 16
+    """Trajectories in each gradient step."""
+    restarts: Count = 1
+    """Independent initialisations; the best on the tuning demonstrations is kept."""
+    tune_fraction: Fraction = 0.1
+    """Part of the training demonstrations held out to stop early and to choose among restarts."""
+    patience: Count | None = 20
+    """Epochs without improvement before a stage stops; null for never."""
+    clip_gradient: Positive | None = None
+    """Largest norm of a gradient; null for no limit."""
+
+
+class InferenceSpec(Model):
+    """How the latent variables are eliminated."""
+
+    engine: Literal["fused", "enumerate"] = "fused"
+    """``fused``: in one compiled pass; ``enumerate``: Pyro's enumeration. Both give the same numbers."""
+
+
+class SelectionSpec(Model):
+    """Cross-validation over a grid."""
+
+    folds: int = Field(default=10, ge=2)
+    """Number of folds."""
+    grid: dict[str, Annotated[Items[Any], Field(min_length=1)]] = Field(default={})
+    """Key path of this spec to the values to try there."""
+
+
+class RolloutSpec(Model):
+    """How the fitted policy is tried in the task."""
+
+    episodes: Count = 50
+    """Number of episodes."""
+    seed: Seed = 1000
+    """Seed of the first episode; the next ones count up from it."""
+    control: Literal["mean", "sample"] = "mean"
+    """Whether the control is the mean of its distribution or a sample."""
+    options: Literal["sample", "most_likely"] = "sample"
+    """Whether options and terminations are sampled or the most likely ones."""
+    policies: Items[Text] = ()
+    """Scripted policies of the task that are rolled out beside, such as ``open_loop``."""

@@ -1,0 +1,32 @@
+"""What every part of the spec is made of: the strict and frozen base of the models, and the types of their values."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+T = TypeVar("T")
+Items = Annotated[tuple[T, ...], Field(strict=False)]  # strict would refuse the lists that YAML gives
+Count = Annotated[int, Field(ge=1)]
+Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
+Positive = Annotated[float, Field(gt=0)]
+Fraction = Annotated[float, Field(gt=0, lt=1)]
+Share = Annotated[float, Field(ge=0, lt=1)]
+Text = Annotated[str, Field(min_length=1)]
+Emission = Literal["options", "control"]
+
+
+class Model(BaseModel):
+    """A part of the spec: nothing else than its keys, in the types they have, and frozen."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+
+def bare(key: str, allowed: Any) -> BeforeValidator:
+    """Reads a bare string as ``{key: that}``; ``allowed`` is the type that the JSON Schema shows."""
+    return BeforeValidator(
+        lambda value: {key: value} if isinstance(value, str) else value, json_schema_input_type=allowed
+    )

@@ -1,0 +1,123 @@
+"""The whole spec, what has to fit together in it, and the same spec with other values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from pydantic import Field, ValidationError, model_validator
+
+from ddco_pyro.spec.hierarchy import Baseline, HierarchySpec
+from ddco_pyro.spec.keypaths import edited
+from ddco_pyro.spec.messages import SpecError, invalid, lines, show
+from ddco_pyro.spec.settings import (
+    ControlSpec,
+    DemonstrationsSpec,
+    InferenceSpec,
+    Observation,
+    RolloutSpec,
+    SelectionSpec,
+    TrainingSpec,
+)
+from ddco_pyro.spec.types import Items, Model, Seed, Text
+
+
+class Spec(Model):
+    """Everything that determines a run."""
+
+    task: Text | None = None
+    """Name of a registered task, or ``module:name``."""
+    demonstrations: DemonstrationsSpec = DemonstrationsSpec()
+    """Where the demonstrations come from."""
+    observations: Items[Observation] = Field(min_length=1)
+    """The observations that the networks see; a bare name stands for ``{key: name}``."""
+    control: ControlSpec = ControlSpec()
+    """The distribution of the control."""
+    hierarchy: HierarchySpec | None = None
+    """Levels of options below a meta-policy; either this or ``baseline``."""
+    baseline: Baseline | None = None
+    """A policy without options; either this or ``hierarchy``. A bare name stands for ``{kind: name}``."""
+    compare_with: Items[Baseline] = ()
+    """Baselines trained beside on the same split, for the report."""
+    training: TrainingSpec = TrainingSpec()
+    """How the model is trained."""
+    inference: InferenceSpec = InferenceSpec()
+    """How the latent variables are eliminated."""
+    selection: SelectionSpec = SelectionSpec()
+    """Cross-validation over a grid."""
+    rollout: RolloutSpec = RolloutSpec()
+    """How the fitted policy is tried in the task."""
+    seed: Seed = 0
+    """Seed of everything random that has no seed of its own."""
+
+    @property
+    def demonstrated_task(self) -> str | None:
+        """Name of the task in which demonstrations are collected; None where there is only a file."""
+        return self.demonstrations.task or self.task
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Spec:
+        problems = [*self._choices(), *self._repeated_observations()]
+        if problems:
+            raise invalid(*problems)
+        if self.selection.grid:
+            problems = list(_grid_problems(self))
+            if problems:
+                raise invalid(*problems)
+        return self
+
+    def _choices(self) -> Iterator[tuple[str, str]]:
+        if self.demonstrated_task is None and self.demonstrations.path is None:
+            yield "task", "missing; name a task, or give a file in demonstrations.path"
+        if self.hierarchy is None and self.baseline is None:
+            yield "hierarchy", "missing; declare a hierarchy, or a baseline in its place"
+        if self.hierarchy is not None and self.baseline is not None:
+            yield "baseline", "stands beside hierarchy; keep one of them (compare_with takes baselines to train beside)"
+
+    def _repeated_observations(self) -> Iterator[tuple[str, str]]:
+        keys = [observation.key for observation in self.observations]
+        for index, key in enumerate(keys):
+            if key in keys[:index]:
+                yield f"observations.{index}.key", f"{key!r} is given twice; keep one"
+
+
+def _grid_problems(spec: Spec) -> Iterator[tuple[str, str]]:
+    """Applies every value of the grid by itself; what the spec then complains about is what is wrong with the value."""
+    data = _given(spec)
+    del data["selection"]["grid"]
+    for path, values in spec.selection.grid.items():
+        here = f"selection.grid.{path}"
+        if path.partition(".")[0] == "selection":
+            yield here, "the selection cannot be part of its own grid; remove it"
+            continue
+        for value in values:
+            try:
+                parse_spec(data, {path: value})
+            except SpecError as error:
+                yield from ((here, f"value {show(value)}: {problem}") for problem in error.problems)
+
+
+def parse_spec(data: Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Spec:
+    """The spec that plain ``data`` declares, as YAML would give it, after the overrides ``{key path: value}``.
+
+    :raises SpecError: it is not a valid spec; one line for each problem.
+    """
+    try:
+        return Spec.model_validate(edited(data, overrides or {}))
+    except ValidationError as error:
+        raise SpecError(*lines(error, Spec)) from None
+
+
+def with_overrides(spec: Spec, overrides: Mapping[str, Any]) -> Spec:
+    """The spec with other values at some key paths, such as ``{"hierarchy.levels.0.count": 3}``.
+
+    Another ``network`` drops the settings beside it that do not apply to it.
+
+    :raises SpecError: a path or a value is not valid; one line for each problem.
+    """
+    return parse_spec(_given(spec), overrides)
+
+
+def _given(spec: Spec) -> dict[str, Any]:
+    """The values that were given, as plain data, without the defaults."""
+    return spec.model_dump(exclude_unset=True)

@@ -1,0 +1,26 @@
+"""Small random demonstrations with a vector, a camera and labels, for tests of files."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ddco_pyro.demonstrations import Demonstration, Demonstrations
+
+
+def demonstration(name: str, steps: int = 4, seed: int = 0) -> Demonstration:
+    random = np.random.default_rng(seed)
+    return Demonstration(
+        name=name,
+        observations={
+            "pose": random.normal(size=(steps, 3)),
+            "camera": random.integers(0, 256, (steps, 6, 5, 3), dtype=np.uint8),
+        },
+        actions=random.normal(size=(steps, 2)),
+        labels={"phase": random.integers(0, 3, steps)},
+        attributes={"seed": seed, "accuracy": 0.5, "success": True, "policy": "supervisor"},
+    )
+
+
+def demonstrations(number: int = 12, masks: dict[str, tuple[str, ...]] | None = None) -> Demonstrations:
+    records = tuple(demonstration(f"demo_{index}", 3 + index % 4, index) for index in range(number))
+    return Demonstrations(records, masks or {}, {"task": "needle", "version": 3})

@@ -1,0 +1,217 @@
+"""The model run forward: its sites, what its samples may be and how often, and the tables it is made of."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pyro
+import pytest
+import torch
+from oracle import brute_force, paths, random_tables
+
+from ddco_pyro.ahmm import NEVER, Tables, Tabulated, ahmm, complete
+from ddco_pyro.inference import log_likelihood
+
+SAMPLES = 4000
+
+
+def run_forward(tables, lengths, seed=0):
+    """The trace of one run of the model."""
+    pyro.set_rng_seed(seed)
+    return pyro.poutine.trace(ahmm).get_trace(complete(tables, lengths))
+
+
+def latents(trace, depth, steps):
+    """Choices h [N, T, D] and terminations b [N, T, D] of a trace, 1 for the b that the first step does not have."""
+    nodes = trace.nodes
+    choices = [[nodes[f"h_{d}_{t}"]["value"] for d in range(1, depth + 1)] for t in range(steps)]
+    ends = [[nodes[f"b_{d}_{t}"]["value"] for d in range(1, depth + 1)] for t in range(1, steps)]
+    ends.insert(0, [torch.ones_like(choices[0][0])] * depth)
+    return tuple(torch.stack([torch.stack(step, -1) for step in part], 1) for part in (choices, ends))
+
+
+def repeated(tables, times):
+    """The first trajectory's tables, that many times."""
+    parts = (tables.selection, tables.termination, tables.control)
+    return Tables(*(tuple(table[:1].expand(times, *table.shape[1:]) for table in part) for part in parts))
+
+
+# --- sites ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_sites_are_those_of_the_paper():
+    trace = run_forward(random_tables((2, 3), (True, False), trajectories=2, steps=3), torch.tensor([3, 2]))
+    sites = [name for name, site in trace.nodes.items() if site["type"] == "sample" and name != "demonstrations"]
+    assert sites == [
+        *("h_2_0", "h_1_0", "a_0"),
+        *("b_1_1", "b_2_1", "h_2_1", "h_1_1", "a_1"),
+        *("b_1_2", "b_2_2", "h_2_2", "h_1_2", "a_2"),
+    ]
+    observed = {name for name in sites if trace.nodes[name]["is_observed"]}
+    assert observed == {"a_0", "a_1", "a_2"}
+    assert all(trace.nodes[name]["value"].shape == (2,) for name in sites if name not in observed)
+
+
+def test_without_options_there_is_only_the_control():
+    tables = random_tables((), (), trajectories=2, steps=2)
+    trace = run_forward(tables, torch.tensor([2, 1]))
+    assert [name for name in trace.nodes if name[:2] in ("h_", "b_", "a_")] == ["a_0", "a_1"]
+    expected = float(tables.control[0][0, :2].sum() + tables.control[0][1, 0])
+    assert float(trace.log_prob_sum()) == pytest.approx(expected, abs=1e-12)
+
+
+# --- samples ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hybrid", [(True, True), (False, True), (True, False), (False, False)])
+def test_samples_keep_to_the_rules(hybrid):
+    steps = 12
+    tables = random_tables((3, 2), hybrid, trajectories=400, steps=steps, seed=3)
+    h, b = latents(run_forward(tables, torch.full((400,), steps)), 2, steps)
+    before, now, ends = h[:, :-1], h[:, 1:], b[:, 1:]
+    assert not (ends[..., 1] > ends[..., 0]).any(), "a level ended above one that did not"
+    kept = ends == 0
+    assert 0 < int(kept.sum()) < kept.numel()
+    assert torch.equal(now[kept], before[kept])
+    called = h[..., 1] == 0
+    assert (h[..., 0][called] == 0).all(), "something is chosen below a choice 0"
+    assert bool(called.any()) == hybrid[1]
+    lowest_control = (h[..., 0] == 0) & ~called
+    assert bool(lowest_control.any()) == hybrid[0]
+    assert (ends[..., 0][before[..., 0] == 0] == 1).all(), "control by the caller lasts longer than one step"
+    assert set(h[..., 0].unique().tolist()) >= {1, 2, 3}
+    assert set(h[..., 1].unique().tolist()) >= {1, 2}
+
+
+def test_past_the_end_every_choice_is_kept():
+    steps, length = 6, 2
+    tables = random_tables((3, 2), (True, True), trajectories=50, steps=steps, seed=5)
+    trace = run_forward(tables, torch.full((50,), length))
+    h, b = latents(trace, 2, steps)
+    assert (b[:, length:] == 0).all()
+    assert torch.equal(h[:, length:], h[:, length - 1 : length].expand(-1, steps - length, -1))
+    assert all(not trace.nodes[f"a_{t}"]["fn"].log_factor.any() for t in range(length, steps))
+
+
+@pytest.mark.parametrize(
+    ("counts", "hybrid", "steps"), [((2,), (True,), 4), ((2, 2), (False, True), 3), ((1, 1, 1), (True, True, True), 3)]
+)
+def test_latents_are_as_frequent_as_the_sum_over_paths_says(counts, hybrid, steps):
+    """Controls of density 1 tell nothing, so what is sampled has the marginals of the prior."""
+    tables = random_tables(counts, hybrid, steps=steps, seed=7)
+    silent = replace(tables, control=tuple(torch.where(c == NEVER, c, 0.0) for c in tables.control))
+    truth = brute_force(silent, 0, steps)
+    assert truth.log_likelihood == pytest.approx(0, abs=1e-12)
+    h, b = latents(run_forward(repeated(silent, SAMPLES), torch.full((SAMPLES,), steps)), len(counts), steps)
+    for d in range(len(counts)):
+        chosen = torch.nn.functional.one_hot(h[..., d], 1 + counts[d]).double()
+        found = {"u": chosen.mean(0), "v": (chosen * b[..., d, None]).mean(0)}
+        found["w"] = (chosen[:, :-1] * (1 - b[:, 1:, d, None])).mean(0)
+        expected = {"u": truth.u[d], "v": truth.v[d], "w": truth.w[d][:-1]}
+        for name, p in expected.items():
+            error = np.sqrt(p * (1 - p) / SAMPLES)
+            assert (np.abs(found[name].numpy() - p) <= 4.5 * error + 1e-12).all(), (name, d, found[name], p)
+
+
+def test_what_is_sampled_has_the_probability_of_the_paper():
+    """By hand: h_0 by η, then ended by ψ and selected again by η (or kept by 1 − ψ); the densities of the controls."""
+    eta, psi, density = 0.7, 0.2, (1.5, -0.5)
+    selection = torch.tensor([0.0, eta, 1 - eta]).double().log().expand(1, 2, 1, 3)
+    termination = torch.tensor([1 - psi, psi]).double().log().expand(1, 2, 2, 2)
+    control = torch.tensor([density]).double().expand(1, 2, 2)
+    tables = Tables((selection,), (termination,), (control, torch.full((1, 2, 1), NEVER)))
+    seen = Counter()
+    for seed in range(60):
+        trace = run_forward(tables, torch.tensor([2]), seed)
+        h, b = latents(trace, 1, 2)
+        (first, second), ended = h[0, :, 0].tolist(), int(b[0, 1, 0])
+        chosen = {1: eta, 2: 1 - eta}
+        expected = chosen[first] * (psi * chosen[second] if ended else 1 - psi)
+        expected_log = np.log(expected) + density[first - 1] + density[second - 1]
+        assert float(trace.log_prob_sum()) == pytest.approx(expected_log, abs=1e-6)
+        seen[first, ended, second] += 1
+    assert len(seen) >= 4
+
+
+# --- a choice with a table --------------------------------------------------------------------------------------------
+
+
+def test_a_tabulated_choice_gives_its_entries_as_they_are():
+    log_probs = torch.tensor([[0.5, NEVER, -2.0], [NEVER, NEVER, 0.0]])  # not normalised
+    choice = Tabulated(log_probs)
+    assert choice.batch_shape == (2,)
+    assert choice.log_prob(torch.tensor([0, 2])).tolist() == [0.5, 0.0]
+    assert choice.log_prob(torch.tensor([1, 0])).tolist() == [-torch.inf, -torch.inf]
+    every = choice.enumerate_support()
+    assert every.tolist() == [[0, 0], [1, 1], [2, 2]]
+    assert choice.enumerate_support(expand=False).tolist() == [[0], [1], [2]]
+    assert torch.equal(choice.log_prob(every), log_probs.T)
+    assert torch.equal(choice.log_prob(choice.enumerate_support(expand=False)), log_probs.T)
+    larger = choice.expand((4, 2))
+    assert larger.batch_shape == (4, 2)
+    assert torch.equal(larger.log_prob(torch.full((4, 2), 2)), torch.tensor([-2.0, 0.0]).expand(4, 2))
+
+
+def test_the_gradient_of_a_tabulated_choice_is_its_entry():
+    log_probs = torch.tensor([NEVER, -1.0, -3.0], requires_grad=True)
+    Tabulated(log_probs).log_prob(torch.tensor(1)).backward()
+    assert log_probs.grad.tolist() == [0, 1, 0]
+
+
+def test_what_cannot_happen_is_never_drawn():
+    torch.manual_seed(0)
+    probabilities = torch.tensor([0.25, 0.0, 0.75])
+    drawn = Tabulated(probabilities.log()).sample((SAMPLES,))
+    assert drawn.shape == (SAMPLES,)
+    frequency = torch.bincount(drawn, minlength=3) / SAMPLES
+    assert frequency[1] == 0
+    assert float(frequency[0]) == pytest.approx(0.25, abs=4.5 * np.sqrt(0.25 * 0.75 / SAMPLES))
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("level", [1, 2])
+def test_a_clamped_level_has_the_choices_it_is_given(level):
+    tables = random_tables((2, 2), (True, True), trajectories=2, steps=3, seed=11)
+    lengths, choices = torch.tensor([3, 2]), torch.tensor([[2, 0, 1], [2, 2, 0]])  # the last is past the end
+    clamped = tables.clamp(level, choices)
+    assert tables.evidence == ()
+    for n, length in enumerate(lengths.tolist()):
+        given = tuple(choices[n, :length].tolist())
+        every = [(path, probability) for path, _, probability in paths(tables, n, length, [3, 3])]
+        truth = sum(probability for path, probability in every if tuple(h[level - 1] for h in path) == given)
+        assert 0 < truth < 0.9 * sum(probability for _, probability in every)
+        for engine in ("fused", "enumerate"):
+            found = log_likelihood(clamped, lengths, engine)[n]
+            assert float(found) == pytest.approx(np.log(truth), abs=1e-9)
+
+
+def test_where_every_choice_is_known_only_terminations_are_summed_over():
+    """By hand: the option may stay, or end and be chosen again. Levels may be clamped in any order."""
+    tables = random_tables((2,), (False,), steps=2, seed=12)
+    choices = torch.tensor([[1, 1]])
+    eta, psi = tables.selection[0][0, :, 0].exp(), tables.termination[0][0, 1, 0].exp()
+    control = tables.control[0][0, :, 0]
+    expected = eta[0, 1].log() + (psi[0] + psi[1] * eta[1, 1]).log() + control.sum()
+    found = log_likelihood(tables.clamp(1, choices), torch.tensor([2]))
+    assert float(found) == pytest.approx(float(expected), abs=1e-12)
+    two = random_tables((2, 2), (False, False), steps=2, seed=12)
+    once, again = two.clamp(1, choices).clamp(2, choices), two.clamp(2, choices).clamp(1, choices)
+    for one, other in zip(once.evidence, again.evidence, strict=True):
+        assert one.tolist() == other.tolist() == [[[NEVER, 0, NEVER]] * 2]
+
+
+def test_a_trajectory_alone_is_what_it_is_among_others():
+    tables = random_tables((2, 3), (True, False), trajectories=3, steps=4, seed=13)
+    lengths = torch.tensor([4, 2, 3])
+    choices = torch.tensor([[1, 2, 2, 1], [2, 1, 0, 0], [1, 1, 2, 0]])
+    for whole in (tables, tables.clamp(1, choices)):
+        for n, length in enumerate(lengths.tolist()):
+            alone = whole.trajectory(n, length)
+            assert alone.selection[0].shape == (1, length, 3, 3)
+            assert torch.equal(alone.control[0][0], whole.control[0][n, :length])
+            found = log_likelihood(alone, torch.tensor([length]))
+            torch.testing.assert_close(found[0], log_likelihood(whole, lengths)[n], atol=1e-12, rtol=0)

@@ -1,0 +1,113 @@
+"""The compiled engine against the log-space recursion in float64, on tables made to break it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracle import random_tables
+
+from ddco_pyro.ahmm import NEVER, Tables, complete
+from ddco_pyro.inference import fused, logspace, posterior
+from ddco_pyro.inference.structure import structure_of
+
+SHAPES = [(1,), (3,), (20,), (1, 1), (2, 2), (4, 1), (2, 1, 2)]
+
+hard = given(
+    counts=st.sampled_from(SHAPES),
+    steps=st.one_of(st.integers(1, 40), st.just(150)),
+    seed=st.integers(0, 10_000),
+    sharp=st.sampled_from([1.0, 30.0, 1e3, 1e5]),
+    termination=st.sampled_from([0.0, 1e-8, 0.3, 1 - 1e-8, 1.0]),
+    impossible=st.floats(0, 0.4),
+    identical=st.booleans(),
+)
+
+
+@settings(deadline=None, max_examples=300, derandomize=True)
+@hard
+def test_value_and_gradient_are_those_of_log_space(**case):
+    compare(**case)
+
+
+@pytest.mark.slow
+@settings(deadline=None, max_examples=5000)
+@hard
+def test_value_and_gradient_are_those_of_log_space_in_thousands_of_cases(**case):
+    compare(**case)
+
+
+def compare(counts, steps, seed, sharp, termination, impossible, identical):
+    """Tiny σ, terminations within 1e-8 of 0 and 1 and at them, impossible options, options that are the same."""
+    hybrid = tuple(bool(seed >> level & 1) for level in range(len(counts)))
+    tables = random_tables(counts, hybrid, trajectories=3, steps=steps, seed=seed)
+    generator = torch.Generator().manual_seed(seed)
+
+    def holes(table):
+        return torch.where(torch.rand(table.shape, generator=generator) < impossible, NEVER, table)
+
+    control = tuple(holes(sharp * table) for table in tables.control)
+    selection = tuple(holes(table) for table in tables.selection)
+    ending = torch.tensor([1 - termination, termination], dtype=torch.float64).log()
+    somewhere = torch.rand(tables.termination[0][..., :1].shape, generator=generator) < 0.5
+    lowest = torch.where(somewhere, ending, tables.termination[0])
+    tables = Tables(selection, (lowest, *tables.termination[1:]), control)
+    if identical:
+        tables = replace(tables, control=(control[0][..., :1].expand_as(control[0]).clone(), *control[1:]))
+    agree(tables, torch.tensor([steps, 1, (steps + 1) // 2]))
+
+
+def agree(tables, lengths):
+    """Values and the gradients of every table, to 1e-6 relative; a trajectory that is impossible has -inf in both."""
+    leaves = [table.requires_grad_() for table in tables.leaves()]
+    value, truth = fused.log_likelihood(tables, lengths), logspace.log_likelihood(complete(tables, lengths))
+    torch.testing.assert_close(value, truth, rtol=1e-9, atol=1e-9)
+    possible = torch.isfinite(truth)
+    if possible.any():
+        found = torch.autograd.grad(value[possible].sum(), leaves, allow_unused=True)
+        expected = torch.autograd.grad(truth[possible].sum(), leaves, allow_unused=True)
+        for ours, theirs, leaf in zip(found, expected, leaves, strict=True):
+            theirs = torch.zeros_like(leaf) if theirs is None else theirs
+            entries = leaf > NEVER  # an impossible entry has no logarithm to differentiate by
+            torch.testing.assert_close(ours[entries], theirs[entries], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("counts", [(199,), (13, 13), (5, 5, 4)])
+def test_two_hundred_joint_choices(counts):
+    tables = random_tables(counts, (True,) * len(counts), trajectories=2, steps=12, seed=31)
+    agree(tables, torch.tensor([12, 7]))
+
+
+@pytest.mark.parametrize("sharp", [1.0, 100.0])
+def test_ten_thousand_steps(sharp):
+    tables = random_tables((5,), (True,), steps=10_000, seed=8)
+    agree(replace(tables, control=tuple(sharp * c for c in tables.control)), torch.tensor([10_000]))
+    assert torch.allclose(posterior(tables, torch.tensor([10_000])).u[0].sum(-1), torch.ones(1, dtype=torch.float64))
+
+
+def test_underflow_is_seen_and_mended():
+    """The past makes option 1 next to impossible, the future allows nothing else: underflow loses the path."""
+    steps = 60
+    control = torch.zeros(1, steps, 2, dtype=torch.float64)
+    control[:, : steps // 2, 0] = -40.0  # e^-1200 in all
+    control[:, steps // 2 :, 1] = -1e4
+    stay = torch.tensor([0.0, NEVER], dtype=torch.float64).expand(1, steps, 2, 2).clone()
+    selection = torch.tensor([NEVER, 0.5, 0.5], dtype=torch.float64).log().nan_to_num(nan=NEVER).expand(1, steps, 1, 3)
+    tables = Tables((selection.clone(),), (stay,), (control, torch.full((1, steps, 1), NEVER, dtype=torch.float64)))
+    assert not exact(tables)
+    agree(tables, torch.tensor([steps]))
+
+
+def exact(tables):
+    """Whether the scaled pass alone trusts itself."""
+    rows = tuple(
+        torch.cat([table.flatten(2) for table in group], -1).exp()
+        for group in (tables.selection, tables.termination, tables.control)
+    )
+    number, steps = tables.control[-1].shape[:2]
+    nothing = torch.empty(number, steps, 0, dtype=torch.float64)
+    _, found, _, _ = fused.run(structure_of(tables), rows, nothing, torch.full((number,), steps))
+    return bool(found.all())

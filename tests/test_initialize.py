@@ -1,0 +1,167 @@
+"""Clusters: planted ones are found, and they are k-means' own of the rows that they should be computed from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from sklearn.cluster import KMeans
+from sklearn.metrics import adjusted_rand_score
+
+from ddco_pyro.encoding import Batch
+from ddco_pyro.initialize import POOLED, Clusters
+from ddco_pyro.networks import Inputs
+
+LENGTHS = (7, 4, 6)
+PLACES = np.array([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
+
+
+def make_batch(vector, actions, images=None, lengths=LENGTHS):
+    """A batch of [steps, ...] rows, cut into demonstrations; what pads them is far from everything."""
+    cuts = np.cumsum(lengths)[:-1]
+
+    def pad(rows, value):
+        parts = [torch.as_tensor(part) for part in np.split(rows, cuts)]
+        return torch.nn.utils.rnn.pad_sequence(parts, batch_first=True, padding_value=value)
+
+    pictures = {key: pad(rows, 255) for key, rows in (images or {}).items()}
+    inputs = Inputs(pad(vector, 1e3).float(), pictures, torch.arange(max(lengths)))
+    return Batch(inputs, pad(actions, 1e3).float(), torch.tensor(lengths))
+
+
+def alive(choices, lengths=LENGTHS):
+    """The choices of every step, padding left out."""
+    return np.concatenate([row[:length] for row, length in zip(choices.numpy(), lengths, strict=True)])
+
+
+def random_rows(seed, columns):
+    return np.random.default_rng(seed).normal(size=(sum(LENGTHS), columns))
+
+
+def planted(seed=0):
+    """Observations near three places, controls near two that say nothing of the place."""
+    random = np.random.default_rng(seed)
+    place, move = random.integers(0, 3, sum(LENGTHS)), np.arange(sum(LENGTHS)) % 2
+    vector = PLACES[place] + 0.1 * random.normal(size=(sum(LENGTHS), 3))
+    actions = np.array([[-9.0, 0.0], [9.0, 0.0]])[move] + 0.1 * random.normal(size=(sum(LENGTHS), 2))
+    return place, move, vector, actions
+
+
+# --- which steps belong together --------------------------------------------------------------------------------------
+
+
+def test_planted_places_are_found():
+    place, _, vector, actions = planted()
+    batch = make_batch(vector, actions)
+    choices = Clusters(batch, 3, seed=0).choices(batch)
+    assert choices.shape == (3, 7)
+    assert choices.dtype == torch.long
+    assert adjusted_rand_score(place, alive(choices)) == 1
+    assert set(alive(choices)) == {1, 2, 3}
+
+
+def test_padding_belongs_to_no_cluster_and_makes_none():
+    _, _, vector, actions = planted()
+    batch = make_batch(vector, actions)
+    for controls in (False, True):
+        choices = Clusters(batch, 3, seed=0, controls=controls).choices(batch)
+        padding = torch.arange(7) >= torch.tensor(LENGTHS)[:, None]
+        assert (choices[padding] == 0).all()
+        assert (choices[~padding] > 0).all()
+
+
+def test_steps_that_look_alike_are_told_apart_by_their_controls_alone_if_asked_to():
+    _, move, _, actions = planted()
+    vector = 0.01 * random_rows(1, 3)
+    batch = make_batch(vector, actions)
+    assert adjusted_rand_score(move, alive(Clusters(batch, 2, seed=0, controls=True).choices(batch))) == 1
+    assert adjusted_rand_score(move, alive(Clusters(batch, 2, seed=0).choices(batch))) < 0.5
+
+
+@pytest.mark.parametrize(("spread", "found"), [(1.0, "place"), (3.0, "move")])
+def test_observations_and_controls_have_the_same_weight(spread, found):
+    """Eight observations say one thing, two controls another; what varies more in mean square decides.
+
+    8 · 2² against (8 / 2) · 2 · spread²: 32 against 8 or 72. Without the weight it would be against 2 or 18.
+    """
+    steps = sum(LENGTHS)
+    truth = {"place": np.arange(steps) % 2, "move": np.arange(steps) // 2 % 2}
+    jitter = 0.01 * random_rows(2, 10)
+    vector = 2.0 * (2 * truth["place"] - 1)[:, None] + jitter[:, :8]
+    actions = spread * (2 * truth["move"] - 1)[:, None] + jitter[:, 8:]
+    batch = make_batch(vector, actions)
+    choices = alive(Clusters(batch, 2, seed=0, controls=True).choices(batch))
+    assert adjusted_rand_score(truth[found], choices) == 1
+
+
+# --- k-means itself ---------------------------------------------------------------------------------------------------
+
+
+def kmeans(rows, options, seed):
+    return KMeans(options, n_init=10, random_state=seed).fit(rows)
+
+
+def test_the_clusters_are_those_of_k_means():
+    vector, actions = random_rows(3, 3).astype(np.float32), random_rows(4, 2).astype(np.float32)
+    batch = make_batch(vector, actions)
+    for seed in range(3):
+        found = Clusters(batch, 4, seed)
+        own = kmeans(vector.astype(np.float64), 4, seed)
+        np.testing.assert_array_equal(alive(found.choices(batch)), own.labels_ + 1)
+        weighted = np.hstack([vector, np.sqrt(3 / 2) * actions.astype(np.float64)])
+        both = Clusters(batch, 4, seed, controls=True)
+        np.testing.assert_array_equal(alive(both.choices(batch)), kmeans(weighted, 4, seed).labels_ + 1)
+
+
+def test_other_demonstrations_go_to_the_nearest_centre():
+    vector, actions = random_rows(5, 3).astype(np.float32), random_rows(6, 2)
+    found = Clusters(make_batch(vector, actions), 4, seed=0)
+    centres = kmeans(vector.astype(np.float64), 4, 0).cluster_centers_
+    others = 2 * random_rows(7, 3)
+    distances = np.linalg.norm(others[:, None] - centres, axis=-1)
+    choices = found.choices(make_batch(others, actions, lengths=(6, 8, 3)))
+    np.testing.assert_array_equal(alive(choices, (6, 8, 3)), distances.argmin(1) + 1)
+
+
+def test_images_are_seen_as_block_means():
+    """Mean brightness of each block of 2 × 3 pixels, by hand, in [0, 1]; beside it the vector."""
+    random = np.random.default_rng(8)
+    height, width = 2 * POOLED, 3 * POOLED
+    images = random.integers(0, 256, (sum(LENGTHS), height, width, 3), dtype=np.uint8)
+    vector = 0.2 * random_rows(9, 2).astype(np.float32)
+    batch = make_batch(vector, random_rows(10, 2), {"camera": images})
+    blocks = images.reshape(-1, POOLED, 2, POOLED, 3, 3).mean((2, 4)) / 255
+    rows = np.hstack([vector, blocks.transpose(0, 3, 1, 2).reshape(len(blocks), -1)])
+    choices = Clusters(batch, 3, seed=0).choices(batch)
+    assert adjusted_rand_score(kmeans(rows, 3, 0).labels_, alive(choices)) == 1
+    dark = np.arange(sum(LENGTHS)) % 2
+    still = make_batch(
+        0 * vector, random_rows(10, 2), {"camera": images // 2 + (dark * 128).astype(np.uint8)[:, None, None, None]}
+    )
+    assert adjusted_rand_score(dark, alive(Clusters(still, 2, seed=0).choices(still))) == 1
+
+
+def test_equal_seeds_give_equal_clusters():
+    batch = make_batch(random_rows(11, 3), random_rows(12, 2))
+    for controls in (False, True):
+        one, other = (Clusters(batch, 4, seed=5, controls=controls).choices(batch) for _ in range(2))
+        assert torch.equal(one, other)
+    assert len({tuple(alive(Clusters(batch, 4, seed=seed).choices(batch))) for seed in range(6)}) > 1
+
+
+def test_the_clusters_leave_the_global_randomness_alone():
+    batch = make_batch(random_rows(11, 3), random_rows(12, 2))
+    np.random.seed(0)  # noqa: NPY002 (the global one is meant)
+    torch.manual_seed(0)
+    before = np.random.get_state()[1].tolist(), torch.get_rng_state()  # noqa: NPY002
+    Clusters(batch, 4, seed=5)
+    assert np.random.get_state()[1].tolist() == before[0]  # noqa: NPY002
+    assert torch.equal(torch.get_rng_state(), before[1])
+
+
+@pytest.mark.filterwarnings("error")
+def test_there_are_no_more_clusters_than_distinct_observations():
+    place, _, _, actions = planted()
+    batch = make_batch(PLACES[place], actions)
+    assert adjusted_rand_score(place, alive(Clusters(batch, 5, seed=0).choices(batch))) == 1
+    assert set(alive(Clusters(batch, 5, seed=0, controls=True).choices(batch))) == {1, 2, 3, 4, 5}

@@ -1,0 +1,168 @@
+"""What the spec refuses, and in which words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from ddco_pyro.spec import SpecError, parse_spec
+
+SMALL = {"task": "needle", "observations": ["pose"], "hierarchy": {"levels": [{"count": 5}]}}
+
+
+def refusal(overrides: dict[str, Any]) -> str:
+    with pytest.raises(SpecError) as caught:
+        parse_spec(SMALL, overrides)
+    return str(caught.value)
+
+
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"hierarchy.levels.0.count": 0}, "hierarchy.levels.0.count: must be at least 1, got 0"),
+    ({"hierarchy.levels.0.count": "5"}, "hierarchy.levels.0.count: must be a whole number, got '5'"),
+    ({"hierarchy.levels.0.count": 5.0}, "hierarchy.levels.0.count: must be a whole number, got 5.0"),
+    ({"hierarchy.levels.0.count": True}, "hierarchy.levels.0.count: must be a whole number, got true"),
+    (
+        {"hierarchy.levels.0": {"name": "a"}},
+        "hierarchy.levels.0.count: missing; it has to be given",
+    ),
+    ({"hierarchy.levels": []}, "hierarchy.levels: must have at least 1 item(s), got []"),
+    ({"hierarchy.levels": {"count": 3}}, "hierarchy.levels: must be a list, got {'count': 3}"),
+    (
+        {"hierarchy.levels.0.cuont": 5},
+        "hierarchy.levels.0.cuont: unknown key; did you mean hierarchy.levels.0.count?",
+    ),
+    ({"epochs": 3}, "epochs: unknown key; did you mean training.epochs?"),
+    (
+        {"inference.xyz": 3},
+        "inference.xyz: unknown key; valid here: engine",
+    ),
+    (
+        {"hierarchy.levels": [{"count": 1}, {"count": 2}]},
+        "hierarchy.levels.1.name: 'option' is also the name of level 0; give each level its own",
+    ),
+    (
+        {"hierarchy.levels.0.name": "a b"},
+        "hierarchy.levels.0.name: must be letters, digits, '_' or '-', a letter first, got 'a b'",
+    ),
+    (
+        {"hierarchy.levels.0.policy.emits": []},
+        "hierarchy.levels.0.policy.emits: must have at least 1 item(s), got []",
+    ),
+    (
+        {"hierarchy.levels.0.policy.emits": ["options", "control"]},
+        "hierarchy.levels.0.policy.emits: the lowest level emits the control and nothing else; leave it out",
+    ),
+    (
+        {"hierarchy.meta_policy.emits": ["option"]},
+        "hierarchy.meta_policy.emits.0: must be options or control, got 'option' (did you mean options?)",
+    ),
+    (
+        {"hierarchy.meta_policy.emits": ["options", "options"]},
+        "hierarchy.meta_policy.emits: 'options' is given twice; keep one",
+    ),
+    (
+        {"hierarchy.meta_policy.network": "mpl"},
+        "hierarchy.meta_policy.network: no network is called 'mpl' (did you mean mlp?); "
+        "use one of linear, mlp, per_timestep, conv, module:Class",
+    ),
+    (
+        {"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}},
+        "hierarchy.meta_policy.hidden: does not apply to network 'linear'; leave it out",
+    ),
+    (
+        {"hierarchy.meta_policy": {"network": "mlp", "options": {"a": 1}}},
+        "hierarchy.meta_policy.options: does not apply to network 'mlp'; leave it out",
+    ),
+    ({"hierarchy.meta_policy.hidden": [8, 0]}, "hierarchy.meta_policy.hidden.1: must be at least 1, got 0"),
+    ({"hierarchy.meta_policy.dropout": 1}, "hierarchy.meta_policy.dropout: must be less than 1, got 1"),
+    ({"hierarchy": None}, "hierarchy: missing; declare a hierarchy, or a baseline in its place"),
+    (
+        {"baseline": "flat"},
+        "baseline: stands beside hierarchy; keep one of them (compare_with takes baselines to train beside)",
+    ),
+    ({"compare_with": ["flt"]}, "compare_with.0.kind: must be flat or per_timestep, got 'flt' (did you mean flat?)"),
+    ({"compare_with": [3]}, "compare_with.0: must be a mapping (key: value), got 3"),
+    ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),
+    ({"task": ""}, "task: must not be empty, got ''"),
+    ({"observations": []}, "observations: must have at least 1 item(s), got []"),
+    ({"observations": "pose"}, "observations: must be a list, got 'pose'"),
+    ({"observations": ["a", "a"]}, "observations.1.key: 'a' is given twice; keep one"),
+    ({"control.std": -0.1}, "control.std: must be a positive number or {learn: true}, got -0.1"),
+    ({"control.std": "0.1"}, "control.std: must be a positive number or {learn: true}, got '0.1'"),
+    ({"control.std": {"learn": False}}, "control.std.learn: must be true, got false"),
+    (
+        {"control.std": {"learn": True, "flor": 1}},
+        "control.std.flor: unknown key; did you mean control.std.floor?",
+    ),
+    (
+        {"control.scale": "standardise"},
+        "control.scale: must be standardize, none, or a list of positive numbers, got 'standardise' "
+        "(did you mean standardize?)",
+    ),
+    ({"control.scale": [1.0, 0.0]}, "control.scale.1: must be greater than 0, got 0.0"),
+    (
+        {"training.optimizer.name": "Adam"},
+        "training.optimizer.name: must be adam or momentum, got 'Adam' (did you mean adam?)",
+    ),
+    ({"training.optimizer.lr": float("inf")}, "training.optimizer.lr: must be a finite number, got inf"),
+    ({"training.layerwise": "yes"}, "training.layerwise: must be true or false, got 'yes'"),
+    ({"training": None}, "training: must be a mapping (key: value), got null"),
+    ({"seed": -1}, "seed: must be at least 0, got -1"),
+    ({"seed": 2**32}, "seed: must be at most 4294967295, got 4294967296"),
+    ({"demonstrations.valid_fraction": 0}, "demonstrations.valid_fraction: must be greater than 0, got 0"),
+    (
+        {"hierarchy.levels.0.policy.network": None},
+        "hierarchy.levels.0.policy.network: must be text, got null",
+    ),
+]
+
+
+@pytest.mark.parametrize(("overrides", "message"), REFUSED, ids=[message.partition(",")[0] for _, message in REFUSED])
+def test_refused_with_the_key_path_and_one_line(overrides: dict[str, Any], message: str) -> None:
+    assert refusal(overrides) == message
+
+
+def test_every_problem_has_its_line() -> None:
+    message = refusal({"seed": "a", "hierarchy.levels.0.count": 0, "traning": {}})
+    assert message.splitlines() == [
+        "hierarchy.levels.0.count: must be at least 1, got 0",
+        "seed: must be a whole number, got 'a'",
+        "traning: unknown key; did you mean training?",
+    ]
+
+
+def test_keys_that_are_not_text_are_refused() -> None:
+    with pytest.raises(SpecError, match=r"^selection\.grid\.3: a key must be text"):
+        parse_spec({**SMALL, "selection": {"grid": {3: [1]}}})
+    with pytest.raises(SpecError, match=r"^3: a key must be text"):
+        parse_spec({**SMALL, 3: 4})  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize(
+    ("grid", "message"),
+    [
+        (
+            {"hierarchy.levels.0.count": [1, 0]},
+            "selection.grid.hierarchy.levels.0.count: value 0: hierarchy.levels.0.count: must be at least 1, got 0",
+        ),
+        (
+            {"hierarchy.levels.0.cuont": [1]},
+            "selection.grid.hierarchy.levels.0.cuont: value 1: hierarchy.levels.0.cuont: unknown key; "
+            "did you mean hierarchy.levels.0.count?",
+        ),
+        (
+            {"hierarchy.levels.1.count": [1]},
+            "selection.grid.hierarchy.levels.1.count: value 1: hierarchy.levels.1.count: "
+            "'1' is not the number of one of the 1 items there (the first is 0)",
+        ),
+        (
+            {"selection.folds": [3]},
+            "selection.grid.selection.folds: the selection cannot be part of its own grid; remove it",
+        ),
+        ({"seed": []}, "selection.grid.seed: must have at least 1 item(s), got []"),
+        ({"seed": 3}, "selection.grid.seed: must be a list, got 3"),
+    ],
+)
+def test_every_value_of_a_grid_has_to_be_valid_in_place(grid: dict[str, Any], message: str) -> None:
+    assert refusal({"selection.grid": grid}) == message
