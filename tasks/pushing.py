@@ -92,8 +92,7 @@ class Pushing(base.Task):
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
         """Send the joint velocities to the servos, which saturate at their limits."""
-        spec = self.action_spec(physics)
-        physics.set_velocities(np.clip(np.asarray(action, float), spec.minimum, spec.maximum))
+        physics.set_velocities(np.clip(np.asarray(action, float), -geometry.MAX_SPEED, geometry.MAX_SPEED))
 
     def after_step(self, physics: Physics) -> None:
         """See what became of the box, and put box and goal where the next steps need them."""

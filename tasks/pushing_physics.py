@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+from mujoco import mj_step, mj_step1
 
 from .pushing_geometry import BOX_HEIGHT
 from .rendering import mujoco
 
 RAMP = 5  # parts of a control step in which the servos' velocities change
 
-JOINTS = ["shoulder", "elbow", "wrist"]
-BOX = ["box_x", "box_z", "box_tilt"]
+# Where the model has them, in the order of pushing.xml; a name looked up takes as long as a time step.
+JOINTS = slice(0, 3)
+BOX = slice(3, 6)
+TIP, GOAL = 0, 0
 LINKS = ("upper", "fore", "hand")
 
 
@@ -35,45 +38,48 @@ class Physics(mujoco.Physics):
         Servos of unequal inertia that were given a step would for a moment send the tip somewhere else, fast enough to
         kick the box away.
         """
-        for number in range(1, RAMP + 1):
-            self.set_control(self._from + number / RAMP * (self._to - self._from))
-            super().step(nstep // RAMP)
+        model, data = self.model.ptr, self.data.ptr
+        with self.check_invalid_state():
+            for number in range(1, RAMP + 1):
+                data.ctrl[:] = self._from + number / RAMP * (self._to - self._from)
+                mj_step(model, data, nstep // RAMP)
+            mj_step1(model, data)  # what is measured belongs to where things are now
 
     def joint_angles(self) -> np.ndarray:
         """[3], rad."""
-        return np.array(self.named.data.qpos[JOINTS])
+        return np.array(self.data.qpos[JOINTS])
 
     def joint_velocities(self) -> np.ndarray:
         """[3], rad/s."""
-        return np.array(self.named.data.qvel[JOINTS])
+        return np.array(self.data.qvel[JOINTS])
 
     def tip(self) -> np.ndarray:
         """The tip of the hand: x, z (m)."""
-        return np.array(self.named.data.site_xpos["tip", ["x", "z"]])
+        return np.array(self.data.site_xpos[TIP, ::2])
 
     def box(self) -> np.ndarray:
         """The box: x and z of its centre (m), and its tilt (rad), positive when its top leans towards -x."""
-        x, raised, tilt = self.named.data.qpos[BOX]
+        x, raised, tilt = self.data.qpos[BOX]
         return np.array([x, BOX_HEIGHT / 2 + raised, tilt])
 
     def box_speed(self) -> float:
         """How fast the box's centre moves (m/s)."""
-        return float(np.linalg.norm(self.named.data.qvel[BOX[:2]]))
+        return float(np.linalg.norm(self.data.qvel[BOX][:2]))
 
     def goal(self) -> float:
         """Where the box has to be: x (m)."""
-        return float(self.named.data.mocap_pos["goal", "x"])
+        return float(self.data.mocap_pos[GOAL, 0])
 
     def place_arm(self, angles: np.ndarray) -> None:
         """Put the arm at joint angles [3], at rest."""
-        self.named.data.qpos[JOINTS] = angles
-        self.named.data.qvel[JOINTS] = 0.0
+        self.data.qpos[JOINTS] = angles
+        self.data.qvel[JOINTS] = 0.0
 
     def place_box(self, x: float) -> None:
         """Put the box upright on the surface, at rest."""
-        self.named.data.qpos[BOX] = [x, 0.0, 0.0]
-        self.named.data.qvel[BOX] = 0.0
+        self.data.qpos[BOX] = [x, 0.0, 0.0]
+        self.data.qvel[BOX] = 0.0
 
     def place_goal(self, x: float) -> None:
         """Put the goal somewhere."""
-        self.named.data.mocap_pos["goal"] = [x, 0.0, 0.0]
+        self.data.mocap_pos[GOAL] = [x, 0.0, 0.0]
