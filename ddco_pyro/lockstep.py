@@ -59,13 +59,13 @@ def _play(
     seen: list[dict[str, list[np.ndarray]]] = [{key: [] for key in keep} for _ in steps]
     while not all(step.last() for step in steps):
         controls = actors.act([step.observation for step in steps])
+        active = actors.choices
         for number, step in enumerate(steps):
-            if step.last():
-                continue
-            choices[number].append(actors.choices[number])
-            for key, values in seen[number].items():
-                values.append(np.array(step.observation[key]))
-            steps[number] = environments[number].step(controls[number])
+            if not step.last():
+                choices[number].append(active[number])
+                for key, values in seen[number].items():
+                    values.append(np.array(step.observation[key]))
+                steps[number] = environments[number].step(controls[number])
     return [
         Played(
             seed,

@@ -95,24 +95,32 @@ class Pushing(base.Task):
         physics.set_velocities(np.clip(np.asarray(action, float), -geometry.MAX_SPEED, geometry.MAX_SPEED))
 
     def after_step(self, physics: Physics) -> None:
-        """See what became of the box, and put box and goal where the next steps need them."""
+        """Count what became of the goal."""
         before = self.counts.goals
         self._steps += 1
         self._since += 1
+        if self._decided(physics):
+            physics.forward()  # things were put somewhere else
+        self._reward = float(self.counts.goals - before)
+
+    def _decided(self, physics: Physics) -> bool:
+        """Whether something became of the goal; if so, box and goal are put where the next steps need them."""
+        x, _, tilt = physics.box()
         if is_reached(physics):
             self.counts.goals += 1
             self._place_goal(physics, -self._side)
-        elif abs(physics.box()[2]) > TOPPLED:
+        elif abs(tilt) > TOPPLED:
             self.counts.topples += 1
             self._put_back(physics)
-        elif abs(physics.box()[0]) > OUT_OF_REACH:
+        elif abs(x) > OUT_OF_REACH:
             self.counts.lost += 1
             self._put_back(physics)
         elif self._goal_steps is not None and self._since >= self._goal_steps:
             self.counts.missed += 1
             self._draw_box_and_goal(physics)
-        self._reward = float(self.counts.goals - before)
-        physics.forward()
+        else:
+            return False
+        return True
 
     def get_observation(self, physics: Physics) -> OrderedDict[str, np.ndarray]:
         """The state, in the paper's coordinates and relative to tip and box.
