@@ -7,7 +7,6 @@ one right after the other; the networks, the data and the tables are the same in
 from __future__ import annotations
 
 import json
-import resource
 import statistics
 import subprocess
 import sys
@@ -21,7 +20,7 @@ import torch
 from ddco_pyro.ahmm import Tables, complete
 from ddco_pyro.encoding import Batch
 from ddco_pyro.hierarchy import Hierarchy
-from ddco_pyro.inference import fused, total_log_likelihood
+from ddco_pyro.inference import Engine, direct, fused, total_log_likelihood
 from ddco_pyro.inference.structure import structure_of
 from ddco_pyro.networks import Inputs
 from ddco_pyro.spec import parse_spec
@@ -77,8 +76,22 @@ def networks_alone(hierarchy: Hierarchy, batch: Batch, pieces: bool = True) -> C
     return run
 
 
-def step(hierarchy: Hierarchy, batch: Batch, engine: str = "fused") -> Callable[[], None]:
+def step(hierarchy: Hierarchy, batch: Batch) -> Callable[[], None]:
     """A whole gradient step, as training does it."""
+    optimizer, volume = torch.optim.Adam(hierarchy.parameters(), lr=1e-3), hierarchy.scaling.log_volume
+
+    def run() -> None:
+        optimizer.zero_grad()
+        for _, piece in batch.pieces():
+            value = direct.log_likelihood(hierarchy(piece.inputs), piece.actions, volume, piece.lengths).sum()
+            (-value / batch.steps).backward()
+        optimizer.step()
+
+    return run
+
+
+def tables_step(hierarchy: Hierarchy, batch: Batch, engine: Engine) -> Callable[[], None]:
+    """The same step by way of log-tables."""
     optimizer = torch.optim.Adam(hierarchy.parameters(), lr=1e-3)
 
     def run() -> None:
@@ -157,8 +170,10 @@ def measured() -> Iterator[tuple[str, float]]:
             )
         hierarchy, batch = problem("mlp", number, steps)
         few = 1 if steps > 1000 else 5
-        slow = ratio(step(hierarchy, batch, "enumerate"), step(hierarchy, batch), few, warm=few > 1)
+        slow = ratio(tables_step(hierarchy, batch, "enumerate"), step(hierarchy, batch), few, warm=few > 1)
         yield f"enumerate_over_step mlp {size}", slow
+        by_tables = tables_step(hierarchy, batch, "fused")
+        yield f"step_with_tables_over_step mlp {size}", ratio(by_tables, step(hierarchy, batch))
         yield f"funsor_over_step mlp {size}", ratio(funsor_step(hierarchy, batch), step(hierarchy, batch), 3)
         tables, lengths = tables_of(number, steps)
         own = kernel(tables, lengths)
@@ -208,9 +223,16 @@ def peak(what: str, network: str) -> float:
     }
     warm, measured_call = calls[what]
     warm()
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    Path("/proc/self/clear_refs").write_text("5")  # the highest mark begins anew
+    before = memory("VmRSS")
     measured_call()
-    return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    return (memory("VmHWM") - before) / 1024
+
+
+def memory(what: str) -> float:
+    """A line of this process's status, KiB."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith(f"{what}:"))
 
 
 def peak_in_process(what: str, network: str) -> float:

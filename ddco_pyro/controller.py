@@ -11,8 +11,9 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from ddco_pyro.ahmm import Tabulated, choose, complete
-from ddco_pyro.hierarchy import Decision, Hierarchy, Outputs
+from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.observing import Window
+from ddco_pyro.outputs import Decision, Outputs
 from ddco_pyro.spec import RolloutSpec
 
 

@@ -8,50 +8,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import logsigmoid, softplus
+from torch.nn.functional import softplus
 
-from ddco_pyro.ahmm import NEVER, Tables
+from ddco_pyro.ahmm import Tables
 from ddco_pyro.encoding import Batch, ControlScaling, ObservationEncoder, Shapes
 from ddco_pyro.networks import Inputs, InputShape, ShapeError, build
+from ddco_pyro.outputs import Decision, Outputs
 from ddco_pyro.spec import ControlSpec, LearnedStd, LevelSpec, NetworkSpec, Spec
-
-TERMINATION_BOUND = 12.0
-"""Termination logits lie within ±12 (ψ between 6e-6 and 1 - 6e-6), so no path's probability is ever exactly 0."""
 
 INITIAL_STD = 0.5
 """A learned standard deviation starts here, in scaled units."""
 
 Emits = Literal["options", "control"]
-
-
-@dataclass(frozen=True)
-class Decision:
-    """What the K callers of one level say: ``selection`` log η [N, T, K, 1 + k] and the ``mean`` control [N, T, K, A]
-    with its ``std`` [A], both in scaled units; None for what they do not emit.
-    """
-
-    selection: Tensor | None
-    mean: Tensor | None
-    std: Tensor
-
-
-@dataclass(frozen=True)
-class Outputs:
-    """What all networks say about a batch, before any control is known; levels lowest first, the top caller last."""
-
-    decisions: tuple[Decision, ...]
-    termination: tuple[Tensor, ...]
-
-    def tables(self, actions: Tensor, log_volume: Tensor) -> Tables:
-        """The tables for controls [N, T, A] in scaled units; densities in the control's own units."""
-        selection = tuple(one.selection for one in self.decisions if one.selection is not None)
-        control = tuple(_log_density(one, actions, log_volume) for one in self.decisions)
-        return Tables(selection, self.termination, control)
 
 
 class Caller(nn.Module):
@@ -74,24 +46,18 @@ class Caller(nn.Module):
         self.options = options
         self.emits_control = "control" in emits
         self.emits_options = "options" in emits and options > 0
-        self.hybrid = self.emits_control and self.emits_options
-        logits = options + self.hybrid if self.emits_options else 0
+        logits = options + self.emits_control if self.emits_options else 0
         self.sizes = (logits, control_size if self.emits_control else 0)
         self.network = build(network, shape, sum(self.sizes), copies)
         self.std = ControlStd(control, control_size)
 
     def forward(self, inputs: Inputs) -> Decision:
-        """Log-probabilities of the choices and mean controls for every step of the inputs."""
-        logits, mean = self.network(inputs).split(self.sizes, dim=-1)
-        selection = self._selection(logits) if self.options else None
-        return Decision(selection, mean if self.emits_control else None, self.std())
-
-    def _selection(self, logits: Tensor) -> Tensor:
-        if self.hybrid:
-            return logits.log_softmax(-1)
-        control = logits.new_full((*logits.shape[:-1], 1), NEVER if self.emits_options else 0.0)
-        options = logits.log_softmax(-1) if self.emits_options else control + NEVER
-        return torch.cat([control, options.expand(*logits.shape[:-1], self.options)], dim=-1)
+        """What the callers say at every step of the inputs."""
+        said = self.network(inputs)
+        logits, mean = said.split(self.sizes, dim=-1) if all(self.sizes) else (said, said)
+        return Decision(
+            self.options, logits if self.emits_options else None, mean if self.emits_control else None, self.std()
+        )
 
 
 class ControlStd(nn.Module):
@@ -138,11 +104,6 @@ class Level(nn.Module):
             )  # fmt: skip
         with _named(f"{place}.termination"):
             self.termination = build(spec.termination, shape, 1, spec.count)
-
-    def log_termination(self, inputs: Inputs) -> Tensor:
-        """(log(1 - ψ), log ψ), [N, T, k, 2]."""
-        logit = TERMINATION_BOUND * torch.tanh(self.termination(inputs).squeeze(-1) / TERMINATION_BOUND)
-        return torch.stack([logsigmoid(-logit), logsigmoid(logit)], dim=-1)
 
 
 @contextmanager
@@ -204,7 +165,7 @@ class Hierarchy(nn.Module):
         levels = self._levels()[:discovering]
         decisions = [level.policy(inputs) for level in levels]
         top = _uniform(inputs, levels[-1].count, decisions[0].std) if discovering else self.meta_policy(inputs)
-        return Outputs((*decisions, top), tuple(level.log_termination(inputs) for level in levels))
+        return Outputs((*decisions, top), tuple(level.termination(inputs).squeeze(-1) for level in levels))
 
     def tabulate(self, batch: Batch, discovering: int | None = None) -> Tables:
         """The tables of a batch: every network once, over all options, steps and trajectories."""
@@ -223,17 +184,4 @@ def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
 
 def _uniform(inputs: Inputs, options: int, like: Tensor) -> Decision:
     """A meta-policy that selects each of the k options with probability 1/k."""
-    selection = like.new_full((*inputs.batch, 1, 1 + options), -math.log(options))
-    selection[..., 0] = NEVER
-    return Decision(selection, None, like)
-
-
-def _log_density(decision: Decision, actions: Tensor, log_volume: Tensor) -> Tensor:
-    """log N(a; μ, σ²) of each caller, [N, T, K], in the control's own units; -inf where it emits no control."""
-    if decision.mean is None:
-        selection = decision.selection
-        assert selection is not None  # a caller emits something
-        return selection.new_full(selection.shape[:-1], NEVER)
-    error = actions.unsqueeze(2) - decision.mean
-    normaliser = decision.std.log().sum(-1) + 0.5 * math.log(2 * math.pi) * actions.shape[-1] + log_volume
-    return error.square() @ (-0.5 / decision.std.square()).to(error.dtype) - normaliser
+    return Decision(options, like.new_zeros(*inputs.batch, 1, options), None, like)

@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from ddco_pyro.ahmm import complete, draw
-from ddco_pyro.hierarchy import Decision, Outputs
 from ddco_pyro.inference import log_likelihood
+from ddco_pyro.outputs import Decision, Outputs
 
 
 class EliminatedAHMM(TorchDistribution):

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.ahmm import Chain, complete
-from ddco_pyro.hierarchy import Hierarchy, Outputs
+from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference.filtering import Belief, Filter
 from ddco_pyro.observing import ObservationError, Window
+from ddco_pyro.outputs import Outputs
 
 
 class Monitor:

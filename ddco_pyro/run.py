@@ -246,7 +246,7 @@ def _train(
     first = make()
     batches = [encode(part, first.encoder, first.scaling) for part in parts]
     few = batches[0].select(torch.arange(min(len(batches[0]), COMPARED)))
-    check = compare_engines(first.tabulate(few), few.lengths)
+    check = compare_engines(first(few.inputs), few.actions, first.scaling.log_volume, few.lengths)
     if not check.agrees:
         raise TrainingError(
             f"the engines disagree (value {check.value:.1e}, gradient {check.gradient:.1e}): "

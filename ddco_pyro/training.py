@@ -24,7 +24,7 @@ from ddco_pyro.encoding import Batch
 from ddco_pyro.errors import Failed
 from ddco_pyro.files import read_tensors, write_tensors
 from ddco_pyro.hierarchy import Hierarchy
-from ddco_pyro.inference import log_likelihood, total_log_likelihood
+from ddco_pyro.inference import direct, log_likelihood, total_log_likelihood
 from ddco_pyro.initialize import Clusters
 from ddco_pyro.spec import OptimizerSpec, Spec
 
@@ -261,10 +261,14 @@ class _Objective:
         return sum(values) / self.trainer.tune.steps
 
     def _total(self, model: Hierarchy, batch: Batch, choices: Tensor | None) -> Tensor:
-        tables = model.tabulate(batch, self.stage.discovering)
+        outputs, volume = model(batch.inputs, self.stage.discovering), model.scaling.log_volume
+        engine = self.trainer.spec.inference.engine
+        if choices is None and engine == "fused":
+            return direct.log_likelihood(outputs, batch.actions, volume, batch.lengths).sum()
+        tables = outputs.tables(batch.actions, volume)
         if choices is not None and self.stage.clamped is not None:
             tables = tables.clamp(self.stage.clamped, choices[:, : batch.inputs.batch[1]])
-        return total_log_likelihood(tables, batch.lengths, self.trainer.spec.inference.engine)
+        return total_log_likelihood(tables, batch.lengths, engine)
 
     def _not_finite(self, model: Hierarchy, batch: Batch, rows: Tensor) -> TrainingError:
         with torch.no_grad():

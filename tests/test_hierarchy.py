@@ -9,9 +9,10 @@ from oracle import brute_force
 from torch.distributions import Normal
 
 from ddco_pyro.encoding import Batch
-from ddco_pyro.hierarchy import TERMINATION_BOUND, Hierarchy
+from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
 from ddco_pyro.networks import Inputs
+from ddco_pyro.outputs import TERMINATION_BOUND
 from ddco_pyro.spec import parse_spec
 
 SHAPES = {"state": (3,)}
@@ -110,7 +111,7 @@ def test_terminations_keep_their_bound():
     level = hierarchy.levels[0]
     with torch.no_grad():
         level.termination.layers[-1].bias[:] = torch.tensor([1e6, -1e6]).reshape(2, 1, 1)
-    psi = level.log_termination(batch.inputs).exp()[..., 1]
+    psi = hierarchy(batch.inputs).termination[0].exp()[..., 1]
     bound = torch.tensor(TERMINATION_BOUND)
     np.testing.assert_allclose(psi[..., 0].detach(), bound.sigmoid(), rtol=1e-5)
     np.testing.assert_allclose(psi[..., 1].detach(), (-bound).sigmoid(), rtol=1e-3)

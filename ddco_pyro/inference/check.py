@@ -8,8 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ddco_pyro.ahmm import NEVER, Tables, complete
-from ddco_pyro.inference import enumeration, fused
+from ddco_pyro.ahmm import Tables, complete
+from ddco_pyro.inference import direct, enumeration, fused
+from ddco_pyro.outputs import Outputs
 
 TRAJECTORIES = 3
 STEPS = 12
@@ -28,31 +29,42 @@ class EngineCheck(NamedTuple):
         return self.value <= TOLERANCE and self.gradient <= TOLERANCE
 
 
-def compare_engines(tables: Tables, lengths: Tensor) -> EngineCheck:
-    """Value and gradient (with respect to the tables) of both engines, on the first steps of the first trajectories."""
+def compare_engines(outputs: Outputs, actions: Tensor, log_volume: Tensor, lengths: Tensor) -> EngineCheck:
+    """Value and gradient of the fused engine, with and without tables in between, against Pyro's enumeration.
+
+    On the first steps of the first trajectories, in float64, with respect to what the networks say.
+    """
     few = lengths[:TRAJECTORIES].clamp(max=STEPS)
-    short = _cut(tables, len(few), int(few.max()))
-    fused_value, fused_gradient = _evaluate(short, few, lambda t, n: fused.log_likelihood(t, n).sum())
-    pyro_value, pyro_gradient = _evaluate(short, few, lambda t, n: enumeration.total_log_likelihood(complete(t, n)))
-    value = (fused_value - pyro_value).abs() / pyro_value.abs().clamp(min=1.0)
-    gradient = (fused_gradient - pyro_gradient).abs().max() / pyro_gradient.abs().max().clamp(min=1.0)
-    return EngineCheck(float(value), float(gradient))
+    short = Outputs.of(outputs.options, [_cut(leaf, len(few), int(few.max())) for leaf in outputs.leaves()])
+    controls = actions[: len(few), : int(few.max())].double()
+    truth = _evaluate(short, lambda one: _enumerated(one.tables(controls, log_volume), few))
+    found = (
+        _evaluate(short, lambda one: direct.log_likelihood(one, controls, log_volume, few).sum()),
+        _evaluate(short, lambda one: fused.log_likelihood(one.tables(controls, log_volume), few).sum()),
+    )
+    value = max(float((one.value - truth.value).abs() / truth.value.abs().clamp(min=1.0)) for one in found)
+    largest = truth.gradient.abs().max().clamp(min=1.0)
+    return EngineCheck(value, max(float((one.gradient - truth.gradient).abs().max() / largest) for one in found))
 
 
-def _cut(tables: Tables, rows: int, steps: int) -> Tables:
-    def cut(level: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        return tuple(table[:rows, :steps].detach().double().requires_grad_() for table in level)
-
-    return Tables(cut(tables.selection), cut(tables.termination), cut(tables.control))
+class _Evaluation(NamedTuple):
+    value: Tensor
+    gradient: Tensor
 
 
-def _evaluate(tables: Tables, lengths: Tensor, engine: Callable[[Tables, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    leaves = [*tables.selection, *tables.termination, *tables.control]
-    value = engine(tables, lengths)
-    gradients = torch.autograd.grad(value, leaves, allow_unused=True)
-    possible = [
-        gradient[leaf > NEVER].flatten()  # an impossible entry has no logarithm to differentiate by
-        for leaf, gradient in zip(leaves, gradients, strict=True)
-        if gradient is not None
-    ]
-    return value.detach(), torch.cat(possible)
+def _cut(leaf: Tensor | None, rows: int, steps: int) -> Tensor | None:
+    """A leaf's first steps; a standard deviation has none."""
+    if leaf is None:
+        return None
+    return (leaf[:rows, :steps] if leaf.dim() > 1 else leaf).detach().double().requires_grad_()
+
+
+def _enumerated(tables: Tables, lengths: Tensor) -> Tensor:
+    return enumeration.total_log_likelihood(complete(tables, lengths))
+
+
+def _evaluate(outputs: Outputs, engine: Callable[[Outputs], Tensor]) -> _Evaluation:
+    leaves = [leaf for leaf in outputs.leaves() if leaf is not None]
+    value = engine(outputs)
+    gradients = torch.autograd.grad(value, leaves, allow_unused=True, materialize_grads=True)
+    return _Evaluation(value.detach(), torch.cat([gradient.flatten() for gradient in gradients]))

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from ddco_pyro.ahmm import Tables, complete
 from ddco_pyro.inference import logspace
 from ddco_pyro.inference.kernel import forward_backward
+from ddco_pyro.inference.once import once
 from ddco_pyro.inference.structure import Structure, structure_of
 from ddco_pyro.inference.threads import as_many_threads_as_torch
 
@@ -55,13 +55,17 @@ class _Eliminate(torch.autograd.Function):
         tables = Tables.of(depth, leaves)
         ctx.evidence = ctx.needs_input_grad[3 + 3 * depth :]
         found = eliminate(tables, lengths, marginals=any(ctx.evidence))
-        ctx.save_for_backward(*found.tables.leaves(), *found.marginals)
+        posteriors = *found.tables.leaves(), *found.marginals
+        ctx.posteriors = len(posteriors)
+        ctx.save_for_backward(*posteriors, *leaves)
         return found.value
 
     @staticmethod
-    @once_differentiable
+    @once
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        gradients = [upstream.reshape(-1, *(1,) * (table.dim() - 1)) * table for table in ctx.saved_tensors]
+        gradients = [
+            upstream.reshape(-1, *(1,) * (table.dim() - 1)) * table for table in ctx.saved_tensors[: ctx.posteriors]
+        ]
         networks = len(ctx.needs_input_grad) - 2 - len(ctx.evidence)
         evidence = gradients[networks:] or [None] * len(ctx.evidence)
         return None, None, *gradients[:networks], *evidence

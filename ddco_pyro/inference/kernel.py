@@ -287,10 +287,13 @@ def _backward(
         )
         exact &= abs(total - 1.0) <= TOLERANCE  # NaN is not
         _adjoint_down(n, t, spread, back, select, selected, sizes, starts, selects)
-        _adjoint_up(n, t, messages, back, end, ended, sizes, starts, ends)
+        if t > 0:
+            _adjoint_up(n, t, messages, back, end, ended, sizes, starts, ends)
         _hand_out(selected, n, t, to_select)
         _hand_out(ended, n, t, to_end)
         _hand_out(emitted, n, t, to_emission)
+    for adjoint in back:  # at t = 0 nothing else would tell that it has overflowed
+        exact &= np.isfinite(adjoint)
     return exact
 
 

@@ -1,0 +1,44 @@
+"""Gradients that have no derivative of their own, and say so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any
+
+import torch
+from torch import Tensor
+
+Gradients = tuple[Tensor | None, ...]
+
+
+def once(backward: Callable[..., Gradients]) -> Callable[..., Gradients]:
+    """A backward whose result refuses to be differentiated, whatever it is differentiated by.
+
+    torch's ``once_differentiable`` refuses only where what comes from above requires a gradient; the derivative with
+    respect to the saved inputs would silently be 0. So the inputs must be among the saved tensors.
+    """
+
+    @wraps(backward)
+    def guarded(ctx: Any, *upstream: Tensor) -> Gradients:
+        with torch.no_grad():
+            found = backward(ctx, *upstream)
+        if not torch.is_grad_enabled():
+            return found
+        inputs = [one for one in (*upstream, *ctx.saved_tensors) if one is not None and one.requires_grad]
+        return tuple(None if one is None else _Refuse.apply(one, *inputs) for one in found)
+
+    return guarded
+
+
+class _Refuse(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, gradient: Tensor, *inputs: Tensor) -> Tensor:
+        return gradient.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> Any:
+        raise RuntimeError(
+            "the fused engine's gradient is the posterior, which it cannot differentiate again: "
+            "use engine='enumerate' where second derivatives are needed"
+        )
