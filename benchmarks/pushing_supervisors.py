@@ -1,6 +1,6 @@
 """What the supervisors of the pushing task achieve, and how well their controls can be predicted from the state.
 
-    python benchmarks/pushing_supervisors.py [--seeds 10] [--slow-seeds 10] [--demonstrations 60] [--jobs 2] [--out DIR]
+    python benchmarks/pushing_supervisors.py [--seeds 5] [--slow-seeds 3] [--demonstrations 30] [--jobs 2] [--out DIR]
 
 Writes ``supervisors.json`` and ``supervisors.md``: goals and topples in 2000 steps over seeds, and the held-out R² of a
 nearest-neighbour regressor and of a neural network on demonstrations of one goal each, split by demonstration, for the
@@ -66,7 +66,7 @@ def predictability(demonstrations: list[Demonstration]) -> dict[str, dict[str, A
     groups = np.concatenate([np.full(len(one), number) for number, one in enumerate(demonstrations)])
     models = {
         "nearest neighbours": KNeighborsRegressor(5, weights="distance"),
-        "network": MLPRegressor((256, 256), early_stopping=True, max_iter=400, random_state=0),
+        "network": MLPRegressor(hidden_layer_sizes=(128, 128), early_stopping=True, max_iter=300, random_state=0),
     }
     scores: dict[str, list[float]] = {name: [] for name in models}
     for train, test in GroupKFold(FOLDS).split(inputs, groups=groups):
@@ -134,9 +134,9 @@ def spread(one: dict[str, Any], form: str) -> str:
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--slow-seeds", type=int, default=10, help="for the policies that plan at every step")
-    parser.add_argument("--demonstrations", type=int, default=60)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--slow-seeds", type=int, default=3, help="for the policies that plan at every step")
+    parser.add_argument("--demonstrations", type=int, default=30)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("docs/results/pushing"))
     arguments = parser.parse_args()
