@@ -6,11 +6,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import combinations
+from typing import Any
 
 import numpy as np
+import torch
 from sklearn.metrics import normalized_mutual_info_score
+from torch import Tensor
 
 from ddco_pyro.inference import Posterior
+from ddco_pyro.outputs import Decision, Outputs
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,36 @@ def _use(choice: int, shares: np.ndarray, active: np.ndarray, selected: np.ndarr
 def as_rows(use: Sequence[Sequence[OptionUse]]) -> list[list[dict[str, float | int | None]]]:
     """The same as plain data."""
     return [[asdict(one) for one in level] for level in use]
+
+
+def divergences(outputs: Outputs, posterior: Posterior) -> list[list[dict[str, Any]]]:
+    """How differently each two ``options`` of each level (lowest first) act, as ``divergence`` in nats per step.
+
+    That is the mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i), averaged over steps with weights u_t(i) + u_t(j): over the
+    time that one of the two is active; None where neither ever is. Two options of divergence 0 are the same skill
+    under two numbers.
+    """
+    return [_pairs(own, u) for own, u in zip(outputs.decisions[:-1], posterior.u, strict=True)]
+
+
+def _pairs(own: Decision, u: Tensor) -> list[dict[str, Any]]:
+    options = range(u.shape[-1] - 1)
+    return [{"options": [i + 1, j + 1], "divergence": _divergence(own, i, j, u)} for i, j in combinations(options, 2)]
+
+
+def _divergence(own: Decision, i: int, j: int, u: Tensor) -> float | None:
+    steps = torch.zeros(u.shape[:2], dtype=torch.float64)
+    control = torch.ones_like(steps)  # mean probability of emitting the control
+    if own.selection is not None:
+        p, q = (own.selection[:, :, option].double() for option in (i, j))
+        both = torch.isfinite(p) & torch.isfinite(q)  # callers of a level emit the same kinds of choices
+        steps += torch.where(both, 0.5 * (p.exp() - q.exp()) * (p - q), 0.0).sum(-1)
+        control = 0.5 * (p[..., 0].exp() + q[..., 0].exp())
+    if own.mean is not None:
+        apart = (own.mean[:, :, i] - own.mean[:, :, j]) / own.std
+        steps += control * 0.5 * apart.double().square().sum(-1)
+    weight = u[..., i + 1] + u[..., j + 1]
+    return float((weight * steps).sum() / weight.sum()) if float(weight.sum()) > 0 else None
 
 
 def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> float:

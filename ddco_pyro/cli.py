@@ -1,4 +1,4 @@
-"""The command line: ``ddco-pyro check | collect | fit | rollout | report``.
+"""The command line: ``ddco-pyro check | collect | fit | select | compare | rollout | report``.
 
 Every command ends with 0 (done), 1 (failed) or 2 (bad input), and says in one line what is wrong, where, and what to
 do; ``--debug`` shows the traceback.
@@ -11,6 +11,7 @@ import os
 import sys
 import time
 import traceback
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,6 +34,15 @@ SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="The spec, a YAML
 Overrides = Annotated[
     list[str], typer.Option("--set", metavar="KEY=VALUE", help="Another value for a key of the spec; repeatable.")
 ]
+
+
+class Backend(StrEnum):
+    """Where folds are trained."""
+
+    LOKY = "loky"
+    DASK = "dask"
+
+
 Jobs = Annotated[int, typer.Option(help="Processes that run episodes; -1 is one for each core.")]
 
 
@@ -67,13 +77,15 @@ def collect(
 ) -> None:
     """Record demonstrations of the task's supervisor, unless they are there already."""
     found = load_spec(spec, overrides)
-    if found.task is None:
+    if found.demonstrated_task is None:
         raise SpecError(f"{spec}: names no task, so there is no supervisor to record")
     from ddco_pyro.collect import collect as record
 
     own = found.demonstrations.path
     with console.Collecting() as progress:
-        path = record(found.task, found.demonstrations, out or (Path(own) if own else None), progress.collected)
+        path = record(
+            found.demonstrated_task, found.demonstrations, out or (Path(own) if own else None), progress.collected
+        )
     print(path)
 
 
@@ -93,7 +105,7 @@ def fit(
     refuse_own_networks(found, spec, allow_code)
     from ddco_pyro import run
     from ddco_pyro.data import check_networks, demonstrations, dimensions
-    from ddco_pyro.report import write_report
+    from ddco_pyro.report import degeneracies, write_report
 
     check_networks(found, dimensions(found))  # before anything is collected, trained or written
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -106,7 +118,76 @@ def fit(
         print(f"interrupted; continue with: ddco-pyro fit {resolved} --out {folder} --resume", file=sys.stderr)
         raise typer.Exit(1) from None
     console.log_likelihoods(fitted.metrics)
+    console.warnings(degeneracies(fitted.spec, fitted.metrics))
     print(f"report: {write_report(fitted, demonstrations(found))}")
+
+
+@app.command(epilog="Example: ddco-pyro select specs/mine.yaml --set selection.grid.hierarchy.levels.0.count=[1,2,4,8]")
+def select(
+    spec: SpecPath,
+    out: Annotated[Path | None, typer.Option(help="The folder; by default runs/SPEC-select-TIME.")] = None,
+    overrides: Overrides = [],  # noqa: B006
+    folds: Annotated[int | None, typer.Option(help="Number of folds; by default the spec's selection.folds.")] = None,
+    jobs: Annotated[int, typer.Option(help="Processes that train folds; -1 is one for each core.")] = -1,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the unfinished selection in --out.")] = False,
+    stop_early: Annotated[bool, typer.Option("--stop-early", help="Give hopeless candidates up.")] = False,
+    backend: Annotated[Backend, typer.Option(help="Where folds are trained: loky (here) or dask.")] = Backend.LOKY,
+    scheduler: Annotated[str | None, typer.Option(help="Address of the dask scheduler, tcp://HOST:PORT.")] = None,
+    allow_code: AllowCode = False,
+) -> None:
+    """Choose among the candidates of the spec's grid by cross-validation; then fit what was chosen to all the data.
+
+    With --stop-early, after each fold from the third on, a candidate is given up where the paired t-test over the folds
+    so far puts it below the best so far (one-sided, p < 0.001), or where a fold of it has failed.
+    """
+    number = [] if folds is None else [f"selection.folds={folds}"]
+    found = load_spec(spec, [*overrides, *number])
+    refuse_own_networks(found, spec, allow_code)
+    if (backend is Backend.DASK) != (scheduler is not None):
+        raise SpecError("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
+    from ddco_pyro import run, selection
+    from ddco_pyro.data import demonstrations
+    from ddco_pyro.report import degeneracies, write_report
+    from ddco_pyro.selection.table import HEAD, cells
+
+    workers = selection.Workers(jobs, scheduler)
+    selection.check(found, workers)  # before anything is collected, trained or written
+    folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"
+    run.claim(folder, found, resume)
+    try:
+        with console.Selecting() as watcher:
+            made = selection.select(found, folder, watcher, workers, stop_early)
+            watcher.end()
+            assert made.choice.chosen is not None  # or it would have failed
+            final = selection.final_spec(found, made.choice.chosen.candidate)
+            fitted = run.fit(final, folder / "fit", watcher)
+    except KeyboardInterrupt:
+        again = f"ddco-pyro select {folder / 'spec.yaml'} --out {folder} --resume{' --stop-early' * stop_early}"
+        print(f"interrupted; continue with: {again}", file=sys.stderr)
+        raise typer.Exit(1) from None
+    console.selection(made.choice, HEAD, [cells(row, made.choice) for row in made.choice.rows])
+    console.warnings(degeneracies(fitted.spec, fitted.metrics))
+    print(f"selection: {folder / 'selection.json'}")
+    print(f"report: {write_report(fitted, demonstrations(fitted.spec))}")
+
+
+@app.command(epilog="Example: ddco-pyro compare runs/needle runs/needle/baselines/flat runs/other")
+def compare(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN RUN...", help="Run folders; a run's baselines are some too.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="The folder to write to; by default runs/compare-TIME.")] = None,
+    allow_code: AllowCode = False,
+) -> None:
+    """Compare runs on the demonstrations that all of them held out, and on rollouts from the same initial states."""
+    from ddco_pyro import comparison
+    from ddco_pyro.comparison import page
+
+    found = comparison.compare(runs, allow_code)
+    console.comparison(page.HEAD, [page.cells(row) for row in found.rows])
+    if found.rollouts:
+        console.comparison(page.ROLLOUT_HEAD, page.rollout_cells(found))
+    print(f"comparison: {comparison.write(found, out or Path('runs') / time.strftime('compare-%Y%m%d-%H%M%S'))}")
 
 
 @app.command(epilog="Example: ddco-pyro rollout runs/needle --episodes 200 --video")

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 if TYPE_CHECKING:
     from ddco_pyro.data import Dimensions
     from ddco_pyro.hierarchy import Hierarchy
+    from ddco_pyro.selection import Choice
     from ddco_pyro.spec import Spec
 
 PLAIN_SECONDS = 10.0
@@ -105,6 +107,26 @@ class Fitting(Collecting):
         self.end()
 
 
+class Selecting(Fitting):
+    """Shows how a cross-validation goes on (a :class:`ddco_pyro.selection.Watcher`), and the fit that follows."""
+
+    def selecting(self, total: int, kept: int) -> None:
+        """So many (candidate, fold) are to be scored in all, of which some were kept from before."""
+        note = f" ({kept} of {total} kept from before)" if kept else ""
+        self.begin(f"cross-validation{note}", total - kept)
+
+    def scored(self, candidate: str, fold: int, failed: str) -> None:
+        """One has been scored, or has failed."""
+        if failed:
+            self._say(f"{candidate}, fold {fold} failed: {failed}")
+        self.advance(self._done + 1, f"{candidate}, fold {fold}")
+
+    def given_up(self, candidate: str, folds: int) -> None:
+        """A candidate has been stopped early: so many of its folds need not be scored."""
+        self._say(f"{candidate}: stopped early, {folds} folds less")
+        self.advance(self._done + folds)
+
+
 class Rolling(_Bar):
     """Shows how many episodes have been rolled out."""
 
@@ -128,7 +150,7 @@ def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy) -> None:
     table.add_row("control", str([size.control_size]))
     for name, network in hierarchy.named_networks():
         table.add_row(name, str(sum(parameter.numel() for parameter in network.parameters())))
-    Console().print(table)
+    _show(table)
 
 
 def log_likelihoods(metrics: Mapping[str, Any]) -> None:
@@ -138,8 +160,48 @@ def log_likelihoods(metrics: Mapping[str, Any]) -> None:
     for name, row in rows.items():
         values, difference = row["log_likelihood_per_step"], row.get("difference")
         shown = f"{difference['nats_per_step']:+.3f} ± {difference['standard_error']:.3f}" if difference else ""
-        table.add_row(name, f"{values['train']:.3f}", f"{values['valid']:.3f}", shown)
-    Console().print(table)
+        table.add_row(name, *(_number(values[part]) for part in ("train", "valid")), shown)
+    _show(table)
+
+
+def selection(choice: Choice, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """The candidates of a selection, with what has to be known to read the numbers."""
+    table = Table(*head, title="held-out log-likelihood by cross-validation, nats per step", show_edge=False)
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    _show(table)
+    for note in choice.notes:
+        Console().print(Text(f"note: {note}"), soft_wrap=True)
+
+
+def comparison(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Runs, the best first."""
+    table = Table(*head, show_edge=False)
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    _show(table)
+
+
+WIDE = 200
+"""Columns of a file or a pipe, which have no width of their own."""
+
+
+def _show(table: Table) -> None:
+    """Nothing is cut: what is too long for a terminal goes on in the next line."""
+    for column in table.columns:
+        column.overflow = "fold"
+    Console(width=None if Console().is_terminal else WIDE).print(table)
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def warnings(found: Sequence[tuple[str, str]]) -> None:
+    """Signs of a degenerate solution, each in words and with what usually helps."""
+    console = Console()
+    for what, advice in found:
+        console.print(Text(f"warning: {what} {advice}"), soft_wrap=True)
 
 
 def successes(results: Mapping[str, Any]) -> None:
@@ -149,7 +211,7 @@ def successes(results: Mapping[str, Any]) -> None:
     table = Table("method", *measures, title=f"{results['episodes']} episodes each", show_edge=False)
     for name, one in methods.items():
         table.add_row(name, *(_measure(one["measures"][measure]) for measure in measures))
-    Console().print(table)
+    _show(table)
 
 
 def _measure(one: Mapping[str, Any]) -> str:

@@ -77,7 +77,7 @@ class Controller:
         actions = torch.zeros(1, 1, len(self.hierarchy.scaling.scale))
         tables = outputs.tables(actions, self.hierarchy.scaling.log_volume)
         now = complete(tables, torch.tensor([1])).steps()[0]
-        with _MostLikely() if self.options == "most_likely" else _Drawn(generator):
+        with MostLikely() if self.options == "most_likely" else _Drawn(generator):
             return choose(self.time, now, self._choices)
 
     def _actor(self, outputs: Outputs) -> tuple[Decision, int]:
@@ -95,7 +95,7 @@ class Controller:
         return mean + decision.std.double() * torch.from_numpy(generator.standard_normal(len(mean)))
 
 
-class _MostLikely(Messenger):
+class MostLikely(Messenger):
     """Every choice takes its most likely value instead of a sample."""
 
     def _pyro_sample(self, message: dict[str, Any]) -> None:

@@ -10,15 +10,23 @@ UNUSED_SHARE = 0.01
 DOMINATING_SHARE = 0.9
 SHORTEST_DURATION = 1.5
 HIGH_FITTING_SHARE = 0.5
+SMALLEST_DIVERGENCE = 0.1
+"""Nats per step; two Gaussian policies whose means are 0.45 σ apart."""
 
 Use = Sequence[Mapping[str, Any]]
 """How each choice of one level is used, control (0) first: ``choice``, ``share``, ``duration`` of ``metrics.json``."""
 
-Kind = Literal["unused", "dominating", "never_persisting", "high_fitting"]
+Alike = Sequence[Mapping[str, Any]]
+"""How differently each two ``options`` of one level act: ``divergence`` in nats per step."""
+
+Kind = Literal["unused", "redundant", "dominating", "never_persisting", "high_fitting"]
 
 ADVICE: Mapping[Kind, str] = {
     "unused": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select), or start "
     "from clusters with training.initialize: vq and try more restarts.",
+    "redundant": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select). If "
+    "they should differ, start from clusters of observations and controls (training.initialize: vq_controls) or lower "
+    "control.std, below which differences do not count.",
     "dominating": "Start from clusters (training.initialize: vq), train layer by layer (training.layerwise: true), or "
     "give the options' policies less capacity, so that one of them cannot do all the work.",
     "never_persisting": "A simpler termination (network: linear), fewer options, or observations that change more "
@@ -32,13 +40,15 @@ ADVICE: Mapping[Kind, str] = {
 @dataclass(frozen=True)
 class Finding:
     """One sign of a degenerate solution: its ``kind``, the ``level`` (1 is the lowest) and ``choice`` it concerns, and
-    the ``value`` that gave it away: a share of the time, or a duration in steps.
+    the ``value`` that gave it away: a share of the time, a duration in steps, or nats per step. A redundant option acts
+    like the ``other``.
     """
 
     kind: Kind
     level: int
     choice: int
     value: float
+    other: int = 0
 
     @property
     def advice(self) -> str:
@@ -46,17 +56,19 @@ class Finding:
         return ADVICE[self.kind]
 
 
-def diagnose(options: Sequence[Use]) -> list[Finding]:
-    """The signs found in ``metrics["options"]``, levels lowest first.
+def diagnose(options: Sequence[Use], divergences: Sequence[Alike] = ()) -> list[Finding]:
+    """The signs found in ``metrics["options"]`` and ``metrics["divergences"]``, levels lowest first.
 
     An option is unused below 1 % of the time, dominating above 90 % where it is not the only one, and never persisting
-    where it is used but is expected to last less than 1.5 steps. A caller is high-fitting where it emits the control
-    itself in more than half of the time that it acts.
+    where it is used but is expected to last less than 1.5 steps. Two options that are both used are redundant where
+    they differ by less than 0.1 nats per step over the time that one of them is active. A caller is high-fitting where
+    it emits the control itself in more than half of the time that it acts.
     """
     found: list[Finding] = []
     for level, use in enumerate(options, start=1):
         for one in use[1:]:
             found += _of_option(level, one, alone=len(use) == 2)
+        found += _of_pairs(level, use, divergences[level - 1] if divergences else ())
         above = options[level] if level < len(options) else None
         found += _of_caller(level, float(use[0]["share"]), float(above[0]["share"]) if above else 0.0)
     return found
@@ -72,6 +84,16 @@ def _of_option(level: int, use: Mapping[str, Any], alone: bool) -> list[Finding]
     if duration is not None and duration < SHORTEST_DURATION:
         found.append(Finding("never_persisting", level, choice, float(duration)))
     return found
+
+
+def _of_pairs(level: int, use: Use, alike: Alike) -> list[Finding]:
+    used = {int(one["choice"]) for one in use if float(one["share"]) >= UNUSED_SHARE}
+    return [
+        Finding("redundant", level, second, float(one["divergence"]), first)
+        for one in alike
+        for first, second in [one["options"]]
+        if {first, second} <= used and one["divergence"] < SMALLEST_DIVERGENCE
+    ]
 
 
 def _of_caller(level: int, control: float, not_acting: float) -> list[Finding]:

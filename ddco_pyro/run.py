@@ -22,7 +22,7 @@ from torch import Tensor
 from ddco_pyro import analysis
 from ddco_pyro.ahmm import Tables
 from ddco_pyro.controller import Controller
-from ddco_pyro.data import Dimensions, baseline_spec, build_hierarchy, demonstrations
+from ddco_pyro.data import Dimensions, baseline_spec, build_hierarchy, demonstrations, parts
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.encoding import encode
 from ddco_pyro.errors import BadInput
@@ -86,26 +86,26 @@ class Fit:
 
     def log_likelihood(self, demos: Demonstrations) -> np.ndarray:
         """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units."""
-        return torch.cat([log_likelihood(*part) for part in self._tables(demos)]).numpy()
+        return log_likelihoods(self.hierarchy, demos)
 
     def posterior(self, demos: Demonstrations) -> Posterior:
         """u, v and w of §4.1 for every level."""
-        parts = [posterior(*part) for part in self._tables(demos)]
+        parts = [posterior(*part) for part in _tables(self.hierarchy, demos)]
         u, v, w = (
             tuple(_stacked(level, 0.0) for level in zip(*tables, strict=True)) for tables in zip(*parts, strict=True)
         )
         return Posterior(u, v, w)
 
+    def divergences(self, demos: Demonstrations, posterior: Posterior) -> list[list[dict[str, Any]]]:
+        """How differently each two options of a level act (:func:`ddco_pyro.analysis.divergences`)."""
+        with torch.no_grad():
+            inputs = self.hierarchy.encoder.inputs(demo.observations for demo in demos)
+            return analysis.divergences(self.hierarchy(inputs), posterior)
+
     def segment(self, demos: Demonstrations) -> tuple[np.ndarray, ...]:
         """Choices of the most likely path, a [N, T] for each level, lowest first; -1 past a demonstration's end."""
-        parts = [segment(*part) for part in self._tables(demos)]
+        parts = [segment(*part) for part in _tables(self.hierarchy, demos)]
         return tuple(_stacked(level, -1).numpy() for level in zip(*parts, strict=True))
-
-    def _tables(self, demos: Demonstrations) -> Iterator[tuple[Tables, Tensor]]:
-        """Tables and lengths of the demonstrations, some at a time."""
-        with torch.no_grad():
-            for _, batch in encode(demos, self.hierarchy.encoder, self.hierarchy.scaling).pieces():
-                yield self.hierarchy.tabulate(batch), batch.lengths
 
     def controller(self, seed: int = 0) -> Controller:
         """The model as a policy that acts, as the spec's ``rollout`` says."""
@@ -120,6 +120,19 @@ def _stacked(parts: Sequence[Tensor], padding: float) -> Tensor:
     """Parts [N_i, T_i, ...] one below the other, padded to the longest."""
     rows = [row for part in parts for row in part]
     return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=padding)
+
+
+def log_likelihoods(hierarchy: Hierarchy, demos: Demonstrations) -> np.ndarray:
+    """log p(ξ) of each demonstration under a trained hierarchy, nats, [N]."""
+    found: np.ndarray = torch.cat([log_likelihood(*part) for part in _tables(hierarchy, demos)]).numpy()
+    return found
+
+
+def _tables(hierarchy: Hierarchy, demos: Demonstrations) -> Iterator[tuple[Tables, Tensor]]:
+    """Tables and lengths of the demonstrations, some at a time."""
+    with torch.no_grad():
+        for _, batch in encode(demos, hierarchy.encoder, hierarchy.scaling).pieces():
+            yield hierarchy.tabulate(batch), batch.lengths
 
 
 def model_name(spec: Spec) -> str:
@@ -139,6 +152,8 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
     missing = [name for name in ("spec.yaml", "model.safetensors", "metrics.json") if not (folder / name).exists()]
     if missing:
         what = "not a run folder" if "spec.yaml" in missing else "an unfinished run: fit it again to continue it"
+        if (folder / "folds.json").exists():
+            what = f"a selection; the fit of what it chose is in {folder / 'fit'} once it is done"
         raise RunError(f"{folder}: {what} (it has no {missing[0]})")
     spec = load_spec(folder / "spec.yaml")
     refuse_own_networks(spec, folder / "spec.yaml", allow_code)
@@ -181,11 +196,12 @@ def fit(spec: Spec, folder: Path, watcher: Watcher) -> Fit:
 
 
 def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, clock: _Clock) -> Fit:
-    train, valid = demos.split(spec.demonstrations.valid_fraction, spec.seed)
-    kept, tune = train.split(spec.training.tune_fraction, spec.seed)
-    with clock("training"), _one_thread():
-        hierarchy, check, rows = _train(spec, folder, Dimensions.of(demos), (kept, tune), watcher)
-    _write_history(folder, rows)
+    split = parts(spec, demos)
+    with clock("training"):
+        checkpoint = folder / "checkpoints" / "latest.safetensors"
+        trained = train(spec, Dimensions.of(demos), split["train"], watcher, checkpoint)
+    hierarchy = trained.hierarchy
+    _write_history(folder, trained.history)
     _write_model(folder, hierarchy, Dimensions.of(demos))
     found = Fit(folder, spec, hierarchy)
     with clock("baselines"):
@@ -195,10 +211,11 @@ def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, cloc
             if not _finished(own):
                 _fit(baseline_spec(spec, baseline), own, demos, watcher, _Clock())
     with clock("evaluation"):
-        metrics = _evaluate(found, {"train": train, "valid": valid}, demos)
+        metrics = _evaluate(found, split, demos)
+    held_out = {"valid": len(split.get("valid", ()))}
     metrics |= {
-        "engine_check": check._asdict(),
-        "demonstrations": {"train": len(kept), "tune": len(tune), "valid": len(valid)} | _supervisor(demos),
+        "engine_check": trained.check._asdict(),
+        "demonstrations": trained.demonstrations | held_out | _supervisor(demos),
         "parameters": sum(parameter.numel() for parameter in hierarchy.parameters()),
         "seconds": clock.seconds,
         "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
@@ -241,19 +258,44 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     write_text(path, text)
 
 
+@dataclass(frozen=True)
+class Trained:
+    """What training gave: the ``hierarchy``, the ``check`` of the engines before it, the ``history`` of its epochs, and
+    the numbers of ``demonstrations`` that it was trained and tuned on.
+    """
+
+    hierarchy: Hierarchy
+    check: EngineCheck
+    history: list[dict[str, Any]]
+    demonstrations: dict[str, int]
+
+
+def train(
+    spec: Spec, dimensions: Dimensions, demos: Demonstrations, watcher: Watcher, checkpoint: Path | None = None
+) -> Trained:
+    """Train the spec's model on these demonstrations, of which ``training.tune_fraction`` are used to tune.
+
+    :param checkpoint: where training is kept to be continued; None for nowhere.
+    :raises TrainingError: a log-likelihood is not finite, or the engines disagree.
+    """
+    kept, tune = demos.split(spec.training.tune_fraction, spec.seed)
+    with one_thread():
+        return _train(spec, dimensions, (kept, tune), watcher, checkpoint)
+
+
 def _train(
     spec: Spec,
-    folder: Path,
     dimensions: Dimensions,
     parts: tuple[Demonstrations, Demonstrations],
     watcher: Watcher,
-) -> tuple[Hierarchy, EngineCheck, list[dict[str, Any]]]:
-    train = parts[0]
+    checkpoint: Path | None,
+) -> Trained:
+    kept, tune = parts
 
     def make() -> Hierarchy:
         hierarchy = build_hierarchy(spec, dimensions)
-        hierarchy.encoder.fit(train)
-        hierarchy.scaling.fit(train)
+        hierarchy.encoder.fit(kept)
+        hierarchy.scaling.fit(kept)
         return hierarchy
 
     first = make()
@@ -267,11 +309,10 @@ def _train(
         )
     stages = len(plan(spec, first.depth))
     watcher.training(model_name(spec), stages * spec.training.epochs * spec.training.restarts)
-    checkpoint = folder / "checkpoints" / "latest.safetensors"
-    trainer = Trainer(spec, make, batches[0], batches[1], checkpoint, list(train.names), watcher.epoch)
+    trainer = Trainer(spec, make, batches[0], batches[1], checkpoint, list(kept.names), watcher.epoch)
     hierarchy = trainer.run()
     watcher.trained(model_name(spec))
-    return hierarchy, check, trainer.progress.history
+    return Trained(hierarchy, check, trainer.progress.history, {"train": len(kept), "tune": len(tune)})
 
 
 def _write_model(folder: Path, hierarchy: Hierarchy, dimensions: Dimensions) -> None:
@@ -290,28 +331,37 @@ def _write_history(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 def _evaluate(found: Fit, parts: dict[str, Demonstrations], demos: Demonstrations) -> dict[str, Any]:
     values = {name: found.log_likelihood(part) for name, part in parts.items()}
-    valid = parts["valid"]
-    lengths = np.array(valid.lengths, dtype=float)
+    per_step = {name: float(v.sum() / sum(parts[name].lengths)) for name, v in values.items()}
     metrics: dict[str, Any] = {
         "model": found.name,
-        "log_likelihood_per_step": {name: float(v.sum() / sum(parts[name].lengths)) for name, v in values.items()},
-        "valid": [
-            {"name": name, "steps": int(steps), "log_likelihood": float(value)}
-            for name, steps, value in zip(valid.names, lengths, values["valid"], strict=True)
-        ],
+        "log_likelihood_per_step": {"train": per_step["train"], "valid": per_step.get("valid")},
+        "valid": _each(parts["valid"], values["valid"]) if "valid" in parts else [],
         "comparison": {
             name: {
                 "log_likelihood_per_step": one.metrics["log_likelihood_per_step"],
-                "difference": analysis.paired(values["valid"], one.log_likelihood(valid), lengths),
+                "difference": _difference(values["valid"], one, parts["valid"]),
             }
             for name, one in found.baselines.items()
         },
     }
     if found.hierarchy.depth:
-        metrics["options"] = analysis.as_rows(analysis.option_use(found.posterior(demos)))
+        posterior = found.posterior(demos)
+        metrics["options"] = analysis.as_rows(analysis.option_use(posterior))
+        metrics["divergences"] = found.divergences(demos, posterior)
         if found.spec.demonstrations.labels:
             metrics["agreement"] = _agreement(found, parts)
     return metrics
+
+
+def _each(demos: Demonstrations, values: np.ndarray) -> list[dict[str, Any]]:
+    return [
+        {"name": demo.name, "steps": len(demo), "log_likelihood": float(value)}
+        for demo, value in zip(demos, values, strict=True)
+    ]
+
+
+def _difference(ours: np.ndarray, baseline: Fit, valid: Demonstrations) -> dict[str, float]:
+    return analysis.paired(ours, baseline.log_likelihood(valid), np.array(valid.lengths, dtype=float))
 
 
 def _agreement(found: Fit, parts: dict[str, Demonstrations]) -> dict[str, Any]:
@@ -335,8 +385,8 @@ def _supervisor(demos: Demonstrations) -> dict[str, Any]:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Gradient steps of small networks on one thread: faster than on several, and the same on every machine."""
+def one_thread() -> Iterator[None]:
+    """Inside, torch works on one thread: faster than on several where networks are small, and the same everywhere."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

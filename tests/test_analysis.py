@@ -10,8 +10,9 @@ import pytest
 import torch
 from oracle import brute_force, random_tables
 
-from ddco_pyro.analysis import agreement, as_rows, option_use, paired
+from ddco_pyro.analysis import agreement, as_rows, divergences, option_use, paired
 from ddco_pyro.inference import Posterior, posterior
+from ddco_pyro.outputs import Decision, Outputs
 
 
 def test_use_of_options_by_sums_over_every_path():
@@ -41,6 +42,56 @@ def test_an_option_that_is_never_selected_has_no_duration():
         {"choice": 2, "share": 0.6, "selected": 1.0, "duration": 3.0},
         {"choice": 3, "share": 0.0, "selected": 0.0, "duration": None},
     ]
+
+
+@pytest.fixture
+def hybrid():
+    """Three callers that choose among control and two options below, in two trajectories of four steps."""
+    random = torch.Generator().manual_seed(0)
+    logits = torch.randn(2, 4, 3, 3, generator=random, dtype=torch.float64)
+    mean = torch.randn(2, 4, 3, 2, generator=random, dtype=torch.float64)
+    u = torch.rand(2, 4, 4, generator=random, dtype=torch.float64)
+    return Decision(2, logits, mean, torch.tensor([0.5, 2.0], dtype=torch.float64)), u
+
+
+def act(decision, n, t, i):
+    """The distribution of what caller i does at a step: (probabilities of the choices, Gaussian of the control)."""
+    control = torch.distributions.Normal(decision.mean[n, t, i], decision.std)
+    return torch.distributions.Categorical(logits=decision.selection[n, t, i]), control
+
+
+def test_divergences_are_mean_kullback_leibler_divergences_in_both_directions(hybrid):
+    decision, u = hybrid
+    (found,) = divergences(Outputs((decision, decision), ()), Posterior((u,), (u,), (u,)))
+    assert [one["options"] for one in found] == [[1, 2], [1, 3], [2, 3]]
+    kl = torch.distributions.kl_divergence
+    for one in found:
+        i, j = (option - 1 for option in one["options"])
+        total = weights = 0.0
+        for n, t in np.ndindex(2, 4):
+            (p, f), (q, g) = act(decision, n, t, i), act(decision, n, t, j)
+            there = kl(p, q) + p.probs[0] * kl(f, g).sum()
+            back = kl(q, p) + q.probs[0] * kl(g, f).sum()
+            weight = u[n, t, i + 1] + u[n, t, j + 1]
+            total, weights = total + weight * (there + back) / 2, weights + weight
+        assert one["divergence"] == pytest.approx(float(total / weights))
+
+
+def test_divergences_of_policies_that_emit_one_kind_of_thing(hybrid):
+    decision, u = hybrid
+    same = Posterior((u,), (u,), (u,))
+    apart = (decision.mean[:, :, 0] - decision.mean[:, :, 1]) / decision.std
+    weight = u[..., 1] + u[..., 2]
+    (found,) = divergences(Outputs((Decision(0, None, decision.mean, decision.std), decision), ()), same)
+    assert found[0]["divergence"] == pytest.approx(float((weight * apart.square().sum(-1) / 2).sum() / weight.sum()))
+    options = decision.logits[..., 1:]
+    (found,) = divergences(Outputs((Decision(2, options, None, decision.std), decision), ()), same)
+    p, q = (options[:, :, i].log_softmax(-1) for i in (0, 1))
+    both = ((p.exp() - q.exp()) * (p - q)).sum(-1) / 2
+    assert found[0]["divergence"] == pytest.approx(float((weight * both).sum() / weight.sum()))
+    never = torch.zeros_like(u)
+    (found,) = divergences(Outputs((decision, decision), ()), Posterior((never,), (never,), (never,)))
+    assert found[0]["divergence"] is None
 
 
 def nmi(ours, theirs):

@@ -136,7 +136,7 @@ def test_rollout_and_report(run):
 
 
 def test_help_has_examples():
-    for command in ("check", "collect", "fit", "rollout", "report"):
+    for command in ("check", "collect", "fit", "select", "compare", "rollout", "report"):
         ended = call(command, "--help")
         assert (ended.status, ended.err) == (0, "")
         assert f"Example: ddco-pyro {command}" in ended.out
@@ -150,6 +150,9 @@ OWN = "hierarchy.levels.0.policy.network=test_networks:Own"
 
 def with_set(*overrides):
     return [argument for override in overrides for argument in ("--set", override)]
+
+
+GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
 
 
 @pytest.mark.parametrize(
@@ -190,6 +193,28 @@ def with_set(*overrides):
         (["fit", "SPEC", "--out", "RUN"], "holds a run of another spec; choose another --out or remove it"),
         (["fit", "RUN/spec.yaml", "--out", "RUN"], "holds a run of this spec already; show it with --resume, or"),
         (["fit", "SPEC", "--out", "SPEC"], r"toy\.yaml: is a file; choose another --out"),
+        (["select", "SPEC"], "selection.grid: is empty; name what to try, such as selection.grid: {.*}"),
+        (["select", "SPEC", "--folds", "1"], "selection.folds: must be at least 2, got 1"),
+        (["select", "SPEC", *GRID, "--folds", "13"], "selection.folds: 13 folds of 12 demonstrations; use at most 12"),
+        (["select", "SPEC", *GRID, "--jobs", "0"], "--jobs 0: give a number of processes, or -1 for one on each core"),
+        (["select", "SPEC", *GRID, "--out", "RUN"], "holds a run of another spec; choose another --out or remove it"),
+        (
+            ["select", "SPEC", *with_set("selection.grid.hierarchy.levels.0.cuont=[1]")],
+            "selection.grid.hierarchy.levels.0.cuont: .*did you mean hierarchy.levels.0.count.*",
+        ),
+        (
+            ["select", "SPEC", *GRID, *with_set("selection.grid.demonstrations.count=[3]")],
+            "selection.grid.demonstrations.count: candidates are compared on the same data; remove it",
+        ),
+        (
+            ["select", "SPEC", *GRID, "--backend", "dask"],
+            "--backend dask and --scheduler tcp://HOST:PORT go together.*",
+        ),
+        (["select", "SPEC", *GRID, "--backend", "spark"], "Invalid value for '--backend': .*'spark' is not one of .*"),
+        (["compare"], r"Missing argument 'RUN RUN...'; see ddco-pyro compare --help"),
+        (["compare", "RUN"], "one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat"),
+        (["compare", "RUN", "RUN"], "the same run is given twice; name each once"),
+        (["compare", "RUN", "nowhere"], r"nowhere: not a run folder \(it has no spec\.yaml\)"),
         (["rollout", "nowhere"], r"nowhere: not a run folder \(it has no spec\.yaml\)"),
         (["report", "nowhere"], r"nowhere: not a run folder \(it has no spec\.yaml\)"),
     ],

@@ -43,6 +43,22 @@ def test_an_unused_option_is_not_also_said_to_be_short():
     assert [one.kind for one in found] == ["unused"]
 
 
+def pair(first, second, divergence):
+    return {"options": [first, second], "divergence": divergence}
+
+
+@pytest.mark.parametrize(("divergence", "redundant"), [(0.0999, True), (0.1, False)])
+def test_redundant_below_a_tenth_of_a_nat(divergence, redundant):
+    alike = [pair(1, 2, 3.0), pair(1, 3, divergence), pair(2, 3, 4.0)]
+    found = diagnose([level(0.0, 0.3, 0.3, 0.4)], [alike])
+    assert found == ([Finding("redundant", 1, 3, divergence, other=1)] if redundant else [])
+
+
+def test_an_unused_option_is_not_also_said_to_be_redundant():
+    found = diagnose([level(0.0, 0.001, 0.5, 0.499)], [[pair(1, 2, 0.0), pair(1, 3, 0.0), pair(2, 3, 1.0)]])
+    assert [one.kind for one in found] == ["unused"]
+
+
 @pytest.mark.parametrize(("control", "high"), [(0.5, False), (0.51, True)])
 def test_high_fitting_where_control_is_chosen_most_of_the_time(control, high):
     rest = (1 - control) / 2
@@ -57,6 +73,7 @@ def test_control_by_a_caller_above_does_not_count_for_the_one_below():
 
 
 def test_every_sign_comes_with_advice():
-    found = diagnose([level(0.6, 0.001, 0.399, durations=[1.0, 1.0, 1.2]), level(0.0, 0.95, 0.05)])
-    assert {one.kind for one in found} == {"unused", "dominating", "never_persisting", "high_fitting"}
+    levels = [level(0.6, 0.001, 0.399, durations=[1.0, 1.0, 1.2]), level(0.0, 0.95, 0.05)]
+    found = diagnose(levels, [[pair(1, 2, 5.0)], [pair(1, 2, 0.01)]])
+    assert {one.kind for one in found} == {"unused", "redundant", "dominating", "never_persisting", "high_fitting"}
     assert all(one.advice for one in found)

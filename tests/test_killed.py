@@ -124,10 +124,10 @@ def test_killed_and_called_again(cases: dict[str, Case], tmp_path: Path) -> None
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["collect", "import", "fit", "segment"])
 def test_killed_at_very_many_moments(cases: dict[str, Case], tmp_path: Path, name: str) -> None:
-    killed = 0
-    for round_ in range(5):
+    killed = round_ = 0
+    while killed < 13:  # four commands: 52 moments; a moment that comes after the end kills nothing
         folder = tmp_path / str(round_)
         folder.mkdir()
         killed += check(cases[name], folder, kills=5, seed=round_)
-    assert killed >= 13  # four commands: at least 52 moments; a moment that comes after the end kills nothing
+        round_ += 1
     print(f"{name}: killed {killed} times")

@@ -110,7 +110,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"training": None}, "training: must be a mapping (key: value), got null"),
     ({"seed": -1}, "seed: must be at least 0, got -1"),
     ({"seed": 2**32}, "seed: must be at most 4294967295, got 4294967296"),
-    ({"demonstrations.valid_fraction": 0}, "demonstrations.valid_fraction: must be greater than 0, got 0"),
+    ({"demonstrations.valid_fraction": -0.1}, "demonstrations.valid_fraction: must be at least 0, got -0.1"),
     (
         {"hierarchy.levels.0.policy.network": None},
         "hierarchy.levels.0.policy.network: must be text, got null",

@@ -10,9 +10,10 @@ from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.files import write_text
 from ddco_pyro.report import sections
 from ddco_pyro.report.pictures import style
+from ddco_pyro.report.sections import degeneracies
 from ddco_pyro.run import Fit
 
-__all__ = ["write_report"]
+__all__ = ["degeneracies", "write_report"]
 
 
 def write_report(fit: Fit, demos: Demonstrations) -> Path:

@@ -18,6 +18,7 @@ from ddco_pyro.report.words import method
 class Likelihood:
     """One method, in nats per step: on training and held-out demonstrations, and by how much the model is above it.
 
+    :param valid: NaN where nothing was held out.
     :param difference: (mean, standard error); None for the model itself.
     :param each: the difference on each held-out demonstration.
     """
@@ -32,7 +33,7 @@ class Likelihood:
 def likelihoods(metrics: Mapping[str, Any], baselines: Mapping[str, Mapping[str, Any]]) -> list[Likelihood]:
     """The model and what it was compared with, from its ``metrics.json`` and those of its baselines."""
     own = metrics["log_likelihood_per_step"]
-    found = [Likelihood(metrics["model"], own["train"], own["valid"])]
+    found = [Likelihood(metrics["model"], own["train"], np.nan if own["valid"] is None else own["valid"])]
     for name, one in metrics["comparison"].items():
         values, difference = one["log_likelihood_per_step"], one["difference"]
         each = _each(metrics["valid"], baselines.get(name, {}).get("valid", ()))

@@ -23,7 +23,7 @@ from ddco_pyro.report import (
 from ddco_pyro.report.activity import Activity, activity
 from ddco_pyro.report.pictures import Picture, keep
 from ddco_pyro.run import Fit
-from ddco_pyro.spec import dump_spec
+from ddco_pyro.spec import Spec, dump_spec
 
 EXAMPLES = 4
 """Demonstrations whose posterior is shown step by step."""
@@ -236,23 +236,32 @@ def _agreement(metrics: Mapping[str, Any], levels: list[str]) -> str:
     found = metrics.get("agreement")
     if not found:
         return ""
-    scores = [
-        f"{words.number(valid)} on held-out and {words.number(train)} on training demonstrations (level “{level}”)"
-        for level, train, valid in zip(levels, found["train"], found["valid"], strict=True)
-    ]
+    scores = [f"{_scores(found, number)} demonstrations (level “{level}”)" for number, level in enumerate(levels)]
     return (
         f"Normalised mutual information with the ground-truth label “{found['labels']}”: {'; '.join(scores)}. "
         "0 is no agreement, 1 the same segments under other names."
     )
 
 
+def _scores(found: Mapping[str, Any], level: int) -> str:
+    held_out = f"{words.number(found['valid'][level])} on held-out and " if "valid" in found else ""
+    return f"{held_out}{words.number(found['train'][level])} on training"
+
+
 def warnings(fit: Fit, metrics: Mapping[str, Any]) -> Warnings | None:
     """Signs of a degenerate solution."""
     if fit.spec.hierarchy is None:
         return None
-    names = [level.name for level in fit.spec.hierarchy.levels]
-    found = diagnose(metrics["options"])
-    return Warnings([(words.warning(one, names[one.level - 1]), one.advice) for one in found])
+    return Warnings(degeneracies(fit.spec, metrics))
+
+
+def degeneracies(spec: Spec, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Signs of a degenerate solution in ``metrics.json``, each in words with its number, and what usually helps."""
+    if spec.hierarchy is None:
+        return []
+    names = [level.name for level in spec.hierarchy.levels]
+    found = diagnose(metrics["options"], metrics.get("divergences", ()))  # runs of before have no divergences
+    return [(words.warning(one, names[one.level - 1]), one.advice) for one in found]
 
 
 def films(fit: Fit) -> Films | None:

@@ -71,6 +71,9 @@ def _capital(text: str) -> str:
 def verdict(metrics: Mapping[str, Any]) -> str:
     """One sentence on how well the model explains held-out demonstrations, with the error of that."""
     name, held_out = _capital(method(metrics["model"])), len(metrics["valid"])
+    if not held_out:
+        value = number(metrics["log_likelihood_per_step"]["train"])
+        return f"{name} was fitted to all demonstrations ({value} nats per step): none was held out to judge it by."
     if not metrics["comparison"]:
         value = number(metrics["log_likelihood_per_step"]["valid"])
         return (
@@ -115,6 +118,8 @@ def warning(finding: Finding, level: str) -> str:
     return {
         "unused": f"{option} is unused: it is active in {share} of all steps.",
         "dominating": f"{option} dominates: it is active in {share} of all steps.",
+        "redundant": f"{option} does the same as option {finding.other}: over the time that one of them is active they "
+        f"differ by {number(finding.value, 3)} nats per step.",
         "never_persisting": f"{option} never persists: it lasts {number(finding.value)} steps on average.",
         "high_fitting": f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its "
         "steps, past its options.",

@@ -34,8 +34,9 @@ def _own(data: Any, place: str) -> Iterator[tuple[str, str]]:
     if isinstance(data, dict):
         for key, value in data.items():
             below = f"{place}.{key}" if place else str(key)
-            if key == "network" and isinstance(value, str) and value not in NETWORK_KEYS:
-                yield below, value
+            if str(key).rpartition(".")[2] == "network":  # the keys of a selection's grid are key paths
+                names = value if isinstance(value, list | tuple) else [value]
+                yield from ((below, name) for name in names if isinstance(name, str) and name not in NETWORK_KEYS)
             elif key != "options":  # keyword arguments of such a network
                 yield from _own(value, below)
     elif isinstance(data, list | tuple):

@@ -15,14 +15,16 @@ class DemonstrationsSpec(Model):
 
     path: Text | None = None
     """HDF5 file in robomimic's layout; without it they are collected in the task."""
+    task: Text | None = None
+    """Task in which they are collected, such as one whose episodes are single demonstrations; null: the spec's own."""
     count: int = Field(default=100, ge=2)
     """Number of demonstrations to collect."""
     seed: Seed = 0
     """Seed of the first collected episode."""
     supervisor: Text = "supervisor"
     """Which of the task's scripted policies is recorded."""
-    valid_fraction: Fraction = 0.1
-    """Part of the demonstrations held out for validation, where the file has no ``mask/valid``."""
+    valid_fraction: Share = 0.1
+    """Part of the demonstrations held out for validation, where the file has no ``mask/valid``; 0 for none."""
     labels: Text | None = None
     """Name of ground-truth labels in the file; the discovered options are compared with them (NMI)."""
 

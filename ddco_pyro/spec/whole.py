@@ -50,9 +50,14 @@ class Spec(Model):
     seed: Seed = 0
     """Seed of everything random that has no seed of its own."""
 
+    @property
+    def demonstrated_task(self) -> str | None:
+        """Name of the task in which demonstrations are collected; None where there is only a file."""
+        return self.demonstrations.task or self.task
+
     @model_validator(mode="after")
     def _consistent(self) -> Spec:
-        problems = [*self._choices(), *self._repeated_observations()]
+        problems = [*self._choices(), *self._repeated_observations(), *self._nothing_held_out()]
         if problems:
             raise invalid(*problems)
         if self.selection.grid:
@@ -62,12 +67,16 @@ class Spec(Model):
         return self
 
     def _choices(self) -> Iterator[tuple[str, str]]:
-        if self.task is None and self.demonstrations.path is None:
+        if self.demonstrated_task is None and self.demonstrations.path is None:
             yield "task", "missing; name a task, or give a file in demonstrations.path"
         if self.hierarchy is None and self.baseline is None:
             yield "hierarchy", "missing; declare a hierarchy, or a baseline in its place"
         if self.hierarchy is not None and self.baseline is not None:
             yield "baseline", "stands beside hierarchy; keep one of them (compare_with takes baselines to train beside)"
+
+    def _nothing_held_out(self) -> Iterator[tuple[str, str]]:
+        if self.compare_with and self.demonstrations.valid_fraction == 0:
+            yield "compare_with", "needs demonstrations held out to compare on; raise demonstrations.valid_fraction"
 
     def _repeated_observations(self) -> Iterator[tuple[str, str]]:
         keys = [observation.key for observation in self.observations]

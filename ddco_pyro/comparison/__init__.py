@@ -1,0 +1,128 @@
+"""Runs compared on the demonstrations that all of them held out, and on rollouts from the same initial states.
+
+The form is that of arviz's ``compare``: rank, total, standard error, difference to the best, its standard error; with
+the held-out log-likelihood of a trajectory where arviz has the elpd of an observation.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddco_pyro.comparison import page, plot
+from ddco_pyro.comparison.rollouts import paired_rollouts
+from ddco_pyro.comparison.shared import Held, held_out
+from ddco_pyro.errors import BadInput
+from ddco_pyro.files import write_text
+from ddco_pyro.run import load
+
+__all__ = ["CompareError", "Comparison", "Row", "compare", "write"]
+
+
+class CompareError(BadInput):
+    """Runs that cannot be compared."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run, in nats over all held-out trajectories.
+
+    :param total: Σ log p(ξ_n), and its standard error ``se``, √(N var).
+    :param difference: the best run's total minus this one's (0 for the best), and its standard error ``dse``, √(N var
+        of the differences by trajectory): smaller than what the two ``se`` suggest, as the trajectories are the same.
+    :param each: log p(ξ_n) of every trajectory.
+    """
+
+    rank: int
+    name: str
+    model: str
+    parameters: int
+    total: float
+    se: float
+    difference: float
+    dse: float
+    per_step: float
+    each: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Rows, the best first; the ``trajectories`` they were compared on, and rollouts paired by initial state."""
+
+    rows: Sequence[Row]
+    trajectories: Sequence[str]
+    steps: int
+    rollouts: Sequence[dict[str, Any]]
+
+    def as_data(self) -> dict[str, Any]:
+        """The same as plain data."""
+        return {
+            "trajectories": list(self.trajectories),
+            "steps": self.steps,
+            "rows": [vars(row) | {"each": list(row.each)} for row in self.rows],
+            "rollouts": list(self.rollouts),
+        }
+
+
+def compare(folders: Sequence[Path], allow_code: bool = False) -> Comparison:
+    """The runs in these folders (a run's ``baselines/NAME`` is a run too), the best first.
+
+    :param allow_code: import the networks of one's own that their specs name.
+    :raises CompareError: there are less than two, or one twice.
+    :raises NotShared: they were not held out on the same data.
+    :raises RunError: a folder is not a finished run.
+    """
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise CompareError("the same run is given twice; name each once")
+    if len(folders) < 2:
+        raise CompareError("one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat")
+    fits = [load(folder, allow_code) for folder in folders]
+    held = held_out(fits)
+    values = np.stack([one.values for one in held])
+    best = int(values.sum(1).argmax())
+    rows = [_row(0, one, values[best]) for one in held]
+    ranked = sorted(rows, key=lambda row: row.difference)
+    return Comparison(
+        [Row(**vars(row) | {"rank": rank}) for rank, row in enumerate(ranked)],
+        held[0].names,
+        sum(held[0].steps),
+        paired_rollouts(fits, [row.name for row in ranked]),
+    )
+
+
+def _row(rank: int, one: Held, best: np.ndarray) -> Row:
+    difference = best - one.values
+    return Row(
+        rank, one.run, one.fit.name, int(one.fit.metrics["parameters"]), float(one.values.sum()), _error(one.values),
+        float(difference.sum()), _error(difference), float(one.values.sum() / sum(one.steps)),
+        tuple(one.values.tolist()),
+    )  # fmt: skip
+
+
+def _error(values: np.ndarray) -> float:
+    """Standard error of a sum of independent values; NaN for a single one."""
+    return float(np.sqrt(len(values) * values.var(ddof=1))) if len(values) > 1 else float("nan")
+
+
+def write(found: Comparison, folder: Path) -> Path:
+    """Write ``compare.json``, ``.md``, ``.html`` and ``.png`` into a folder; the path of the page."""
+    picture = plot.write(found, folder / "compare.png")
+    data = json.dumps(_finite(found.as_data()), indent=1) + "\n"
+    write_text(folder / "compare.json", data)
+    write_text(folder / "compare.md", page.markdown(found))
+    write_text(folder / "compare.html", page.html(found, picture))
+    return folder / "compare.html"
+
+
+def _finite(data: Any) -> Any:
+    """NaN as null: JSON has no NaN."""
+    if isinstance(data, dict):
+        return {key: _finite(value) for key, value in data.items()}
+    if isinstance(data, list):
+        return [_finite(value) for value in data]
+    return None if isinstance(data, float) and np.isnan(data) else data

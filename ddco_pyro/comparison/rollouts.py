@@ -1,0 +1,48 @@
+"""Rollouts of different runs from the same initial states."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ddco_pyro.evaluate import SUCCESS
+from ddco_pyro.rollout import paired_difference, rate
+from ddco_pyro.run import Fit
+
+Outcomes = Mapping[int, float]
+"""Success (1) or not (0) by the seed of the initial state."""
+
+
+def paired_rollouts(fits: Sequence[Fit], order: Sequence[str]) -> list[dict[str, Any]]:
+    """Success of each run against the first in ``order`` that was rolled out, on the initial states that both have.
+
+    Runs of other tasks, or without rollouts, are left out. ``p_value`` is McNemar's exact one.
+    """
+    by_name = {str(fit.folder): fit for fit in fits}
+    known = {name: own for name in order if (own := _outcomes(by_name[name]))}
+    if len(known) < 2:
+        return []
+    first, *others = known
+    alike = [name for name in others if by_name[name].spec.task == by_name[first].spec.task]
+    found = [_pair(first, known[first], name, known[name]) for name in alike]
+    return [one for one in found if one["trials"]]
+
+
+def _pair(first: str, ours: Outcomes, second: str, theirs: Outcomes) -> dict[str, Any]:
+    seeds = sorted(ours.keys() & theirs.keys())
+    left, right = [ours[seed] for seed in seeds], [theirs[seed] for seed in seeds]
+    rates = {"rate": rate(int(sum(left)), len(left)), "other_rate": rate(int(sum(right)), len(right))}
+    return {"run": first, "other": second, **paired_difference(left, right), **rates}
+
+
+def _outcomes(fit: Fit) -> Outcomes:
+    """What ``rollout`` wrote: for a baseline into the folder of the run that it belongs to."""
+    above = fit.folder.resolve().parent
+    places = [fit.folder, above.parent] if above.name == "baselines" else [fit.folder]
+    path = next((place / "rollouts.csv" for place in places if (place / "rollouts.csv").exists()), None)
+    if path is None:
+        return {}
+    with path.open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["method"] == fit.name and row.get(SUCCESS)]
+    return {int(row["seed"]): float(row[SUCCESS]) for row in rows}

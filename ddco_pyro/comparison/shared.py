@@ -1,0 +1,84 @@
+"""The held-out demonstrations that runs share; runs that share none cannot be compared, and are told why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ddco_pyro.data import demonstrations, parts
+from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.errors import BadInput
+from ddco_pyro.run import Fit
+
+TOLERANCE = 1e-4
+"""Relative; a log-likelihood computed again on another machine differs in the last digits of float32."""
+
+
+class NotShared(BadInput):
+    """Runs that were not held out on the same data; one line with the two runs and what is different."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """A run and log p(ξ) of each of its held-out demonstrations, in the order of ``names``."""
+
+    run: str
+    fit: Fit
+    names: tuple[str, ...]
+    steps: tuple[int, ...]
+    values: np.ndarray
+
+
+def held_out(fits: Sequence[Fit]) -> list[Held]:
+    """Every run on the held-out demonstrations that all of them share.
+
+    :raises NotShared: a run held nothing out, its demonstrations are no longer those it was fitted to, or the others
+        held out others.
+    """
+    own = [_own(fit) for fit in fits]
+    for fit, demos in zip(fits[1:], own[1:], strict=True):
+        _check_same(fits[0], own[0], fit, demos)
+    return [_held(fit, demos.select(own[0].names)) for fit, demos in zip(fits, own, strict=True)]
+
+
+def _own(fit: Fit) -> Demonstrations:
+    """What a run held out."""
+    found = parts(fit.spec, demonstrations(fit.spec))
+    if "valid" not in found:
+        raise NotShared(
+            f"{fit.folder}: held nothing out (demonstrations.valid_fraction: 0); there is nothing to compare"
+        )
+    return found["valid"]
+
+
+def _check_same(first: Fit, ours: Demonstrations, second: Fit, theirs: Demonstrations) -> None:
+    """Held-out demonstrations have the same names, controls, and observations where both runs see them."""
+    lead = f"{first.folder} and {second.folder} were not held out on the same data"
+    only = sorted(set(ours.names) ^ set(theirs.names))
+    if only:
+        where = first if only[0] in ours.names else second
+        remedy = "fit both with the same demonstrations, valid_fraction and seed"
+        raise NotShared(f"{lead}: {only[0]} was held out by {where.folder} alone; {remedy}")
+    for mine, yours in zip(ours, theirs.select(ours.names), strict=True):
+        different = _different(mine, yours)
+        if different:
+            raise NotShared(f"{lead}: {mine.name} has other {different}; fit both to the same demonstrations")
+
+
+def _different(mine: Demonstration, yours: Demonstration) -> str:
+    """What two demonstrations differ in, among what both have; nothing where they are the same."""
+    both = [key for key in mine.observations if key in yours.observations]
+    arrays = {f"obs/{key}": (mine.observations[key], yours.observations[key]) for key in both}
+    arrays["actions"] = (mine.actions, yours.actions)
+    return ", ".join(key for key, (left, right) in arrays.items() if not np.array_equal(left, right))
+
+
+def _held(fit: Fit, demos: Demonstrations) -> Held:
+    values = fit.log_likelihood(demos)
+    recorded = {one["name"]: one["log_likelihood"] for one in fit.metrics["valid"]}
+    for name, value in zip(demos.names, values, strict=True):
+        if not np.isclose(recorded.get(name, np.nan), value, rtol=TOLERANCE, atol=TOLERANCE):
+            raise NotShared(f"{fit.folder}: {name} has changed since this run was fitted to it; fit it again")
+    return Held(str(fit.folder), fit, demos.names, demos.lengths, values)

@@ -1,0 +1,178 @@
+"""Selection by k-fold cross-validation (paper §4.3): any grid over the spec, the same folds for every candidate.
+
+``selection.json`` has the result, ``folds/`` a file for each finished (candidate, fold), ``fit/`` the final fit.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from ddco_pyro.data import demonstrations, dimensions
+from ddco_pyro.errors import Failed
+from ddco_pyro.files import write_text
+from ddco_pyro.selection import choice as choosing
+from ddco_pyro.selection import folds as dividing
+from ddco_pyro.selection import grid, parallel, plot, scoring, table
+from ddco_pyro.selection.choice import STOP_RULE, Choice
+from ddco_pyro.selection.folds import Folds
+from ddco_pyro.selection.grid import Candidate
+from ddco_pyro.selection.parallel import Workers
+from ddco_pyro.selection.scoring import Score
+from ddco_pyro.spec import Spec, with_overrides
+
+__all__ = ["Choice", "Selection", "SelectionFailed", "Workers", "check", "final_spec", "select"]
+
+
+HERE = Workers()
+"""One process for each core of this machine."""
+
+
+class SelectionFailed(Failed):
+    """Nothing could be chosen."""
+
+
+class Watcher(Protocol):
+    """Is told how a selection goes on."""
+
+    def collected(self, done: int, total: int) -> None:
+        """So many of the demonstrations have been collected."""
+
+    def selecting(self, total: int, kept: int) -> None:
+        """So many (candidate, fold) are to be scored in all, of which some were kept from before."""
+
+    def scored(self, candidate: str, fold: int, failed: str) -> None:
+        """One has been scored, or has failed."""
+
+    def given_up(self, candidate: str, folds: int) -> None:
+        """A candidate has been stopped early: so many of its folds need not be scored."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """A finished cross-validation and the folder it lives in."""
+
+    folder: Path
+    choice: Choice
+    folds: Folds
+
+
+def check(spec: Spec, workers: Workers = HERE) -> list[Candidate]:
+    """The candidates, all of them valid, without collecting or training anything.
+
+    :raises SpecError: a candidate is not valid, or the grid is empty.
+    :raises FoldError: there are fewer demonstrations than folds.
+    :raises BackendError: the workers cannot be reached.
+    """
+    found = grid.candidates(spec, dimensions(grid.wide(spec)))
+    own = spec.demonstrations
+    if own.path is None or not Path(own.path).exists():  # they will be collected
+        dividing.assign(own.count, spec.selection.folds, spec.seed)
+    else:
+        dividing.divide(demonstrations(grid.wide(spec)), spec.selection.folds, spec.seed)
+    workers.check()
+    return found
+
+
+def select(spec: Spec, folder: Path, watcher: Watcher, workers: Workers = HERE, stop_early: bool = False) -> Selection:
+    """Score every candidate of the spec's grid in every fold, choose, and write table and figure into the folder.
+
+    What the folder has already is not done again. Which folds are scored depends on nothing but the spec, the
+    demonstrations and ``stop_early``; neither on the workers nor on interruptions.
+
+    :raises SelectionFailed: every candidate has failed in some fold.
+    """
+    demos = demonstrations(grid.wide(spec), watcher.collected)
+    folds = dividing.divide(demos, spec.selection.folds, spec.seed)
+    dividing.keep(folds, folder / "folds.json")
+    work = _Work(folder, folds, grid.candidates(spec, folds.dimensions), watcher)
+    work.load()
+    with parallel.pool(workers) as pool:
+        for numbers in _rounds(len(folds.held_out), stop_early):
+            work.score(pool, numbers)
+            if stop_early:
+                work.give_up(numbers[-1])
+    found = choosing.choose(work.candidates, work.scores(), len(folds.held_out))
+    _write(folder, spec, found, folds, stop_early)
+    if found.chosen is None:
+        reasons = [reason for row in found.rows for reason in row.failed.values()]
+        raise SelectionFailed(f"every candidate has failed in some fold; the first reason: {reasons[0]}")
+    return Selection(folder, found, folds)
+
+
+def final_spec(spec: Spec, chosen: Candidate) -> Spec:
+    """The spec of the fit that follows: what was chosen, on all demonstrations but those its file sets apart."""
+    return with_overrides(chosen.spec, {"demonstrations.valid_fraction": 0.0})
+
+
+def _rounds(folds: int, stop_early: bool) -> list[list[int]]:
+    """Which folds are scored at a time: fold after fold where candidates can be given up in between."""
+    return [[fold] for fold in range(folds)] if stop_early else [list(range(folds))]
+
+
+@dataclass
+class _Work:
+    """What is to be scored, what has been, and who has been given up."""
+
+    folder: Path
+    folds: Folds
+    candidates: Sequence[Candidate]
+    watcher: Watcher
+    done: dict[tuple[int, int], Score] = field(default_factory=dict)
+    stopped: set[int] = field(default_factory=set)
+
+    def load(self) -> None:
+        """Take what is kept from before."""
+        for candidate in self.candidates:
+            for fold in range(len(self.folds.held_out)):
+                found = scoring.kept(self.folder, candidate.number, fold)
+                if found is not None:
+                    self.done[candidate.number, fold] = found
+        self.watcher.selecting(len(self.candidates) * len(self.folds.held_out), len(self.done))
+
+    def score(self, pool: parallel.Parallel, folds: Sequence[int]) -> None:
+        """Score what is missing in some folds, and keep each score as soon as it is there."""
+        missing = [
+            (candidate, fold)
+            for fold in folds
+            for candidate in self.candidates
+            if candidate.number not in self.stopped and (candidate.number, fold) not in self.done
+        ]
+        if not missing:
+            return
+        for found in parallel.scores(pool, self.folds, missing):
+            scoring.keep(self.folder, found)
+            self.done[found.candidate, found.fold] = found
+            self.watcher.scored(self.candidates[found.candidate].name, found.fold, found.failed)
+
+    def give_up(self, last: int) -> None:
+        """Give up the candidates that are hopeless by their folds 0 to ``last``; later scores of theirs do not count,
+        should there be some from before.
+        """
+        running = [one for one in self.candidates if one.number not in self.stopped]
+        seen = [one for one in self.scores() if one.fold <= last and one.candidate not in self.stopped]
+        for number in sorted(choosing.hopeless(running, seen)):
+            later = [(number, fold) for fold in range(last + 1, len(self.folds.held_out))]
+            missing = [key for key in later if self.done.pop(key, None) is None]
+            self.watcher.given_up(self.candidates[number].name, len(missing))
+            self.stopped.add(number)
+
+    def scores(self) -> list[Score]:
+        """All scores, in the candidates' and folds' order."""
+        return [self.done[key] for key in sorted(self.done)]
+
+
+def _write(folder: Path, spec: Spec, found: Choice, folds: Folds, stop_early: bool) -> None:
+    data = {
+        "folds": len(folds.held_out),
+        "demonstrations": len(folds.demos),
+        "seed": spec.seed,
+        "stop_early": STOP_RULE if stop_early else None,
+        **choosing.as_data(found),
+    }
+    write_text(folder / "selection.md", table.markdown(found, data))
+    plot.write(found, folder / "figures" / "selection.png")
+    write_text(folder / "selection.json", json.dumps(data, indent=1) + "\n")

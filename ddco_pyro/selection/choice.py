@@ -1,0 +1,197 @@
+"""From the scores of all folds to a choice: paired differences, their standard errors, the one-standard-error rule.
+
+The demonstrations held out in one fold are scored by one trained model, so their errors go together: a fold, and not
+a demonstration, counts as one observation in every standard error here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from ddco_pyro.analysis import paired
+from ddco_pyro.selection.grid import Candidate
+from ddco_pyro.selection.scoring import Score
+
+RULE = (
+    "chosen: the fewest parameters among the candidates whose mean held-out log-likelihood per step is at most one "
+    "standard error of the paired difference below the best's (the better one where parameters are equal); a candidate "
+    "with a failed fold, or one that was stopped early, is not chosen"
+)
+
+STOP_FOLDS = 3
+STOP_LEVEL = 0.001
+STOP_RULE = (
+    f"--stop-early: after each fold from the {STOP_FOLDS}rd on, a candidate is given up where the paired t-test over "
+    f"the folds so far puts it below the best so far (one-sided, p < {STOP_LEVEL}), or where a fold of it has failed"
+)
+
+STD_NOTE = (
+    "control.std differs between candidates: a fixed σ rescales the log-likelihood (each step has the terms "
+    "−A log σ and −error²/2σ²), so between different σ most of a difference says how well σ fits the size of the "
+    "errors, not how well the options explain the control; compare other fields at equal σ"
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One candidate's result; log-likelihoods in nats per step.
+
+    :param status: ``scored``; ``failed`` where a fold has failed; ``stopped`` where it was given up early.
+    :param mean: held-out log-likelihood per step over the folds that were scored, and its standard ``error``.
+    :param difference: this minus the best over the folds that both have, and its standard error.
+    :param folds: log-likelihood per step of each fold that was scored, by number.
+    :param failed: why, by number of the fold.
+    """
+
+    candidate: Candidate
+    status: str
+    mean: float | None
+    error: float | None
+    difference: tuple[float, float] | None
+    folds: Mapping[int, float]
+    failed: Mapping[int, str]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """All rows in the candidates' order; the ``best`` and the ``chosen`` row, None where every candidate failed."""
+
+    rows: Sequence[Row]
+    best: Row | None
+    chosen: Row | None
+
+    @property
+    def notes(self) -> list[str]:
+        """What has to be known to read the numbers."""
+        return [STD_NOTE] if std_varies([row.candidate for row in self.rows]) else []
+
+
+def std_varies(candidates: Sequence[Candidate]) -> bool:
+    """Whether candidates differ in σ."""
+    stds = [candidate.spec.control.std for candidate in candidates]
+    return any(std != stds[0] for std in stds)
+
+
+def choose(candidates: Sequence[Candidate], scores: Sequence[Score], folds: int) -> Choice:
+    """The best candidate and the one that the one-standard-error rule chooses.
+
+    :param folds: how many folds a candidate needs to have been scored in.
+    """
+    by_candidate = {one.number: _Scored(one, [s for s in scores if s.candidate == one.number]) for one in candidates}
+    complete = [one for one in by_candidate.values() if len(one.good) == folds]
+    best = max(complete, key=lambda one: one.mean, default=None)
+    reference = best or max((one for one in by_candidate.values() if one.good), key=lambda one: one.mean, default=None)
+    rows = [one.row(folds, reference) for one in by_candidate.values()]
+    return Choice(rows, rows[best.candidate.number] if best else None, simplest(rows))
+
+
+def simplest(rows: Sequence[Row]) -> Row | None:
+    """The one-standard-error choice: the fewest parameters among what is within one standard error of the best."""
+    within = [row for row in rows if within_one_error(row)]
+    return min(within, key=lambda row: (row.candidate.parameters, -(row.mean or 0.0)), default=None)
+
+
+def within_one_error(row: Row) -> bool:
+    """Whether a candidate is complete, and at most one standard error of the paired difference below the best."""
+    return row.status == "scored" and row.difference is not None and -row.difference[0] <= row.difference[1]
+
+
+class _Scored:
+    """The scores of one candidate by fold."""
+
+    def __init__(self, candidate: Candidate, scores: Sequence[Score]) -> None:
+        self.candidate = candidate
+        self.good = {one.fold: one for one in sorted(scores, key=lambda one: one.fold) if not one.failed}
+        self.failed = {one.fold: one.failed for one in sorted(scores, key=lambda one: one.fold) if one.failed}
+
+    def arrays(self, folds: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Log-likelihood and steps of some folds."""
+        chosen = [self.good[fold] for fold in folds]
+        return np.array([one.total for one in chosen]), np.array([float(sum(one.steps)) for one in chosen])
+
+    @property
+    def mean(self) -> float:
+        """Held-out log-likelihood per step."""
+        values, steps = self.arrays(list(self.good))
+        return float(values.sum() / steps.sum())
+
+    def row(self, folds: int, best: _Scored | None) -> Row:
+        """Its row, compared with the best."""
+        status = "failed" if self.failed else "scored" if len(self.good) == folds else "stopped"
+        if not self.good:
+            return Row(self.candidate, status, None, None, None, {}, self.failed)
+        values, steps = self.arrays(list(self.good))
+        own = paired(values, np.zeros(len(values)), steps)
+        per_fold = dict(zip(self.good, (values / steps).tolist(), strict=True))
+        return Row(
+            self.candidate, status, self.mean, _finite(own["standard_error"]), self.against(best), per_fold, self.failed
+        )
+
+    def against(self, best: _Scored | None) -> tuple[float, float] | None:
+        """Difference to another candidate per step and its standard error, over the folds that both have."""
+        both = [fold for fold in self.good if best and fold in best.good]
+        if best is None or len(both) < 2:
+            return None
+        (ours, steps), (theirs, _) = self.arrays(both), best.arrays(both)
+        found = paired(ours, theirs, steps)
+        return found["nats_per_step"], found["standard_error"]
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def hopeless(candidates: Sequence[Candidate], scores: Sequence[Score]) -> set[int]:
+    """Numbers of the candidates to give up after some folds, by :data:`STOP_RULE`."""
+    found = {one.candidate for one in scores if one.failed}
+    scored = [_Scored(one, [s for s in scores if s.candidate == one.number]) for one in candidates]
+    scored = [one for one in scored if one.candidate.number not in found]
+    best = max(scored, key=lambda one: one.mean, default=None)
+    if best is None or len(best.good) < STOP_FOLDS:
+        return found
+    return found | {one.candidate.number for one in scored if one is not best and _below(one, best)}
+
+
+def _below(one: _Scored, best: _Scored) -> bool:
+    (ours, steps), (theirs, _) = one.arrays(list(one.good)), best.arrays(list(one.good))
+    difference = (ours - theirs) / steps
+    if np.ptp(difference) == 0:
+        return bool(difference[0] < 0)
+    return bool(stats.ttest_1samp(difference, 0, alternative="less").pvalue < STOP_LEVEL)
+
+
+def as_data(choice: Choice) -> dict[str, Any]:
+    """The choice as plain data for ``selection.json``."""
+    return {
+        "rule": RULE,
+        "notes": choice.notes,
+        "best": choice.best.candidate.number if choice.best else None,
+        "chosen": choice.chosen.candidate.number if choice.chosen else None,
+        "candidates": [_row(row) for row in choice.rows],
+        "failed": [
+            {"candidate": row.candidate.number, "name": row.candidate.name, "fold": fold, "reason": reason}
+            for row in choice.rows
+            for fold, reason in row.failed.items()
+        ],
+    }
+
+
+def _row(row: Row) -> dict[str, Any]:
+    mean, error = row.difference or (None, None)
+    return {
+        "number": row.candidate.number,
+        "name": row.candidate.name,
+        "values": dict(row.candidate.values),
+        "parameters": row.candidate.parameters,
+        "status": row.status,
+        "log_likelihood_per_step": row.mean,
+        "standard_error": row.error,
+        "difference": {"nats_per_step": mean, "standard_error": error},
+        "within_one_standard_error": within_one_error(row),
+        "folds": [{"fold": fold, "log_likelihood_per_step": value} for fold, value in row.folds.items()],
+    }

@@ -1,0 +1,86 @@
+"""The folds of a cross-validation: the same for every candidate, and kept with the results."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from sklearn.model_selection import KFold
+
+from ddco_pyro.data import Dimensions
+from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.errors import BadInput
+from ddco_pyro.files import write_text
+
+
+class FoldError(BadInput):
+    """Demonstrations that cannot be divided as asked, or are others than those that were divided before."""
+
+
+@dataclass(frozen=True)
+class Folds:
+    """Demonstrations ``demos`` and, for each fold, the names of those that are ``held_out``."""
+
+    demos: Demonstrations
+    held_out: tuple[tuple[str, ...], ...]
+
+    def split(self, fold: int) -> tuple[Demonstrations, Demonstrations]:
+        """The demonstrations to train with in a fold, and those to score on."""
+        out = set(self.held_out[fold])
+        train = [name for name in self.demos.names if name not in out]
+        return self.demos.select(train), self.demos.select(self.held_out[fold])
+
+    @property
+    def dimensions(self) -> Dimensions:
+        """The dimensions of all the demonstrations, so that networks are the same in every fold."""
+        return Dimensions.of(self.demos)
+
+
+def divide(demos: Demonstrations, folds: int, seed: int) -> Folds:
+    """Folds over all demonstrations, or over those to train with where the file has masks: what its author set apart to
+    validate with is not touched.
+
+    :raises FoldError: there are fewer demonstrations than folds, or too few to train and tune with.
+    """
+    used = demos.split(0.5, seed)[0] if demos.masks.keys() & {"train", "valid"} else demos
+    return Folds(used, tuple(tuple(used.names[row] for row in rows) for rows in assign(len(used), folds, seed)))
+
+
+def assign(count: int, folds: int, seed: int) -> list[list[int]]:
+    """The numbers of the demonstrations held out in each fold: a partition of 0 to count - 1, as even as can be.
+
+    :raises FoldError: there are fewer demonstrations than folds, or too few to train and tune with.
+    """
+    if folds > count:
+        raise FoldError(f"selection.folds: {folds} folds of {count} demonstrations; use at most {count}")
+    if count - -(-count // folds) < 2:
+        raise FoldError(f"selection.folds: {folds} folds of {count} demonstrations leave less than 2 to train with")
+    shuffled = KFold(folds, shuffle=True, random_state=seed).split(np.zeros(count))
+    return [sorted(int(row) for row in held_out) for _, held_out in shuffled]
+
+
+def keep(folds: Folds, path: Path) -> None:
+    """Write the folds, or see that those already there are the same.
+
+    :raises FoldError: they are of other demonstrations.
+    """
+    text = json.dumps({"demonstrations": digest(folds.demos), "folds": folds.held_out}, indent=1) + "\n"
+    if path.exists() and path.read_text() != text:
+        raise FoldError(f"{path}: the demonstrations have changed since; choose another --out")
+    if not path.exists():
+        write_text(path, text)
+
+
+def digest(demos: Demonstrations, observations: Sequence[str] | None = None) -> str:
+    """SHA-256 of names, controls and observations (all of them, or those named)."""
+    found = hashlib.sha256()
+    for demo in demos:
+        keys = sorted(demo.observations) if observations is None else observations
+        found.update(json.dumps([demo.name, *demo.actions.shape, *keys]).encode())
+        for array in (demo.actions, *(demo.observations[key] for key in keys)):
+            found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()

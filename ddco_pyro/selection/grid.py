@@ -1,0 +1,97 @@
+"""The candidates of a selection: one for each point of the grid, all of them valid before any work starts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+from ddco_pyro.data import Dimensions, build_hierarchy
+from ddco_pyro.spec import Spec, SpecError, with_overrides
+from ddco_pyro.spec.messages import show
+
+DATA = ("task", "demonstrations")
+"""What all candidates have to share, because they are compared on the same demonstrations."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One point of the grid: its ``number`` (from 0), the ``values`` at the grid's key paths, the whole ``spec`` with
+    them, and the number of trained ``parameters``.
+    """
+
+    number: int
+    values: Mapping[str, Any]
+    spec: Spec
+    parameters: int
+
+    @property
+    def name(self) -> str:
+        """What it is called in tables, such as ``count = 3``."""
+        return ", ".join(f"{_short(path, self.values)} = {_value(value)}" for path, value in self.values.items())
+
+
+def _short(path: str, paths: Iterable[str]) -> str:
+    """As much of the end of a key path as tells it from the others."""
+    others = [f".{one}" for one in paths if one != path]
+    parts = path.split(".")
+    for start in range(len(parts) - 1, 0, -1):
+        end = ".".join(parts[start:])
+        if not parts[start].isdecimal() and not any(one.endswith(f".{end}") for one in others):
+            return end
+    return path
+
+
+def _value(value: Any) -> str:
+    """A value of the grid in a few words: a list of levels as their numbers of options, lowest first."""
+    if isinstance(value, list | tuple) and value and all(isinstance(one, Mapping) and "count" in one for one in value):
+        return f"[{', '.join(str(one['count']) for one in value)}]"
+    return value if isinstance(value, str) else show(value)
+
+
+def wide(spec: Spec) -> Spec:
+    """The spec with every observation that a candidate sees, for reading the demonstrations once for all."""
+    alone = with_overrides(spec, {"selection.grid": {}})
+    seen = {one.key: one for one in spec.observations}
+    for path, values in spec.selection.grid.items():
+        if path.partition(".")[0] == "observations":
+            for value in values:
+                seen |= {one.key: one for one in with_overrides(alone, {path: value}).observations}
+    return alone.model_copy(update={"observations": tuple(seen.values())})
+
+
+def candidates(spec: Spec, dimensions: Dimensions) -> list[Candidate]:
+    """The Cartesian product of the grid's values, the last key path changing fastest.
+
+    :raises SpecError: the grid is empty or touches the data, or a candidate is not valid; one line for each problem.
+    """
+    grid = spec.selection.grid
+    if not grid:
+        example = "{hierarchy.levels.0.count: [1, 2, 3, 4]}"
+        raise SpecError(f"selection.grid: is empty; name what to try, such as selection.grid: {example}")
+    shared = [path for path in grid if path.partition(".")[0] in DATA]
+    if shared:
+        raise SpecError(
+            *(f"selection.grid.{path}: candidates are compared on the same data; remove it" for path in shared)
+        )
+    found, problems = [], []
+    for number, values in enumerate(product(*grid.values())):
+        try:
+            found.append(_candidate(number, dict(zip(grid, values, strict=True)), spec, dimensions))
+        except SpecError as error:
+            problems += [f"selection.grid: {_where(grid, values)}: {problem}" for problem in error.problems]
+    if problems:
+        raise SpecError(*problems)
+    return found
+
+
+def _where(grid: Mapping[str, Any], values: tuple[Any, ...]) -> str:
+    return ", ".join(f"{path}={show(value)}" for path, value in zip(grid, values, strict=True))
+
+
+def _candidate(number: int, values: dict[str, Any], spec: Spec, dimensions: Dimensions) -> Candidate:
+    alone: dict[str, Any] = {"selection.grid": {}, "compare_with": []}  # baselines are compared, not selected
+    own = with_overrides(spec, alone | values)
+    parameters = sum(one.numel() for one in build_hierarchy(own, dimensions).parameters())
+    return Candidate(number, values, own, parameters)

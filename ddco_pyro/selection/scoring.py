@@ -1,0 +1,104 @@
+"""One fold of one candidate: trained on the rest, scored on what was held out."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from ddco_pyro.errors import Failed
+from ddco_pyro.files import write_text
+from ddco_pyro.run import Watcher, log_likelihoods, one_thread, train
+from ddco_pyro.selection.folds import Folds
+from ddco_pyro.selection.grid import Candidate
+
+
+@dataclass(frozen=True)
+class Score:
+    """What came of one fold of one candidate: ``log_likelihood`` in nats and ``steps`` of each held-out demonstration
+    in ``names``; or why there is none, ``failed``.
+
+    :param final: False where another attempt could go otherwise (out of memory); such a score is not kept.
+    """
+
+    candidate: int
+    fold: int
+    names: tuple[str, ...]
+    steps: tuple[int, ...]
+    log_likelihood: tuple[float, ...] = ()
+    failed: str = ""
+    final: bool = True
+    seconds: float = 0.0
+
+    @property
+    def total(self) -> float:
+        """Log-likelihood of all its demonstrations, nats."""
+        return math.fsum(self.log_likelihood)
+
+
+class Unwatched(Watcher):
+    """Nobody watches a single fold: the selection as a whole is watched."""
+
+    def collected(self, done: int, total: int) -> None:
+        """Nothing."""
+
+    def training(self, name: str, epochs: int) -> None:
+        """Nothing."""
+
+    def epoch(self, row: dict[str, Any]) -> None:
+        """Nothing."""
+
+    def trained(self, name: str) -> None:
+        """Nothing."""
+
+
+def score(folds: Folds, candidate: Candidate, fold: int) -> Score:
+    """Train the candidate without the fold's demonstrations, and score it on them; on one thread, so that the numbers
+    are the same in any process.
+
+    Early stopping and the choice among restarts use a part of what it is trained with (``training.tune_fraction``).
+    A fold that fails does not stop the others: the reason is in the score.
+    """
+    start = time.perf_counter()
+    training, held_out = folds.split(fold)
+    empty = Score(candidate.number, fold, held_out.names, held_out.lengths)
+    try:
+        with threadpool_limits(1), one_thread():
+            trained = train(candidate.spec, folds.dimensions, training, Unwatched())
+            values = tuple(float(value) for value in log_likelihoods(trained.hierarchy, held_out))
+    except Failed as error:
+        found = replace(empty, failed=str(error))
+    except Exception as error:  # whatever it is, the other folds go on and the user is told
+        reason = f"unexpected {type(error).__name__}: {' '.join(str(error).split())}"
+        found = replace(empty, failed=reason, final=False)
+    else:
+        bad = [name for name, value in zip(held_out.names, values, strict=True) if not math.isfinite(value)]
+        reason = f"the held-out log-likelihood of {', '.join(bad)} is not finite"
+        found = replace(empty, failed=reason) if bad else replace(empty, log_likelihood=values)
+    return replace(found, seconds=time.perf_counter() - start)
+
+
+def path_of(folder: Path, candidate: int, fold: int) -> Path:
+    """Where a score is kept."""
+    return folder / "folds" / f"{candidate:03d}-{fold:02d}.json"
+
+
+def keep(folder: Path, found: Score) -> None:
+    """Write a score, whole or not at all, unless another attempt could go otherwise."""
+    if found.final:
+        write_text(path_of(folder, found.candidate, found.fold), json.dumps(asdict(found)) + "\n")
+
+
+def kept(folder: Path, candidate: int, fold: int) -> Score | None:
+    """The score kept from before, if there is one."""
+    path = path_of(folder, candidate, fold)
+    if not path.exists():
+        return None
+    data: dict[str, Any] = json.loads(path.read_text())
+    data |= {key: tuple(value) for key, value in data.items() if isinstance(value, list)}
+    return Score(**data)

@@ -1,0 +1,43 @@
+"""The result of a selection as a table in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ddco_pyro.report.words import number, signed
+from ddco_pyro.selection.choice import Choice, Row
+
+HEAD = ("Candidate", "Parameters", "Held-out nats/step", "Minus the best", "Folds", "")
+
+
+def markdown(choice: Choice, data: Mapping[str, Any]) -> str:
+    """Table, rule, failed folds and notes."""
+    lines = [
+        f"{data['folds']}-fold cross-validation over {data['demonstrations']} demonstrations, the same folds for every "
+        "candidate; ± is one standard error over the folds.",
+        "",
+        f"| {' | '.join(HEAD)} |",
+        "|---|--:|--:|--:|--:|---|",
+        *(f"| {' | '.join(cells(row, choice))} |" for row in choice.rows),
+        "",
+        data["rule"] + ".",
+    ]
+    if data["stop_early"]:
+        lines += ["", data["stop_early"] + "."]
+    for one in data["failed"]:
+        lines += ["", f"**Failed:** {one['name']}, fold {one['fold']}: {one['reason']}"]
+    for note in choice.notes:
+        lines += ["", f"**Note:** {note}."]
+    return "\n".join(lines) + "\n"
+
+
+def cells(row: Row, choice: Choice) -> list[str]:
+    """A candidate's row."""
+    mean = "–" if row.mean is None else f"{number(row.mean, 3)} ± {number(row.error, 3)}"
+    difference = "–"
+    if row.difference is not None and row is not choice.best:
+        difference = f"{signed(row.difference[0], 3)} ± {number(row.difference[1], 3)}"
+    marks = [name for name, one in (("best", choice.best), ("chosen", choice.chosen)) if one is row]
+    marks += [] if row.status == "scored" else [row.status]
+    return [row.candidate.name, str(row.candidate.parameters), mean, difference, str(len(row.folds)), ", ".join(marks)]

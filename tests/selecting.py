@@ -1,0 +1,77 @@
+"""A small selection for tests: demonstrations of a point, a grid, and scores without any training."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.selection.scoring import Score, Unwatched
+from ddco_pyro.spec import parse_spec
+
+
+class Told(Unwatched):
+    """What a selection told its watcher."""
+
+    def __init__(self):
+        self.begun, self.pairs, self.stopped = [], [], []
+
+    def selecting(self, total, kept):
+        self.begun.append((total, kept))
+
+    def scored(self, candidate, fold, failed):
+        self.pairs.append((candidate, fold, failed))
+
+    def given_up(self, candidate, folds):
+        self.stopped.append((candidate, folds))
+
+
+def two_skills(count=12, steps=8, seed=0):
+    """Demonstrations in which the sign of the control turns half way."""
+    random = np.random.default_rng(seed)
+    records = []
+    for number in range(count):
+        place = random.normal(size=(steps + number % 3, 2))
+        turn = np.where(np.arange(len(place)) < steps // 2, 1.0, -1.0)[:, None]
+        control = turn * place + 0.1 * random.normal(size=place.shape)
+        records.append(Demonstration(f"demo_{number}", {"place": place, "turn": turn}, control))
+    return Demonstrations(tuple(records))
+
+
+DATA = {
+    "observations": ["place", "turn"],
+    "control": {"std": 0.5, "scale": "none"},
+    "hierarchy": {
+        "levels": [{"count": 2, "policy": {"network": "linear"}, "termination": {"network": "linear"}}],
+        "meta_policy": {"network": "linear"},
+    },
+    "training": {"initialize": "vq", "epochs": 2, "batch_size": 6, "optimizer": {"lr": 0.05}},
+    "selection": {"folds": 4, "grid": {"hierarchy.levels.0.count": [1, 2]}},
+}
+
+
+def data_at(folder, demos=None):
+    """The spec's data, for demonstrations that are written into the folder."""
+    path = folder / "demos.hdf5"
+    (demos or two_skills()).write(path)
+    return {**DATA, "demonstrations": {"path": str(path)}}
+
+
+def spec_at(folder, demos=None, **selection):
+    """The spec of a selection."""
+    data = data_at(folder, demos)
+    return parse_spec({**data, "selection": {**data["selection"], **selection}})
+
+
+def score(candidate, fold, per_step, lengths=(10,), failed=""):
+    """A score that says ``per_step`` nats in each of these demonstrations."""
+    names = tuple(f"demo_{fold}_{number}" for number in range(len(lengths)))
+    values = () if failed else tuple(per_step * steps for steps in lengths)
+    return Score(candidate, fold, names, tuple(lengths), values, failed)
+
+
+def kept(folder):
+    """The scores in a selection's folder, by candidate and fold."""
+    found = [json.loads(path.read_text()) for path in sorted((folder / "folds").iterdir())]
+    return {(one["candidate"], one["fold"]): one for one in found}

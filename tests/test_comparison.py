@@ -1,0 +1,248 @@
+"""Runs compared: against sums by hand, and refused with the reason where their data are not the same."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from ddco_pyro import load
+from ddco_pyro.comparison import CompareError, compare, page, write
+from ddco_pyro.comparison.shared import NotShared
+from ddco_pyro.data import demonstrations, parts
+from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.evaluate import roll_out
+from ddco_pyro.run import fit
+from ddco_pyro.selection.scoring import Unwatched
+from ddco_pyro.spec import with_overrides
+
+SHORT = {"training.epochs": 1, "compare_with": []}
+
+
+@pytest.fixture(scope="module")
+def held_out(toy_spec, cache):
+    return parts(toy_spec, demonstrations(toy_spec))["valid"]
+
+
+@pytest.fixture(scope="module")
+def other(toy_spec, cache, tmp_path_factory):
+    """Makes a fit of the toy spec, with changes."""
+
+    def make(name="other", **changes):
+        paths = {key.replace("__", "."): value for key, value in changes.items()}
+        return fit(with_overrides(toy_spec, SHORT | paths), tmp_path_factory.mktemp("runs") / name, Unwatched())
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def folders(toy_run, other):
+    """The toy run, both its baselines, and a run with three options."""
+    three = other(hierarchy__levels__0__count=3)
+    return [toy_run.folder, *(toy_run.folder / "baselines" / kind for kind in ("flat", "per_timestep")), three.folder]
+
+
+@pytest.fixture(scope="module")
+def found(folders):
+    return compare(folders)
+
+
+# --- log-likelihood ---------------------------------------------------------------------------------------------------
+
+
+def test_rows_are_what_az_compare_would_say(found, folders, held_out):
+    """rank, elpd, se, elpd_diff and dse of arviz, with a trajectory's log-likelihood for the elpd of an observation."""
+    values = {str(folder): load(folder).log_likelihood(held_out) for folder in folders}
+    n = len(held_out)
+    order = sorted(values, key=lambda name: -values[name].sum())
+    assert [row.name for row in found.rows] == order
+    assert [row.rank for row in found.rows] == [0, 1, 2, 3]
+    for row in found.rows:
+        own, difference = values[row.name], values[order[0]] - values[row.name]
+        assert row.each == pytest.approx(own.tolist())
+        assert row.total == pytest.approx(own.sum())
+        assert row.se == pytest.approx(np.sqrt(n) * own.std(ddof=1))
+        assert row.difference == pytest.approx(difference.sum(), abs=1e-9)
+        assert row.dse == pytest.approx(np.sqrt(n) * difference.std(ddof=1), abs=1e-9)
+        assert row.per_step == pytest.approx(own.sum() / sum(held_out.lengths))
+    assert (found.rows[0].difference, found.rows[0].dse) == (0.0, 0.0)
+    assert found.steps == sum(held_out.lengths)
+    assert found.trajectories == held_out.names
+
+
+def test_models_and_parameters_are_named(found, folders):
+    by_name = {row.name: row for row in found.rows}
+    assert [by_name[str(folder)].model for folder in folders] == ["ddco", "flat", "per_timestep", "ddco"]
+    for folder in folders:
+        assert by_name[str(folder)].parameters == sum(one.numel() for one in load(folder).hierarchy.parameters())
+
+
+def test_the_order_of_the_runs_does_not_matter(found, folders):
+    again = compare(folders[::-1])
+    assert [row.name for row in again.rows] == [row.name for row in found.rows]
+    for row, before in zip(again.rows, found.rows, strict=True):
+        assert row.total == pytest.approx(before.total, abs=1e-9)
+
+
+def test_demonstrations_may_be_held_out_in_another_order(folders, toy_spec, other, tmp_path):
+    """A run that reads the same demonstrations from a file of its own, turned round, with masks."""
+    demos = demonstrations(toy_spec)
+    split = parts(toy_spec, demos)
+    masks = {name: tuple(reversed(part.names)) for name, part in split.items()}
+    Demonstrations(demos.demonstrations[::-1], masks).write(tmp_path / "own.hdf5")
+    turned = other("turned", demonstrations__path=str(tmp_path / "own.hdf5"))
+    found = compare([folders[0], turned.folder])
+    by_name = {row.name: row for row in found.rows}
+    expected = load(turned.folder).log_likelihood(split["valid"])
+    assert by_name[str(turned.folder)].each == pytest.approx(expected.tolist())
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"seed": 1}, r"not held out on the same data: demo_\d+ was held out by \S+ alone; fit both with the same"),
+        ({"demonstrations__seed": 50}, r"same data: demo_\d+ was held out by \S+ alone"),
+        ({"demonstrations__valid_fraction": 0.0}, r"held nothing out \(demonstrations.valid_fraction: 0\); there is"),
+    ],
+    ids=["another split", "other demonstrations", "nothing held out"],
+)
+def test_runs_that_share_no_held_out_data_are_refused(folders, other, changes, reason):
+    with pytest.raises(NotShared, match=reason) as refused:
+        compare([folders[0], other(**changes).folder])
+    assert "\n" not in str(refused.value)
+
+
+def test_demonstrations_of_the_same_names_are_looked_at(folders, toy_spec, other, tmp_path):
+    demos = demonstrations(toy_spec)
+    for demo in demos:
+        demo.observations["visited"][:] = 1 - demo.observations["visited"]
+    demos.write(tmp_path / "own.hdf5")
+    changed = other("changed", demonstrations__path=str(tmp_path / "own.hdf5"))
+    with pytest.raises(NotShared, match=r"same data: demo_\d+ has other obs/visited; fit both to the same demonstra"):
+        compare([folders[0], changed.folder])
+
+
+def test_demonstrations_that_have_changed_since_are_refused(toy_spec, other, tmp_path):
+    path = tmp_path / "own.hdf5"
+    demos = demonstrations(toy_spec)
+    demos.write(path)
+    first, second = (other(name, demonstrations__path=str(path), seed=0) for name in ("first", "second"))
+    assert len(compare([first.folder, second.folder]).rows) == 2
+    for demo in demos:
+        demo.actions[0] += 0.5
+    demos.write(path)
+    with pytest.raises(NotShared, match=r"first: demo_\d+ has changed since this run was fitted to it; fit it again"):
+        compare([first.folder, second.folder])
+
+
+def test_one_run_is_nothing_to_compare(folders):
+    with pytest.raises(CompareError, match="one run alone cannot be compared"):
+        compare(folders[:1])
+    with pytest.raises(CompareError, match="the same run is given twice"):
+        compare([folders[0], folders[0] / "baselines" / ".."])
+
+
+# --- rollouts ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rolled(toy_run, other, tmp_path_factory):
+    """Two runs with rollouts from initial states of which some are the same; one more without."""
+    first = load(shutil.copytree(toy_run.folder, tmp_path_factory.mktemp("rolled") / "first"))
+    second = other("second", rollout__seed=1002, rollout__policies=[])
+    for run, episodes in ((first, 6), (second, 7)):
+        roll_out(run, episodes, film=0, on_episode=lambda name: None, jobs=1)
+    return first, second, other("third")
+
+
+def successes(folder, method):
+    with (folder / "rollouts.csv").open() as file:
+        return {int(one["seed"]): float(one["success"]) for one in csv.DictReader(file) if one["method"] == method}
+
+
+def test_rollouts_are_paired_by_initial_state(rolled):
+    first, second, third = rolled
+    flat = first.folder / "baselines" / "flat"
+    found = compare([first.folder, flat, second.folder, third.folder])
+    outcomes = {str(first.folder): successes(first.folder, "ddco"), str(flat): successes(first.folder, "flat")}
+    outcomes[str(second.folder)] = successes(second.folder, "ddco")
+    order = [row.name for row in found.rows if row.name in outcomes]
+    assert [(one["run"], one["other"]) for one in found.rollouts] == [(order[0], name) for name in order[1:]]
+    for one in found.rollouts:
+        ours, theirs = outcomes[one["run"]], outcomes[one["other"]]
+        both = ours.keys() & theirs.keys()
+        assert one["trials"] == len(both) < max(len(ours), len(theirs)) + 1
+        assert one["only_ours"] == sum(ours[seed] > theirs[seed] for seed in both)
+        assert one["only_theirs"] == sum(ours[seed] < theirs[seed] for seed in both)
+        assert one["rate"]["successes"] == sum(ours[seed] for seed in both)
+        assert one["rate"]["trials"] == one["other_rate"]["trials"] == len(both)
+        discordant = one["only_ours"] + one["only_theirs"]
+        expected = stats.binomtest(one["only_ours"], discordant).pvalue if discordant else 1.0
+        assert one["p_value"] == pytest.approx(expected)
+
+
+def test_without_rollouts_there_is_no_table_of_them(found):
+    assert found.rollouts == []
+    assert "rollouts" not in page.markdown(found)
+
+
+# --- what is written --------------------------------------------------------------------------------------------------
+
+
+class Cells(HTMLParser):
+    """The text of all cells of a page, and what it would load from elsewhere."""
+
+    def __init__(self):
+        super().__init__()
+        self.cells, self.loaded, self.inside = [], [], False
+
+    def handle_starttag(self, tag, attributes):
+        self.inside = tag in ("td", "th")
+        self.cells += [""] * self.inside
+        self.loaded += [value for key, value in attributes if key in ("src", "href") and not value.startswith("data:")]
+
+    def handle_data(self, data):
+        if self.inside:
+            self.cells[-1] += data
+
+    def handle_endtag(self, tag):
+        self.inside = False
+
+
+def test_the_files_say_the_same(found, tmp_path):
+    path = write(found, tmp_path / "comparison")
+    folder = path.parent
+    data = json.loads((folder / "compare.json").read_text())
+    assert [row["name"] for row in data["rows"]] == [row.name for row in found.rows]
+    assert [row["total"] for row in data["rows"]] == [row.total for row in found.rows]
+    assert data["trajectories"] == list(found.trajectories)
+    text = (folder / "compare.md").read_text()
+    table = [re.split(r" *\| *", line.strip("| ")) for line in text.splitlines() if line.startswith("|")]
+    assert table[0] == list(page.HEAD)
+    assert table[2:] == [page.cells(row) for row in found.rows]
+    read = Cells()
+    read.feed(path.read_text())
+    assert read.loaded == []
+    assert read.cells == [*page.HEAD, *(cell for row in found.rows for cell in page.cells(row))]
+    assert (folder / "compare.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_single_trajectory_has_no_error(other, tmp_path):
+    runs = [
+        other(name, demonstrations__valid_fraction=0.05, seed=0, training__epochs=n) for n, name in ((1, "a"), (2, "b"))
+    ]
+    found = compare([one.folder for one in runs])
+    assert len(found.trajectories) == 1
+    assert np.isnan(found.rows[1].dse)
+    assert "–" in page.cells(found.rows[1])
+    data = json.loads((write(found, tmp_path / "x").parent / "compare.json").read_text())
+    assert data["rows"][1]["dse"] is None

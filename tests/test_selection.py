@@ -1,0 +1,258 @@
+"""A whole selection: scores against fits by hand, nothing done twice, and the same result however it was run."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from selecting import Told, data_at, kept, score, spec_at, two_skills
+
+import ddco_pyro
+from ddco_pyro.data import Dimensions
+from ddco_pyro.errors import Failed
+from ddco_pyro.run import log_likelihoods, train
+from ddco_pyro.selection import SelectionFailed, Workers, check, final_spec, parallel, scoring, select
+from ddco_pyro.selection.folds import FoldError
+from ddco_pyro.selection.parallel import BackendError
+from ddco_pyro.selection.scoring import Unwatched
+from ddco_pyro.spec import SpecError, with_overrides
+
+ONE = Workers(1)
+COMMAND = Path(sys.executable).with_name("ddco-pyro")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A selection over two candidates and four folds: its spec, folder, result, and what was told."""
+    folder = tmp_path_factory.mktemp("selection")
+    spec, told = spec_at(folder), Told()
+    return spec, folder / "run", select(spec, folder / "run", told, ONE), told
+
+
+def test_a_score_is_that_of_a_fit_without_the_fold(finished):
+    """Nothing that training sees, tuning and restarts included, comes from the fold that is scored."""
+    _, folder, made, _ = finished
+    demos = two_skills()
+    scores = kept(folder)
+    for row in made.choice.rows:
+        names = made.folds.held_out[2]
+        rest = demos.select([name for name in demos.names if name not in names])
+        trained = train(row.candidate.spec, Dimensions.of(demos), rest, Unwatched())
+        expected = log_likelihoods(trained.hierarchy, demos.select(names))
+        np.testing.assert_array_equal(scores[row.candidate.number, 2]["log_likelihood"], expected)
+
+
+def test_restarts_are_chosen_inside_the_training_part(tmp_path, monkeypatch):
+    spec = spec_at(tmp_path, grid={"training.restarts": [2]}, folds=3)
+    seen = []
+
+    def spied(spec, dimensions, demos, watcher, checkpoint=None):
+        seen.append(set(demos.names))
+        return train(spec, dimensions, demos, watcher, checkpoint)
+
+    monkeypatch.setattr(scoring, "train", spied)
+    made = select(spec, tmp_path / "run", Told(), ONE)
+    assert [seen[fold] & set(made.folds.held_out[fold]) for fold in range(3)] == [set()] * 3
+    assert [len(names) for names in seen] == [8, 8, 8]
+
+
+def test_every_candidate_has_the_same_folds(finished):
+    _, folder, made, told = finished
+    scores = kept(folder)
+    assert set(scores) == {(c, f) for c in range(2) for f in range(4)}
+    for (_, fold), one in scores.items():
+        assert tuple(one["names"]) == made.folds.held_out[fold]
+        assert one["steps"] == [len(demo) for demo in two_skills().select(one["names"])]
+    assert told.begun == [(8, 0)]
+    assert {pair[:2] for pair in told.pairs} == {(row.candidate.name, f) for row in made.choice.rows for f in range(4)}
+
+
+def test_the_file_is_what_the_scores_say(finished):
+    _, folder, made, _ = finished
+    data = json.loads((folder / "selection.json").read_text())
+    scores, means = kept(folder), []
+    for row in data["candidates"]:
+        own = [scores[row["number"], fold] for fold in range(4)]
+        total, steps = (sum(sum(one[key]) for one in own) for key in ("log_likelihood", "steps"))
+        means.append(total / steps)
+        assert row["log_likelihood_per_step"] == pytest.approx(means[-1])
+        assert row["status"] == "scored"
+    assert data["best"] == int(np.argmax(means)) == made.choice.best.candidate.number
+    assert data["chosen"] == made.choice.chosen.candidate.number
+    assert (data["folds"], data["demonstrations"], data["stop_early"]) == (4, 12, None)
+    assert (folder / "figures" / "selection.png").read_bytes().startswith(b"\x89PNG")
+    assert made.choice.chosen.candidate.name in (folder / "selection.md").read_text()
+
+
+def test_what_is_there_is_not_done_again(finished, monkeypatch):
+    spec, folder, made, _ = finished
+    before = (folder / "selection.json").read_bytes()
+    monkeypatch.setattr(parallel, "score", None)
+    told = Told()
+    again = select(spec, folder, told, ONE)
+    assert (told.begun, told.pairs) == ([(8, 8)], [])
+    assert (folder / "selection.json").read_bytes() == before
+    assert again.choice == made.choice
+
+
+def test_other_demonstrations_are_refused(finished, tmp_path):
+    spec, folder, *_ = finished
+    two_skills(seed=1).write(tmp_path / "other.hdf5")
+    other = with_overrides(spec, {"demonstrations.path": str(tmp_path / "other.hdf5")})
+    with pytest.raises(FoldError, match="the demonstrations have changed since"):
+        select(other, folder, Told(), ONE)
+
+
+def test_the_final_fit_is_on_all_the_data(finished):
+    spec, _, made, _ = finished
+    final = final_spec(spec, made.choice.chosen.candidate)
+    assert final.demonstrations.valid_fraction == 0
+    assert final.hierarchy.levels[0].count == made.choice.chosen.candidate.values["hierarchy.levels.0.count"]
+    assert final.selection.grid == {}
+
+
+# --- failures, and giving up ------------------------------------------------------------------------------------------
+
+
+def faked(values, calls=None):
+    """Instead of training: the value of a candidate in a fold, or why it fails."""
+
+    def scored(folds, candidate, fold):
+        if calls is not None:
+            calls.append((candidate.number, fold))
+        value = values(candidate.number, fold)
+        failed = value if isinstance(value, str) else ""
+        return score(candidate.number, fold, 0.0 if failed else value, failed=failed)
+
+    return scored
+
+
+def test_a_fold_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch):
+    spec = spec_at(tmp_path, grid={"training.optimizer.lr": [0.05, 1e30], "training.patience": [None]}, folds=3)
+    told = Told()
+    made = select(spec, tmp_path / "run", told, ONE)
+    assert made.choice.chosen.candidate.number == made.choice.best.candidate.number == 0
+    failed = made.choice.rows[1].failed
+    assert sorted(failed) == [0, 1, 2]
+    assert all("is not finite" in reason for reason in failed.values())
+    data = json.loads((tmp_path / "run" / "selection.json").read_text())
+    assert [(one["candidate"], one["fold"]) for one in data["failed"]] == [(1, 0), (1, 1), (1, 2)]
+    assert {pair[2] for pair in told.pairs if pair[0].startswith("lr = 0.05")} == {""}
+
+
+def test_where_nothing_is_left_the_first_reason_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(parallel, "score", faked(lambda c, f: "it diverged" if f == 1 else 1.0))
+    with pytest.raises(SelectionFailed, match="every candidate has failed in some fold; the first reason: it diverged"):
+        select(spec_at(tmp_path), tmp_path / "run", Told(), ONE)
+    assert json.loads((tmp_path / "run" / "selection.json").read_text())["chosen"] is None
+
+
+def test_an_unexpected_error_is_told_and_tried_again_next_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(scoring, "train", lambda *_: 1 / 0)
+    with pytest.raises(SelectionFailed, match="unexpected ZeroDivisionError: division by zero"):
+        select(spec_at(tmp_path), tmp_path / "run", Told(), ONE)
+    monkeypatch.undo()
+    assert select(spec_at(tmp_path), tmp_path / "run", Told(), ONE).choice.chosen is not None
+
+
+def hopeless_second(candidate, fold):
+    return -candidate * (10 + fold)
+
+
+def test_hopeless_candidates_are_given_up_only_if_asked(tmp_path, monkeypatch):
+    spec, calls = spec_at(tmp_path, folds=6), []
+    monkeypatch.setattr(parallel, "score", faked(hopeless_second, calls))
+    whole = select(spec, tmp_path / "whole", Told(), ONE)
+    assert len(calls) == 12
+    assert [row.status for row in whole.choice.rows] == ["scored", "scored"]
+    calls.clear()
+    told = Told()
+    early = select(spec, tmp_path / "early", told, ONE, stop_early=True)
+    last = max(fold for candidate, fold in calls if candidate == 1)
+    assert 2 <= last < 5
+    assert told.stopped == [(early.choice.rows[1].candidate.name, 5 - last)]
+    assert [row.status for row in early.choice.rows] == ["scored", "stopped"]
+    assert early.choice.chosen.candidate.number == whole.choice.chosen.candidate.number == 0
+    assert "--stop-early" in json.loads((tmp_path / "early" / "selection.json").read_text())["stop_early"]
+
+
+def test_giving_up_does_not_depend_on_interruptions(tmp_path, monkeypatch):
+    """Scores that are there already, of folds after the one in which a candidate is given up, do not count."""
+    spec = spec_at(tmp_path, folds=6)
+    monkeypatch.setattr(parallel, "score", faked(hopeless_second))
+    select(spec, tmp_path / "early", Told(), ONE, stop_early=True)
+    select(spec, tmp_path / "whole", Told(), ONE)
+    select(spec, tmp_path / "whole", Told(), ONE, stop_early=True)
+    first, second = ((tmp_path / name / "selection.json").read_bytes() for name in ("early", "whole"))
+    assert first == second
+
+
+# --- before any work --------------------------------------------------------------------------------------------------
+
+
+def test_everything_is_checked_before_any_work(tmp_path):
+    assert [one.number for one in check(spec_at(tmp_path), ONE)] == [0, 1]
+    with pytest.raises(SpecError, match="is empty"):
+        check(spec_at(tmp_path, grid={}))
+    with pytest.raises(FoldError, match="13 folds of 12 demonstrations"):
+        check(spec_at(tmp_path, folds=13))
+    for jobs in (0, -2):
+        with pytest.raises(BackendError, match=f"^--jobs {jobs}: give a number of processes, or -1 for one on each"):
+            Workers(jobs)
+
+
+# --- in processes -----------------------------------------------------------------------------------------------------
+
+
+def written(folder):
+    """A spec file of a selection that takes a while."""
+    data = data_at(folder)
+    data |= {"training": data["training"] | {"epochs": 4, "patience": None}}
+    (folder / "spec.yaml").write_text(yaml.safe_dump(data))
+    return folder / "spec.yaml"
+
+
+def test_a_killed_selection_goes_on_and_gives_the_same(tmp_path):
+    """kill -9 of the whole process group when some folds are done; what was done is not done again."""
+    spec = written(tmp_path)
+    arguments = [COMMAND, "select", spec, "--out"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    cut = tmp_path / "cut"
+    process = subprocess.Popen([*arguments, cut, "--jobs", "2"], env=environment, start_new_session=True, **pipes)
+    while len(list((cut / "folds").glob("*.json"))) < 2 and process.poll() is None:
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    done = {path: path.read_bytes() for path in (cut / "folds").glob("*.json")}
+    assert 2 <= len(done) < 8
+    resumed = subprocess.run(
+        [*arguments, cut, "--jobs", "1", "--resume"], env=environment, capture_output=True, text=True
+    )
+    assert resumed.returncode == 0, resumed.stderr
+    assert f"({len(done)} of 8 kept from before)" in resumed.stderr
+    assert {path: path.read_bytes() for path in done} == done
+    told = Told()
+    select(ddco_pyro.load_spec(spec), tmp_path / "whole", told, ONE)
+    assert (cut / "selection.json").read_bytes() == (tmp_path / "whole" / "selection.json").read_bytes()
+    assert (cut / "selection.md").read_bytes() == (tmp_path / "whole" / "selection.md").read_bytes()
+    assert ddco_pyro.load(cut / "fit").metrics["demonstrations"]["train"] == 11  # and one to tune with
+
+
+def test_a_process_that_is_ended_from_outside_has_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(parallel, "score", ending)
+    with pytest.raises(Failed, match=r"was ended from outside .* what was scored is kept: continue with --resume"):
+        select(spec_at(tmp_path), tmp_path / "run", Told(), Workers(2))
+
+
+def ending(folds, candidate, fold):
+    os.kill(os.getpid(), signal.SIGKILL)

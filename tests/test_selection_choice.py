@@ -1,0 +1,140 @@
+"""From scores to a choice, against sums by hand: means, paired differences, standard errors, and the two rules."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+from selecting import DATA, score
+
+from ddco_pyro.selection.choice import as_data, choose, hopeless
+from ddco_pyro.selection.grid import Candidate
+from ddco_pyro.selection.table import cells, markdown
+from ddco_pyro.spec import parse_spec
+
+SPEC = parse_spec({**DATA, "demonstrations": {"path": "demos.hdf5"}})
+
+
+def candidate(number, parameters=None, spec=SPEC):
+    values = {"hierarchy.levels.0.count": number + 1}
+    return Candidate(number, values, spec, 10 * (number + 1) if parameters is None else parameters)
+
+
+def rows(table, lengths=(10,), parameters=None):
+    """The choice among candidates with these log-likelihoods per step, one row each, one column per fold."""
+    scores = [score(c, f, value, lengths) for c, row in enumerate(table) for f, value in enumerate(row)]
+    sizes = parameters or [None] * len(table)
+    return choose([candidate(c, size) for c, size in enumerate(sizes)], scores, len(table[0]))
+
+
+def test_means_and_standard_errors_are_those_of_the_folds():
+    table = np.array([[1.0, 2.0, 4.0, 1.0], [1.5, 2.0, 5.0, 1.5]])
+    found = rows(table.tolist(), lengths=(3, 7))
+    for row, values in zip(found.rows, table, strict=True):
+        assert row.mean == pytest.approx(values.mean())
+        assert row.error == pytest.approx(values.std(ddof=1) / 2)
+        assert list(row.folds.values()) == pytest.approx(values.tolist())
+    difference = table[0] - table[1]
+    assert found.best is found.rows[1]
+    assert found.rows[0].difference == pytest.approx((difference.mean(), difference.std(ddof=1) / 2))
+    assert found.rows[1].difference == (0.0, 0.0)
+
+
+def test_the_mean_is_over_steps_and_not_over_folds():
+    scores = [score(0, 0, 1.0, (2,)), score(0, 1, 4.0, (6,)), score(0, 2, 2.0, (4,))]
+    row = choose([candidate(0)], scores, 3).rows[0]
+    assert row.mean == pytest.approx((2 * 1 + 6 * 4 + 4 * 2) / 12)
+    residual = np.array([2 * 1, 6 * 4, 4 * 2]) - row.mean * np.array([2, 6, 4])
+    assert row.error == pytest.approx(math.sqrt((residual**2).sum() / 2 * 3) / 12)  # that of a ratio of sums
+
+
+def test_the_choice_is_the_smallest_within_one_standard_error():
+    base = np.array([0.0, 1.0, 2.0, 3.0])
+    wobble = np.array([0.1, -0.1, 0.1, -0.1])
+    far, near = base - 0.06 + wobble, base - 0.05 + wobble  # the error of a difference is 0.2 / √12 = 0.0577
+    found = rows([far.tolist(), near.tolist(), base.tolist(), near.tolist()])
+    assert 0.05 < found.rows[0].difference[1] < 0.06
+    assert (found.best.candidate.number, found.chosen.candidate.number) == (2, 1)
+    assert found.chosen.candidate.parameters == 20
+
+
+def test_errors_that_go_together_do_not_count():
+    """Each candidate alone is uncertain by 0.6, but one is below the other in every fold."""
+    base = np.array([0.0, 1.0, 2.0, 3.0])
+    found = rows([(base - 0.1).tolist(), base.tolist()])
+    assert found.rows[0].error > 0.5
+    assert found.chosen is found.best is found.rows[1]
+
+
+def test_among_equal_sizes_the_better_one_is_chosen():
+    base, wobble = np.array([0.0, 1.0, 2.0]), np.array([0.1, -0.1, 0.0])
+    found = rows(
+        [(base - 0.02 + wobble).tolist(), (base - 0.01 + wobble).tolist(), base.tolist()], parameters=[5, 5, 9]
+    )
+    assert (found.best.candidate.number, found.chosen.candidate.number) == (2, 1)
+
+
+def test_a_candidate_with_a_failed_fold_is_named_and_not_chosen():
+    scores = [score(0, 0, 9.0), score(0, 1, 0.0, failed="it diverged"), score(1, 0, 1.0), score(1, 1, 2.0)]
+    found = choose([candidate(0), candidate(1)], scores, 2)
+    assert [row.status for row in found.rows] == ["failed", "scored"]
+    assert found.best is found.chosen is found.rows[1]
+    data = as_data(found)
+    assert data["failed"] == [{"candidate": 0, "name": "count = 1", "fold": 1, "reason": "it diverged"}]
+    text = markdown(found, {**data, "folds": 2, "demonstrations": 2, "stop_early": None})
+    assert "**Failed:** count = 1, fold 1: it diverged" in text
+    assert cells(found.rows[0], found)[-1] == "failed"
+
+
+def test_where_all_have_failed_there_is_no_choice():
+    scores = [score(0, 0, 1.0), score(0, 1, 0.0, failed="out of memory"), score(1, 0, 0.0, failed="x")]
+    found = choose([candidate(0), candidate(1)], scores, 2)
+    assert found.best is None
+    assert found.chosen is None
+    assert [row.mean for row in found.rows] == [1.0, None]
+    data = as_data(found)
+    assert (data["best"], data["chosen"]) == (None, None)
+
+
+def test_a_stopped_candidate_is_compared_on_the_folds_it_has():
+    scores = [score(0, f, v) for f, v in enumerate([1.0, 2.0])]
+    scores += [score(1, f, v) for f, v in enumerate([2.0, 4.0, 9.0])]
+    found = choose([candidate(0), candidate(1)], scores, 3)
+    assert found.rows[0].status == "stopped"
+    assert found.rows[0].difference == pytest.approx((-1.5, 0.5))
+    assert found.chosen is found.rows[1]
+
+
+def test_hopeless_is_what_a_paired_t_test_says():
+    random = np.random.default_rng(0)
+    for shift in (0.05, 0.1, 0.2, 0.4):
+        best = random.normal(size=6)
+        other = best - shift + 0.05 * random.normal(size=6)
+        scores = [score(c, f, v) for c, row in enumerate([best, other]) for f, v in enumerate(row)]
+        below = stats.ttest_rel(other, best, alternative="less").pvalue < 0.001
+        assert (1 in hopeless([candidate(0), candidate(1)], scores)) == below
+        assert 0 not in hopeless([candidate(0), candidate(1)], scores)
+
+
+def test_two_folds_are_not_enough_to_give_up():
+    scores = [score(c, f, -10.0 * c + 0.001 * f * c) for c in (0, 1) for f in range(2)]
+    assert hopeless([candidate(0), candidate(1)], scores) == set()
+    scores += [score(0, 2, 0.0), score(1, 2, -10.0)]
+    assert hopeless([candidate(0), candidate(1)], scores) == {1}
+
+
+def test_a_candidate_that_has_failed_is_given_up():
+    scores = [score(0, 0, 1.0), score(1, 0, 0.0, failed="it diverged")]
+    assert hopeless([candidate(0), candidate(1)], scores) == {1}
+
+
+def test_different_fixed_errors_are_noted():
+    def fixed(std):
+        return parse_spec({**DATA, "demonstrations": {"path": "x"}, "control": {"std": std}})
+
+    both = [candidate(0, spec=fixed(0.1)), candidate(1, spec=fixed(0.2))]
+    scores = [score(c, f, 1.0) for c in (0, 1) for f in (0, 1)]
+    assert "control.std differs" in choose(both, scores, 2).notes[0]
+    assert choose([both[0], both[0]], scores, 2).notes == []
