@@ -14,11 +14,17 @@ from ddco_pyro.inspection import Field, Inspection
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.spec.reading import read_yaml
 
+MANY = 100
+"""Of so many demonstrations a tenth is held out, of fewer a fifth."""
+
 LEAST = 3
 """Demonstrations that a fit needs: to train, to stop early, and to validate."""
 
 STEPS_PER_BATCH = 1000
 """A minibatch has about so many steps: enough for a steady gradient, and several of them in an epoch."""
+
+LINEAR_BELOW = 2000
+"""With fewer steps than this in all, options have linear policies: hidden layers fit what will not come again."""
 
 GRADIENT_STEPS = 600
 """A stage may take about so many gradient steps, and at least :data:`EPOCHS` epochs."""
@@ -65,7 +71,8 @@ def _lines(found: Inspection, path: str) -> Iterator[str]:
     yield "  levels:"
     yield "    - name: option"
     yield "      count: 4                      # how many options; try others: --set hierarchy.levels.0.count=3"
-    yield f"      policy: {_network(found)}"
+    few = lengths.sum() < LINEAR_BELOW
+    yield f"      policy: {_smallest(found) if few else _network(found)}"
     yield f"      termination: {_smallest(found)}"
     yield f"  meta_policy: {_smallest(found)}"
     yield "training:"
@@ -99,7 +106,7 @@ def _validation(found: Inspection) -> Iterator[str]:
     if used:
         yield f"  # held out: as mask/{' and mask/'.join(used)} in the file say"
     else:
-        fraction = max(0.1, 1.5 / len(found.lengths))  # one demonstration at least
+        fraction = max(0.2 if len(found.lengths) < MANY else 0.1, 1.5 / len(found.lengths))  # one at least
         yield f"  valid_fraction: {fraction:.2g}               # of the demonstrations, held out"
     others = [name for name in found.masks if name not in ("train", "valid")]
     if others:

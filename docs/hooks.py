@@ -59,7 +59,10 @@ def equations(text: str) -> str:
 
 
 def _mathml(tex: str, display: str) -> str:
-    return latex2mathml.converter.convert(" ".join(tex.split()), display=display)
+    found = latex2mathml.converter.convert(" ".join(tex.split()), display=display)
+    if display == "inline":
+        return f"<span>{found}</span>"  # a line that begins with <math> would be a paragraph of its own
+    return f'<div style="margin: 1.2em 0; overflow-x: auto">{found}</div>'
 
 
 # --- commands that are run --------------------------------------------------------------------------------------------
@@ -125,7 +128,13 @@ def _section(name: str, model: dict[str, Any], definitions: dict[str, Any]) -> I
     yield "| key | takes | default | |\n|---|---|---|---|"
     for key, field in model.get("properties", {}).items():
         default = "required" if key in model.get("required", ()) else _default(field)
-        yield f"| `{key}` | {_type(field, definitions)} | {default} | {_cell(field.get('description', ''))} |"
+        yield f"| `{key}` | {_type(field, definitions)} | {default} | {_cell(_about(field, definitions))} |"
+
+
+def _about(field: dict[str, Any], definitions: dict[str, Any]) -> str:
+    """What a key is; a part of the spec says it itself."""
+    own = definitions.get(field.get("$ref", "").rpartition("/")[2], {})
+    return str(field.get("description") or own.get("description", ""))
 
 
 def _default(field: dict[str, Any]) -> str:
@@ -152,7 +161,7 @@ def _type(field: dict[str, Any], definitions: dict[str, Any]) -> str:
         return f"list of {_type(field.get('items', {}), definitions)}"
     names = {"integer": "whole number", "string": "text", "boolean": "true, false", "object": "mapping"}
     limits = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
-    bounds = ", ".join(f"{sign} {field[limit]:g}" for limit, sign in limits.items() if limit in field)
+    bounds = ", ".join(f"{sign} {field[limit]}" for limit, sign in limits.items() if limit in field)
     found = names.get(field.get("type", ""), field.get("type", "anything"))
     return f"{found} {bounds}".strip()
 
@@ -175,16 +184,9 @@ def command_page() -> str:
         usage = " ".join(command.collect_usage_pieces(context))
         about = " ".join(command.help.split("\n\n")[0].split())
         parts.append(f"\n## {name}\n\n{html.escape(about)}\n\n```console\n$ ddco-pyro {name} {usage}\n```\n")
-        rows = [(_shown(one), _cell(one.help or "")) for one in command.params]
-        parts.append("| | |\n|---|---|\n" + "\n".join(f"| `{left}` | {right} |" for left, right in rows))
+        rows = [one.get_help_record(context) for one in command.params]
+        table = "\n".join(f"| `{left}` | {_cell(right)} |" for left, right in rows)
+        parts.append(f"| argument or option | what it is |\n|---|---|\n{table}")
         if command.epilog:
             parts.append(f"\nExample: `{command.epilog.removeprefix('Example: ')}`\n")
     return "\n".join(parts)
-
-
-def _shown(parameter: Any) -> str:
-    value = parameter.metavar or parameter.name.upper()
-    if parameter.param_type_name == "argument":
-        return str(value)
-    takes = "" if parameter.is_flag else f" {parameter.metavar or parameter.type.name.upper()}"
-    return f"{', '.join(parameter.opts)}{takes}"

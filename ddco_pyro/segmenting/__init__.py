@@ -133,5 +133,6 @@ def _segment(fit: Fit, group: list[Demonstration], names: tuple[str, ...]) -> It
         for name, options, ended, u in zip(names, path.choices, path.terminations, active, strict=True):
             chosen, anew = options[row, : len(demo)].numpy(), ended[row, : len(demo)].numpy() == 1
             anew[0] = True
-            levels[name] = LevelLabels(chosen, anew, u[row].numpy()[steps, chosen])
+            probability = np.minimum(u[row].numpy()[steps, chosen], 1.0)  # rounding can exceed it
+            levels[name] = LevelLabels(chosen, anew, probability)
         yield Segments(demo.name, levels, dict(demo.labels))
