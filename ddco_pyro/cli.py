@@ -74,13 +74,15 @@ def collect(
 ) -> None:
     """Record demonstrations of the task's supervisor, unless they are there already."""
     found = load_spec(spec, overrides)
-    if found.task is None:
+    if found.demonstrated_task is None:
         raise SpecError(f"{spec}: names no task, so there is no supervisor to record")
     from ddco_pyro.collect import collect as record
 
     own = found.demonstrations.path
     with console.Collecting() as progress:
-        path = record(found.task, found.demonstrations, out or (Path(own) if own else None), progress.collected)
+        path = record(
+            found.demonstrated_task, found.demonstrations, out or (Path(own) if own else None), progress.collected
+        )
     print(path)
 
 

@@ -71,7 +71,7 @@ class Controller:
         tables = outputs.tables(actions, self.hierarchy.scaling.log_volume)
         now = complete(tables, torch.tensor([1])).steps()[0]
         if self.options == "most_likely":
-            with _MostLikely():
+            with MostLikely():
                 return choose(self.time, now, self._choices)
         return choose(self.time, now, self._choices)
 
@@ -88,7 +88,7 @@ class Controller:
         return mean if self.control == "mean" else torch.normal(mean, decision.std)
 
 
-class _MostLikely(Messenger):
+class MostLikely(Messenger):
     """Every choice takes its most likely value instead of a sample."""
 
     def _pyro_sample(self, message: dict[str, Any]) -> None:

@@ -73,9 +73,9 @@ def dimensions(spec: Spec) -> Dimensions:
     A task that does not say how long its episodes are counts as having one step.
     """
     path = spec.demonstrations.path
-    if spec.task is None or (path is not None and Path(path).exists()):
+    if spec.demonstrated_task is None or (path is not None and Path(path).exists()):
         return Dimensions.of(demonstrations(spec))
-    task = find_task(spec.task)
+    task = find_task(spec.demonstrated_task)
     environment = task.load(spec.demonstrations.seed)
     try:
         shapes = {name: tuple(one.shape) for name, one in environment.observation_spec().items()}
@@ -99,8 +99,8 @@ def demonstrations(spec: Spec, on_demonstration: OnDemonstration | None = None) 
     """
     own = spec.demonstrations
     path = Path(own.path) if own.path else None
-    if spec.task is not None and (path is None or not path.exists()):
-        path = collect(spec.task, own, path, on_demonstration)
+    if spec.demonstrated_task is not None and (path is None or not path.exists()):
+        path = collect(spec.demonstrated_task, own, path, on_demonstration)
     assert path is not None  # a spec has a task or a file
     labels = (own.labels,) if own.labels else ()
     return Demonstrations.read(path, [one.key for one in spec.observations], labels)

@@ -4,12 +4,13 @@ The gradient of the marginal log-likelihood *is* the expectation-gradient step: 
 networks' gradients. A gradient step sees a minibatch of whole trajectories.
 
 Everything random in an epoch is seeded by (seed, restart, stage, epoch), so a run that was interrupted and resumed from
-the end of any epoch gives the same result, bit for bit, as one that was not.
+the end of any epoch gives the same result, bit for bit, as one that was not. Checkpoints are of ends of epochs.
 """
 
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -26,6 +27,8 @@ from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference import direct, log_likelihood, total_log_likelihood
 from ddco_pyro.initialize import Clusters
 from ddco_pyro.spec import OptimizerSpec, Spec
+
+SAVE_EVERY = 1.0  # s between checkpoints, at least: an epoch of a small model takes less time than its checkpoint
 
 State = dict[str, Tensor]
 
@@ -116,6 +119,7 @@ class Trainer:
         self.checkpoint, self.names, self.on_epoch = checkpoint, names, on_epoch
         self.progress = Progress()
         self._saved: dict[str, State] = {}
+        self._saved_at = -np.inf  # the first epoch is saved
 
     def run(self) -> Hierarchy:
         """The best restart's hierarchy, in evaluation mode.
@@ -157,7 +161,8 @@ class Trainer:
         while now.epoch < self.spec.training.epochs and now.stale < (self.spec.training.patience or np.inf):
             train = self._epoch(model, optimizer, parameters, objective)
             self._record(stage, train, objective.tune(model), model)
-            self._save(model, optimizer)
+            if time.monotonic() - self._saved_at > SAVE_EVERY:
+                self._save(model, optimizer)
         model.load_state_dict(self._saved["best"])
         now.epoch = 0
 
@@ -202,6 +207,7 @@ class Trainer:
     def _save(self, model: Hierarchy, optimizer: torch.optim.Optimizer | None) -> None:
         if self.checkpoint is None:
             return
+        self._saved_at = time.monotonic()
         self._saved["model"] = _copy(model)
         self._saved["optimizer"] = {} if optimizer is None else _optimizer_state(optimizer)
         tensors = {f"{part}/{name}": value for part, state in self._saved.items() for name, value in state.items()}

@@ -8,24 +8,46 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from ompl import base, geometric, util
 
 SEED = 1
-RANGE = 0.3  # rad: the longest step of the tree
-RESOLUTION = 0.01  # of the extent of the joint space, between validity checks
 ITERATIONS = 5000
 
 util.setLogLevel(util.LOG_ERROR)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a path is planned.
+
+    :param range: the longest step of the tree (rad).
+    :param resolution: between validity checks, as a part of the extent of the joint space.
+    :param shortcuts: how many times a shortcut between two random points of the path is tried, at most.
+    :param repeatable: start the random numbers anew for this path. If not, equal ends give different paths.
+    """
+
+    range: float = 0.3
+    resolution: float = 0.01
+    shortcuts: int = 0
+    repeatable: bool = True
 
 
 class NoPath(RuntimeError):
     """No collision-free path was found."""
 
 
+DEFAULT = Settings()
+
+
 def plan_path(
-    start: np.ndarray, goal: np.ndarray, ranges: np.ndarray, is_free: Callable[[np.ndarray], bool]
+    start: np.ndarray,
+    goal: np.ndarray,
+    ranges: np.ndarray,
+    is_free: Callable[[np.ndarray], bool],
+    settings: Settings = DEFAULT,
 ) -> np.ndarray:
     """The corners [K, J] of a short path from ``start`` [J] to ``goal`` [J] through joints where ``is_free`` holds.
 
@@ -33,10 +55,13 @@ def plan_path(
     :raises NoPath: when an end is not free, or the planner gives up.
     """
     for name, end in (("start", start), ("goal", goal)):
+        if np.any(end < ranges[:, 0]) or np.any(end > ranges[:, 1]):
+            raise NoPath(f"the {name} of the path is beyond the joints' limits: {np.round(end, 3)}")
         if not is_free(end):  # OMPL would wait for other ends until it runs out of iterations
             raise NoPath(f"the {name} of the path collides: {np.round(end, 3)}")
     joints = len(ranges)
-    _restart_random_numbers()
+    if settings.repeatable:
+        _restart_random_numbers()
     space = base.RealVectorStateSpace(joints)
     bounds = base.RealVectorBounds(joints)
     for joint, (low, high) in enumerate(ranges):
@@ -46,9 +71,9 @@ def plan_path(
     setup = geometric.SimpleSetup(space)
     setup.setStateValidityChecker(lambda state: bool(is_free(_to_array(state, joints))))
     information = setup.getSpaceInformation()
-    information.setStateValidityCheckingResolution(RESOLUTION)
+    information.setStateValidityCheckingResolution(settings.resolution)
     planner = geometric.RRTConnect(information)
-    planner.setRange(RANGE)
+    planner.setRange(settings.range)
     setup.setPlanner(planner)
     setup.setStartAndGoalStates(_to_state(space, start), _to_state(space, goal))
     iterations = itertools.count()
@@ -56,8 +81,17 @@ def plan_path(
     if not setup.haveExactSolutionPath():
         raise NoPath(f"no path from {np.round(start, 3)} to {np.round(goal, 3)} within {ITERATIONS} iterations")
     path = setup.getSolutionPath()
-    geometric.PathSimplifier(information).reduceVertices(path)
+    _simplify(path, information, settings.shortcuts)
     return np.array([_to_array(path.getState(corner), joints) for corner in range(path.getStateCount())])
+
+
+def _simplify(path: geometric.PathGeometric, information: base.SpaceInformation, shortcuts: int) -> None:
+    """Leave out corners; then cut across what the tree's random growth left, which makes paths alike."""
+    simplifier = geometric.PathSimplifier(information)
+    simplifier.reduceVertices(path)
+    if shortcuts:
+        simplifier.partialShortcutPath(path, shortcuts, shortcuts)
+        simplifier.reduceVertices(path)
 
 
 def _restart_random_numbers() -> None:

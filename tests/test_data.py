@@ -51,6 +51,14 @@ def test_demonstrations_are_collected_where_there_is_no_file_yet(tmp_path):
     assert path.exists()
 
 
+def test_demonstrations_may_come_from_another_task(tmp_path):
+    """``toy_task:short`` has episodes of 5 steps; the task to roll out in does not exist."""
+    elsewhere = {"task": "toy_task:short", "path": str(tmp_path / "demos.hdf5"), "count": 3}
+    given = spec(task="not_registered", demonstrations=elsewhere)
+    assert dimensions(given) == Dimensions({"offsets": (4,), "visited": (1,)}, 2, 5)
+    assert demonstrations(given).lengths == (5, 5, 5)
+
+
 def test_a_file_that_is_not_there_and_cannot_be_collected_is_an_error(tmp_path):
     missing = {"path": str(tmp_path / "none.hdf5")}
     for read in (demonstrations, dimensions):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import dm_env
@@ -19,8 +20,8 @@ MEANS = np.array([[-1.0, 0.0], [0.0, 1.0], [1.0, 0.0]])  # of start, via-point a
 class Point(dm_env.Environment):
     """Starts near (-1, 0); the via-point lies near (0, 1), the goal near (1, 0)."""
 
-    def __init__(self, seed: int) -> None:
-        self._random = np.random.default_rng(seed)
+    def __init__(self, seed: int, steps: int = STEPS) -> None:
+        self._random, self._steps = np.random.default_rng(seed), steps
         self.closed = False
 
     def reset(self) -> dm_env.TimeStep:
@@ -32,7 +33,7 @@ class Point(dm_env.Environment):
         self.time += 1
         self.position = self.position + SPEED * np.clip(action, -1, 1)
         self.visited = self.visited or self.distance(self.via) < REACH
-        if self.arrived or self.time == STEPS:
+        if self.arrived or self.time == self._steps:
             return dm_env.termination(float(self.arrived), self._observation())
         return dm_env.transition(0.0, self._observation())
 
@@ -101,6 +102,7 @@ def frame(environment: Point) -> np.ndarray:
 
 
 task = Task("toy", Point, {"supervisor": Supervisor, "open_loop": OpenLoop}, outcome, frame, (Path(__file__),))
+short = replace(task, name="short", load=lambda seed: Point(seed, 5), steps=5)
 
 SPEC = """
 task: toy_task:task

@@ -15,6 +15,8 @@ class DemonstrationsSpec(Model):
 
     path: Text | None = None
     """HDF5 file in robomimic's layout; without it they are collected in the task."""
+    task: Text | None = None
+    """Task in which they are collected, such as one whose episodes are single demonstrations; null: the spec's own."""
     count: int = Field(default=100, ge=2)
     """Number of demonstrations to collect."""
     seed: Seed = 0

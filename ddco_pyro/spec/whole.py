@@ -50,6 +50,11 @@ class Spec(Model):
     seed: Seed = 0
     """Seed of everything random that has no seed of its own."""
 
+    @property
+    def demonstrated_task(self) -> str | None:
+        """Name of the task in which demonstrations are collected; None where there is only a file."""
+        return self.demonstrations.task or self.task
+
     @model_validator(mode="after")
     def _consistent(self) -> Spec:
         problems = [*self._choices(), *self._repeated_observations(), *self._nothing_held_out()]
@@ -62,7 +67,7 @@ class Spec(Model):
         return self
 
     def _choices(self) -> Iterator[tuple[str, str]]:
-        if self.task is None and self.demonstrations.path is None:
+        if self.demonstrated_task is None and self.demonstrations.path is None:
             yield "task", "missing; name a task, or give a file in demonstrations.path"
         if self.hierarchy is None and self.baseline is None:
             yield "hierarchy", "missing; declare a hierarchy, or a baseline in its place"

@@ -1,0 +1,182 @@
+"""One cell of the pushing studies: a method fitted to some demonstrations under one seed, and rolled out.
+
+What a cell gives is kept in a small JSON of its own, so that a study can be stopped and resumed at any time.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from ddco_tasks import pushing
+
+from ddco_pyro.data import Dimensions, build_hierarchy
+from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.encoding import encode
+from ddco_pyro.files import read_tensors, write_tensors, write_text
+from ddco_pyro.hierarchy import Hierarchy
+from ddco_pyro.inference import log_likelihood
+from ddco_pyro.lockstep import Played, play
+from ddco_pyro.rollout import run_episode
+from ddco_pyro.spec import Spec, load_spec, with_overrides
+from ddco_pyro.task import Task
+from ddco_pyro.training import Trainer, plan
+
+SETTINGS = Path(__file__).parent / "pushing_settings.json"  # written by the sweep
+SUPERVISOR = "scripted_noisy"
+POOL = 80  # demonstrations of a seed; a cell takes the first ones
+HELD_OUT = 40  # demonstrations, the same for every cell
+EPISODES = 20
+UPDATES = 3000  # gradient steps of a fit, whatever the method and the number of demonstrations
+
+# Seeds of the simulation. Those of development are used for nothing but the choice of hyper-parameters.
+TRAINING, DEVELOPMENT, HELD_OUT_SEED, EVALUATION = 100_000, 800_000, 900_000, 1_000
+
+METHODS: dict[str, tuple[str, dict[str, Any]]] = {
+    "flat linear": ("pushing_flat_linear", {}),
+    "flat MLP": ("pushing_flat_mlp", {}),
+    "flat MLP, equal parameters": ("pushing_flat_mlp", {"baseline.policy.hidden": [131]}),
+    "DDCO linear": ("pushing_linear", {}),
+    "DDCO MLP": ("pushing_mlp", {}),
+    "hybrid MLP": ("pushing_mlp", {"hierarchy.meta_policy.emits": ["options", "control"]}),
+}
+"""Name of a method to its spec and what it changes there."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A method with k options (None: as its spec says, or flat), a number of demonstrations, and a training seed."""
+
+    method: str
+    options: int | None
+    demonstrations: int
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """A file name."""
+        method = self.method.replace(" ", "-").replace(",", "").lower()
+        return f"{method}-k{self.options or 0}-n{self.demonstrations}-s{self.seed}"
+
+
+def spec_of(cell: Cell, settings: Mapping[str, Any] | None = None) -> Spec:
+    """The spec of a cell, with the method's chosen ``settings`` (as the sweep found them, where none are given)."""
+    file, overrides = METHODS[cell.method]
+    chosen = json.loads(SETTINGS.read_text())["chosen"][cell.method] if settings is None else settings
+    changed = {**overrides, **chosen, "seed": cell.seed, "demonstrations.count": cell.demonstrations}
+    if cell.options is not None:
+        changed["hierarchy.levels.0.count"] = cell.options
+    spec = with_overrides(load_spec(Path(__file__).parents[1] / "specs" / f"{file}.yaml"), changed)
+    stages = len(plan(spec, 1 if spec.hierarchy else 0))
+    trained = cell.demonstrations - round_tune(cell.demonstrations, spec.training.tune_fraction)
+    epochs = int(np.ceil(UPDATES / stages / np.ceil(trained / spec.training.batch_size)))
+    return with_overrides(spec, {"training.epochs": epochs})
+
+
+def round_tune(count: int, fraction: float) -> int:
+    """How many demonstrations are held out to stop by, about."""
+    return max(1, round(count * fraction))
+
+
+def demonstrations(folder: Path, first: int, count: int) -> Demonstrations:
+    """Demonstrations of one goal each from seeds ``first`` on; kept in a file."""
+    path = folder / "demonstrations" / f"{first}.hdf5"
+    if not path.exists():
+        episodes = [run_episode(pushing.single, SUPERVISOR, first + number) for number in range(count)]
+        Demonstrations(tuple(one.record for one in episodes)).write(path)
+    return Demonstrations.read(path)
+
+
+def pool(folder: Path, seed: int, development: bool = False) -> Demonstrations:
+    """All demonstrations of a training seed."""
+    return demonstrations(folder, (DEVELOPMENT if development else TRAINING) + 1000 * seed, POOL)
+
+
+def held_out(folder: Path, development: bool = False) -> Demonstrations:
+    """Demonstrations that nothing is trained on; others for development."""
+    return demonstrations(folder, HELD_OUT_SEED + 1000 * development, HELD_OUT)
+
+
+def fit(spec: Spec, demos: Demonstrations, checkpoint: Path) -> tuple[Hierarchy, float]:
+    """The fitted hierarchy, and the seconds that it took."""
+    train, tune = demos.split(spec.training.tune_fraction, spec.seed)
+
+    def make() -> Hierarchy:
+        hierarchy = build_hierarchy(spec, Dimensions.of(demos))
+        hierarchy.encoder.fit(train)
+        hierarchy.scaling.fit(train)
+        return hierarchy
+
+    first = make()
+    batches = [encode(part, first.encoder, first.scaling) for part in (train, tune)]
+    start = time.perf_counter()
+    hierarchy = Trainer(spec, make, batches[0], batches[1], checkpoint, list(train.names), lambda row: None).run()
+    checkpoint.unlink(missing_ok=True)
+    return hierarchy, time.perf_counter() - start
+
+
+def per_step(hierarchy: Hierarchy, demos: Demonstrations) -> float:
+    """Log-likelihood per step, nats, at the spec's σ."""
+    with torch.no_grad():
+        pieces = encode(demos, hierarchy.encoder, hierarchy.scaling).pieces()
+        total = sum(float(log_likelihood(hierarchy.tabulate(one), one.lengths).sum()) for _, one in pieces)
+    return total / sum(demos.lengths)
+
+
+def fitted(cell: Cell, folder: Path) -> Hierarchy:
+    """The hierarchy of a cell, fitted unless it has been already."""
+    path, spec = folder / "models" / f"{cell.name}.safetensors", spec_of(cell)
+    demos = pool(folder, cell.seed)
+    demos = demos.select(demos.names[: cell.demonstrations])
+    if path.exists():
+        hierarchy = build_hierarchy(spec, Dimensions.of(demos))
+        hierarchy.load_state_dict(read_tensors(path)[0])
+        return hierarchy.eval()
+    hierarchy, seconds = fit(spec, demos, path.with_suffix(".checkpoint"))
+    likelihood = {"train": per_step(hierarchy, demos), "held_out": per_step(hierarchy, held_out(folder))}
+    found = {
+        **asdict(cell),
+        "parameters": sum(one.numel() for one in hierarchy.parameters()),
+        "std": spec.control.std,
+        "seconds": seconds,
+        "log_likelihood_per_step": likelihood,
+    }
+    write_text(folder / "fits" / f"{cell.name}.json", json.dumps(found, indent=1) + "\n")
+    write_tensors(path, hierarchy.state_dict(), {})
+    return hierarchy
+
+
+def run(cell: Cell, folder: Path, limited: bool = False) -> None:
+    """Fit and roll out a cell, and keep what came of it; nothing where it has been kept already.
+
+    :param limited: at most 250 steps for each goal.
+    """
+    torch.set_num_threads(1)
+    path = folder / ("limited" if limited else "rollouts") / f"{cell.name}.json"
+    if path.exists():
+        return
+    hierarchy = fitted(cell, folder)
+    first = EVALUATION + 1000 * cell.seed
+    task: Task = pushing.limited if limited else pushing.task
+    start = time.perf_counter()
+    episodes = play(task, hierarchy, spec_of(cell).rollout, range(first, first + EPISODES))
+    found = {**summary(episodes), "seconds": time.perf_counter() - start}
+    write_text(path, json.dumps(found, indent=1) + "\n")
+
+
+def summary(episodes: Sequence[Played]) -> dict[str, Any]:
+    """Each episode's counts; mean steps between changes of option; part of the steps that the meta-policy acts."""
+    counts = {name: [one.outcome[name] for one in episodes] for name in ("goals", "topples", "lost")}
+    choices = [one.choices for one in episodes]
+    if choices[0].shape[1] == 0:
+        return {**counts, "dwell": None, "own_control": None}
+    changes = sum(int((one[1:] != one[:-1]).any(axis=1).sum()) for one in choices)
+    steps = sum(len(one) for one in choices)
+    own = sum(int((one[:, -1] == 0).sum()) for one in choices)
+    return {**counts, "dwell": steps / (changes + len(choices)), "own_control": own / steps}

@@ -1,0 +1,91 @@
+"""Trajectories in joint-angle space: the supervisor's by the goal's side, a fitted hierarchy's by its active option.
+
+    python benchmarks/pushing_joint_angles.py [--demonstrations 80] [--seed 0] [--runs DIR] [--out DIR]
+
+After the paper's figure of backhand and forehand (SM 1.1). The hierarchy is a cell of ``pushing_studies.py``, which is
+fitted if it has not been. Writes ``joint_angles.png`` and ``joint_angles.json``: how often option and side agree.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from ddco_tasks import pushing
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from pushing_cell import EVALUATION, Cell, fitted, pool, spec_of
+from sklearn.metrics import normalized_mutual_info_score
+
+from ddco_pyro.colours import option_colour
+from ddco_pyro.files import whole_file, write_text
+from ddco_pyro.lockstep import play
+
+EPISODES = 3
+SIDES = ("goal on the left (backhand)", "goal on the right (forehand)")
+PROJECTIONS = ((0, 1), (0, 2))
+JOINTS = ("shoulder", "elbow", "wrist")
+
+Coloured = tuple[np.ndarray, np.ndarray]
+"""Joint angles [T, 3] and the choice at each step [T]."""
+
+
+def draw(panels: dict[str, tuple[Sequence[Coloured], dict[int, str]]]) -> Figure:
+    """One row of projections for each panel, coloured by the choice."""
+    figure = Figure(figsize=(9, 3.6 * len(panels)), layout="constrained")
+    FigureCanvasAgg(figure)
+    for row, (title, (trajectories, names)) in zip(
+        figure.subplots(len(panels), len(PROJECTIONS), squeeze=False), panels.items(), strict=True
+    ):
+        for axes, (across, up) in zip(row, PROJECTIONS, strict=True):
+            for choice, name in names.items():
+                points = np.concatenate([angles[choices == choice] for angles, choices in trajectories])
+                axes.plot(points[:, across], points[:, up], ".", ms=1.2, color=option_colour(choice), label=name)
+            axes.set(xlabel=f"{JOINTS[across]} (rad)", ylabel=f"{JOINTS[up]} (rad)", title=title)
+        row[-1].legend(markerscale=8, fontsize=8)
+    return figure
+
+
+def main() -> None:
+    """Draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--demonstrations", type=int, default=80)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--runs", type=Path, default=Path("runs/pushing-studies"))
+    parser.add_argument("--out", type=Path, default=Path("docs/results/pushing"))
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    cell = Cell("DDCO MLP", 2, arguments.demonstrations, arguments.seed)
+    hierarchy, first = fitted(cell, arguments.runs), EVALUATION + 1000 * arguments.seed
+    keep = ("joint_angles", "goal_from_box")
+    episodes = play(pushing.task, hierarchy, spec_of(cell).rollout, range(first, first + EPISODES), keep)
+    ours = [(one.observations["joint_angles"], one.choices[:, 0]) for one in episodes]
+    sides = np.concatenate([one.observations["goal_from_box"][:, 0] > 0 for one in episodes])
+    options = np.concatenate([choices for _, choices in ours])
+    demos = pool(arguments.runs, arguments.seed)[: arguments.demonstrations]
+    shown = [(one.observations["joint_angles"], 1 + (one.observations["goal_from_box"][:, 0] > 0)) for one in demos]
+    figure = draw(
+        {
+            f"{len(demos)} demonstrations": (shown, dict(enumerate(SIDES, 1))),
+            f"DDCO MLP, {EPISODES} episodes": (ours, {number: f"option {number}" for number in np.unique(options)}),
+        }
+    )
+    with whole_file(arguments.out / "joint_angles.png") as temporary:
+        figure.savefig(temporary, dpi=110, format="png")
+    found = {
+        "command": "python benchmarks/pushing_joint_angles.py"
+        f" --demonstrations {arguments.demonstrations} --seed {arguments.seed}",
+        "goals": [one.outcome["goals"] for one in episodes],
+        "nmi_option_side": float(normalized_mutual_info_score(sides, options)),
+        "goal_on_the_right_given_option": {int(o): float(sides[options == o].mean()) for o in np.unique(options)},
+    }
+    write_text(arguments.out / "joint_angles.json", json.dumps(found, indent=1) + "\n")
+    print(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()

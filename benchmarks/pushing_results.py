@@ -1,0 +1,219 @@
+"""What came of a pushing study: every cell as a row of a CSV, the means over seeds as Markdown, and a figure."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from pushing_cell import EPISODES, Cell
+from scipy import stats
+
+from ddco_pyro.files import whole_file, write_text
+
+COLOURS = ("#9a9a9a", "#3f6fb0", "#79a8d9", "#d98f3f", "#b03f4a")
+Row = dict[str, Any]
+
+
+def rows_of(cells: Sequence[Cell], folder: Path) -> list[Row]:
+    """What is known of the cells that have been rolled out."""
+    found = []
+    for cell in cells:
+        rollout, fit = (folder / part / f"{cell.name}.json" for part in ("rollouts", "fits"))
+        if not rollout.exists():
+            continue
+        row: Row = json.loads(fit.read_text())
+        row |= {f"log_likelihood_{part}": value for part, value in row.pop("log_likelihood_per_step").items()}
+        row |= _means(json.loads(rollout.read_text()), "")
+        limited = folder / "limited" / f"{cell.name}.json"
+        row |= _means(json.loads(limited.read_text()) if limited.exists() else {}, "limited_")
+        found.append(row)
+    return found
+
+
+def _means(found: dict[str, Any], prefix: str) -> Row:
+    """Means over the episodes, and what is one number already."""
+    row: Row = {f"{prefix}{key}": np.mean(found[key]) if found else None for key in ("goals", "topples", "lost")}
+    if not prefix:
+        row |= {"success": float(np.mean(np.array(found["goals"]) > 0))}
+        row |= {key: found[key] for key in ("dwell", "own_control")}
+    return row
+
+
+def over_seeds(rows: Sequence[Row], measure: str) -> tuple[float, float, int]:
+    """Mean over training seeds, half of its 95 % t interval (NaN for a single seed), and the number of seeds."""
+    values = [row[measure] for row in rows if row[measure] is not None]
+    if len(values) < 2:
+        return (float(values[0]) if values else np.nan), np.nan, len(values)
+    half = stats.sem(values) * stats.t.ppf(0.975, len(values) - 1)
+    return float(np.mean(values)), float(half), len(values)
+
+
+def grouped(rows: Sequence[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]:
+    """Rows by the values of some columns, in the order of their first appearance."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return groups
+
+
+def write(study: str, cells: Sequence[Cell], folder: Path, out: Path, command: str) -> None:
+    """NAME.csv, NAME.md and NAME.png of the cells that are done."""
+    rows = rows_of(cells, folder)
+    if not rows:
+        raise SystemExit(f"{study}: nothing has been measured yet")
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(out / f"{study}.csv", text.getvalue())
+    describe, draw = STUDIES[study]
+    supervisor = _supervisor(out)
+    head = [f"Command: `{command}`", "", _protocol(supervisor), ""]
+    write_text(out / f"{study}.md", "\n".join([*head, *describe(rows)]) + "\n")
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    draw(figure, rows, supervisor)
+    with whole_file(out / f"{study}.png") as temporary:
+        figure.savefig(temporary, dpi=120, format="png")
+
+
+def _supervisor(out: Path) -> float | None:
+    """The level of the supervisor that was recorded, with an exact hand."""
+    path = out / "supervisors.json"
+    return float(json.loads(path.read_text())["supervisors"]["scripted"]["goals"]["mean"]) if path.exists() else None
+
+
+def _protocol(supervisor: float | None) -> str:
+    level = "" if supervisor is None else f" The supervisor itself: {supervisor:.1f} goals."
+    return (
+        f"Every training seed has its own demonstrations; {EPISODES} episodes of 2000 steps for each fit. Means over "
+        f"training seeds with 95 % t intervals; the last column is the number of seeds.{level}"
+    )
+
+
+def cell_text(rows: Sequence[Row], measure: str, form: str = "{:.1f}") -> str:
+    """A mean and its interval in a few characters."""
+    mean, half, seeds = over_seeds(rows, measure)
+    if not seeds:
+        return "-"
+    return form.format(mean) + ("" if np.isnan(half) else f" ± {form.format(half)}")
+
+
+def table(rows: Sequence[Row], columns: dict[str, tuple[str, str]], *keys: str) -> list[str]:
+    """A Markdown table: one line for each group, one column for each measure (title to measure and format)."""
+    lines = [f"| {' | '.join([*keys, *columns, 'seeds'])} |", "|" + "---|" * (len(keys) + len(columns) + 1)]
+    for group, own in grouped(rows, *keys).items():
+        cells = [cell_text(own, *column) for column in columns.values()]
+        lines.append(f"| {' | '.join([*map(str, group), *cells, str(len(own))])} |")
+    return lines
+
+
+def curve(axes: Axes, rows: Sequence[Row], across: str, measure: str, colour: str, label: str) -> None:
+    """Mean with its interval against a column."""
+    groups = grouped(rows, across)
+    found = [over_seeds(own, measure) for own in groups.values()]
+    places = [key[0] for key in groups]
+    axes.errorbar(places, [f[0] for f in found], [f[1] for f in found], color=colour, label=label, marker="o", ms=4,
+                  capsize=2, lw=1.5)  # fmt: skip
+
+
+GOALS = {
+    "goals": ("goals", "{:.1f}"),
+    "goals, 250 steps each at most": ("limited_goals", "{:.1f}"),
+    "topples": ("topples", "{:.1f}"),
+    "lost": ("lost", "{:.1f}"),
+    "held-out nats/step": ("log_likelihood_held_out", "{:.3f}"),
+    "steps an option lasts": ("dwell", "{:.0f}"),
+    "parameters": ("parameters", "{:.0f}"),
+}
+
+
+def describe_complexity(rows: Sequence[Row]) -> list[str]:
+    """The table against the number of demonstrations."""
+    return [*table(rows, GOALS, "method", "demonstrations"), "", *_sigma(rows)]
+
+
+def draw_complexity(figure: Figure, rows: Sequence[Row], supervisor: float | None) -> None:
+    """Goals, without and with a limit, against the number of demonstrations."""
+    for axes, measure, title in zip(
+        figure.subplots(1, 2, sharey=True),
+        ("goals", "limited_goals"),
+        ("no limit", "at most 250 steps for each goal"),
+        strict=True,
+    ):
+        for colour, ((method,), own) in zip(COLOURS, grouped(rows, "method").items(), strict=True):
+            curve(axes, own, "demonstrations", measure, colour, method)
+        if supervisor is not None:
+            axes.axhline(supervisor, color="k", ls=":", lw=1, label="supervisor")
+        axes.set(xscale="log", xlabel="demonstrations", title=title)
+        counts = sorted({row["demonstrations"] for row in rows})
+        axes.set_xticks(counts, [str(count) for count in counts])
+        axes.minorticks_off()
+    figure.axes[0].set_ylabel("goals in 2000 steps")
+    figure.axes[0].legend(fontsize=7)
+
+
+def describe_options(rows: Sequence[Row]) -> list[str]:
+    """The table against k, and how the two curves agree."""
+    lines = [*table(rows, GOALS, "method", "options"), ""]
+    for (method,), own in grouped(rows, "method").items():
+        means = {m: [over_seeds(one, m)[0] for one in grouped(own, "options").values()]
+                 for m in ("goals", "log_likelihood_held_out")}  # fmt: skip
+        found = stats.spearmanr(*means.values())
+        lines.append(
+            f"- {method}: Spearman's rank correlation over k of mean goals and mean held-out log-likelihood "
+            f"{found.statistic:.2f} (p = {found.pvalue:.2f}, {len(means['goals'])} values of k)."
+        )
+    return [*lines, "", *_sigma(rows)]
+
+
+def draw_options(figure: Figure, rows: Sequence[Row], supervisor: float | None) -> None:
+    """Goals and held-out log-likelihood against k."""
+    measures = {"goals": "goals in 2000 steps", "log_likelihood_held_out": "held-out nats/step"}
+    for axes, (measure, label) in zip(figure.subplots(1, 2), measures.items(), strict=True):
+        for colour, ((method,), own) in zip(COLOURS[3:], grouped(rows, "method").items(), strict=True):
+            curve(axes, own, "options", measure, colour, method)
+        axes.set(xlabel="options k", ylabel=label)
+    if supervisor is not None:
+        figure.axes[0].axhline(supervisor, color="k", ls=":", lw=1, label="supervisor")
+    figure.axes[0].legend(fontsize=8)
+
+
+def describe_augmentation(rows: Sequence[Row]) -> list[str]:
+    """The table of success and of the meta-policy's own control."""
+    columns = {"success": ("success", "{:.2f}"), "steps under own control": ("own_control", "{:.2f}"), **GOALS}
+    success = "Success: at least one goal in the episode."
+    return [success, "", *table(rows, columns, "method", "options"), "", *_sigma(rows)]
+
+
+def draw_augmentation(figure: Figure, rows: Sequence[Row], supervisor: float | None) -> None:
+    """Success, goals and the fraction of steps under the meta-policy's own control against k."""
+    del supervisor
+    measures = {"success": "success rate", "goals": "goals in 2000 steps", "own_control": "steps under own control"}
+    for axes, (measure, label) in zip(figure.subplots(1, 3), measures.items(), strict=True):
+        for colour, ((method,), own) in zip(COLOURS[3:], grouped(rows, "method").items(), strict=True):
+            curve(axes, own, "options", measure, colour, method)
+        axes.set(xlabel="options k", ylabel=label)
+    figure.axes[0].legend(fontsize=8)
+
+
+def _sigma(rows: Sequence[Row]) -> list[str]:
+    values = sorted({row["std"] for row in rows})
+    return [f"Log-likelihoods are at σ = {', '.join(map(str, values))} of the controls' own spread, for every method."]
+
+
+Describe = Callable[[Sequence[Row]], list[str]]
+Draw = Callable[[Figure, Sequence[Row], float | None], None]
+STUDIES: dict[str, tuple[Describe, Draw]] = {
+    "sample_complexity": (describe_complexity, draw_complexity),
+    "number_of_options": (describe_options, draw_options),
+    "augmentation": (describe_augmentation, draw_augmentation),
+}

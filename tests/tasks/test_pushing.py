@@ -1,0 +1,372 @@
+"""The pushing task against independent truths: MuJoCo's poses, Coulomb friction, statics, brute-force collisions."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from ddco_tasks import pushing, pushing_geometry, pushing_planner
+from ddco_tasks.planning import plan_path, points_along
+from ddco_tasks.pushing import Environment, limited, single, task
+from ddco_tasks.pushing_rules import PUSH_HEIGHT, Scene
+from ddco_tasks.rendering import render
+
+from ddco_pyro.rollout import run_episode
+
+GRAVITY, FRICTION = 9.81, 0.4
+BEHIND_BOX = np.array([-0.3, PUSH_HEIGHT])  # of the tip, for a box at 0
+
+
+@pytest.fixture
+def environment() -> Iterator[Environment]:
+    """The environment of seed 0, after its reset."""
+    environment = task.load(0)
+    environment.reset()
+    yield environment
+    environment.close()
+
+
+def arrange(environment: Environment, angles: np.ndarray, box: float, goal: float) -> None:
+    """Put arm, box and goal somewhere."""
+    with environment.physics.reset_context():
+        environment.physics.place_arm(angles)
+        environment.physics.place_box(box)
+        environment.physics.place_goal(goal)
+
+
+def push(environment: Environment, height: float, distance: float = 0.3) -> float:
+    """Push the box from the left at a height, 5 mm a step; the largest tilt (rad) on the way."""
+    start = np.array([-0.2, height])
+    arrange(environment, pushing_geometry.inverse(start, 0.3), 0.0, 0.45)
+    tilts = []
+    for step in range(round(distance / 0.005)):
+        goal = pushing_geometry.inverse(start + np.array([0.005 * (step + 1), 0.0]), 0.3)
+        environment.step((goal - environment.physics.joint_angles()) / 0.05)
+        tilts.append(abs(environment.physics.box()[2]))
+    return max(tilts)
+
+
+# Kinematics.
+
+
+def test_forward_kinematics_is_mujocos(environment: Environment) -> None:
+    low, high = pushing_geometry.JOINT_RANGES.T
+    for angles in np.random.default_rng(0).uniform(low, high, (20, 3)):
+        arrange(environment, angles, 0.0, 0.3)
+        np.testing.assert_allclose(pushing_geometry.tip_position(angles), environment.physics.tip(), atol=1e-9)
+
+
+def test_forward_kinematics_is_the_closed_form() -> None:
+    first, second, third = 0.3, 0.9, -0.5
+    x = 0.5 * np.sin(0.3) + 0.5 * np.sin(1.2) + 0.3 * np.sin(0.7)
+    z = 0.95 - 0.5 * np.cos(0.3) - 0.5 * np.cos(1.2) - 0.3 * np.cos(0.7)
+    np.testing.assert_allclose(pushing_geometry.tip_position(np.array([first, second, third])), [x, z])
+
+
+def test_inverse_kinematics_is_the_inverse() -> None:
+    for x in np.linspace(-0.65, 0.65, 9):
+        for z in (0.1, 0.25, 0.45):
+            for pitch in (-0.3, 0.0, 0.3):
+                if np.hypot(x - 0.3 * np.sin(pitch), 0.95 - z - 0.3 * np.cos(pitch)) > 0.99:
+                    continue
+                angles = pushing_geometry.inverse(np.array([x, z]), pitch)
+                np.testing.assert_allclose(pushing_geometry.tip_position(angles), [x, z], atol=1e-9)
+                assert np.sum(angles) == pytest.approx(pitch)
+
+
+def test_joint_ranges_are_the_models(environment: Environment) -> None:
+    model = environment.physics.named.model
+    np.testing.assert_allclose(model.jnt_range[["shoulder", "elbow", "wrist"]], pushing_geometry.JOINT_RANGES)
+    np.testing.assert_allclose(np.abs(model.actuator_ctrlrange[:]), pushing_geometry.MAX_SPEED)
+
+
+def test_joints_move_at_the_velocities_that_are_set(environment: Environment) -> None:
+    arrange(environment, pushing.RAISED, 0.4, -0.4)
+    velocities = np.array([0.3, -0.2, 0.5])
+    environment.step(velocities)
+    before = environment.physics.joint_angles()
+    for _ in range(10):
+        environment.step(velocities)
+    np.testing.assert_allclose(environment.physics.joint_angles() - before, 0.5 * velocities, atol=0.01)
+
+
+def test_clear_is_what_points_along_the_links_say() -> None:
+    generator = np.random.default_rng(1)
+    low, high = pushing_geometry.JOINT_RANGES.T
+    verdicts = []
+    for angles in generator.uniform(low, high, (400, 3)):
+        corners = np.array(pushing_geometry.joints_positions(angles))
+        points = points_along(corners, np.linspace(0.0, 1.0, 2000))
+        inside = (np.abs(points[:, 0] - 0.1) < 0.11 + 0.02) & (points[:, 1] < 0.28 + 0.02)
+        clear = not inside.any() and corners[1:, 1].min() >= 0.03
+        verdicts.append(clear)
+        assert pushing_geometry.is_clear(angles, 0.1, 0.02) == clear
+    assert 0.05 < np.mean(verdicts) < 0.95
+
+
+# The box.
+
+
+def test_the_box_does_not_move_without_contact(environment: Environment) -> None:
+    arrange(environment, pushing.RAISED, 0.2, -0.4)
+    before = environment.physics.box()
+    for _ in range(40):
+        environment.step(np.array([0.2, 0.0, -0.3]))
+    np.testing.assert_allclose(environment.physics.box(), before, atol=1e-3)
+
+
+@pytest.mark.parametrize("speed", [0.4, 0.8])
+def test_a_sliding_box_stops_by_coulomb_friction(environment: Environment, speed: float) -> None:
+    arrange(environment, pushing.RAISED, 0.0, 0.45)
+    environment.physics.named.data.qvel["box_x"] = speed
+    for _ in range(10):
+        environment.step(np.zeros(3))
+    assert environment.physics.box()[0] == pytest.approx(speed**2 / (2 * FRICTION * GRAVITY), rel=0.05)
+
+
+def test_a_low_push_slides_the_box_and_a_high_one_topples_it(environment: Environment) -> None:
+    """Statics: it tips over its edge where the push is higher than half its width over the friction, 0.2 m."""
+    assert push(environment, 0.10) < 0.05
+    assert environment.physics.box()[0] > 0.2
+    assert environment.task.counts.topples == 0
+    push(environment, 0.23)
+    assert environment.task.counts.topples == 1
+
+
+def test_a_toppled_box_is_put_back_upright_somewhere_else(environment: Environment) -> None:
+    for angle in (1.0, -1.0):
+        arrange(environment, pushing.RAISED, 0.1, 0.3)
+        environment.physics.named.data.qpos["box_tilt"] = angle
+        before = environment.task.counts.topples
+        step = environment.step(np.zeros(3))
+        assert environment.task.counts.topples == before + 1
+        assert step.reward == 0.0
+        x, z, tilt = step.observation["box_pose"]
+        assert (z, tilt) == (pytest.approx(0.125), 0.0)
+        assert x != pytest.approx(0.1, abs=1e-3)
+        assert abs(x - 0.3) >= pushing.MIN_DISTANCE
+        assert step.observation["goal"] == 0.3
+
+
+def test_a_box_out_of_reach_is_put_back(environment: Environment) -> None:
+    arrange(environment, pushing.RAISED, 0.6, 0.3)
+    step = environment.step(np.zeros(3))
+    assert environment.task.counts.lost == 1
+    assert abs(step.observation["box_pose"][0]) <= pushing.EXTENT
+
+
+# Goals.
+
+
+def test_a_goal_is_reached_by_a_box_at_rest_within_its_tolerance(environment: Environment) -> None:
+    for offset, tilt, speed, reached in (
+        (0.029, 0.0, 0.0, True),
+        (0.031, 0.0, 0.0, False),
+        (0.0, 0.11, 0.0, False),
+        (0.0, 0.0, 0.021, False),
+    ):
+        arrange(environment, pushing.RAISED, 0.1 + offset, 0.1)
+        environment.physics.named.data.qpos["box_tilt"] = tilt
+        environment.physics.named.data.qvel["box_x"] = speed
+        assert pushing.is_reached(environment.physics) == reached
+
+
+def test_a_reached_goal_is_drawn_anew_on_the_other_side(environment: Environment) -> None:
+    goals = []
+    for number in range(12):
+        arrange(environment, pushing.RAISED, environment.physics.goal(), environment.physics.goal())
+        box = environment.physics.box()[0]
+        step = environment.step(np.zeros(3))
+        assert step.reward == 1.0
+        assert environment.task.counts.goals == number + 1
+        goals.append(step.observation["goal"][0] - box)
+        assert environment.step(np.zeros(3)).reward == 0.0
+    assert (np.sign(goals[1:]) == -np.sign(goals[:-1])).all()
+    assert np.min(np.abs(goals)) >= pushing.MIN_DISTANCE - 1e-3
+
+
+def test_observations_are_the_same_state_in_other_frames(environment: Environment) -> None:
+    step = environment.step(np.array([0.1, 0.2, 0.3]))
+    seen = step.observation
+    np.testing.assert_allclose(seen["tip"], pushing_geometry.tip_position(seen["joint_angles"]), atol=1e-3)
+    np.testing.assert_allclose(seen["box_from_tip"], seen["box_pose"][:2] - seen["tip"])
+    np.testing.assert_allclose(seen["goal_from_box"], seen["goal"] - seen["box_pose"][:1])
+    np.testing.assert_allclose(seen["goal_from_tip"], seen["goal"] - seen["tip"][:1])
+
+
+def test_episodes_start_apart_from_the_box_and_its_goal() -> None:
+    sides = []
+    for seed in range(30):
+        environment = task.load(seed)
+        seen = environment.reset().observation
+        assert abs(seen["goal_from_box"][0]) >= pushing.MIN_DISTANCE
+        assert abs(seen["box_pose"][0]) <= pushing.EXTENT
+        assert pushing_geometry.is_clear(seen["joint_angles"], seen["box_pose"][0], 0.0)
+        sides.append(np.sign(seen["goal_from_box"][0]))
+        environment.close()
+    assert 8 < np.sum(np.array(sides) > 0) < 22
+
+
+# Variants.
+
+
+def idle(variant: pushing.Task, steps: int) -> tuple[int, dict[str, float]]:
+    """Steps and outcome of an episode, or its first ``steps``, in which the arm does nothing."""
+    environment = variant.load(2)
+    environment.reset()
+    number = 1
+    while not environment.step(np.zeros(3)).last() and number < steps:
+        number += 1
+    measures = variant.outcome(environment)
+    environment.close()
+    return number, measures
+
+
+def test_lengths_and_limits_of_the_variants() -> None:
+    taken, measures = idle(task, 3000)
+    assert taken == task.steps == 2000
+    assert (measures["success"], measures["goals"]) == (0.0, 0.0)
+    assert np.isnan(measures["missed"])
+    taken, measures = idle(limited, 3000)
+    assert taken == limited.steps == 2000
+    assert measures["missed"] == 2000 // 250
+    taken, measures = idle(single, 3000)
+    assert taken == single.steps == 250
+    assert (measures["success"], measures["missed"]) == (0.0, 1.0)
+
+
+def test_an_episode_about_one_goal_ends_where_it_is_reached() -> None:
+    for seed in range(4):
+        episode = run_episode(single, "scripted", seed)
+        assert episode.outcome["goals"] == episode.outcome["success"] == 1.0
+        assert len(episode.record) < single.steps
+
+
+# Supervisors.
+
+
+@pytest.mark.parametrize(("name", "least"), [("scripted", 25), ("supervisor", 20), ("scripted_noisy", 15)])
+def test_supervisors_reach_goals(name: str, least: int) -> None:
+    measures = run_episode(task, name, 3).outcome
+    assert measures["goals"] >= least
+    assert measures["topples"] <= 3
+
+
+def test_intentions_are_recorded_and_the_hand_is_inexact() -> None:
+    environment = task.load(0)
+    policy = task.policies["scripted_noisy"](environment)
+    exact = task.policies["scripted"](environment)
+    policy.reset(0)
+    step = environment.reset()
+    offsets = []
+    for _ in range(300):
+        executed = policy.act(step.observation)
+        np.testing.assert_array_equal(policy.intended, exact.act(step.observation))
+        offsets.append(executed - policy.intended)
+        step = environment.step(executed)
+    environment.close()
+    assert np.std(offsets) == pytest.approx(pushing.pushing_supervisor.HAND, rel=0.3)
+
+
+def test_the_scripted_supervisor_is_a_function_of_the_observation() -> None:
+    record = run_episode(single, "scripted_noisy", 1).record
+    environment = single.load(0)
+    policy = single.policies["scripted"](environment)
+    for row in np.random.default_rng(0).permutation(len(record)):
+        observation = {key: value[row] for key, value in record.observations.items()}
+        np.testing.assert_array_equal(policy.act(observation), record.actions[row])
+    environment.close()
+
+
+def scenes() -> Iterator[Scene]:
+    """Scenes with the arm beside, above and behind the box."""
+    for box, goal in ((0.0, 0.3), (0.3, -0.2), (-0.35, 0.1), (0.2, 0.45)):
+        for tip in ((-0.25, 0.12), (0.22, 0.15), (0.0, 0.45)):
+            yield Scene(pushing_geometry.inverse(np.array([tip[0] + box, tip[1]]), 0.0), box, goal)
+
+
+def test_planned_approaches_are_clear_and_lead_behind_the_box() -> None:
+    for scene in scenes():
+        if not pushing_geometry.is_clear(scene.angles, scene.box, pushing_planner.MARGIN):
+            continue
+        planner = pushing_planner.Planner()
+        path = planner._approach(scene)
+        np.testing.assert_allclose(path[0], scene.angles)
+        assert pushing_planner.may_push(path[-1], scene)
+        assert all(pushing_geometry.is_clear(angles, scene.box, 0.5 * pushing_planner.MARGIN) for angles in path)
+        again = pushing_planner.Planner()._approach(scene)
+        np.testing.assert_array_equal(path, again)
+
+
+def test_planned_pushes_stay_low_and_end_at_the_goal() -> None:
+    for side in (-1, 1):
+        scene = Scene(pushing_planner.behind(side, -0.3 * side, 0.16), -0.3 * side, 0.3 * side)
+        path = pushing_planner.Planner()._push(scene)
+        heights = np.array([pushing_geometry.tip_position(angles)[1] for angles in path])
+        assert np.abs(heights - PUSH_HEIGHT).max() < 1.2 * pushing_planner.BAND
+        assert pushing_geometry.tip_position(path[-1])[0] == pytest.approx(scene.goal - 0.09 * side, abs=1e-6)
+
+
+def test_unrepeatable_plans_differ() -> None:
+    scene = next(scenes())
+    planner = pushing_planner.Planner(repeatable=False)
+    one, other = planner._approach(scene), planner._approach(scene)
+    assert one.shape != other.shape or not np.allclose(one, other)
+
+
+def test_shortcuts_make_paths_shorter() -> None:
+    def is_free(point: np.ndarray) -> bool:
+        return not (abs(point[0]) < 0.2 and point[1] < 0.5)
+
+    ranges = np.array([[-1.0, 1.0]] * 2)
+    ends = np.array([[-0.6, 0.0], [0.6, 0.0]])
+    lengths = []
+    for shortcuts in (0, 60):
+        settings = pushing_planner.Settings(range=0.1, shortcuts=shortcuts)
+        path = plan_path(*ends, ranges, is_free, settings)
+        lengths.append(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    shortest = 2 * np.hypot(0.4, 0.5) + 0.4
+    assert shortest - 0.02 < lengths[1] < lengths[0]
+    assert lengths[1] < 1.15 * shortest
+
+
+DIGEST = """
+import hashlib, json
+from ddco_pyro.rollout import run_episode
+from ddco_tasks.pushing import single
+names = ("supervisor", "supervisor_noisy", "scripted_noisy", "supervisor_every_step")
+print(json.dumps([hashlib.sha256(run_episode(single, name, 4).record.actions.tobytes()).hexdigest() for name in names]))
+"""
+
+
+def test_demonstrations_are_the_same_in_every_process() -> None:
+    found = [
+        json.loads(subprocess.run([sys.executable, "-c", DIGEST], capture_output=True, text=True, check=True).stdout)
+        for _ in range(2)
+    ]
+    assert found[0] == found[1]
+    assert len(set(found[0])) == 4
+
+
+# Pictures.
+
+
+@pytest.mark.parametrize(("height", "width"), [(480, 640), (64, 64)])
+def test_arm_box_and_goal_are_in_the_picture(environment: Environment, height: int, width: int) -> None:
+    arrange(environment, pushing_geometry.inverse(np.array([0.0, 0.5]), 0.0), -0.3, 0.3)
+    picture = render(environment.physics, "side", height, width).astype(int)
+    assert picture.shape == (height, width, 3)
+    red, green, blue = np.moveaxis(picture, -1, 0)
+    half = width // 2
+    box = (red > 150) & (blue < 90) & (green > 80)
+    goal = (green > red + 40) & (green > blue + 40)
+    arm = blue > red + 40
+    assert box[:, :half].sum() > 0.01 * height * width
+    assert box[:, half:].sum() == 0
+    assert goal[:, half:].sum() > 0.0005 * height * width
+    assert goal[:, :half].sum() == 0
+    assert arm.sum() > 0.005 * height * width

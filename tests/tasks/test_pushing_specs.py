@@ -1,0 +1,59 @@
+"""Every spec of the pushing task can be checked and fitted, and its policy acts in the task."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ddco_tasks import pushing
+
+from ddco_pyro.data import check_networks, dimensions
+from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.lockstep import play
+from ddco_pyro.rollout import run_episode
+from ddco_pyro.run import fit
+from ddco_pyro.spec import Spec, load_spec
+
+SPECS = sorted((Path(__file__).parents[2] / "specs").glob("pushing*.yaml"))
+LEVELS = {"flat_linear": 0, "flat_mlp": 0, "linear": 1, "mlp": 1, "hybrid": 1, "3level": 2}
+
+
+@pytest.fixture(scope="module")
+def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file with four demonstrations."""
+    path = tmp_path_factory.mktemp("pushing") / "demonstrations.hdf5"
+    episodes = [run_episode(pushing.single, "scripted_noisy", seed) for seed in range(4)]
+    Demonstrations(tuple(one.record for one in episodes)).write(path)
+    return path
+
+
+def short(path: Path, demonstrations: Path) -> Spec:
+    """The spec, on these demonstrations, for two epochs."""
+    return load_spec(path, [f"demonstrations.path={demonstrations}", "training.epochs=2"])
+
+
+def test_all_specs_are_here() -> None:
+    assert {path.stem.removeprefix("pushing_") for path in SPECS} == set(LEVELS)
+
+
+@pytest.mark.parametrize("path", SPECS, ids=lambda path: path.stem)
+def test_specs_fit_and_act(path: Path, demonstrations: Path, tmp_path: Path, watched: object) -> None:
+    found = fit(short(path, demonstrations), tmp_path / "run", watched)
+    assert found.metrics["engine_check"]["value"] < 1e-6
+    brief = replace(pushing.limited, load=lambda seed: pushing.load_single(seed))
+    (episode,) = play(brief, found.hierarchy, found.spec.rollout, [0], keep=("tip",))
+    levels = LEVELS[path.stem.removeprefix("pushing_")]
+    assert episode.choices.shape == (len(episode.observations["tip"]), levels)
+    lowest = 0 if path.stem == "pushing_hybrid" else 1
+    assert not levels or episode.choices.min() >= lowest
+    assert np.ptp(episode.observations["tip"], axis=0).max() > 1e-3  # the arm moves
+
+
+@pytest.mark.parametrize("path", SPECS, ids=lambda path: path.stem)
+def test_specs_are_checked_against_the_task(path: Path) -> None:
+    spec = load_spec(path)
+    known = dimensions(spec)
+    assert (known.control_size, known.steps) == (3, pushing.GOAL_STEPS)
+    assert check_networks(spec, known).depth == LEVELS[path.stem.removeprefix("pushing_")]

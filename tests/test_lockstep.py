@@ -1,0 +1,97 @@
+"""Episodes played together against the same episodes of a controller played alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import toy_task
+
+from ddco_pyro.controller import Controller
+from ddco_pyro.hierarchy import Hierarchy
+from ddco_pyro.lockstep import play
+from ddco_pyro.rollout import run_episode
+from ddco_pyro.spec import RolloutSpec, parse_spec
+
+SEEDS = (3, 4, 5, 6)
+MEAN = RolloutSpec(control="mean", options="most_likely")
+SHAPES = {"offsets": (4,), "visited": (1,)}
+OBSERVATIONS = [{"key": "offsets", "differences": True}, "visited"]
+
+
+def make(model):
+    """A randomly initialised model of the toy task whose networks see differences."""
+    spec = parse_spec({"demonstrations": {"path": "unused.hdf5"}, "observations": OBSERVATIONS, **model})
+    torch.manual_seed(0)
+    return Hierarchy(spec, SHAPES, 2, steps=toy_task.STEPS)
+
+
+def two_levels(emits):
+    """Two option levels whose callers all emit ``emits``."""
+    levels = [{"name": "low", "count": 3}, {"name": "high", "count": 2, "policy": {"emits": emits}}]
+    return {"hierarchy": {"levels": levels, "meta_policy": {"emits": emits}}}
+
+
+MODELS = {
+    "flat": {"baseline": "flat"},
+    "options": two_levels(["options"]),
+    "hybrid": two_levels(["options", "control"]),
+}
+
+
+def ragged(task):
+    """The task with episodes of different lengths."""
+    return replace(task, load=lambda seed: toy_task.Point(seed, steps=seed))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_together_as_alone(name):
+    task, hierarchy = ragged(toy_task.task), make(MODELS[name])
+    for found in play(task, hierarchy, MEAN, SEEDS, keep=("offsets",)):
+        alone = run_episode(task, Controller.from_spec(hierarchy, MEAN), found.seed)
+        assert found.outcome == alone.outcome
+        np.testing.assert_array_equal(found.choices, alone.choices)
+        np.testing.assert_allclose(found.observations["offsets"], alone.record.observations["offsets"], atol=1e-5)
+
+
+def test_the_hybrid_meta_policy_acts_in_some_step():
+    """Otherwise the test above would not see its control."""
+    found = play(toy_task.task, make(MODELS["hybrid"]), MEAN, range(30))
+    choices = np.concatenate([one.choices for one in found])
+    assert (choices[:, 1] == 0).any() or (choices[:, 0] == 0).any()
+
+
+def test_equal_seeds_draw_equally():
+    sampled, hierarchy = RolloutSpec(control="sample", options="sample"), make(MODELS["hybrid"])
+    groups = (SEEDS, SEEDS, SEEDS[:3])
+    first, again, other = (play(toy_task.task, hierarchy, sampled, seeds, ("offsets",)) for seeds in groups)
+    for one, two in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one.observations["offsets"], two.observations["offsets"])
+    assert not np.array_equal(first[0].observations["offsets"][1], other[0].observations["offsets"][1])
+
+
+def test_sampled_options_have_the_controllers_frequencies():
+    """The first choice of many episodes from one start, together and alone."""
+    task = replace(toy_task.task, load=lambda seed: toy_task.Point(0, steps=1))
+    sampled, hierarchy = RolloutSpec(options="sample"), make(MODELS["options"])
+    together = [tuple(one.choices[0]) for one in play(task, hierarchy, sampled, range(1500))]
+    controller = Controller.from_spec(hierarchy, sampled)
+    alone = [tuple(run_episode(task, controller, seed).choices[0]) for seed in range(500)]
+    for choice in set(alone) | set(together):
+        p, q = together.count(choice) / 1500, alone.count(choice) / 500
+        assert abs(p - q) < 4 * np.sqrt(0.25 / 500 + 0.25 / 1500)
+
+
+def test_environments_are_closed_when_one_fails():
+    made = []
+
+    def load(seed):
+        made.append(toy_task.Point(seed))
+        return made[-1]
+
+    broken = replace(toy_task.task, load=load, outcome=lambda environment: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        play(broken, make(MODELS["flat"]), MEAN, SEEDS)
+    assert [one.closed for one in made] == [True] * len(SEEDS)
