@@ -169,23 +169,20 @@ def _differences(rows: Sequence[Row], ours: str, theirs: str) -> list[str]:
 
 
 def draw_complexity(figure: Figure, rows: Sequence[Row], supervisor: float | None) -> None:
-    """Goals, without and with a limit, against the number of demonstrations."""
-    for axes, measure, title in zip(
-        figure.subplots(1, 2, sharey=True),
-        ("goals", "limited_goals"),
-        ("no limit", "at most 250 steps for each goal"),
-        strict=True,
-    ):
+    """Goals, without and (where it was measured) with a limit, and likelihood against the number of demonstrations."""
+    measures = {"goals": "goals in 2000 steps", "limited_goals": "goals, 250 steps each at most",
+                "log_likelihood_held_out": "held-out nats/step"}  # fmt: skip
+    shown = {key: label for key, label in measures.items() if any(row[key] is not None for row in rows)}
+    counts = sorted({row["demonstrations"] for row in rows})
+    for axes, (measure, label) in zip(figure.subplots(1, len(shown)), shown.items(), strict=True):
         for (method,), own in grouped(rows, "method").items():
             curve(axes, own, "demonstrations", measure, method)
-        if supervisor is not None:
+        if supervisor is not None and "goals" in measure:
             axes.axhline(supervisor, color="k", ls=":", lw=1, label="supervisor")
-        axes.set(xscale="log", xlabel="demonstrations", title=title)
-        counts = sorted({row["demonstrations"] for row in rows})
+        axes.set(xscale="log", xlabel="demonstrations", ylabel=label)
         axes.set_xticks(counts, [str(count) for count in counts])
         axes.minorticks_off()
-    figure.axes[0].set_ylabel("goals in 2000 steps")
-    figure.axes[0].legend(fontsize=7)
+    figure.axes[0].legend(fontsize=7, loc="center left", bbox_to_anchor=(0.0, 0.75))
 
 
 def describe_options(rows: Sequence[Row]) -> list[str]:
