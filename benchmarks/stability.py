@@ -188,7 +188,7 @@ def _variance(value: float, against: dict[str, float | None]) -> str:
 def draw(summaries: dict[str, Any], path: Path) -> None:
     """A row for each spec: log-likelihoods of all seeds, NMI of all pairs, probability of an option."""
     with style():
-        figure = blank(0.5 + 1.5 * len(summaries))
+        figure = blank(0.5 + 1.7 * len(summaries))
         rows = figure.subplots(len(summaries), 3, squeeze=False, sharey=True)
         for (left, middle, right), (name, summary) in zip(rows, summaries.items(), strict=True):
             for place, one in enumerate(summary.values()):
@@ -197,9 +197,9 @@ def draw(summaries: dict[str, Any], path: Path) -> None:
                 _dots(right, place, one["values"]["selects_option"])
             left.set_yticks(range(len(summary)), list(summary))
             left.set_ylim(len(summary) - 0.5, -0.5)
-            left.set_title(f"{name}: held-out nats per step")
-            middle.set(title="NMI of pairs of seeds", xlim=(-0.02, 1.02))
-            right.set(title="P(meta-policy selects an option)", xlim=(-0.02, 1.02))
+            left.set(title=name, xlabel="held-out nats per step")
+            middle.set(xlabel="NMI of pairs of seeds", xlim=(-0.02, 1.02))
+            right.set(xlabel="P(meta-policy selects an option)", xlim=(-0.02, 1.02))
         keep(figure, path, "Quality and structure of fits from different seeds, for each way to train", "")
 
 

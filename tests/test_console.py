@@ -69,3 +69,24 @@ def test_successes(capsys):
     ddco, flat = printed.splitlines()[-2:]
     assert [cell.strip() for cell in ddco.split("│")] == ["ddco", "3/4 [30%, 95%]", "1.50"]
     assert [cell.strip() for cell in flat.split("│")] == ["flat", "3/4 [30%, 95%]", "-"]
+
+
+def test_nothing_is_cut_where_there_is_no_terminal(capsys):
+    name = "runs/" + "long-" * 20 + "name"
+    console.comparison(["rank", "run"], [["0", name]])
+    assert name in capsys.readouterr().out
+
+
+def test_a_selection_says_what_was_kept_failed_and_given_up(clock, capsys):
+    with console.Selecting() as progress:
+        progress.selecting(total=9, kept=2)
+        progress.scored("count = 1", 0, "")
+        progress.scored("count = 2", 0, "it diverged")
+        progress.given_up("count = 3", 4)
+        progress.scored("count = 1", 1, "")
+    lines = capsys.readouterr().err.splitlines()
+    assert all(line.startswith("cross-validation (2 of 9 kept from before): ") for line in lines)
+    said = [line.partition("before): ")[2] for line in lines]
+    assert "count = 2, fold 0 failed: it diverged" in said
+    assert "count = 3: stopped early, 4 folds less" in said
+    assert said[-1].startswith("7/7, at most 0 s left")

@@ -50,29 +50,26 @@ def test_the_mean_is_over_steps_and_not_over_folds():
     assert row.error == pytest.approx(math.sqrt((residual**2).sum() / 2 * 3) / 12)  # that of a ratio of sums
 
 
-def test_the_choice_is_the_smallest_within_one_standard_error():
+def test_the_choice_is_the_smallest_within_one_standard_error_of_the_best():
     base = np.array([0.0, 1.0, 2.0, 3.0])
-    wobble = np.array([0.1, -0.1, 0.1, -0.1])
-    far, near = base - 0.06 + wobble, base - 0.05 + wobble  # the error of a difference is 0.2 / √12 = 0.0577
-    found = rows([far.tolist(), near.tolist(), base.tolist(), near.tolist()])
-    assert 0.05 < found.rows[0].difference[1] < 0.06
+    error = base.std(ddof=1) / 2  # 0.645
+    found = rows([(base - 0.66).tolist(), (base - 0.63).tolist(), base.tolist(), (base - 0.01).tolist()])
+    assert found.best.error == pytest.approx(error)
     assert (found.best.candidate.number, found.chosen.candidate.number) == (2, 1)
-    assert found.chosen.candidate.parameters == 20
+    assert [row["within_one_standard_error"] for row in as_data(found)["candidates"]] == [False, True, True, True]
 
 
-def test_errors_that_go_together_do_not_count():
-    """Each candidate alone is uncertain by 0.6, but one is below the other in every fold."""
+def test_the_paired_difference_is_shown_and_not_the_rule():
+    """The smaller one is below the best in every fold, and yet within the error of the best's mean."""
     base = np.array([0.0, 1.0, 2.0, 3.0])
     found = rows([(base - 0.1).tolist(), base.tolist()])
-    assert found.rows[0].error > 0.5
-    assert found.chosen is found.best is found.rows[1]
+    assert found.rows[0].difference == pytest.approx((-0.1, 0.0), abs=1e-12)
+    assert (found.best, found.chosen) == (found.rows[1], found.rows[0])
 
 
 def test_among_equal_sizes_the_better_one_is_chosen():
-    base, wobble = np.array([0.0, 1.0, 2.0]), np.array([0.1, -0.1, 0.0])
-    found = rows(
-        [(base - 0.02 + wobble).tolist(), (base - 0.01 + wobble).tolist(), base.tolist()], parameters=[5, 5, 9]
-    )
+    base = np.array([0.0, 1.0, 2.0])
+    found = rows([(base - 0.02).tolist(), (base - 0.01).tolist(), base.tolist()], parameters=[5, 5, 9])
     assert (found.best.candidate.number, found.chosen.candidate.number) == (2, 1)
 
 

@@ -19,8 +19,8 @@ from ddco_pyro.selection.scoring import Score
 
 RULE = (
     "chosen: the fewest parameters among the candidates whose mean held-out log-likelihood per step is at most one "
-    "standard error of the paired difference below the best's (the better one where parameters are equal); a candidate "
-    "with a failed fold, or one that was stopped early, is not chosen"
+    "standard error of the best's mean below it (the better one where parameters are equal); a candidate with a failed "
+    "fold, or one that was stopped early, is not chosen"
 )
 
 STOP_FOLDS = 3
@@ -87,18 +87,17 @@ def choose(candidates: Sequence[Candidate], scores: Sequence[Score], folds: int)
     best = max(complete, key=lambda one: one.mean, default=None)
     reference = best or max((one for one in by_candidate.values() if one.good), key=lambda one: one.mean, default=None)
     rows = [one.row(folds, reference) for one in by_candidate.values()]
-    return Choice(rows, rows[best.candidate.number] if best else None, simplest(rows))
+    best_row = rows[best.candidate.number] if best else None
+    within = [row for row in rows if within_one_error(row, best_row)]
+    chosen = min(within, key=lambda row: (row.candidate.parameters, -(row.mean or 0.0)), default=None)
+    return Choice(rows, best_row, chosen)
 
 
-def simplest(rows: Sequence[Row]) -> Row | None:
-    """The one-standard-error choice: the fewest parameters among what is within one standard error of the best."""
-    within = [row for row in rows if within_one_error(row)]
-    return min(within, key=lambda row: (row.candidate.parameters, -(row.mean or 0.0)), default=None)
-
-
-def within_one_error(row: Row) -> bool:
-    """Whether a candidate is complete, and at most one standard error of the paired difference below the best."""
-    return row.status == "scored" and row.difference is not None and -row.difference[0] <= row.difference[1]
+def within_one_error(row: Row, best: Row | None) -> bool:
+    """Whether a candidate is complete, and its mean at most one standard error of the best's mean below that."""
+    if row.status != "scored" or best is None or row.mean is None or best.mean is None or best.error is None:
+        return False
+    return best.mean - row.mean <= best.error
 
 
 class _Scored:
@@ -172,7 +171,7 @@ def as_data(choice: Choice) -> dict[str, Any]:
         "notes": choice.notes,
         "best": choice.best.candidate.number if choice.best else None,
         "chosen": choice.chosen.candidate.number if choice.chosen else None,
-        "candidates": [_row(row) for row in choice.rows],
+        "candidates": [_row(row, choice.best) for row in choice.rows],
         "failed": [
             {"candidate": row.candidate.number, "name": row.candidate.name, "fold": fold, "reason": reason}
             for row in choice.rows
@@ -181,7 +180,7 @@ def as_data(choice: Choice) -> dict[str, Any]:
     }
 
 
-def _row(row: Row) -> dict[str, Any]:
+def _row(row: Row, best: Row | None) -> dict[str, Any]:
     mean, error = row.difference or (None, None)
     return {
         "number": row.candidate.number,
@@ -192,6 +191,6 @@ def _row(row: Row) -> dict[str, Any]:
         "log_likelihood_per_step": row.mean,
         "standard_error": row.error,
         "difference": {"nats_per_step": mean, "standard_error": error},
-        "within_one_standard_error": within_one_error(row),
+        "within_one_standard_error": within_one_error(row, best),
         "folds": [{"fold": fold, "log_likelihood_per_step": value} for fold, value in row.folds.items()],
     }

@@ -25,13 +25,15 @@ def write(choice: Choice, path: Path) -> None:
 
 
 def draw(choice: Choice) -> Figure:
-    """Two panels: log-likelihood of each candidate, and its paired difference to the best with the rule's reach."""
+    """Two panels: log-likelihood of each candidate with the rule's reach, and its paired difference to the best."""
     figure = blank(1.35 + 0.3 * len(choice.rows) + 0.35 * len(choice.notes))
     left, right = figure.subplots(1, 2, sharey=True)
     for place, row in enumerate(choice.rows):
         _mean(left, place, row, choice)
         _difference(right, place, row, choice)
     right.axvline(0, color=FAINT, linewidth=0.8, zorder=1)
+    if choice.best and choice.best.mean is not None and choice.best.error is not None:
+        left.axvspan(choice.best.mean - choice.best.error, choice.best.mean, color=CHOSEN, alpha=0.12, linewidth=0)
     left.set_yticks(np.arange(len(choice.rows)), [_label(row) for row in choice.rows])
     left.set_ylim(len(choice.rows) - 0.4, -0.6)
     left.set(xlabel="held-out log-likelihood (nats per step)", title="Each candidate, ± one standard error")
@@ -76,6 +78,7 @@ def _label(row: Row) -> str:
 
 def _legend(figure: Figure, choice: Choice) -> None:
     """What the marks mean, and the notes."""
-    marks = ["diamond: best", "orange: chosen by the one-standard-error rule", "grey dots: single folds"]
+    marks = ["diamond: best", "orange: chosen, the smallest in the band of one standard error below the best"]
+    marks += ["grey dots: single folds"]
     lines = ["; ".join(marks), *(line for note in choice.notes for line in textwrap.wrap(f"Note: {note}.", 150))]
     figure.supxlabel("\n".join(lines), fontsize=8, color=INK, x=0.01, ha="left")
