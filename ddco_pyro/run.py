@@ -248,7 +248,7 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     if path.exists():
         if path.read_text() != text:
             raise RunError(f"{folder}: holds a run of another spec; choose another --out or remove it")
-        if not resume and _finished(folder):
+        if not resume and _finished(folder) and (folder / "report.html").exists():  # what `fit` writes last
             raise RunError(
                 f"{folder}: holds a run of this spec already; show it with --resume, or choose another --out"
             )

@@ -259,6 +259,8 @@ def test_claiming_a_folder(tmp_path, toy_spec):
     (folder / ".spec.yaml-killed.tmp").touch()  # what a killed process left
     claim(folder, toy_spec, resume=False)
     (folder / "metrics.json").touch()
+    claim(folder, toy_spec, resume=False)  # killed before its report
+    (folder / "report.html").touch()
     claim(folder, toy_spec, resume=True)
     with pytest.raises(RunError, match=r"run: holds a run of this spec already; show it with --resume, or choose"):
         claim(folder, toy_spec, resume=False)
