@@ -2,13 +2,14 @@
 #   make demo     fit the needle spec on this machine's CPU and write its report
 #   make test     lint, then the tests
 #   make bench    what exact inference costs, beside other tools
+#   make docs     the documentation site, in build/site; the commands of its tutorial are run meanwhile
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 STAMP := .venv/.installed
 # A torch wheel without the several GB of CUDA packages. Where this page cannot be reached pip takes torch from its usual index.
 TORCH_CPU := https://download.pytorch.org/whl/cpu/torch/
 
-.PHONY: demo test bench lint format clean .venv
+.PHONY: demo test bench docs lint format clean .venv
 
 # --resume: an interrupted demo goes on where it stopped, a finished one shows its result again.
 demo: $(STAMP)
@@ -22,6 +23,10 @@ test: lint
 bench: $(STAMP)
 	$(BIN)/pip install -q -c constraints.txt -e '.[bench]'
 	$(BIN)/python benchmarks/performance.py
+
+docs: $(STAMP)
+	$(BIN)/pip install -q -c constraints.txt -e '.[docs,export]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -18,8 +18,10 @@ from typing import Annotated, Any
 import typer
 
 from ddco_pyro import console
+from ddco_pyro.commands import incoming, outgoing
+from ddco_pyro.commands.options import AllowCode, RunPath
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.spec import SpecError, dump_spec, load_spec, spec_schema
+from ddco_pyro.spec import SpecError, dump_spec, load_spec, refuse_own_networks, spec_schema
 
 app = typer.Typer(
     add_completion=False,
@@ -32,7 +34,6 @@ SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="The spec, a YAML
 Overrides = Annotated[
     list[str], typer.Option("--set", metavar="KEY=VALUE", help="Another value for a key of the spec; repeatable.")
 ]
-RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a finished fit.", show_default=False)]
 
 
 class Backend(StrEnum):
@@ -50,6 +51,7 @@ def check(
     spec: Annotated[Path | None, typer.Argument(metavar="[SPEC]", help="The spec, a YAML file.")] = None,
     overrides: Overrides = [],  # noqa: B006 (typer reads the default, nobody changes it)
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON Schema of specs instead.")] = False,
+    allow_code: AllowCode = False,
 ) -> None:
     """Print the spec with all defaults, the shapes it works on, and the parameters of each network."""
     if schema:
@@ -58,6 +60,7 @@ def check(
     if spec is None:
         raise SpecError("name a spec, such as: ddco-pyro check specs/needle.yaml")
     found = load_spec(spec, overrides)
+    refuse_own_networks(found, spec, allow_code)
     from ddco_pyro.data import check_networks, dimensions
 
     size = dimensions(found)
@@ -91,10 +94,15 @@ def fit(
     spec: SpecPath,
     out: Annotated[Path | None, typer.Option(help="The run folder; by default runs/SPEC-TIME.")] = None,
     overrides: Overrides = [],  # noqa: B006
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the unfinished run in --out.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Where --out holds this run whole, show it again.")] = False,
+    allow_code: AllowCode = False,
 ) -> None:
-    """Fit the spec's hierarchy and its baselines; write the run folder with its report."""
+    """Fit the spec's hierarchy and its baselines; write the run folder with its report.
+
+    An unfinished run of this very spec in --out is continued.
+    """
     found = load_spec(spec, overrides)
+    refuse_own_networks(found, spec, allow_code)
     from ddco_pyro import run
     from ddco_pyro.data import check_networks, demonstrations, dimensions
     from ddco_pyro.report import degeneracies, write_report
@@ -125,6 +133,7 @@ def select(
     stop_early: Annotated[bool, typer.Option("--stop-early", help="Give hopeless candidates up.")] = False,
     backend: Annotated[Backend, typer.Option(help="Where folds are trained: loky (here) or dask.")] = Backend.LOKY,
     scheduler: Annotated[str | None, typer.Option(help="Address of the dask scheduler, tcp://HOST:PORT.")] = None,
+    allow_code: AllowCode = False,
 ) -> None:
     """Choose among the candidates of the spec's grid by cross-validation; then fit what was chosen to all the data.
 
@@ -133,6 +142,7 @@ def select(
     """
     number = [] if folds is None else [f"selection.folds={folds}"]
     found = load_spec(spec, [*overrides, *number])
+    refuse_own_networks(found, spec, allow_code)
     if (backend is Backend.DASK) != (scheduler is not None):
         raise SpecError("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
     from ddco_pyro import run, selection
@@ -167,12 +177,13 @@ def compare(
         list[Path], typer.Argument(metavar="RUN RUN...", help="Run folders; a run's baselines are some too.")
     ],
     out: Annotated[Path | None, typer.Option(help="The folder to write to; by default runs/compare-TIME.")] = None,
+    allow_code: AllowCode = False,
 ) -> None:
     """Compare runs on the demonstrations that all of them held out, and on rollouts from the same initial states."""
     from ddco_pyro import comparison
     from ddco_pyro.comparison import page
 
-    found = comparison.compare(runs)
+    found = comparison.compare(runs, allow_code)
     console.comparison(page.HEAD, [page.cells(row) for row in found.rows])
     if found.rollouts:
         console.comparison(page.ROLLOUT_HEAD, page.rollout_cells(found))
@@ -185,6 +196,7 @@ def rollout(
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each method; by default the spec's.")] = None,
     video: Annotated[bool, typer.Option("--video", help="Film the first episodes of each method.")] = False,
     jobs: Jobs = -1,
+    allow_code: AllowCode = False,
 ) -> None:
     """Roll the model, its baselines and the spec's scripted policies out from the same initial states."""
     from ddco_pyro.data import demonstrations
@@ -192,7 +204,7 @@ def rollout(
     from ddco_pyro.report import write_report
     from ddco_pyro.run import load
 
-    fitted = load(run)
+    fitted = load(run, allow_code)
     number = episodes or fitted.spec.rollout.episodes
     with console.Rolling(number * len(policies(fitted))) as progress:
         results = roll_out(fitted, number, FILMED if video else 0, progress.episode, jobs)
@@ -205,14 +217,21 @@ FILMED = 3
 
 
 @app.command(epilog="Example: ddco-pyro report runs/needle")
-def report(run: RunPath) -> None:
+def report(run: RunPath, allow_code: AllowCode = False) -> None:
     """Write the report of a run again."""
     from ddco_pyro.data import demonstrations
     from ddco_pyro.report import write_report
     from ddco_pyro.run import load
 
-    fitted = load(run)
+    fitted = load(run, allow_code)
     print(f"report: {write_report(fitted, demonstrations(fitted.spec))}")
+
+
+app.command(epilog="Example: ddco-pyro inspect mine.hdf5")(incoming.inspect)
+app.command(epilog="Example: ddco-pyro init mine.hdf5 --out mine.yaml")(incoming.init)
+app.command("import", epilog="Example: ddco-pyro import pusht --out demos.hdf5")(incoming.import_)
+app.command(epilog="Example: ddco-pyro segment runs/mine mine.hdf5 --html segments.html")(outgoing.segment)
+app.command(epilog="Example: ddco-pyro export runs/mine --out controller --onnx")(outgoing.export)
 
 
 def main() -> None:

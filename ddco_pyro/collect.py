@@ -7,8 +7,10 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.demonstrations import DemonstrationsError, recording_of
+from ddco_pyro.parts import Parts, parts_of
 from ddco_pyro.rollout import run_episodes, summarize
 from ddco_pyro.spec import DemonstrationsSpec
 from ddco_pyro.task import Task, find_task
@@ -26,16 +28,23 @@ def cache_folder() -> Path:
 
 def cache_path(task: Task, name: str, spec: DemonstrationsSpec) -> Path:
     """Where demonstrations of this task, policy, number and seeds are kept: the name changes with the task's code."""
+    return cache_folder() / "demonstrations" / f"{task.name}-{_identity(task, name, spec)[:16]}.hdf5"
+
+
+def _identity(task: Task, name: str, spec: DemonstrationsSpec) -> str:
+    """A digest of all that decides what is recorded."""
     digest = hashlib.sha256(json.dumps([name, spec.supervisor, spec.count, spec.seed]).encode())
     for source in sorted(task.sources):
         digest.update(hashlib.sha256(source.read_bytes()).digest())
-    return cache_folder() / "demonstrations" / f"{task.name}-{digest.hexdigest()[:16]}.hdf5"
+    return digest.hexdigest()
 
 
 def collect(
     task_name: str, spec: DemonstrationsSpec, path: Path | None = None, on_demonstration: OnDemonstration | None = None
 ) -> Path:
     """Record ``spec.count`` demonstrations, unless the file is there already; the path of the file.
+
+    Each is kept as soon as it is recorded: after an interruption the next call goes on with those that are missing.
 
     The root of the file says how often the supervisor succeeded itself (``supervisor``, as JSON).
 
@@ -48,12 +57,22 @@ def collect(
     path = path or cache_path(task, task_name, spec)
     if path.exists():
         return path
-    records, outcomes = [], []
-    for episode in run_episodes(task_name, spec.supervisor, range(spec.seed, spec.seed + spec.count)):
-        records.append(episode.record)
-        outcomes.append(episode.outcome)
-        if on_demonstration:
-            on_demonstration(len(records), spec.count)
-    attributes = {"task": task.name, "policy": spec.supervisor, "supervisor": json.dumps(summarize(outcomes))}
-    Demonstrations(tuple(records), attributes=attributes).write(path)
+    with parts_of(path, _identity(task, task_name, spec), wait=True, at_most=1) as parts:
+        if parts is None:
+            return path
+        seeds = range(spec.seed + len(parts.done), spec.seed + spec.count)
+        for episode in run_episodes(task_name, spec.supervisor, seeds):
+            parts.add(recording_of(episode.record))
+            if on_demonstration:
+                on_demonstration(len(parts.done), spec.count)
+        attributes = {"task": task.name, "policy": spec.supervisor, "supervisor": json.dumps(_summary(parts))}
+        parts.finish(attributes, {}, {})
     return path
+
+
+def _summary(parts: Parts) -> dict[str, Any]:
+    """How often the supervisor succeeded itself."""
+    facts = parts.attributes()
+    return summarize(
+        [{name: float(value) for name, value in one.items() if name not in ("seed", "num_samples")} for one in facts]
+    )

@@ -77,12 +77,16 @@ class _Bar:
 
 
 class Collecting(_Bar):
-    """Shows how many demonstrations have been collected."""
+    """Shows how many demonstrations have been collected, or whatever else is done with them one by one."""
+
+    def __init__(self, label: str = "collecting demonstrations") -> None:
+        super().__init__()
+        self._what = label
 
     def collected(self, done: int, total: int) -> None:
         """So many of the demonstrations have been collected."""
         if self._task is None:
-            self.begin("collecting demonstrations", total)
+            self.begin(self._what, total)
         self.advance(done)
 
 

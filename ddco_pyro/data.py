@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
+
+import torch
 
 from ddco_pyro.collect import OnDemonstration, collect
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.encoding import Shapes
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.networks import ShapeError
-from ddco_pyro.spec import BaselineSpec, Spec, SpecError
+from ddco_pyro.spec import BaselineSpec, Spec, SpecError, own_networks
 from ddco_pyro.task import find_task
 
 
@@ -42,10 +45,46 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
         raise SpecError(
             f"control.scale: has {len(scale)} numbers, but the control has {dimensions.control_size} dimensions"
         )
+    _refuse_giants(spec, dimensions)
     try:
         return Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps)
     except ShapeError as error:
         raise SpecError(str(error)) from error
+
+
+MOST_PARAMETERS = 50_000_000
+"""Of all networks together. Training holds each five times: itself, its gradient, Adam's moments, the best so far."""
+
+MOST_CHOICES = 10_000
+"""Joint choices of all levels, Π(1 + k): every step of a demonstration has so many entries in the inference."""
+
+
+def _refuse_giants(spec: Spec, dimensions: Dimensions) -> None:
+    """A typing error in a size is refused before it fills the memory: networks are made without their numbers first.
+
+    :raises SpecError: the model is larger than any that can be trained here.
+    """
+    choices = math.prod(1 + level.count for level in spec.hierarchy.levels) if spec.hierarchy else 1
+    if choices > MOST_CHOICES:
+        raise SpecError(
+            f"hierarchy.levels: the levels have {choices} joint choices, at most {MOST_CHOICES} can be summed over; "
+            "lower count"
+        )
+    if own_networks(spec):
+        return  # its sizes are its own affair
+    try:
+        with torch.device("meta"):
+            hierarchy = Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps)
+    except ShapeError:
+        return  # it is said better where the networks are made
+    except (RuntimeError, MemoryError, TypeError):  # sizes that no tensor can have
+        parameters = "more parameters than a machine can count"
+    else:
+        number = sum(parameter.numel() for parameter in hierarchy.parameters())
+        if number <= MOST_PARAMETERS:
+            return
+        parameters = f"{number} parameters, more than {MOST_PARAMETERS}"
+    raise SpecError(f"the networks have {parameters}; lower count, hidden, filters or kernel, or scale the images down")
 
 
 def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:

@@ -6,8 +6,6 @@ A file holds groups ``data/<name>`` with ``actions`` [T, A], ``obs/<key>`` [T, .
 
 from __future__ import annotations
 
-import difflib
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,18 +14,21 @@ from typing import Any, overload
 import h5py
 import numpy as np
 
-from ddco_pyro.errors import BadInput
 from ddco_pyro.files import whole_file
-
-Attribute = float | int | str | bool
-
-LARGEST_INFLATION = 1100  # deflate, the strongest of HDF5's usual filters, stores at most 1032 bytes in one
-# What h5py raises for a damaged file.
-_DAMAGE = (OSError, RuntimeError, ValueError, TypeError, KeyError, MemoryError)
-
-
-class DemonstrationsError(BadInput):
-    """Demonstrations that cannot be used; one line with the file, the demonstration and the key."""
+from ddco_pyro.hdf5 import (
+    Attribute,
+    DemonstrationsError,
+    array_at,
+    attributes_of,
+    datasets,
+    member,
+    names_in_mask,
+    natural,
+    nearest,
+    opened,
+    written,
+)
+from ddco_pyro.sources.recording import Recording, of_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,19 +138,12 @@ class Demonstrations(Sequence[Demonstration]):
         :param labels: names of the ground-truth labels to read.
         :raises DemonstrationsError: the file cannot be read or does not hold what was asked for.
         """
-        try:
-            with h5py.File(path, "r") as file:
-                return cls(*_read(file, observations, labels))
-        except DemonstrationsError as error:
-            raise DemonstrationsError(f"{path}: {error}") from None
-        except FileNotFoundError:
-            raise DemonstrationsError(f"{path}: there is no such file; check the path") from None
-        except _DAMAGE as error:
-            raise DemonstrationsError(f"{path}: cannot be read as HDF5, or is damaged: {error}") from error
+        with opened(path) as file:
+            return cls(*_read(file, observations, labels))
 
     def write(self, path: str | Path) -> None:
         """Write an HDF5 file, whole or not at all."""
-        with whole_file(Path(path)) as temporary, h5py.File(temporary, "w") as file:
+        with whole_file(Path(path)) as temporary, written(temporary) as file:
             file.attrs.update(self.attributes)
             data = file.create_group("data")
             data.attrs["total"] = sum(self.lengths)
@@ -253,37 +247,27 @@ def _differ(other: Demonstration, where: str, array: np.ndarray, first: Demonstr
 
 
 def _unknown(name: str, names: Sequence[str]) -> str:
-    return f"there is no demonstration {name!r}{_nearest(name, names)}"
-
-
-def _nearest(name: str, names: Iterable[str]) -> str:
-    close = difflib.get_close_matches(name, list(names), n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""
+    return f"there is no demonstration {name!r}{nearest(name, names)}"
 
 
 # --- HDF5 -------------------------------------------------------------------------------------------------------------
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorts ``demo_2`` before ``demo_10``."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
-
-
 def _read(
     file: h5py.File, observations: Sequence[str] | None, labels: Sequence[str]
 ) -> tuple[tuple[Demonstration, ...], dict[str, tuple[str, ...]], dict[str, Attribute]]:
-    data = _member(file, "data", h5py.Group, "")
-    names = sorted((name for name in data if isinstance(data.get(name), h5py.Group)), key=_natural)
+    data = member(file, "data", h5py.Group, "")
+    names = sorted((name for name in data if isinstance(data.get(name), h5py.Group)), key=natural)
     if not names:
         raise DemonstrationsError("the group 'data' holds no demonstrations; at least one is needed")
     demonstrations = tuple(_read_one(data[name], name, observations, labels) for name in names)
-    masks = _member(file, "mask", h5py.Group, "") if "mask" in file else {}
-    return demonstrations, {mask: _read_mask(masks, mask) for mask in masks}, _attributes(file)
+    masks = member(file, "mask", h5py.Group, "") if "mask" in file else {}
+    return demonstrations, {mask: names_in_mask(masks, mask) for mask in masks}, attributes_of(file)
 
 
 def _read_one(group: h5py.Group, name: str, observations: Sequence[str] | None, labels: Sequence[str]) -> Demonstration:
-    actions = _array(group, "actions", f"{name}: ")
-    attributes = _attributes(group)
+    actions = array_at(group, "actions", f"{name}: ")
+    attributes = attributes_of(group)
     claimed = attributes.pop("num_samples", len(actions))
     if claimed != len(actions):
         raise DemonstrationsError(f"{name}: actions has {len(actions)} steps, but num_samples is {claimed}")
@@ -300,65 +284,8 @@ def _arrays(group: h5py.Group, folder: str, keys: Sequence[str] | None, name: st
     """The arrays ``keys`` of a folder of a demonstration; all of them if None."""
     if keys is not None and not keys:
         return {}
-    members = _member(group, folder, h5py.Group, f"{name}: ")
-    return {key: _array(members, key, f"{name}: {folder}/") for key in (_datasets(members) if keys is None else keys)}
-
-
-def _datasets(group: h5py.Group) -> list[str]:
-    """The names of all datasets below a group; dm_control's own keys have a / in them."""
-    found: list[str] = []
-    group.visititems(lambda name, one: found.append(name) if isinstance(one, h5py.Dataset) else None)
-    return sorted(found)
-
-
-def _array(group: h5py.Group, key: str, where: str) -> np.ndarray:
-    dataset = _member(group, key, h5py.Dataset, where)
-    if dataset.shape is None or dataset.ndim == 0:
-        raise DemonstrationsError(f"{where}{key} has no steps; it has to be an array")
-    # A damaged header can claim any size, and HDF5 would fill what is not in the file with zeros.
-    stored = dataset.id.get_storage_size()
-    if not dataset.is_virtual and dataset.nbytes > LARGEST_INFLATION * stored:
-        raise DemonstrationsError(
-            f"{where}{key} claims {dataset.nbytes} bytes, but the file holds {stored}; write it again"
-        )
-    try:
-        return np.asarray(dataset[()])
-    except _DAMAGE as error:
-        raise DemonstrationsError(f"{where}{key} cannot be read ({error}); the file may be damaged") from error
-
-
-def _member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
-    """A group or a dataset below ``group``."""
-    try:
-        found = group[key]
-    except (KeyError, OSError):
-        known = _datasets(group) if kind is h5py.Dataset else list(group)
-        raise DemonstrationsError(
-            f"{where}{key} is missing{_nearest(key, known)}; there is: {', '.join(known) or 'nothing'}"
-        ) from None
-    if not isinstance(found, kind):
-        raise DemonstrationsError(
-            f"{where}{key} has to be a {kind.__name__.lower()}, not a {type(found).__name__.lower()}"
-        )
-    return found
-
-
-def _read_mask(masks: h5py.Group, mask: str) -> tuple[str, ...]:
-    names = _array(masks, mask, "mask/").ravel().tolist()
-    return tuple(name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names)
-
-
-def _attributes(owner: h5py.HLObject) -> dict[str, Attribute]:
-    """The attributes that hold one number or text. Others are not even read: a damaged one can claim any size."""
-    kinds = {name: owner.attrs.get_id(name) for name in owner.attrs}
-    single = [name for name, kind in kinds.items() if kind.shape == () and _is_number_or_text(kind.dtype)]
-    values = {name: owner.attrs[name] for name in single}
-    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
-    return {name: value for name, value in plain.items() if isinstance(value, Attribute)}
-
-
-def _is_number_or_text(dtype: np.dtype) -> bool:
-    return dtype.kind in "iufb" or h5py.check_string_dtype(dtype) is not None
+    members = member(group, folder, h5py.Group, f"{name}: ")
+    return {key: array_at(members, key, f"{name}: {folder}/") for key in (datasets(members) if keys is None else keys)}
 
 
 def _write(group: h5py.Group, demo: Demonstration) -> None:
@@ -369,3 +296,14 @@ def _write(group: h5py.Group, demo: Demonstration) -> None:
         group.create_dataset(f"obs/{key}", data=array)
     for key, array in demo.labels.items():
         group.create_dataset(f"labels/{key}", data=array)
+
+
+def recording_of(demo: Demonstration) -> Recording:
+    """A demonstration as a recording, to be written by itself."""
+    return Recording(
+        demo.name,
+        {key: of_array(array) for key, array in demo.observations.items()},
+        of_array(demo.actions),
+        {key: of_array(array) for key, array in demo.labels.items()},
+        demo.attributes,
+    )

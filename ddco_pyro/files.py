@@ -1,9 +1,13 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, by one process at a time."""
 
 from __future__ import annotations
 
+import errno
+import fcntl
+import glob
 import json
 import os
+import platform
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,22 +17,109 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from ddco_pyro.errors import BadInput, Failed
+
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR}
+
+
+class NoSpace(Failed):
+    """There is no room for a file; what was there before is as it was."""
+
+
+class NotWritable(BadInput):
+    """A place where nothing may be written."""
+
+
+class Busy(BadInput):
+    """Another process is writing there."""
+
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A temporary name beside ``path``, which takes the place of ``path`` once the block has ended without an error."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}-", suffix=".tmp", dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
+    """A temporary name beside ``path``, which takes the place of ``path`` once the block has ended without an error.
+
+    :raises NoSpace: the disk is full.
+    :raises NotWritable: nothing may be written there.
+    """
+    with _explained(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_stale(path)
+        prefix = f".{path.name}-{platform.node()}-{os.getpid()}-"
+        handle, name = tempfile.mkstemp(prefix=prefix, suffix=_TEMPORARY, dir=path.parent)
+        os.close(handle)
+        temporary = Path(name)
+        try:
+            yield temporary
+            with temporary.open("rb") as written:
+                os.fsync(written.fileno())
+            temporary.chmod(0o644)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+_TEMPORARY = ".tmp"
+
+
+def _remove_stale(path: Path) -> None:
+    """Remove what a process of this machine, killed while it wrote this very file, has left."""
+    prefix = f".{path.name}-{platform.node()}-"
+    for old in path.parent.glob(f"{glob.escape(prefix)}*{_TEMPORARY}"):
+        process = old.name.removeprefix(prefix).partition("-")[0]
+        if process.isdecimal() and not Path(f"/proc/{process}").exists():
+            old.unlink(missing_ok=True)
+
+
+def leftovers(folder: Path) -> list[Path]:
+    """What processes that were killed left of files they were writing in this folder."""
+    return [path for path in folder.glob(f".*{_TEMPORARY}") if path.is_file()]
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """What the system says of a place, in words."""
     try:
-        yield temporary
-        with temporary.open("rb") as written:
-            os.fsync(written.fileno())
-        temporary.chmod(0o644)
-        temporary.replace(path)
+        yield
+    except OSError as error:
+        if error.errno in _FULL:
+            raise NoSpace(f"{path}: there is no room to write it; free some space, then do the same again") from error
+        if error.errno in _FORBIDDEN:
+            text = os.strerror(error.errno)
+            raise NotWritable(f"{path}: cannot be written: {text}; choose another place or change this one") from error
+        raise
+
+
+@contextmanager
+def only_one(folder: Path, wait: bool = False) -> Iterator[None]:
+    """Nobody else writes in this folder, which is made where it is missing, while the block lasts.
+
+    The lock is the system's: it ends with the process, however that ends, and leaves no file behind.
+
+    :param wait: wait for another process to end rather than refuse.
+    :raises Busy: another process holds the folder.
+    :raises NotWritable: the folder cannot be made.
+    """
+    handle = _locked(folder, wait)
+    try:
+        yield
     finally:
-        temporary.unlink(missing_ok=True)
+        os.close(handle)
+
+
+def _locked(folder: Path, wait: bool) -> int:
+    while True:
+        with _explained(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            handle = os.open(folder, os.O_RDONLY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            os.close(handle)
+            raise Busy(f"{folder}: another process is at work on it; wait for it, or choose another place") from None
+        if folder.exists() and os.path.samestat(os.fstat(handle), folder.stat()):
+            return handle
+        os.close(handle)  # who held it has removed it meanwhile
 
 
 def write_text(path: Path, text: str) -> None:

@@ -147,12 +147,17 @@ class Hierarchy(nn.Module):
         """The number D of option levels."""
         return len(self.levels)
 
-    def _levels(self) -> list[Level]:
+    def callers(self) -> list[Caller]:
+        """Who chooses: the policies of each level, lowest first, and the meta-policy."""
+        return [*(level.policy for level in self.option_levels()), self.meta_policy]
+
+    def option_levels(self) -> list[Level]:
+        """The levels of options, lowest first."""
         return [level for level in self.levels if isinstance(level, Level)]
 
     def named_networks(self) -> Iterator[tuple[str, nn.Module]]:
         """Every network by its place in the spec."""
-        for number, level in enumerate(self._levels()):
+        for number, level in enumerate(self.option_levels()):
             yield f"hierarchy.levels.{number}.policy", level.policy
             yield f"hierarchy.levels.{number}.termination", level.termination
         yield "hierarchy.meta_policy" if self.depth else "baseline.policy", self.meta_policy
@@ -162,7 +167,7 @@ class Hierarchy(nn.Module):
 
         :param discovering: d gives levels 1 to d alone under a uniform meta-policy (layer-wise training, SM 2.3).
         """
-        levels = self._levels()[:discovering]
+        levels = self.option_levels()[:discovering]
         decisions = [level.policy(inputs) for level in levels]
         top = _uniform(inputs, levels[-1].count, decisions[0].std) if discovering else self.meta_policy(inputs)
         return Outputs((*decisions, top), tuple(level.termination(inputs).squeeze(-1) for level in levels))

@@ -28,7 +28,7 @@ class Window:
 
         :raises ObservationError: an observation is missing, has an unseen shape, or is not finite.
         """
-        now = {key: _checked(observation, key, shape) for key, shape in self.encoder.shapes.items()}
+        now = {key: self._checked(observation, key, shape) for key, shape in self.encoder.shapes.items()}
         before = self._last or now
         both = self.encoder.inputs([{key: np.stack([before[key], now[key]]) for key in now}])
         images = {key: image[:, 1:] for key, image in both.images.items()}
@@ -36,14 +36,18 @@ class Window:
         self._last, self.time = now, self.time + 1
         return found
 
-
-def _checked(observation: Mapping[str, np.ndarray], key: str, shape: tuple[int, ...]) -> np.ndarray:
-    if key not in observation:
-        known = ", ".join(sorted(observation))
-        raise ObservationError(f"the observation has no {key!r} (it has: {known})")
-    value = np.asarray(observation[key])
-    if value.shape != tuple(shape):
-        raise ObservationError(f"observation {key!r} has shape {value.shape}, the demonstrations had {tuple(shape)}")
-    if not np.isfinite(value).all():
-        raise ObservationError(f"observation {key!r} is not finite")
-    return value
+    def _checked(self, observation: Mapping[str, np.ndarray], key: str, shape: tuple[int, ...]) -> np.ndarray:
+        if key not in observation:
+            known = ", ".join(sorted(observation))
+            raise ObservationError(f"the observation has no {key!r} (it has: {known})")
+        value = np.asarray(observation[key])
+        if value.shape != tuple(shape):
+            raise ObservationError(
+                f"observation {key!r} has shape {value.shape}, the demonstrations had {tuple(shape)}"
+            )
+        if value.dtype.kind not in "fiub" or (key in self.encoder.images and value.dtype != np.uint8):
+            needed = "uint8" if key in self.encoder.images else "numbers"
+            raise ObservationError(f"observation {key!r} is {value.dtype}, it has to be {needed}")
+        if not np.isfinite(value).all():
+            raise ObservationError(f"observation {key!r} is not finite")
+        return value

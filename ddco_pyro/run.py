@@ -26,13 +26,13 @@ from ddco_pyro.data import Dimensions, baseline_spec, build_hierarchy, demonstra
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.encoding import encode
 from ddco_pyro.errors import BadInput
-from ddco_pyro.files import read_tensors, write_tensors, write_text
+from ddco_pyro.files import leftovers, only_one, read_tensors, write_tensors, write_text
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference import Posterior, log_likelihood, posterior, segment
 from ddco_pyro.inference.check import TRAJECTORIES as COMPARED
 from ddco_pyro.inference.check import EngineCheck, compare_engines
 from ddco_pyro.monitor import Monitor
-from ddco_pyro.spec import Spec, dump_spec, load_spec
+from ddco_pyro.spec import Spec, dump_spec, load_spec, own_networks, refuse_own_networks
 from ddco_pyro.training import Trainer, TrainingError, plan
 
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
@@ -81,7 +81,8 @@ class Fit:
     def baselines(self) -> dict[str, Fit]:
         """The baselines that were trained beside it, by name."""
         folders = [self.folder / "baselines" / baseline.kind for baseline in self.spec.compare_with]
-        return {folder.name: load(folder) for folder in folders if _finished(folder)}
+        own = bool(own_networks(self.spec))  # theirs are named in this spec too
+        return {folder.name: load(folder, own) for folder in folders if _finished(folder)}
 
     def log_likelihood(self, demos: Demonstrations) -> np.ndarray:
         """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units."""
@@ -139,19 +140,23 @@ def model_name(spec: Spec) -> str:
     return spec.baseline.kind if spec.baseline else "ddco"
 
 
-def load(folder: str | Path) -> Fit:
+def load(folder: str | Path, allow_code: bool = False) -> Fit:
     """The fit in a run folder.
 
+    :param allow_code: import the networks of one's own (``module:Class``) that its spec names; nothing else in a run
+        is ever executed.
     :raises RunError: the folder has no finished fit, or a damaged one.
+    :raises SpecError: its spec names a network of one's own, and that is not allowed.
     """
     folder = Path(folder)
     missing = [name for name in ("spec.yaml", "model.safetensors", "metrics.json") if not (folder / name).exists()]
     if missing:
-        what = "not a run folder" if "spec.yaml" in missing else "an unfinished run: continue it with --resume"
+        what = "not a run folder" if "spec.yaml" in missing else "an unfinished run: fit it again to continue it"
         if (folder / "folds.json").exists():
             what = f"a selection; the fit of what it chose is in {folder / 'fit'} once it is done"
         raise RunError(f"{folder}: {what} (it has no {missing[0]})")
     spec = load_spec(folder / "spec.yaml")
+    refuse_own_networks(spec, folder / "spec.yaml", allow_code)
     try:
         return Fit(folder, spec, _read_model(spec, folder / "model.safetensors").eval())
     except BadInput:
@@ -178,12 +183,16 @@ def fit(spec: Spec, folder: Path, watcher: Watcher) -> Fit:
     :raises TrainingError: training stopped; nothing that was written before is lost.
     """
     claim(folder, spec)
-    if _finished(folder):
-        return load(folder)
-    clock = _Clock()
-    with clock("demonstrations"):
-        demos = demonstrations(spec, watcher.collected)
-    return _fit(spec, folder, demos, watcher, clock)
+    with only_one(folder):
+        if _finished(folder):
+            return load(folder, allow_code=True)  # it is this very spec, which the caller has
+        for part in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
+            for old in leftovers(part):
+                old.unlink()
+        clock = _Clock()
+        with clock("demonstrations"):
+            demos = demonstrations(spec, watcher.collected)
+        return _fit(spec, folder, demos, watcher, clock)
 
 
 def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, clock: _Clock) -> Fit:
@@ -228,8 +237,10 @@ def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
 def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     """Make the folder this spec's run.
 
-    :param resume: whether it may hold (part of) this very run already.
-    :raises RunError: it holds something else, or may not be resumed.
+    A part of this very run is continued.
+
+    :param resume: whether it may hold all of it already.
+    :raises RunError: it holds something else, or all of it and may not.
     """
     text, path = dump_spec(spec), folder / "spec.yaml"
     if folder.exists() and not folder.is_dir():
@@ -237,10 +248,12 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     if path.exists():
         if path.read_text() != text:
             raise RunError(f"{folder}: holds a run of another spec; choose another --out or remove it")
-        if not resume:
-            raise RunError(f"{folder}: holds a run of this spec already; continue it with --resume")
+        if not resume and _finished(folder):
+            raise RunError(
+                f"{folder}: holds a run of this spec already; show it with --resume, or choose another --out"
+            )
         return
-    if folder.exists() and any(folder.iterdir()):
+    if folder.exists() and set(folder.iterdir()) - set(leftovers(folder)):
         raise RunError(f"{folder}: is not empty and not a run; choose another --out")
     write_text(path, text)
 

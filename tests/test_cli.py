@@ -166,13 +166,18 @@ GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
         (["check", "SPEC", *with_set("observations=[pose]")], r"observations: there is no pose \(there are: offsets, "),
         (["check", "SPEC", *with_set("task=toi")], "no task is registered as 'toi'"),
         (
-            ["check", "SPEC", *with_set(OWN, "hierarchy.levels.0.policy.options={gian: 1}")],
+            ["check", "SPEC", "--allow-code", *with_set(OWN, "hierarchy.levels.0.policy.options={gian: 1}")],
             r"hierarchy\.levels\.0\.policy: network 'test_networks:Own' .*unexpected keyword argument 'gian'",
         ),
         (
             ["check", "SPEC", *with_set("control.scale=[1, 2, 3]")],
             "control.scale: has 3 numbers, but the control has 2",
         ),
+        (
+            ["check", "SPEC", *with_set(OWN)],
+            r"hierarchy\.levels\.0\.policy\.network: 'test_networks:Own' is code that .*--allow-code",
+        ),
+        (["fit", "SPEC", *with_set(OWN)], "'test_networks:Own' is code that would be executed"),
         (["check", "--foo"], "No such option: --foo; see ddco-pyro check --help"),
         (["fit"], "Missing argument 'SPEC'; see ddco-pyro fit --help"),
         (["chekc"], "No such command 'chekc'.*; see ddco-pyro --help"),
@@ -186,7 +191,7 @@ GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
             r"toy\.yaml: names no task, so there is no supervisor to record",
         ),
         (["fit", "SPEC", "--out", "RUN"], "holds a run of another spec; choose another --out or remove it"),
-        (["fit", "RUN/spec.yaml", "--out", "RUN"], "holds a run of this spec already; continue it with --resume"),
+        (["fit", "RUN/spec.yaml", "--out", "RUN"], "holds a run of this spec already; show it with --resume, or"),
         (["fit", "SPEC", "--out", "SPEC"], r"toy\.yaml: is a file; choose another --out"),
         (["select", "SPEC"], "selection.grid: is empty; name what to try, such as selection.grid: {.*}"),
         (["select", "SPEC", "--folds", "1"], "selection.folds: must be at least 2, got 1"),
@@ -238,7 +243,7 @@ def test_an_own_network_of_another_shape_is_refused_before_any_work(spec, tmp_pa
         f"it has to be a tensor [N, T, copies, outputs], here {shapes[1]}\n"
     )
     kept = sorted(cache.rglob("*"))
-    changed = with_set(override, "demonstrations.seed=77")
+    changed = ["--allow-code", *with_set(override, "demonstrations.seed=77")]
     assert call("check", spec, *changed) == (2, "", line)
     assert call("fit", spec, "--out", tmp_path / "run", *changed) == (2, "", line)
     assert not (tmp_path / "run").exists()

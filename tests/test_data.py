@@ -8,7 +8,7 @@ import pytest
 
 from ddco_pyro.data import Dimensions, build_hierarchy, check_networks, demonstrations, dimensions
 from ddco_pyro.demonstrations import Demonstration, Demonstrations, DemonstrationsError
-from ddco_pyro.spec import SpecError, parse_spec
+from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 
 TASK = "toy_task:task"
 SIZE = Dimensions({"offsets": (4,), "camera": (8, 8, 3)}, control_size=2, steps=12)
@@ -118,3 +118,16 @@ def test_only_what_the_spec_names_has_to_be_in_order(path):
     with h5py.File(path, "r+") as file:
         file["data/demo_9/obs/unused"] = np.full((9, 1), np.nan)
     assert dimensions(spec(demonstrations={"path": str(path)})) == Dimensions({"offsets": (7,)}, 3, 9)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"hierarchy.levels.0.policy.hidden": [10**6, 10**6]}, r"the networks have \d+ parameters, more than 50000000"),
+        ({"hierarchy.levels.0.policy.hidden": [10**30]}, "the networks have more parameters than a machine can count"),
+        ({"hierarchy.levels.0.count": 10**9}, "the levels have 1000000001 joint choices, at most 10000"),
+    ],
+)
+def test_a_model_that_fills_the_memory_is_refused_before_it_is_made(toy_spec, overrides, message):
+    with pytest.raises(SpecError, match=message):
+        build_hierarchy(with_overrides(toy_spec, overrides), Dimensions({"offsets": (4,), "visited": (1,)}, 2, 12))

@@ -229,7 +229,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(toy_run, toy_spec, tmp_pat
     folder = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
         fit(toy_spec, folder, Interrupting(epochs))
-    with pytest.raises(RunError, match=r"run: an unfinished run: continue it with --resume"):
+    with pytest.raises(RunError, match=r"run: an unfinished run: fit it again to continue it"):
         ddco_pyro.load(folder)
     fit(toy_spec, folder, Silent())
     for name in ("model.safetensors", "history.csv", "baselines/flat/model.safetensors", "spec.yaml"):
@@ -256,8 +256,11 @@ def test_claiming_a_folder(tmp_path, toy_spec):
     folder = tmp_path / "run"
     claim(folder, toy_spec, resume=False)
     assert (folder / "spec.yaml").read_text() == dump_spec(toy_spec)
+    (folder / ".spec.yaml-killed.tmp").touch()  # what a killed process left
+    claim(folder, toy_spec, resume=False)
+    (folder / "metrics.json").touch()
     claim(folder, toy_spec, resume=True)
-    with pytest.raises(RunError, match=r"run: holds a run of this spec already; continue it with --resume$"):
+    with pytest.raises(RunError, match=r"run: holds a run of this spec already; show it with --resume, or choose"):
         claim(folder, toy_spec, resume=False)
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match=r": is not empty and not a run; choose another --out$"):
@@ -270,8 +273,8 @@ def test_claiming_a_folder(tmp_path, toy_spec):
     ("removed", "message"),
     [
         ("spec.yaml", r"run: not a run folder \(it has no spec\.yaml\)$"),
-        ("model.safetensors", r"run: an unfinished run: continue it with --resume \(it has no model\.safetensors\)$"),
-        ("metrics.json", r"run: an unfinished run: continue it with --resume \(it has no metrics\.json\)$"),
+        ("model.safetensors", r"run: an unfinished run: fit it again to continue it \(it has no model\.safetensors\)$"),
+        ("metrics.json", r"run: an unfinished run: fit it again to continue it \(it has no metrics\.json\)$"),
     ],
 )
 def test_what_is_not_a_finished_run_is_not_loaded(copied, removed, message):

@@ -69,9 +69,10 @@ class Comparison:
         }
 
 
-def compare(folders: Sequence[Path]) -> Comparison:
+def compare(folders: Sequence[Path], allow_code: bool = False) -> Comparison:
     """The runs in these folders (a run's ``baselines/NAME`` is a run too), the best first.
 
+    :param allow_code: import the networks of one's own that their specs name.
     :raises CompareError: there are less than two, or one twice.
     :raises NotShared: they were not held out on the same data.
     :raises RunError: a folder is not a finished run.
@@ -80,7 +81,7 @@ def compare(folders: Sequence[Path]) -> Comparison:
         raise CompareError("the same run is given twice; name each once")
     if len(folders) < 2:
         raise CompareError("one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat")
-    fits = [load(folder) for folder in folders]
+    fits = [load(folder, allow_code) for folder in folders]
     held = held_out(fits)
     values = np.stack([one.values for one in held])
     best = int(values.sum(1).argmax())

@@ -6,6 +6,7 @@ An unknown key, a wrong type or a value out of range is a :class:`SpecError` wit
 from ddco_pyro.spec.hierarchy import BaselineSpec, HierarchySpec, LevelSpec
 from ddco_pyro.spec.messages import SpecError
 from ddco_pyro.spec.networks import MetaPolicySpec, NetworkSpec, PolicySpec
+from ddco_pyro.spec.own_code import own_networks, refuse_own_networks
 from ddco_pyro.spec.reading import dump_spec, load_spec, spec_schema
 from ddco_pyro.spec.settings import (
     ControlSpec,
@@ -40,7 +41,9 @@ __all__ = [
     "TrainingSpec",
     "dump_spec",
     "load_spec",
+    "own_networks",
     "parse_spec",
+    "refuse_own_networks",
     "spec_schema",
     "with_overrides",
 ]

@@ -48,7 +48,7 @@ def load_spec(path: str | Path, overrides: Iterable[str] = ()) -> Spec:
     except OSError as error:
         raise SpecError(f"{path}: cannot be read: {error.strerror}; check the path") from error
     try:
-        data = _read_yaml(content)
+        data = read_yaml(content)
         if data is None:
             raise SpecError("the file is empty; it has to hold a spec")
         if not isinstance(data, dict):
@@ -71,7 +71,11 @@ def spec_schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "ddco-pyro spec"}
 
 
-def _read_yaml(content: bytes | str) -> Any:
+def read_yaml(content: bytes | str) -> Any:
+    """Plain data in YAML text.
+
+    :raises SpecError: it is not YAML.
+    """
     try:
         return plain(yaml.load(content, Loader=_Loader))
     except yaml.MarkedYAMLError as error:
@@ -89,6 +93,6 @@ def _parse_override(text: str) -> tuple[str, Any]:
     if not equals or not path.strip():
         raise SpecError(f"override {text!r}: write it as key.path=value")
     try:
-        return path.strip(), _read_yaml(value)
+        return path.strip(), read_yaml(value)
     except SpecError as error:
         raise SpecError(f"override {text!r}: {error}") from None

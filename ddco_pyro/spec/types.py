@@ -10,7 +10,7 @@ T = TypeVar("T")
 Items = Annotated[tuple[T, ...], Field(strict=False)]  # strict would refuse the lists that YAML gives
 Count = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(gt=0, le=1e30)]  # networks are float32, which ends at 3e38
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 Share = Annotated[float, Field(ge=0, lt=1)]
 Text = Annotated[str, Field(min_length=1)]

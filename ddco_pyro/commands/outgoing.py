@@ -1,0 +1,112 @@
+"""What goes out: ``segment`` and ``export``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ddco_pyro.commands.options import AllowCode, RunPath
+from ddco_pyro.errors import BadInput
+
+if TYPE_CHECKING:
+    from ddco_pyro.run import Fit
+    from ddco_pyro.segmenting import Segmented
+    from ddco_pyro.sources import Source
+
+
+def segment(
+    run: RunPath,
+    demos: Annotated[
+        Path, typer.Argument(metavar="DEMOS", help="Demonstrations: an HDF5 file, or a Minari or LeRobot dataset.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Write labels into this copy of the file, not into the file.", show_default=False),
+    ] = None,
+    csv: Annotated[Path | None, typer.Option(help="A table with a row for each step.", show_default=False)] = None,
+    parquet: Annotated[Path | None, typer.Option(help="The same table as Parquet.", show_default=False)] = None,
+    html: Annotated[
+        Path | None, typer.Option(help="A page with the timeline of every demonstration.", show_default=False)
+    ] = None,
+    lerobot: Annotated[
+        Path | None,
+        typer.Option(help="A copy of the LeRobot dataset with options as subtasks.", show_default=False),
+    ] = None,
+    level: Annotated[
+        str | None, typer.Option(help="The level that gives the subtasks; the lowest by default.", show_default=False)
+    ] = None,
+    allow_code: AllowCode = False,
+) -> None:
+    """Label every step of demonstrations with a run's options: into the file, as a table, as subtasks, as a page."""
+    from ddco_pyro import console
+    from ddco_pyro.run import load
+    from ddco_pyro.segmenting import segments
+    from ddco_pyro.segmenting.hdf5 import write_labels
+    from ddco_pyro.segmenting.page import write_page
+    from ddco_pyro.segmenting.tables import write_csv, write_parquet
+    from ddco_pyro.sources import open_source
+
+    fit = load(run, allow_code)
+    with open_source(demos) as source, console.Collecting("segmenting") as progress:
+        form = source.format
+        if form != "robomimic" and not (csv or parquet or html or lerobot):
+            raise BadInput(f"{demos}: labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot")
+        if lerobot:
+            found = _annotate(fit, source, lerobot, level, progress.collected)
+        else:
+            found = segments(fit, source, progress.collected)
+    if csv:
+        write_csv(csv, found)
+        print(csv)
+    if parquet:
+        write_parquet(parquet, found)
+        print(parquet)
+    if html:
+        write_page(html, found, str(run), str(demos))
+        print(html)
+    if form == "robomimic":
+        write_labels(demos, out or demos, found)
+        print(f"{out or demos}: labels/{', labels/'.join(found.counts)}")
+
+
+def _annotate(
+    fit: Fit, source: Source, out: Path, level: str | None, on_demonstration: Callable[[int, int], None]
+) -> Segmented:
+    """The segments of a LeRobot dataset, after a copy with a level's options as subtasks was written."""
+    from ddco_pyro.segmenting import segments
+
+    if source.format != "lerobot":
+        raise BadInput(f"{source.files[0]}: is no LeRobot dataset; --lerobot annotates a copy of one")
+    from ddco_pyro.segmenting.lerobot import annotate, check_target
+    from ddco_pyro.sources.lerobot import LeRobot
+
+    assert isinstance(source, LeRobot)
+    check_target(source, out)
+    levels = [one.name for one in fit.spec.hierarchy.levels] if fit.spec.hierarchy else []
+    if level is not None and level not in levels:
+        raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(levels)})")
+    found = segments(fit, source, on_demonstration)
+    annotate(source, out, found, level or levels[0])
+    print(out)
+    return found
+
+
+def export(
+    run: RunPath,
+    out: Annotated[Path, typer.Option(help="The folder to write.", show_default=False)],
+    onnx: Annotated[bool, typer.Option("--onnx", help="Write ONNX too (pip install 'ddco-pyro[export]').")] = False,
+    allow_code: AllowCode = False,
+) -> None:
+    """Write the controller as files that need nothing of this library: numpy with a runner, torch.export, ONNX.
+
+    Every form has to act as the original does, to 1e-6, on made-up observations, or nothing is usable.
+    """
+    from ddco_pyro.export import export as write
+    from ddco_pyro.run import load
+
+    for form, (difference, seconds) in write(load(run, allow_code), out, onnx).items():
+        print(f"{form}: largest difference of a control {difference:.1e}, a step takes {1e3 * seconds:.3f} ms")
+    print(f"{out}: try it with: python {out / 'runner.py'} {out}")

@@ -1,0 +1,253 @@
+"""Runs an exported controller with numpy alone. This file stands by itself: it is copied beside what it runs.
+
+    from runner import Runner
+
+    controller = Runner(".")
+    controller.reset(seed=0)
+    control = controller.act({"state": state})    # [A], in the control's own units
+    controller.choices, controller.terminations   # active options, lowest level first, and their ψ
+
+``python runner.py [FOLDER]`` replays the episodes in ``check.npz`` and says by how much it differs from the original.
+Networks of one's own, which numpy cannot evaluate, run with ``Runner(".", networks="onnx")`` and onnxruntime.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Outputs = dict[str, np.ndarray]
+"""``selection_d`` log-probabilities [K, 1 + k], ``termination_d`` ψ [k], ``control_d`` means [K, A]; d counts levels
+from 0, and the last d is the meta-policy."""
+
+Networks = Callable[[np.ndarray, int, Mapping[str, np.ndarray]], Outputs]
+"""Features [F], step, and images by key to :data:`Outputs`."""
+
+
+class Runner:
+    """An exported controller: :meth:`reset`, then :meth:`act` with each observation.
+
+    :param networks: ``numpy``, or ``onnx`` to evaluate the networks with onnxruntime.
+    """
+
+    def __init__(self, folder: str | Path, networks: str = "numpy") -> None:
+        folder = Path(folder)
+        self.about: dict[str, Any] = json.loads((folder / "controller.json").read_text(encoding="utf-8"))
+        self._networks: Networks = NumpyNetworks(folder, self.about) if networks == "numpy" else OnnxNetworks(folder)
+        self.reset()
+
+    def reset(self, seed: int = 0) -> None:
+        """Begin an episode. Equal seeds and observations give equal controls."""
+        self.seed, self.time = seed, 0
+        self.choices: tuple[int, ...] = ()
+        self.terminations: tuple[float, ...] = ()
+        self._last: dict[str, np.ndarray] | None = None
+
+    def act(self, observation: Mapping[str, Any]) -> np.ndarray:
+        """The control [A], in the control's own units.
+
+        :raises ValueError: an observation is missing, has an unseen shape or is not finite.
+        """
+        now = {one["key"]: _checked(observation, one) for one in self.about["observations"]}
+        features = self._features(now, self._last or now)
+        images = {one["key"]: now[one["key"]] for one in self.about["observations"] if one["image"]}
+        outputs = self._networks(features, self.time, images)
+        generator = np.random.default_rng([self.seed, self.time])
+        self.choices = self._choose(outputs, generator)
+        self.terminations = tuple(
+            float(outputs[f"termination_{level}"][choice - 1]) if choice else 1.0
+            for level, choice in enumerate(self.choices)
+        )
+        self._last, self.time = now, self.time + 1
+        return self._control(outputs, generator)
+
+    def _features(self, now: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray]) -> np.ndarray:
+        parts = [np.zeros(0)]
+        for one in self.about["observations"]:
+            if not one["image"]:
+                value = now[one["key"]].astype(np.float64).ravel()
+                parts.append(value)
+                if one["differences"]:
+                    parts.append(value - before[one["key"]].astype(np.float64).ravel())
+        return np.concatenate(parts)
+
+    def _choose(self, outputs: Outputs, generator: np.random.Generator) -> tuple[int, ...]:
+        """Terminations go bottom-up, selections top-down; at the first step everything is selected."""
+        depth, terminated = len(self.about["levels"]), [True] * len(self.about["levels"])
+        if self.choices:
+            below = True
+            for level, choice in enumerate(self.choices):
+                psi = float(outputs[f"termination_{level}"][choice - 1]) if choice else 1.0
+                ends = self._pick(np.array([1 - psi, psi] if below else [1.0, 0.0]), generator)
+                terminated[level] = below = bool(ends)
+        found, caller = [0] * depth, 0
+        for level in reversed(range(depth)):
+            table = outputs[f"selection_{level + 1}"]
+            if level < depth - 1 and caller == 0:
+                probabilities = np.eye(table.shape[-1])[0]  # below control there is nothing left to choose
+            else:
+                probabilities = np.exp(table[caller - 1 if level < depth - 1 else 0].astype(np.float64))
+            if not terminated[level]:
+                probabilities = np.eye(len(probabilities))[self.choices[level]]
+            caller = found[level] = self._pick(probabilities, generator)
+        return tuple(found)
+
+    def _pick(self, probabilities: np.ndarray, generator: np.random.Generator) -> int:
+        if self.about["options"] == "most_likely":
+            return int(probabilities.argmax())
+        total = np.cumsum(probabilities)
+        return int((total <= generator.random() * total[-1]).sum())
+
+    def _control(self, outputs: Outputs, generator: np.random.Generator) -> np.ndarray:
+        """The mean of the lowest level whose choice is an option, else of the meta-policy, or a sample around it."""
+        level, actor = next(((d, h - 1) for d, h in enumerate(self.choices) if h > 0), (len(self.choices), 0))
+        found: np.ndarray = outputs[f"control_{level}"][actor]
+        if self.about["control"] == "sample":
+            found = found + np.array(self.about["std"][level]) * generator.standard_normal(len(found))
+        return found
+
+
+def _checked(observation: Mapping[str, Any], one: Mapping[str, Any]) -> np.ndarray:
+    key, shape = one["key"], tuple(one["shape"])
+    if key not in observation:
+        raise ValueError(f"the observation has no {key!r} (it has: {', '.join(sorted(observation))})")
+    value = np.asarray(observation[key])
+    if value.shape != shape:
+        raise ValueError(f"observation {key!r} has shape {value.shape}, the demonstrations had {shape}")
+    if value.dtype.kind not in "fiub" or (one["image"] and value.dtype != np.uint8):
+        raise ValueError(f"observation {key!r} is {value.dtype}, it has to be {'uint8' if one['image'] else 'numbers'}")
+    if not np.isfinite(value).all():
+        raise ValueError(f"observation {key!r} is not finite")
+    return value
+
+
+class NumpyNetworks:
+    """Every network of the hierarchy, from ``weights.npz``."""
+
+    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
+        if not about["numpy"]:
+            raise ValueError('it has networks that numpy cannot evaluate: use Runner(..., networks="onnx")')
+        with np.load(folder / "weights.npz", allow_pickle=False) as file:
+            self._weights = {name: file[name] for name in file.files}
+        self._about = about
+
+    def __call__(self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray]) -> Outputs:
+        """The outputs of every network for one observation."""
+        weights, depth = self._weights, len(self._about["levels"])
+        vector = ((features - weights["mean"]) / weights["deviation"]).astype(np.float32)
+        found: Outputs = {}
+        for level, one in enumerate(self._about["callers"]):
+            out = self._network(one["network"], f"caller_{level}", vector, step, images)
+            logits, mean = out[:, : one["logits"]], out[:, one["logits"] :]
+            if one["choices"]:
+                found[f"selection_{level}"] = _selection(logits, one)
+            if mean.shape[1]:
+                found[f"control_{level}"] = mean.astype(np.float64) * weights["scale"] + weights["shift"]
+            if level < depth:
+                raw = self._network(self._about["terminations"][level], f"end_{level}", vector, step, images)[:, 0]
+                bound = np.float32(self._about["termination_bound"])
+                found[f"termination_{level}"] = 1 / (1 + np.exp(-(bound * np.tanh(raw / bound)).astype(np.float64)))
+        return found
+
+    def _network(
+        self, kind: Mapping[str, Any], name: str, vector: np.ndarray, step: int, images: Mapping[str, np.ndarray]
+    ) -> np.ndarray:
+        """[K, outputs] of K networks."""
+        copies = kind["copies"]
+        values = np.broadcast_to(vector, (copies, 1, len(vector)))
+        if kind["network"] == "conv":
+            maps = [self._convolved(kind, f"{name}.{key}", images[key]) for key in kind["images"]]
+            values = np.concatenate([values, *(one[:, None] for one in maps)], axis=2)
+        first = min(step, kind["steps"] - 1) * copies if kind["network"] == "per_timestep" else 0
+        for layer in range(kind["layers"]):
+            weight, bias = self._weights[f"{name}.{layer}.weight"], self._weights[f"{name}.{layer}.bias"]
+            values = values @ weight[first : first + copies] + bias[first : first + copies]
+            if layer < kind["layers"] - 1:
+                values = np.maximum(values, 0)
+        return values[:, 0]
+
+    def _convolved(self, kind: Mapping[str, Any], name: str, image: np.ndarray) -> np.ndarray:
+        """Convolution with stride 2, ReLU, and means over ``pooled`` × ``pooled`` fields, [K, filters · pooled²]."""
+        weight, bias = self._weights[f"{name}.weight"], self._weights[f"{name}.bias"]
+        size, pooled = weight.shape[-1], kind["pooled"]
+        padded = np.pad(image.astype(np.float32) / 255, ((size // 2,) * 2, (size // 2,) * 2, (0, 0)))
+        windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(0, 1))[::2, ::2]
+        maps = np.maximum(np.einsum("hwcij,fcij->fhw", windows, weight, optimize=True) + bias[:, None, None], 0)
+        rows, columns = (_fields(length, pooled) for length in maps.shape[1:])
+        means = np.stack([[maps[:, a:b, c:d].mean((1, 2)) for c, d in columns] for a, b in rows])
+        return means.transpose(2, 0, 1).reshape(kind["copies"], -1)
+
+
+def _fields(length: int, number: int) -> list[tuple[int, int]]:
+    return [(i * length // number, -((i + 1) * length // -number)) for i in range(number)]
+
+
+def _selection(logits: np.ndarray, one: Mapping[str, Any]) -> np.ndarray:
+    """Log-probabilities of control and of each option; -inf for what this caller does not emit."""
+    if not one["logits"]:
+        return np.array([[0.0] + [-np.inf] * one["choices"]] * len(logits))
+    shifted = logits - logits.max(1, keepdims=True)
+    found = shifted - np.log(np.exp(shifted).sum(1, keepdims=True))
+    return found if one["hybrid"] else np.insert(found, 0, -np.inf, axis=1)
+
+
+class OnnxNetworks:
+    """Every network of the hierarchy, from ``controller.onnx``."""
+
+    def __init__(self, folder: Path) -> None:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        self._session = onnxruntime.InferenceSession(str(folder / "controller.onnx"), options)
+        self._inputs = {one.name for one in self._session.get_inputs()}
+        self._outputs = [one.name for one in self._session.get_outputs()]
+
+    def __call__(self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray]) -> Outputs:
+        """The outputs of every network for one observation."""
+        given = {"features": features, "step": np.array([step], np.int64)}
+        given |= {f"image_{number}": image for number, image in enumerate(images.values())}
+        values = self._session.run(self._outputs, {name: one for name, one in given.items() if name in self._inputs})
+        return dict(zip(self._outputs, values, strict=True))
+
+
+def replay(controller: Runner, episodes: Mapping[str, np.ndarray]) -> tuple[float, float]:
+    """Act on recorded observations again: the largest difference of a control (infinite where another option is
+    active), and the median seconds of a step.
+
+    Differences are in the control's own units, but in its spread where that is above 1: networks are float32.
+    """
+    largest, seconds = 0.0, []
+    unit = np.maximum(1.0, controller.about["scale"])
+    for number, seed in enumerate(episodes["seeds"]):
+        controller.reset(int(seed))
+        for step in range(len(episodes[f"controls_{number}"])):
+            prefix = f"observation_{number}_"
+            seen = {key.removeprefix(prefix): one[step] for key, one in episodes.items() if key.startswith(prefix)}
+            start = time.perf_counter()
+            control = controller.act(seen)
+            seconds.append(time.perf_counter() - start)
+            same = list(controller.choices) == episodes[f"choices_{number}"][step].tolist()
+            difference = (np.abs(control - episodes[f"controls_{number}"][step]) / unit).max()
+            largest = max(largest, float(difference) if same else np.inf)
+    return largest, float(np.median(seconds))
+
+
+def main() -> None:
+    """Replay the recorded episodes."""
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
+    networks = sys.argv[2] if len(sys.argv) > 2 else "numpy"
+    with np.load(folder / "check.npz", allow_pickle=False) as file:
+        difference, seconds = replay(Runner(folder, networks), {name: file[name] for name in file.files})
+    print(f"largest difference of a control: {difference:.1e}; a step takes {1e3 * seconds:.3f} ms")
+    sys.exit(0 if difference < 1e-6 else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,138 @@
+"""Labels for demonstrations: the options of a run, step by step, and what they can be written as."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.encoding import STEPS_AT_ONCE, encode
+from ddco_pyro.errors import BadInput
+from ddco_pyro.hdf5 import DemonstrationsError, nearest
+from ddco_pyro.inference import most_likely_path, posterior
+from ddco_pyro.run import Fit
+from ddco_pyro.sources import Recording, Source
+
+__all__ = ["LevelLabels", "Segmented", "Segments", "segments"]
+
+
+@dataclass(frozen=True)
+class LevelLabels:
+    """One level over one demonstration of T steps.
+
+    :param options: choices of the most likely path [T]: 1 to k, 0 where the caller emits the control itself.
+    :param boundaries: whether a choice is made anew at this step [T], be it the same again; true at the first.
+    :param probability: of that choice at that step, given the whole demonstration [T].
+    """
+
+    options: np.ndarray
+    boundaries: np.ndarray
+    probability: np.ndarray
+
+    def runs(self) -> list[tuple[int, int, int]]:
+        """(option, first step, step after the last) of each segment."""
+        starts = np.flatnonzero(self.boundaries).tolist()
+        return [(int(self.options[a]), a, b) for a, b in zip(starts, [*starts[1:], len(self.options)], strict=True)]
+
+
+@dataclass(frozen=True)
+class Segments:
+    """One demonstration: its levels by name, lowest first, and the labels it had, name to [T]."""
+
+    name: str
+    levels: dict[str, LevelLabels]
+    labels: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.levels.values())).options)
+
+
+@dataclass(frozen=True)
+class Segmented:
+    """All demonstrations of a source. ``counts`` has the number of options of each level by name."""
+
+    segments: tuple[Segments, ...]
+    counts: dict[str, int]
+    frequency: float | None
+
+    def __len__(self) -> int:
+        return len(self.segments)
+
+
+def segments(
+    fit: Fit, source: Source, on_demonstration: Callable[[int, int], None] = lambda done, total: None
+) -> Segmented:
+    """The options of a run over every demonstration of a source, some at a time.
+
+    :raises BadInput: the run has no options, or was fitted to other observations.
+    :raises DemonstrationsError: a demonstration cannot be used.
+    """
+    hierarchy = fit.spec.hierarchy
+    if hierarchy is None:
+        raise BadInput(f"{fit.folder}: is a {fit.name} policy without options; name a run with a hierarchy")
+    counts = {level.name: level.count for level in hierarchy.levels}
+    found: list[Segments] = []
+    for group in _groups(source, fit):
+        found += _segment(fit, group, tuple(counts))
+        on_demonstration(len(found), len(source.names))
+    return Segmented(tuple(found), counts, source.frequency)
+
+
+def _groups(source: Source, fit: Fit) -> Iterator[list[Demonstration]]:
+    """Demonstrations of about so many steps together as the networks take at once."""
+    group: list[Demonstration] = []
+    for name in source.names:
+        demo = _demonstration(source.recording(name), fit)
+        if group and (len(group) + 1) * max(len(demo), *map(len, group)) > STEPS_AT_ONCE:
+            yield group
+            group = []
+        group.append(demo)
+    yield group
+
+
+def _demonstration(recording: Recording, fit: Fit) -> Demonstration:
+    """What the run's networks see of a recording, and its ground-truth labels.
+
+    :raises DemonstrationsError: it lacks an observation, or one or its control has another shape than was fitted to.
+    """
+    shapes, known = fit.hierarchy.encoder.shapes, recording.observations
+    for key, shape in shapes.items():
+        if key not in known:
+            there = ", ".join(known)
+            raise DemonstrationsError(
+                f"{recording.name}: there is no observation {key!r}{nearest(key, known)}, which the run was fitted to; "
+                f"there is: {there}"
+            )
+        _check_shape(f"{recording.name}: obs/{key}", known[key].shape[1:], tuple(shape))
+    _check_shape(f"{recording.name}: actions", recording.actions.shape[1:], (len(fit.hierarchy.scaling.scale),))
+    labels = {
+        key: one.array() for key, one in recording.labels.items() if one.dtype.kind in "iub" and len(one.shape) == 1
+    }
+    return Demonstration(recording.name, {key: known[key].array() for key in shapes}, recording.actions.array(), labels)
+
+
+def _check_shape(where: str, found: tuple[int, ...], fitted: tuple[int, ...]) -> None:
+    if tuple(found) != fitted:
+        raise DemonstrationsError(f"{where} has shape {found} at each step, the run was fitted to {fitted}")
+
+
+def _segment(fit: Fit, group: list[Demonstration], names: tuple[str, ...]) -> Iterator[Segments]:
+    alike = [Demonstration(demo.name, demo.observations, demo.actions) for demo in group]
+    hierarchy = fit.hierarchy
+    with torch.no_grad():
+        batch = encode(Demonstrations(tuple(alike)), hierarchy.encoder, hierarchy.scaling)
+        tables = hierarchy.tabulate(batch)
+        path = most_likely_path(tables, batch.lengths)
+        active = posterior(tables, batch.lengths).u
+    for row, demo in enumerate(group):
+        steps = np.arange(len(demo))
+        levels = {}
+        for name, options, ended, u in zip(names, path.choices, path.terminations, active, strict=True):
+            chosen, anew = options[row, : len(demo)].numpy(), ended[row, : len(demo)].numpy() == 1
+            anew[0] = True
+            probability = np.minimum(u[row].numpy()[steps, chosen], 1.0)  # rounding can exceed it
+            levels[name] = LevelLabels(chosen, anew, probability)
+        yield Segments(demo.name, levels, dict(demo.labels))

@@ -1,0 +1,262 @@
+"""Damaged specs and files of demonstrations, by seed, and a process in which they are tried."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import random
+import select
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import yaml
+from random_demonstrations import demonstrations
+
+SECONDS = 60
+"""A file that keeps the process busy for longer hangs."""
+
+VALUES: tuple[Any, ...] = (
+    None, True, -1, 0, 1, 3, 10**6, 10**12, 10**40, -0.0, 1e-320, 1e308, float("nan"), float("inf"), "", " ", "x",
+    "x" * 9999, "linear", "mlp", "conv", "per_timestep", "os:system", "a:b:c", "state", "\u0000", "é\U0001f9ea", "1e3",
+    [], [[]], [1, "a"], [None], {}, {"a": {}}, {"learn": True}, {"network": "mlp"}, ["options", "control"], "../../x",
+)  # fmt: skip
+
+
+# --- specs ------------------------------------------------------------------------------------------------------------
+
+
+def damaged_spec(base: dict[str, Any], seed: int) -> bytes:
+    """The text of a spec with some things wrong, or right in another way."""
+    choose = random.Random(seed)
+    data = json.loads(json.dumps(base))
+    for _ in range(choose.randint(1, 3)):
+        _damage_data(data, choose)
+    text = yaml.safe_dump(data, allow_unicode=True, sort_keys=choose.random() < 0.5).encode()
+    return _damage_bytes(text, choose) if choose.random() < 0.25 else text
+
+
+def _places(node: Any) -> Iterator[tuple[Any, Any]]:
+    """Every container with each of its keys."""
+    for key in list(node) if isinstance(node, dict) else range(len(node)):
+        yield node, key
+        if isinstance(node[key], dict | list):
+            yield from _places(node[key])
+
+
+def _damage_data(data: dict[str, Any], choose: random.Random) -> None:
+    places = list(_places(data))
+    if not places:
+        return
+    node, key = choose.choice(places)
+    other_node, other_key = choose.choice(places)
+    how = choose.randrange(6)
+    if how == 0:
+        del node[key]
+    elif how == 1 and isinstance(node, dict):
+        name = str(key)
+        at = choose.randrange(len(name) + 1)
+        node[name[:at] + choose.choice("xs_. ") + name[at + 1 :]] = node.pop(key)
+    elif how == 2:
+        node[key] = json.loads(json.dumps(other_node[other_key]))
+    elif how == 3 and isinstance(node, list):
+        node.insert(key, json.loads(json.dumps(node[key])))
+    else:
+        node[key] = choose.choice(VALUES)
+
+
+def _damage_bytes(content: bytes, choose: random.Random) -> bytes:
+    damaged = bytearray(content)
+    for _ in range(choose.randint(1, 4)):
+        if not damaged:
+            break
+        at = choose.randrange(len(damaged))
+        end = min(at + choose.choice([1, 2, 8, 64, 512]), len(damaged))
+        how = choose.randrange(5)
+        if how == 0:
+            damaged[at] = choose.randrange(256)
+        elif how == 1:
+            del damaged[at:end]
+        elif how == 2:
+            damaged[at:at] = bytes(choose.randrange(256) for _ in range(choose.choice([1, 4, 8])))
+        elif how == 3:
+            damaged[at:end] = bytes([choose.choice([0, 255])]) * (end - at)
+        else:
+            damaged[at] ^= 1 << choose.randrange(8)
+    return bytes(damaged[: choose.randrange(len(damaged) + 1)] if choose.random() < 0.1 else damaged)
+
+
+# --- files of demonstrations ------------------------------------------------------------------------------------------
+
+
+def damaged_file(path: Path, seed: int) -> None:
+    """Write a file of demonstrations with something wrong, or right in another way."""
+    choose = random.Random(seed)
+    demonstrations(4, {"train": ("demo_0", "demo_1"), "valid": ("demo_2",)}).write(path)
+    if choose.random() < 0.3:
+        with h5py.File(path, "r+") as file:
+            for group in file["data"].values():
+                camera = group["obs/camera"][()]
+                del group["obs/camera"]
+                group.create_dataset("obs/camera", data=camera, chunks=(1, *camera.shape[1:]), compression="gzip")
+    if choose.random() < 0.5:
+        with h5py.File(path, "r+") as file:
+            for _ in range(choose.randint(1, 3)):
+                with contextlib.suppress(ValueError, OSError, RuntimeError, KeyError, TypeError):
+                    choose.choice(EDITS)(file, choose)
+    else:
+        path.write_bytes(_damage_bytes(path.read_bytes(), choose))
+
+
+Edit = Callable[[h5py.File, random.Random], None]
+
+
+def _anything(file: h5py.File, choose: random.Random) -> str:
+    found: list[str] = []
+    file.visit(found.append)
+    return choose.choice(found or ["data"])
+
+
+def _replace(make: Callable[[random.Random], Any]) -> Edit:
+    def edit(file: h5py.File, choose: random.Random) -> None:
+        place = _anything(file, choose)
+        if place in file:
+            del file[place]
+        file[place] = make(choose)
+
+    return edit
+
+
+def _remove(file: h5py.File, choose: random.Random) -> None:
+    place = _anything(file, choose)
+    if place in file:
+        del file[place]
+
+
+def _huge(file: h5py.File, choose: random.Random) -> None:
+    place = _anything(file, choose)
+    if place in file:
+        del file[place]
+    steps = choose.choice([10**9, 10**15])
+    file.create_dataset(place, shape=(steps, 3), chunks=(1024, 3), dtype=choose.choice(["f8", "u1"]),
+                        compression=choose.choice([None, "gzip"]))  # fmt: skip
+
+
+def _bomb(file: h5py.File, choose: random.Random) -> None:
+    """Zeros that take little room in the file, and very much in memory."""
+    place = f"data/demo_0/obs/bomb{choose.randrange(9)}"
+    if place not in file and "data/demo_0/obs" in file:
+        file.create_dataset(place, shape=(4, 10**8), chunks=(1, 10**7), dtype="u1", compression="gzip", fillvalue=0)
+
+
+def _loop(file: h5py.File, choose: random.Random) -> None:
+    place = _anything(file, choose)
+    group = file.get(place, file)
+    if isinstance(group, h5py.Group):
+        group[f"again{choose.randrange(9)}"] = choose.choice(
+            [file["/"], h5py.SoftLink("/data"), h5py.SoftLink("nowhere"), h5py.ExternalLink("none.hdf5", "/")]
+        )
+
+
+def _attribute(file: h5py.File, choose: random.Random) -> None:
+    place = _anything(file, choose)
+    values = [np.nan, -1, 10**18, "x" * 9999, np.zeros((50, 50)), h5py.Empty("f8"), b"\xff\xfe", "{", 7]
+    if place in file:
+        names = ["num_samples", "env_args", "control_frequency", "total", "segmented_by", "imported"]
+        file[place].attrs[choose.choice(names)] = choose.choice(values)
+
+
+def _rename(file: h5py.File, choose: random.Random) -> None:
+    place = _anything(file, choose)
+    if place in file:
+        file.move(place, place + choose.choice(["x", "\n", " ", "é", "/y", "[red]", "<b>"]))
+
+
+DTYPES = ("i1", "f2", "c16", "?", "u8")
+
+EDITS: tuple[Edit, ...] = (
+    _remove, _remove, _huge, _bomb, _loop, _attribute, _attribute, _rename,
+    _replace(lambda choose: np.full((choose.randint(0, 5), 2), choose.choice([np.nan, np.inf, 1e308, 0.0]))),
+    _replace(lambda choose: np.zeros((choose.randint(0, 5),) * choose.randint(0, 4), choose.choice(DTYPES))),
+    _replace(lambda choose: np.zeros(4, dtype=[("a", "f8"), ("b", "S3")])),
+    _replace(lambda choose: [b"demo_0", b"demo_9", b"\xff"]),
+    _replace(lambda choose: h5py.Empty("f8")),
+    _replace(lambda choose: np.array(["a", "bb"], dtype=object)),
+    _replace(lambda choose: np.zeros((4, 0))),
+)  # fmt: skip
+
+
+# --- where they are tried ---------------------------------------------------------------------------------------------
+
+WORKER = """
+import json, resource, sys, traceback
+from pathlib import Path
+import ddco_pyro.demonstrations, ddco_pyro.inspection, ddco_pyro.starting, ddco_pyro.importing
+from ddco_pyro.errors import BadInput
+from ddco_pyro.sources.recording import BLOCK_BYTES
+
+def tried(what):
+    try:
+        what()
+        return "fine"
+    except BadInput as error:
+        return "refused" if "\\n" not in str(error) else f"more than one line: {error!r}"
+    except BaseException:
+        return traceback.format_exc()
+
+print("ready", flush=True)
+for line in sys.stdin:
+    path = Path(line.strip())
+    out = path.with_suffix(".imported")
+    def started():
+        ddco_pyro.starting.starting_spec(ddco_pyro.inspection.inspect(path), path)
+    found = [
+        tried(lambda: ddco_pyro.demonstrations.Demonstrations.read(path)),
+        tried(started),
+        tried(lambda: ddco_pyro.importing.import_demonstrations(path, out)),
+    ]
+    out.unlink(missing_ok=True)
+    print(json.dumps([found, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss]), flush=True)
+"""
+
+
+class Worker:
+    """A process that reads files; one that dies or hangs is the file's fault, and is replaced."""
+
+    def __init__(self) -> None:
+        self.process: subprocess.Popen[str] | None = None
+
+    def try_file(self, path: Path) -> list[str]:
+        """How each way to read a file ended: ``fine``, ``refused``, or what went wrong."""
+        if self.process is None:
+            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+            self.process = subprocess.Popen([sys.executable, "-c", WORKER], text=True, **pipes)  # type: ignore[call-overload]
+            assert self._line() == "ready\n"
+        assert self.process is not None
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{path}\n")
+        self.process.stdin.flush()
+        answer = self._line()
+        if not answer:
+            status = self.process.poll()
+            self.close()
+            return [f"died or hung ({status})"]
+        found, peak = json.loads(answer)
+        return found if peak < 2 * 2**20 else [f"took {peak} KiB of memory"]
+
+    def _line(self) -> str:
+        assert self.process is not None
+        assert self.process.stdout is not None
+        ready, _, _ = select.select([self.process.stdout], [], [], SECONDS)
+        return self.process.stdout.readline() if ready else ""
+
+    def close(self) -> None:
+        """End the process."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.communicate()
+            self.process = None

@@ -1,0 +1,47 @@
+"""What the documentation shows is so: its examples, the commands that it names, the keys that its tables list."""
+
+from __future__ import annotations
+
+import doctest
+import re
+from pathlib import Path
+
+import pytest
+import typer
+
+import ddco_pyro
+from ddco_pyro.cli import app
+from ddco_pyro.spec import spec_schema
+
+ROOT = Path(ddco_pyro.__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+@pytest.mark.parametrize("page", ["docs/model.md"])
+def test_examples_give_what_is_shown(page: str) -> None:
+    found = doctest.testfile(str(ROOT / page), module_relative=False)
+    assert found.failed == 0
+    assert found.attempted > 0
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_every_command_and_option_that_is_named_exists(page: Path) -> None:
+    group = typer.main.get_command(app)
+    for name, rest in re.findall(r"ddco-pyro ([a-z]+)\b([^`\n|]*)", page.read_text()):
+        assert name in group.commands, name
+        known = {option for one in group.commands[name].params for option in one.opts}
+        assert set(re.findall(r"--[a-z-]+", rest)) <= known | {"--help", "--debug"}, rest
+
+
+def test_the_site_is_generated_from_the_code() -> None:
+    """The pages that ``make docs`` generates, where what it needs is installed."""
+    pytest.importorskip("mkdocs")
+    pytest.importorskip("latex2mathml")
+    hooks: dict[str, object] = {"__file__": str(ROOT / "docs" / "hooks.py")}
+    exec(compile((ROOT / "docs" / "hooks.py").read_text(), "hooks.py", "exec"), hooks)
+    spec, commands = hooks["spec_page"](), hooks["command_page"]()  # type: ignore[operator]
+    for key in spec_schema()["properties"]:
+        assert f"| `{key}` |" in spec
+    for name, command in typer.main.get_command(app).commands.items():
+        assert f"\n## {name}\n" in commands
+        assert all(one.opts[0] in commands for one in command.params if one.param_type_name == "option")

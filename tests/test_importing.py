@@ -1,0 +1,317 @@
+"""Files that robomimic, LeRobot and Minari themselves wrote, imported: every number is there, interrupted or not.
+
+How ``fixtures/`` was made: ``fixtures/write_robomimic.py`` and ``fixtures/write_lerobot.py``.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import gymnasium
+import h5py
+import minari
+import numpy as np
+import pyarrow.parquet as parquet
+import pytest
+from gymnasium import spaces
+from minari.data_collector.episode_buffer import EpisodeBuffer
+from random_demonstrations import demonstrations
+from test_cli import call
+
+from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.errors import BadInput
+from ddco_pyro.importing import Choice, import_demonstrations
+from ddco_pyro.inspection import inspect
+
+FIXTURES = Path(__file__).parent / "fixtures"
+ROBOMIMIC, LEROBOT = FIXTURES / "robomimic.hdf5", FIXTURES / "lerobot"
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "demos.hdf5"
+
+
+# --- robomimic --------------------------------------------------------------------------------------------------------
+
+
+def test_a_file_of_robomimics_is_read_as_it_is() -> None:
+    demos = Demonstrations.read(ROBOMIMIC)
+    with h5py.File(ROBOMIMIC) as file:
+        for demo in demos:
+            np.testing.assert_array_equal(demo.actions, file[f"data/{demo.name}/actions"])
+            np.testing.assert_array_equal(demo.observations["object"], file[f"data/{demo.name}/obs/object"])
+    assert demos.observation_shapes == {"agentview_image": (12, 10, 3), "object": (2,), "robot0_eef_pos": (2,)}
+    assert set(demos.masks) == {"train", "valid", "better"}
+    assert inspect(ROBOMIMIC).frequency == 20
+
+
+def test_robomimic_in_this_layout(out: Path) -> None:
+    found = import_demonstrations(ROBOMIMIC, out)
+    assert found.names == tuple(f"demo_{number}" for number in range(6))
+    before, after = Demonstrations.read(ROBOMIMIC), Demonstrations.read(out)
+    assert after.masks == before.masks
+    for one, other in zip(before, after, strict=True):
+        assert (one.name, one.attributes) == (other.name, other.attributes)
+        np.testing.assert_array_equal(one.actions, other.actions)
+        for key, array in one.observations.items():
+            np.testing.assert_array_equal(array, other.observations[key])
+    with h5py.File(out) as file, h5py.File(ROBOMIMIC) as source:
+        assert file["data"].attrs["env_args"] == source["data"].attrs["env_args"]
+        assert file["data/demo_0/obs/object"].dtype == np.float32
+        assert file["data/demo_0/obs/robot0_eef_pos"].dtype == np.float64
+        assert file.attrs["control_frequency"] == 20
+        assert "next_obs" not in file["data/demo_0"]
+
+
+def test_a_filter_key_some_observations_and_smaller_pictures(out: Path) -> None:
+    choice = Choice(("object", "agentview_image"), mask="better", image_size=(6, 5))
+    import_demonstrations(ROBOMIMIC, out, choice=choice)
+    demos = Demonstrations.read(out)
+    assert demos.names == ("demo_0", "demo_1", "demo_2")
+    assert demos.observation_shapes == {"agentview_image": (6, 5, 3), "object": (2,)}
+    assert all(set(names) <= set(demos.names) for names in demos.masks.values())
+    before = Demonstrations.read(ROBOMIMIC)[0].observations["agentview_image"]
+    halved = before.reshape(-1, 6, 2, 5, 2, 3).mean((2, 4))
+    np.testing.assert_allclose(demos[0].observations["agentview_image"], halved, atol=1)
+
+
+# --- LeRobot ----------------------------------------------------------------------------------------------------------
+
+
+def test_lerobot_without_its_videos(out: Path) -> None:
+    import_demonstrations(LEROBOT, out)
+    demos = Demonstrations.read(out)
+    assert demos.lengths == (5, 6, 7, 8)
+    assert demos.observation_shapes == {"state": (3,), "images/wrist": (8, 10, 3)}
+    for episode, demo in enumerate(demos):
+        steps = np.arange(len(demo))
+        np.testing.assert_array_equal(demo.observations["state"][:, :2], [[episode, step] for step in steps])
+        np.testing.assert_allclose(demo.actions, np.stack([0.1 * steps, np.full(len(demo), -0.1 * episode)], 1), 1e-6)
+        picture = demo.observations["images/wrist"]
+        assert (picture[..., 0] == 50 * episode).all()
+        assert (picture[:, 0, 0, 1:] == 10 * steps[:, None]).all()
+        assert demo.attributes["task"] == ("push the block" if episode % 2 else "pull the block")
+    with h5py.File(out) as file:
+        assert (file.attrs["control_frequency"], file.attrs["robot_type"]) == (10, "point")
+
+
+def test_lerobots_videos_frame_by_frame(out: Path) -> None:
+    import_demonstrations(LEROBOT, out, choice=Choice(("images/top",)))
+    for episode, demo in enumerate(Demonstrations.read(out)):
+        brightness = demo.observations["images/top"].mean((1, 2, 3))
+        np.testing.assert_allclose(brightness, 40 * episode + 5 * np.arange(len(demo)), atol=1.5)
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    return shutil.copytree(LEROBOT, tmp_path / "dataset")
+
+
+def test_lerobot_splits_and_subtasks(dataset: Path, out: Path) -> None:
+    info = dataset / "meta" / "info.json"
+    said = json.loads(info.read_text()) | {"splits": {"train": "0:3", "val": "3:4"}}
+    info.write_text(json.dumps(said))
+    data = next((dataset / "data").rglob("*.parquet"))
+    table = parquet.read_table(data)
+    parquet.write_table(table.append_column("subtask_index", table["frame_index"]), data)
+    import_demonstrations(dataset, out)
+    demos = Demonstrations.read(out, labels=["subtask"])
+    assert demos.masks == {"train": ("demo_0", "demo_1", "demo_2"), "valid": ("demo_3",)}
+    np.testing.assert_array_equal(demos[3].labels["subtask"], np.arange(8))
+
+
+def remove_video(dataset: Path) -> None:
+    next((dataset / "videos").rglob("*.mp4")).unlink()
+
+
+def older(dataset: Path) -> None:
+    info = dataset / "meta" / "info.json"
+    info.write_text(info.read_text().replace('"v3.0"', '"v2.1"'))
+
+
+def cut(dataset: Path) -> None:
+    data = next((dataset / "data").rglob("*.parquet"))
+    data.write_bytes(data.read_bytes()[:-100])
+
+
+def no_rows(dataset: Path) -> None:
+    data = next((dataset / "data").rglob("*.parquet"))
+    parquet.write_table(parquet.read_table(data).slice(6), data)
+
+
+def no_json(dataset: Path) -> None:
+    (dataset / "meta" / "info.json").write_text("{")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (remove_video, r"file-000\.mp4: the video is missing; leave its observation out with --observation"),
+        (older, r"is a LeRobot dataset v2\.1, and v3\.x can be read; convert it with LeRobot's own script first"),
+        (cut, r"demo_0: cannot be read, or is damaged"),
+        (no_rows, r"the rows of episode 0 are missing or not together"),
+        (no_json, r"info\.json: cannot be read, or is damaged"),
+    ],
+)
+def test_a_damaged_lerobot_dataset_is_refused(dataset: Path, out: Path, change, message: str) -> None:
+    change(dataset)
+    with pytest.raises(DemonstrationsError, match=message):
+        import_demonstrations(dataset, out, choice=Choice(videos=True))
+    assert not out.exists()
+
+
+# --- Minari -----------------------------------------------------------------------------------------------------------
+
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari.*")
+
+
+@pytest.fixture
+def written_by_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Makes a dataset with Minari: its folder, and the buffers it was made of."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+
+    def make(action: gymnasium.Space) -> tuple[Path, list[EpisodeBuffer]]:
+        random = np.random.default_rng(0)
+        arm = spaces.Dict({"joints": spaces.Box(-9, 9, (3,), np.float64)})
+        space = spaces.Dict(
+            {"arm": arm, "camera": spaces.Box(0, 255, (32, 32, 3), np.uint8), "goal": spaces.Discrete(4)}
+        )
+        action.seed(0)
+        buffers = []
+        for episode in range(4):
+            steps = 5 + episode
+            observations = {
+                "arm": {"joints": random.normal(size=(steps + 1, 3))},
+                "camera": np.full((steps + 1, 32, 32, 3), 60 * episode, np.uint8),
+                "goal": np.full(steps + 1, episode),
+            }
+            actions = np.stack([action.sample() for _ in range(steps)])
+            ends = np.arange(steps) == steps - 1
+            buffers.append(
+                EpisodeBuffer(episode, 7 + episode, None, observations, actions, np.ones(steps), ends, ~ends, {})
+            )
+        minari.create_dataset_from_buffers("arm/reach-v0", buffers, observation_space=space, action_space=action)
+        return tmp_path / "arm" / "reach-v0", buffers
+
+    return make
+
+
+def test_minari(written_by_minari, out: Path) -> None:
+    folder, buffers = written_by_minari(spaces.Box(-1, 1, (2,)))
+    import_demonstrations(folder, out)
+    demos = Demonstrations.read(out)
+    assert demos.lengths == (5, 6, 7, 8)
+    for buffer, demo in zip(buffers, demos, strict=True):
+        np.testing.assert_array_equal(demo.actions, buffer.actions)
+        np.testing.assert_array_equal(demo.observations["arm/joints"], buffer.observations["arm"]["joints"][:-1])
+        np.testing.assert_array_equal(demo.observations["goal"][:, 0], buffer.observations["goal"][:-1])
+        np.testing.assert_allclose(demo.observations["camera"], buffer.observations["camera"][:-1], atol=2)  # JPEG
+        assert demo.attributes["seed"] == buffer.seed
+    for other in (folder / "data", folder / "data" / "main_data.hdf5"):
+        assert inspect(other).format == "minari"
+
+
+def test_minari_with_actions_that_are_no_numbers_is_refused(written_by_minari, out: Path) -> None:
+    folder, _ = written_by_minari(spaces.Discrete(3))
+    with pytest.raises(DemonstrationsError, match="demo_0: actions are int64, they have to be one array of reals"):
+        import_demonstrations(folder, out)
+
+
+def test_minaris_environment_is_never_made(written_by_minari, out: Path) -> None:
+    """Without its spaces in the metadata, Minari would run the environment that the data names."""
+    folder, _ = written_by_minari(spaces.Box(-1, 1, (2,)))
+    path = folder / "data" / "metadata.json"
+    metadata = json.loads(path.read_text())
+    del metadata["observation_space"]
+    path.write_text(json.dumps(metadata | {"env_spec": '{"id": "x-v0", "entry_point": "antigravity:x"}'}))
+    with pytest.raises(DemonstrationsError, match=r"metadata\.json does not say its observation and action spaces"):
+        import_demonstrations(folder, out)
+
+
+# --- whole or not at all, and resumed ---------------------------------------------------------------------------------
+
+
+class Stopped(Exception):
+    pass
+
+
+def stop_after(number: int):
+    def on_recording(done: int, total: int) -> None:
+        if done == number:
+            raise Stopped
+
+    return on_recording
+
+
+@pytest.mark.parametrize("number", [1, 2, 5])
+def test_an_interrupted_import_goes_on(out: Path, tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ddco_pyro.parts.PART_BYTES", 8000)  # one or two demonstrations in a part
+    whole = tmp_path / "whole.hdf5"
+    import_demonstrations(ROBOMIMIC, whole)
+    with pytest.raises(Stopped):
+        import_demonstrations(ROBOMIMIC, out, on_recording=stop_after(number))
+    assert not out.exists()
+    kept = sorted((tmp_path / ".demos.hdf5.parts").glob("*.hdf5"))
+    times = [path.stat().st_mtime_ns for path in kept]
+    with pytest.raises(Stopped):
+        import_demonstrations(ROBOMIMIC, out, on_recording=stop_after(6))
+    assert [path.stat().st_mtime_ns for path in kept] == times  # not made again
+    import_demonstrations(ROBOMIMIC, out)
+    assert out.read_bytes() == whole.read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["demos.hdf5", "whole.hdf5"]
+
+
+def test_parts_of_another_import_are_not_used(out: Path, tmp_path: Path) -> None:
+    with pytest.raises(Stopped):
+        import_demonstrations(ROBOMIMIC, out, choice=Choice(("object",)), on_recording=stop_after(6))
+    import_demonstrations(ROBOMIMIC, out)
+    assert set(Demonstrations.read(out).observation_shapes) == {"agentview_image", "object", "robot0_eef_pos"}
+
+
+def test_an_import_that_is_there_is_left_alone_and_nothing_else_replaced(out: Path) -> None:
+    first = import_demonstrations(ROBOMIMIC, out)
+    before = out.stat().st_mtime_ns
+    assert import_demonstrations(ROBOMIMIC, out).names == first.names
+    assert out.stat().st_mtime_ns == before
+    with pytest.raises(BadInput, match=r"demos\.hdf5: is there already and is not this import"):
+        import_demonstrations(ROBOMIMIC, out, choice=Choice(mask="train"))
+
+
+# --- what cannot be used ----------------------------------------------------------------------------------------------
+
+
+def test_broken_demonstrations_are_refused_or_left_out(tmp_path: Path, out: Path) -> None:
+    source = tmp_path / "source.hdf5"
+    demonstrations(5, {"valid": ("demo_1", "demo_2")}).write(source)
+    with h5py.File(source, "r+") as file:
+        file["data/demo_1/actions"][0, 0] = np.nan
+        del file["data/demo_3/obs/pose"]
+    with pytest.raises(DemonstrationsError, match=r"demo_1: actions has NaN or .*; or leave such ones out with --skip"):
+        import_demonstrations(source, out)
+    ended = call("import", source, "--out", out, "--skip-broken")
+    assert (ended.status, ended.out) == (0, f"{out}: 3 demonstrations\n")
+    assert "left out demo_1: demo_1: actions has NaN or infinite values" in ended.err
+    assert "left out demo_3: demo_3: obs/pose is missing, which demo_0 has" in ended.err
+    demos = Demonstrations.read(out)
+    assert (demos.names, demos.masks) == (("demo_0", "demo_2", "demo_4"), {"valid": ("demo_2",)})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--mask", "bettr"], "there is no mask 'bettr' (did you mean 'better'?); there is: better, train, valid"),
+        (["--observation", "objct"], "demo_0: there is no observation 'objct' (did you mean 'object'?); there is: "),
+        (["--format", "lerobot"], "info.json: cannot be read, or is damaged"),
+        (["--format", "minari"], "cannot be read, or is damaged"),
+        (["--image-size", "3"], "Invalid value for '--image-size'"),
+    ],
+)
+def test_wrong_choices_are_refused_in_one_line(out: Path, arguments: list[str], message: str) -> None:
+    ended = call("import", ROBOMIMIC, "--out", out, *arguments)
+    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
+    assert message in ended.err
+    assert not out.exists()

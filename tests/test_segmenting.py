@@ -1,0 +1,259 @@
+"""What ``segment`` writes, against the fit's own segments: into HDF5, tables, LeRobot's subtasks, a page."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pyarrow.parquet as parquet
+import pytest
+import yaml
+from test_cli import call
+from test_run import Silent
+
+import ddco_pyro
+from ddco_pyro.data import demonstrations
+from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.importing import import_demonstrations
+from ddco_pyro.run import fit
+from ddco_pyro.segmenting import Segmented, segments
+from ddco_pyro.sources import open_source
+from ddco_pyro.spec import parse_spec
+
+LEROBOT = Path(__file__).parent / "fixtures" / "lerobot"
+SPEC = """
+demonstrations: {path: PATH, valid_fraction: 0.25}
+observations: [state]
+control: {std: 0.5}
+hierarchy:
+  levels:
+    - {name: skill, count: 2, policy: {network: linear}}
+    - {name: phase, count: 2, policy: {network: linear, emits: [options, control]}}
+  meta_policy: {network: linear}
+training: {epochs: 2, batch_size: 3}
+"""
+
+
+@pytest.fixture
+def file(toy_spec, toy_run, tmp_path):
+    """The toy task's demonstrations, with their labels."""
+    path = tmp_path / "demos.hdf5"
+    demonstrations(toy_spec).write(path)
+    return path
+
+
+def look(run: Path, demos: Path) -> Segmented:
+    with open_source(demos) as source:
+        return segments(ddco_pyro.load(run), source)
+
+
+@pytest.mark.parametrize("at_once", [8192, 1])
+def test_they_are_the_fits_own(toy_run, toy_spec, file, at_once, monkeypatch):
+    monkeypatch.setattr("ddco_pyro.segmenting.STEPS_AT_ONCE", at_once)
+    demos = demonstrations(toy_spec)
+    (path,) = toy_run.segment(demos)
+    (u,) = toy_run.posterior(demos).u
+    found = look(toy_run.folder, file)
+    assert [one.name for one in found.segments] == list(demos.names)
+    for row, (one, demo) in enumerate(zip(found.segments, demos, strict=True)):
+        level = one.levels["option"]
+        np.testing.assert_array_equal(level.options, path[row, : len(demo)])
+        np.testing.assert_allclose(level.probability, u[row, np.arange(len(demo)), level.options], rtol=1e-6)
+        assert level.boundaries[0]
+        assert level.boundaries[1:][np.diff(level.options) != 0].all()
+        assert [option for option, a, b in level.runs() for _ in range(a, b)] == level.options.tolist()
+        np.testing.assert_array_equal(one.labels["phase"], demo.labels["phase"])
+
+
+def test_labels_go_into_the_file_and_are_read_from_there(toy_run, file):
+    before = Demonstrations.read(file, labels=["phase"])
+    ended = call("segment", toy_run.folder, file)
+    assert (ended.status, ended.out) == (0, f"{file}: labels/option\n")
+    after = Demonstrations.read(file, labels=["phase", "option", "option_boundary"])
+    for one, demo, was in zip(look(toy_run.folder, file).segments, after, before, strict=True):
+        np.testing.assert_array_equal(demo.labels["option"], one.levels["option"].options)
+        np.testing.assert_array_equal(demo.labels["option_boundary"], one.levels["option"].boundaries)
+        np.testing.assert_array_equal(demo.labels["phase"], was.labels["phase"])
+        np.testing.assert_array_equal(demo.actions, was.actions)
+    time = file.stat().st_mtime_ns
+    assert call("segment", toy_run.folder, file).status == 0
+    assert file.stat().st_mtime_ns == time  # it has these labels already
+
+
+def test_a_copy_is_labelled_and_the_file_left_alone(toy_run, file, tmp_path):
+    before = file.read_bytes()
+    copy = tmp_path / "labelled.hdf5"
+    assert call("segment", toy_run.folder, file, "--out", copy).status == 0
+    assert file.read_bytes() == before
+    assert Demonstrations.read(copy, labels=["option"]).names == Demonstrations.read(file).names
+
+
+def test_labels_from_elsewhere_are_never_replaced(toy_run, file):
+    with h5py.File(file, "r+") as opened:
+        opened["data/demo_3/labels/option"] = np.zeros(len(opened["data/demo_3/actions"]), int)
+    before = file.read_bytes()
+    ended = call("segment", toy_run.folder, file)
+    assert ended.status == 2
+    assert "demo_3: labels/option is there already and was not written by ddco-pyro segment" in ended.err
+    assert file.read_bytes() == before
+
+
+def test_tables_have_a_row_for_each_step(toy_run, file, tmp_path):
+    with h5py.File(file, "r+") as opened:
+        opened.attrs["control_frequency"] = 20.0
+    table, binary = tmp_path / "segments.csv", tmp_path / "segments.parquet"
+    assert call("segment", toy_run.folder, file, "--csv", table, "--parquet", binary).status == 0
+    found = look(toy_run.folder, file)
+    rows = list(csv.DictReader(table.open()))
+    assert list(rows[0]) == ["demonstration", "step", "seconds", "option", "option_boundary", "option_probability"]
+    assert len(rows) == sum(len(one) for one in found.segments)
+    at = 0
+    for one in found.segments:
+        part, level = rows[at : at + len(one)], one.levels["option"]
+        assert {row["demonstration"] for row in part} == {one.name}
+        assert [int(row["option"]) for row in part] == level.options.tolist()
+        assert [row["option_boundary"] == "1" for row in part] == level.boundaries.tolist()
+        assert [float(row["option_probability"]) for row in part] == level.probability.tolist()
+        assert [float(row["seconds"]) for row in part] == [step / 20 for step in range(len(one))]
+        at += len(one)
+    columns = parquet.read_table(binary).to_pylist()
+    assert [{key: str(value) for key, value in row.items()} for row in columns] == rows
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_shows_every_segment(toy_run, file, tmp_path):
+    page = tmp_path / "segments.html"
+    assert call("segment", toy_run.folder, file, "--html", page).status == 0
+    text, found = page.read_text(), look(toy_run.folder, file)
+    assert len(re.findall('class="demonstration"', text)) == len(found)
+    titles = re.findall(r'title="option (\d), steps (\d+) to (\d+), probability', text)
+    runs = [run for one in found.segments for run in one.levels["option"].runs()]
+    assert [(int(o), int(a), int(b) + 1) for o, a, b in titles] == runs
+    assert "http" not in text
+    assert "<script" not in text
+
+
+def test_the_page_escapes_what_it_shows(toy_run, tmp_path, toy_spec):
+    path = tmp_path / "<img src=x>.hdf5"
+    demonstrations(toy_spec).write(path)
+    with h5py.File(path, "r+") as opened:
+        opened.move("data/demo_0", "data/<script>alert(1)<%script>")
+        for group in opened["data"].values():
+            group.move("labels/phase", "labels/<b>phase")
+    page = tmp_path / "segments.html"
+    assert call("segment", toy_run.folder, path, "--html", page).status == 0
+    text = page.read_text()
+    assert "&lt;script&gt;alert(1)&lt;%script&gt;" in text
+    assert "&lt;b&gt;phase" in text
+    assert not re.search("<script|<img|<b>", text)
+
+
+# --- LeRobot ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def lerobot_run(tmp_path_factory):
+    """A run of two levels on the LeRobot fixture, imported."""
+    folder = tmp_path_factory.mktemp("lerobot")
+    import_demonstrations(LEROBOT, folder / "demos.hdf5")
+    spec = parse_spec(yaml.safe_load(SPEC.replace("PATH", str(folder / "demos.hdf5"))))
+    return fit(spec, folder / "run", Silent())
+
+
+def files(folder):
+    return {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()}
+
+
+def test_lerobot_subtasks(lerobot_run, tmp_path):
+    """``fixtures/write_lerobot.py`` says how the dataset was made; LeRobot 0.4.4 reads what is written here."""
+    out = tmp_path / "annotated"
+    ended = call("segment", lerobot_run.folder, LEROBOT, "--lerobot", out, "--level", "phase")
+    assert (ended.status, ended.out) == (0, f"{out}\n")
+    found = look(lerobot_run.folder, LEROBOT)
+    assert list(found.counts.items()) == [("skill", 2), ("phase", 2)]
+    table = parquet.read_table(next((out / "data").rglob("*.parquet"))).to_pylist()
+    for one in found.segments:
+        rows = [row for row in table if row["episode_index"] == int(one.name[5:])]
+        assert [row["subtask_index"] for row in rows] == one.levels["phase"].options.tolist()
+    names = parquet.read_table(out / "meta" / "subtasks.parquet").to_pylist()
+    assert [row["subtask"] for row in names] == ["control", "phase 1", "phase 2"]
+    info = json.loads((out / "meta" / "info.json").read_text())
+    assert info["features"]["subtask_index"] == {"dtype": "int64", "shape": [1], "names": None}
+    before = json.loads((LEROBOT / "meta" / "info.json").read_text())
+    del info["features"]["subtask_index"]
+    assert info == before
+    rest = {path.relative_to(LEROBOT) for path in LEROBOT.rglob("*") if path.is_file()}
+    assert {path.relative_to(out) for path in out.rglob("*") if path.is_file()} == rest | {
+        Path("meta/subtasks.parquet")
+    }
+    with open_source(out) as source:  # and it can be read here again
+        np.testing.assert_array_equal(
+            source.recording("demo_2").labels["subtask"].array(), found.segments[2].levels["phase"].options
+        )
+    for wrong, message in (
+        ([LEROBOT, "--lerobot", out], "annotated: is there already; choose another --lerobot"),
+        ([out, "--lerobot", tmp_path / "twice"], "has subtasks already; name a dataset without them"),
+        (
+            [LEROBOT, "--lerobot", tmp_path / "x", "--level", "skil"],
+            "there is no level 'skil' (there is: skill",
+        ),
+        ([LEROBOT], "labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot"),
+    ):
+        ended = call("segment", lerobot_run.folder, *wrong)
+        assert (ended.status, ended.err.count("\n")) == (2, 1)
+        assert message in ended.err
+
+
+# --- what cannot be segmented -----------------------------------------------------------------------------------------
+
+
+def reshape(group):
+    steps = len(group["actions"])
+    del group["obs/offsets"]
+    group["obs/offsets"] = np.zeros((steps, 3))
+
+
+def rename(group):
+    group.move("obs/offsets", "obs/offset")
+
+
+def narrow(group):
+    steps = len(group["actions"])
+    del group["actions"]
+    group["actions"] = np.zeros((steps, 1))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (reshape, "demo_0: obs/offsets has shape (3,) at each step, the run was fitted to (4,)"),
+        (rename, "demo_0: there is no observation 'offsets' (did you mean 'offset'?), which the run was fitted to"),
+        (narrow, "demo_0: actions has shape (1,) at each step, the run was fitted to (2,)"),
+    ],
+)
+def test_other_demonstrations_are_refused(toy_run, file, change, message):
+    with h5py.File(file, "r+") as opened:
+        for group in opened["data"].values():
+            change(group)
+    ended = call("segment", toy_run.folder, file)
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert message in ended.err
+
+
+def test_a_policy_without_options_is_refused(toy_run, file):
+    ended = call("segment", toy_run.folder / "baselines" / "flat", file)
+    assert ended.status == 2
+    assert "is a flat policy without options; name a run with a hierarchy" in ended.err
+
+
+def test_a_copied_run_names_nothing_of_this_machine(toy_run, file, tmp_path):
+    """A run that was moved segments as before."""
+    moved = shutil.copytree(toy_run.folder, tmp_path / "moved")
+    assert call("segment", moved, file, "--csv", tmp_path / "a.csv").status == 0
