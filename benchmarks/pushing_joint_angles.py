@@ -1,6 +1,6 @@
 """Trajectories in joint-angle space: the supervisor's by the goal's side, a fitted hierarchy's by its active option.
 
-    python benchmarks/pushing_joint_angles.py [--demonstrations 80] [--seed 0] [--runs DIR] [--out DIR]
+    python benchmarks/pushing_joint_angles.py [--demonstrations 40] [--seed 0] [--runs DIR] [--out DIR]
 
 After the paper's figure of backhand and forehand (SM 1.1). The hierarchy is a cell of ``pushing_studies.py``, which is
 fitted if it has not been. Writes ``joint_angles.png`` and ``joint_angles.json``: how often option and side agree.
@@ -53,7 +53,7 @@ def draw(panels: dict[str, tuple[Sequence[Coloured], dict[int, str]]]) -> Figure
 def main() -> None:
     """Draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--demonstrations", type=int, default=80)
+    parser.add_argument("--demonstrations", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=Path, default=Path("runs/pushing-studies"))
     parser.add_argument("--out", type=Path, default=Path("docs/results/pushing"))

@@ -18,7 +18,14 @@ from scipy import stats
 
 from ddco_pyro.files import whole_file, write_text
 
-COLOURS = ("#9a9a9a", "#3f6fb0", "#79a8d9", "#d98f3f", "#b03f4a")
+COLOURS = {
+    "flat linear": "#9a9a9a",
+    "flat MLP": "#3f6fb0",
+    "flat MLP, equal parameters": "#79a8d9",
+    "DDCO linear": "#d98f3f",
+    "DDCO MLP": "#b03f4a",
+    "hybrid MLP": "#4f8f4a",
+}
 Row = dict[str, Any]
 
 
@@ -116,13 +123,13 @@ def table(rows: Sequence[Row], columns: dict[str, tuple[str, str]], *keys: str) 
     return lines
 
 
-def curve(axes: Axes, rows: Sequence[Row], across: str, measure: str, colour: str, label: str) -> None:
+def curve(axes: Axes, rows: Sequence[Row], across: str, measure: str, method: str) -> None:
     """Mean with its interval against a column."""
-    groups = grouped(rows, across)
+    groups = grouped(sorted(rows, key=lambda row: row[across]), across)
     found = [over_seeds(own, measure) for own in groups.values()]
     places = [key[0] for key in groups]
-    axes.errorbar(places, [f[0] for f in found], [f[1] for f in found], color=colour, label=label, marker="o", ms=4,
-                  capsize=2, lw=1.5)  # fmt: skip
+    means, halves = [f[0] for f in found], [f[1] for f in found]
+    axes.errorbar(places, means, halves, color=COLOURS[method], label=method, marker="o", ms=4, capsize=2, lw=1.5)
 
 
 GOALS = {
@@ -138,27 +145,44 @@ GOALS = {
 
 def describe_complexity(rows: Sequence[Row]) -> list[str]:
     """The table against the number of demonstrations."""
-    return [*table(rows, GOALS, "method", "demonstrations"), "", *_sigma(rows)]
+    lines = [*table(rows, GOALS, "method", "demonstrations"), "", *_sigma(rows), ""]
+    for other in ("flat MLP", "flat MLP, equal parameters"):
+        lines += _differences(rows, "DDCO MLP", other)
+    return lines
+
+
+def _differences(rows: Sequence[Row], ours: str, theirs: str) -> list[str]:
+    """Goals and held-out log-likelihood of one method minus another's on the same demonstrations, over seeds."""
+    lines = []
+    for (count,), own in grouped(rows, "demonstrations").items():
+        pairs = [pair for pair in grouped(own, "seed").values() if {ours, theirs} <= {row["method"] for row in pair}]
+        by_name = [{row["method"]: row for row in pair} for pair in pairs]
+        measures = ("goals", "log_likelihood_held_out")
+        differences = [{key: pair[ours][key] - pair[theirs][key] for key in measures} for pair in by_name]
+        if differences:
+            goals, likelihood = cell_text(differences, "goals"), cell_text(differences, measures[1], "{:.3f}")
+            lines.append(
+                f"- {ours} minus {theirs}, {count} demonstrations, paired by seed ({len(pairs)}): {goals} goals, "
+                f"{likelihood} held-out nats/step."
+            )
+    return lines
 
 
 def draw_complexity(figure: Figure, rows: Sequence[Row], supervisor: float | None) -> None:
-    """Goals, without and with a limit, against the number of demonstrations."""
-    for axes, measure, title in zip(
-        figure.subplots(1, 2, sharey=True),
-        ("goals", "limited_goals"),
-        ("no limit", "at most 250 steps for each goal"),
-        strict=True,
-    ):
-        for colour, ((method,), own) in zip(COLOURS, grouped(rows, "method").items(), strict=True):
-            curve(axes, own, "demonstrations", measure, colour, method)
-        if supervisor is not None:
+    """Goals, without and (where it was measured) with a limit, and likelihood against the number of demonstrations."""
+    measures = {"goals": "goals in 2000 steps", "limited_goals": "goals, 250 steps each at most",
+                "log_likelihood_held_out": "held-out nats/step"}  # fmt: skip
+    shown = {key: label for key, label in measures.items() if any(row[key] is not None for row in rows)}
+    counts = sorted({row["demonstrations"] for row in rows})
+    for axes, (measure, label) in zip(figure.subplots(1, len(shown)), shown.items(), strict=True):
+        for (method,), own in grouped(rows, "method").items():
+            curve(axes, own, "demonstrations", measure, method)
+        if supervisor is not None and "goals" in measure:
             axes.axhline(supervisor, color="k", ls=":", lw=1, label="supervisor")
-        axes.set(xscale="log", xlabel="demonstrations", title=title)
-        counts = sorted({row["demonstrations"] for row in rows})
+        axes.set(xscale="log", xlabel="demonstrations", ylabel=label)
         axes.set_xticks(counts, [str(count) for count in counts])
         axes.minorticks_off()
-    figure.axes[0].set_ylabel("goals in 2000 steps")
-    figure.axes[0].legend(fontsize=7)
+    figure.axes[0].legend(fontsize=7, loc="center left", bbox_to_anchor=(0.0, 0.75))
 
 
 def describe_options(rows: Sequence[Row]) -> list[str]:
@@ -179,8 +203,8 @@ def draw_options(figure: Figure, rows: Sequence[Row], supervisor: float | None) 
     """Goals and held-out log-likelihood against k."""
     measures = {"goals": "goals in 2000 steps", "log_likelihood_held_out": "held-out nats/step"}
     for axes, (measure, label) in zip(figure.subplots(1, 2), measures.items(), strict=True):
-        for colour, ((method,), own) in zip(COLOURS[3:], grouped(rows, "method").items(), strict=True):
-            curve(axes, own, "options", measure, colour, method)
+        for (method,), own in grouped(rows, "method").items():
+            curve(axes, own, "options", measure, method)
         axes.set(xlabel="options k", ylabel=label)
     if supervisor is not None:
         figure.axes[0].axhline(supervisor, color="k", ls=":", lw=1, label="supervisor")
@@ -199,8 +223,8 @@ def draw_augmentation(figure: Figure, rows: Sequence[Row], supervisor: float | N
     del supervisor
     measures = {"success": "success rate", "goals": "goals in 2000 steps", "own_control": "steps under own control"}
     for axes, (measure, label) in zip(figure.subplots(1, 3), measures.items(), strict=True):
-        for colour, ((method,), own) in zip(COLOURS[3:], grouped(rows, "method").items(), strict=True):
-            curve(axes, own, "options", measure, colour, method)
+        for (method,), own in grouped(rows, "method").items():
+            curve(axes, own, "options", measure, method)
         axes.set(xlabel="options k", ylabel=label)
     figure.axes[0].legend(fontsize=8)
 

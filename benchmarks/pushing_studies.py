@@ -19,6 +19,7 @@ import argparse
 import itertools
 import json
 import os
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -128,8 +129,16 @@ def main() -> None:
     if not arguments.summarize:
         prepare(seeds, arguments.runs)
         work(cells_of(arguments, cells), arguments)
-    command = f"python benchmarks/pushing_studies.py {arguments.study} --seeds {len(seeds)}"
-    write(arguments.study, cells, arguments.runs, arguments.out, command + " --limited" * arguments.limited)
+    write(arguments.study, cells, arguments.runs, arguments.out, command_of(arguments))
+
+
+def command_of(arguments: argparse.Namespace) -> str:
+    """The command that runs what was asked for."""
+    parts = ["python", "benchmarks/pushing_studies.py", arguments.study, "--seeds", str(arguments.seeds)]
+    for name, everything in (("demonstrations", COUNTS), ("options", OPTIONS), ("methods", tuple(METHODS))):
+        asked = tuple(getattr(arguments, name))
+        parts += [f"--{name}", *map(str, asked)] if asked != everything else []
+    return shlex.join(parts + ["--limited"] * arguments.limited)
 
 
 def cells_of(arguments: argparse.Namespace, cells: Sequence[Cell]) -> list[Cell]:

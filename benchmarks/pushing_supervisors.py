@@ -1,6 +1,6 @@
 """What the supervisors of the pushing task achieve, and how well their controls can be predicted from the state.
 
-    python benchmarks/pushing_supervisors.py [--seeds 5] [--slow-seeds 3] [--demonstrations 30] [--jobs 2] [--out DIR]
+    python benchmarks/pushing_supervisors.py [--seeds 5] [--slow-seeds 3] [--demonstrations 40] [--jobs 2] [--out DIR]
 
 Writes ``supervisors.json`` and ``supervisors.md``: goals and topples in 2000 steps over seeds, and the held-out R² of a
 nearest-neighbour regressor and of a neural network on demonstrations of one goal each, split by demonstration, for the
@@ -11,8 +11,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import os
+import shlex
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -20,7 +23,7 @@ from typing import Any
 import numpy as np
 from ddco_tasks import pushing
 from ddco_tasks.pushing_planner import Planner
-from ddco_tasks.pushing_supervisor import HAND, policy
+from ddco_tasks.pushing_supervisor import HAND, WayPoints, policy
 from joblib import Parallel, delayed
 from scipy import stats
 from sklearn.model_selection import GroupKFold
@@ -36,8 +39,8 @@ from ddco_pyro.task import Task
 
 SLOW = ("supervisor_every_step", "supervisor_every_step_noisy")
 MINDS = {
+    "way points": lambda: WayPoints(),
     "repeatable plans": lambda: Planner(),
-    "repeatable plans, every step": lambda: Planner("every_step"),
     "plain planner": lambda: Planner(repeatable=False),
     "plain planner, every step": lambda: Planner("every_step", repeatable=False),
 }
@@ -88,40 +91,57 @@ def mean(values: list[float]) -> dict[str, Any]:
     return {"mean": centre, "interval": [float(centre - half), float(centre + half)], "trials": len(values)}
 
 
-def measure(arguments: argparse.Namespace) -> dict[str, Any]:
-    """All numbers."""
-    workers = Parallel(n_jobs=arguments.jobs)
-    results: dict[str, Any] = {"supervisors": {}, "predictability": {}}
+def measure_supervisors(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Goals, topples and speed of every scripted policy of the task."""
+    found = {}
     for name in pushing.task.policies:
         seeds = range(arguments.slow_seeds if name in SLOW else arguments.seeds)
-        outcomes = workers(delayed(play)(name, seed) for seed in seeds)
+        outcomes = Parallel(n_jobs=arguments.jobs)(delayed(play)(name, seed) for seed in seeds)
         measures = ("goals", "topples", "lost", "steps_per_second")
-        results["supervisors"][name] = {key: mean([one[key] for one in outcomes]) for key in measures}
-        print(name, results["supervisors"][name], flush=True)
-    for mind in MINDS:
-        for noise in (0.0, HAND):
-            found = workers(delayed(demonstrate)(mind, noise, seed) for seed in range(arguments.demonstrations))
-            row = predictability([record for record, _ in found])
-            row["success"] = {"mean": float(np.mean([success for _, success in found])), "trials": len(found)}
-            results["predictability"][f"{mind}, noise {noise}"] = row
-            print(mind, noise, row, flush=True)
+        found[name] = {key: mean([one[key] for one in outcomes]) for key in measures}
+        print(name, found[name], flush=True)
+    return found
+
+
+def measure_predictability(arguments: argparse.Namespace) -> dict[str, Any]:
+    """How well the controls of each mind can be predicted, with an exact and an inexact hand."""
+    results = {}
+    for mind, noise in itertools.product(arguments.minds, (0.0, HAND)):
+        seeds = range(arguments.demonstrations)
+        found = Parallel(n_jobs=arguments.jobs)(delayed(demonstrate)(mind, noise, seed) for seed in seeds)
+        row = predictability([record for record, _ in found])
+        row["success"] = {"mean": float(np.mean([success for _, success in found])), "trials": len(found)}
+        results[f"{mind}, hand {noise} rad/s"] = row
+        print(mind, noise, row, flush=True)
     return results
 
 
-def table(results: dict[str, Any], command: str) -> str:
+PARTS = {"supervisors": measure_supervisors, "predictability": measure_predictability}
+
+
+def table(results: dict[str, Any]) -> str:
     """The numbers as Markdown."""
-    lines = [f"Command: `{command}`", "", "Mean and 95 % t interval over seeds of an episode of 2000 steps.", ""]
-    lines += ["| supervisor | goals | topples | lost | control steps per second | seeds |", "|---|---|---|---|---|---|"]
-    for name, one in results["supervisors"].items():
-        cells = [spread(one[key], "{:.1f}") for key in ("goals", "topples", "lost")]
-        lines.append(
-            f"| {name} | {' | '.join(cells)} | {one['steps_per_second']['mean']:.0f} | {one['goals']['trials']} |"
-        )
-    lines += ["", f"Held-out R² of the controls, mean and 95 % t interval over {FOLDS} folds by demonstration.", ""]
-    lines += ["| demonstrations | nearest neighbours | network | success |", "|---|---|---|---|"]
-    for name, one in results["predictability"].items():
-        cells = [spread(one[key], "{:.2f}") for key in ("nearest neighbours", "network")]
-        lines.append(f"| {name} | {' | '.join(cells)} | {one['success']['mean']:.2f} |")
+    lines = []
+    if "supervisors" in results:
+        lines += [f"Command: `{results['supervisors_command']}`", ""]
+        lines += ["Mean and 95 % t interval over seeds of an episode of 2000 steps.", ""]
+        lines += [
+            "| supervisor | goals | topples | lost | control steps per second | seeds |",
+            "|---|---|---|---|---|---|",
+        ]
+        for name, one in results["supervisors"].items():
+            cells = [spread(one[key], "{:.1f}") for key in ("goals", "topples", "lost")]
+            speed = f"{one['steps_per_second']['mean']:.0f}"
+            lines.append(f"| {' | '.join([name, *cells, speed, str(one['goals']['trials'])])} |")
+        lines.append("")
+    if "predictability" in results:
+        lines += [f"Command: `{results['predictability_command']}`", ""]
+        lines += [f"Held-out R² of the controls, mean and 95 % t interval over {FOLDS} folds by demonstration.", ""]
+        lines += ["| supervisor | nearest neighbours | network | success | demonstrations |", "|---|---|---|---|---|"]
+        for name, one in results["predictability"].items():
+            cells = [spread(one[key], "{:.2f}") for key in ("nearest neighbours", "network")]
+            success = one["success"]
+            lines.append(f"| {' | '.join([name, *cells, format(success['mean'], '.2f'), str(success['trials'])])} |")
     return "\n".join(lines) + "\n"
 
 
@@ -136,18 +156,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--slow-seeds", type=int, default=3, help="for the policies that plan at every step")
-    parser.add_argument("--demonstrations", type=int, default=30)
+    parser.add_argument("--demonstrations", type=int, default=40)
+    parser.add_argument("--minds", nargs="+", default=tuple(MINDS), choices=MINDS, help="whose controls are predicted")
+    parser.add_argument("--parts", nargs="+", default=tuple(PARTS), choices=PARTS)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("docs/results/pushing"))
     arguments = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    results = measure(arguments)
-    command = f"python benchmarks/pushing_supervisors.py --seeds {arguments.seeds} --slow-seeds {arguments.slow_seeds}"
-    command += f" --demonstrations {arguments.demonstrations}"
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    write_text(arguments.out / "supervisors.json", json.dumps(results, indent=1) + "\n")
-    write_text(arguments.out / "supervisors.md", table(results, command))
-    print(table(results, command))
+    path = arguments.out / "supervisors.json"
+    results: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    for part in arguments.parts:
+        results[part] = PARTS[part](arguments)
+        results[f"{part}_command"] = shlex.join(["python", *sys.argv])
+    write_text(path, json.dumps(results, indent=1) + "\n")
+    write_text(path.with_suffix(".md"), table(results))
+    print(table(results))
 
 
 if __name__ == "__main__":
