@@ -1,0 +1,83 @@
+# ---
+# jupyter:
+#   jupytext:
+#     cell_metadata_filter: -all
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
+# ---
+
+# %% [markdown]
+# # Which options are in the needle demonstrations?
+#
+# A simulated surgical arm picks up a needle and pushes it into a phantom, 15 steps each time. Five options under a
+# meta-policy are fitted to 100 demonstrations; nobody says where one skill ends and the next begins.
+
+# %%
+import os
+import warnings
+from pathlib import Path
+
+from IPython.display import Image, Markdown
+
+warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
+
+from ddco_pyro import load_spec
+from ddco_pyro.console import Fitting
+from ddco_pyro.data import demonstrations
+from ddco_pyro.report import tables, words, write_report
+from ddco_pyro.run import fit
+
+RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))
+SMALLER = os.environ.get("NOTEBOOK_SMALLER", "").split()  # a test makes the fits smaller
+
+# %% [markdown]
+# A fit that is in its folder already is read back, not done again. The same at the command line:
+# `ddco-pyro fit specs/needle.yaml --out runs/needle --resume`.
+
+# %%
+spec = load_spec("../specs/needle.yaml", SMALLER)
+with Fitting() as progress:
+    needle = fit(spec, RUNS / "needle", progress)
+demos = demonstrations(spec)
+write_report(needle, demos)
+figures = needle.folder / "figures"
+
+# %% [markdown]
+# ## When is which option active?
+#
+# Each row is a demonstration, each colour an option of the most likely path.
+
+# %%
+Image(figures / "segments.png")
+
+# %% [markdown]
+# The same along the way of the gripper:
+
+# %%
+Image(figures / "trajectories.png")
+
+# %% [markdown]
+# How sure the model is of it, step by step, in some of the demonstrations that it was not trained with:
+
+# %%
+Image(figures / "posterior.png")
+
+# %% [markdown]
+# ## How are they used?
+
+# %%
+use = tables.option_use(["option"], needle.metrics["options"], len(demos))
+Markdown("\n".join(["|".join(use.head), "|".join("-" * len(use.head)), *("|".join(row) for row in use.rows)]))
+
+# %% [markdown]
+# ## Does the hierarchy explain what it has not seen?
+
+# %%
+Markdown(words.verdict(needle.metrics))
+
+# %%
+Image(figures / "likelihood.png")

@@ -1,0 +1,97 @@
+# ---
+# jupyter:
+#   jupytext:
+#     cell_metadata_filter: -all
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
+# ---
+
+# %% [markdown]
+# # Your own demonstrations
+#
+# Anything in robomimic's HDF5 layout can be fitted. Here: 50 demonstrations of Meta-World's scripted expert, which were
+# recorded by somebody else, where they lie beside this repository; otherwise demonstrations of the needle task,
+# written to a file, take their place.
+
+# %%
+import os
+import warnings
+from pathlib import Path
+
+from IPython.display import Image, Markdown
+
+warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
+
+from ddco_pyro import Demonstrations, load_spec
+from ddco_pyro.collect import collect
+from ddco_pyro.console import Fitting
+from ddco_pyro.report import words, write_report
+from ddco_pyro.run import fit
+from ddco_pyro.spec import DemonstrationsSpec
+
+RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))
+SMALLER = os.environ.get("NOTEBOOK_SMALLER", "").split()  # a test makes the fits smaller
+
+# %%
+METAWORLD = Path(os.environ.get("NOTEBOOK_METAWORLD", "../../shared/data/metaworld_pick_place.hdf5"))
+if METAWORLD.exists():
+    path, observations = METAWORLD, ["hand_pos", "gripper", "object_pos", "goal_pos"]
+else:
+    path, observations = collect("needle", DemonstrationsSpec(count=12)), ["gripper_pose", "jaw", "needle_ellipse"]
+
+# %% [markdown]
+# What is in the file?
+
+# %%
+demos = Demonstrations.read(path, labels=["phase"])
+print(len(demos), "demonstrations of", min(demos.lengths), "to", max(demos.lengths), "steps")
+print("observations:", demos.observation_shapes)
+print("control:", demos.control_size, "dimensions; labels:", list(demos[0].labels))
+
+# %% [markdown]
+# A spec for it. Observations that change quickly get their differences too.
+
+# %%
+SPEC = f"""
+demonstrations: {{path: {path}, labels: phase}}
+observations: [{", ".join(f"{{key: {key}, differences: true}}" for key in observations)}]
+control: {{std: {{learn: true, floor: 0.01}}}}
+hierarchy:
+  levels:
+    - {{count: 4, policy: {{network: linear}}, termination: {{network: linear}}}}
+  meta_policy: {{network: linear}}
+training: {{initialize: vq_controls, optimizer: {{lr: 1.0e-2}}, epochs: 100}}
+compare_with: [flat]
+"""
+RUNS.mkdir(parents=True, exist_ok=True)
+(RUNS / "mine.yaml").write_text(SPEC)
+spec = load_spec(RUNS / "mine.yaml", [one for one in SMALLER if not one.startswith("demonstrations.")])
+
+# %%
+with Fitting() as progress:
+    mine = fit(spec, RUNS / "mine", progress)
+write_report(mine, demos)
+Markdown(words.verdict(mine.metrics))
+
+# %% [markdown]
+# The options over time, beside the phases that the expert itself says it is in (the model has not seen them):
+
+# %%
+Image(mine.folder / "figures" / "segments.png")
+
+# %%
+agreement = mine.metrics["agreement"]
+print("normalised mutual information with the expert's phases:",
+      *(f"{name} {values[0]:.2f}" for name, values in agreement.items() if name != "labels"))  # fmt: skip
+
+# %% [markdown]
+# As a policy that acts, one observation at a time:
+
+# %%
+controller = mine.controller(seed=0)
+controller.reset()
+controller.act({key: demos[0].observations[key][0] for key in observations})

@@ -1,0 +1,53 @@
+"""The notebooks: pairs that say the same, with outputs, without logic, and runnable from a fresh clone."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jupytext
+import nbformat
+import pytest
+
+ROOT = Path(__file__).parent.parent
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+SMALL = "demonstrations.count=12 demonstrations.seed=0 training.epochs=2 selection.folds=2"
+
+
+def sources(notebook):
+    return [(cell.cell_type, cell.source) for cell in notebook.cells]
+
+
+def test_every_one_is_a_pair_and_has_its_number():
+    assert [path.stem for path in NOTEBOOKS] == sorted(path.stem for path in (ROOT / "notebooks").glob("*.py"))
+    assert [path.stem[:2] for path in NOTEBOOKS] == [f"{number:02d}" for number in range(1, len(NOTEBOOKS) + 1)]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_pair_says_the_same(path):
+    assert sources(nbformat.read(path, as_version=4)) == sources(jupytext.read(path.with_suffix(".py")))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_holds_outputs_and_no_logic(path):
+    notebook = nbformat.read(path, as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert any("image/png" in output.get("data", {}) for cell in code for output in cell.outputs)
+    assert not any(output.output_type == "error" for cell in code for output in cell.outputs)
+    tree = ast.parse("\n".join(cell.source for cell in code))
+    assert not any(isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Lambda) for node in ast.walk(tree))
+    assert not re.search(r"/(home|root|tmp|work)/", path.read_text())
+
+
+def test_all_run_on_small_data_from_a_fresh_clone(tmp_path, cache):
+    """No data of anybody else's lies beside the repository; fits are made anew."""
+    own = {"NOTEBOOK_RUNS": str(tmp_path / "runs"), "NOTEBOOK_METAWORLD": str(tmp_path / "none"), "MUJOCO_GL": "egl"}
+    environment = os.environ | own | {"NOTEBOOK_SMALLER": SMALL, "DDCO_PYRO_CACHE": str(cache)}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--nbmake", *map(str, NOTEBOOKS)]
+    ended = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stdout[-5000:]
+    assert f"{len(NOTEBOOKS)} passed" in ended.stdout
