@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+from joblib.externals.loky import get_reusable_executor
 from test_cli import call
 
 import ddco_pyro
@@ -73,6 +74,7 @@ def outside(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def installed(outside: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(outside)
     monkeypatch.chdir(tmp_path)
+    get_reusable_executor().shutdown(wait=True)  # processes from before do not know of the new package
 
 
 @pytest.mark.parametrize("task", ["reach", "outside.parts:task"])
