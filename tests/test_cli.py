@@ -52,7 +52,12 @@ def start(*arguments):
     """The command line in a process of its own, in the folder of the toy task."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    return subprocess.Popen([COMMAND, *map(str, arguments)], cwd=HERE, env=environment, **pipes)
+    return subprocess.Popen([COMMAND, *map(str, arguments)], cwd=HERE, env=environment, preexec_fn=_heed, **pipes)
+
+
+def _heed():
+    """A shell's background jobs, and all they start, ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.lockstep import play
 from ddco_pyro.rollout import run_episode
 from ddco_pyro.run import fit
+from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import Spec, load_spec
 
 SPECS = sorted((Path(__file__).parents[2] / "specs").glob("pushing*.yaml"))
@@ -39,8 +40,8 @@ def test_all_specs_are_here() -> None:
 
 
 @pytest.mark.parametrize("path", SPECS, ids=lambda path: path.stem)
-def test_specs_fit_and_act(path: Path, demonstrations: Path, tmp_path: Path, watched: object) -> None:
-    found = fit(short(path, demonstrations), tmp_path / "run", watched)
+def test_specs_fit_and_act(path: Path, demonstrations: Path, tmp_path: Path) -> None:
+    found = fit(short(path, demonstrations), tmp_path / "run", Unwatched())
     assert found.metrics["engine_check"]["value"] < 1e-6
     brief = replace(pushing.limited, load=lambda seed: pushing.load_single(seed))
     (episode,) = play(brief, found.hierarchy, found.spec.rollout, [0], keep=("tip",))
