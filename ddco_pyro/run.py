@@ -31,6 +31,7 @@ from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference import Posterior, log_likelihood, posterior, segment
 from ddco_pyro.inference.check import TRAJECTORIES as COMPARED
 from ddco_pyro.inference.check import EngineCheck, compare_engines
+from ddco_pyro.metrics import evaluate, supervisor
 from ddco_pyro.monitor import Monitor
 from ddco_pyro.spec import Spec, dump_spec, load_spec, own_networks, refuse_own_networks
 from ddco_pyro.training import Trainer, TrainingError, plan
@@ -211,11 +212,11 @@ def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, cloc
             if not _finished(own):
                 _fit(baseline_spec(spec, baseline), own, demos, watcher, _Clock())
     with clock("evaluation"):
-        metrics = _evaluate(found, split, demos)
+        metrics = evaluate(found, split, demos)
     held_out = {"valid": len(split.get("valid", ()))}
     metrics |= {
         "engine_check": trained.check._asdict(),
-        "demonstrations": trained.demonstrations | held_out | _supervisor(demos),
+        "demonstrations": trained.demonstrations | held_out | supervisor(demos),
         "parameters": sum(parameter.numel() for parameter in hierarchy.parameters()),
         "seconds": clock.seconds,
         "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
@@ -327,61 +328,6 @@ def _write_history(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
     writer.writeheader()
     writer.writerows(rows)
     write_text(folder / "history.csv", text.getvalue())
-
-
-def _evaluate(found: Fit, parts: dict[str, Demonstrations], demos: Demonstrations) -> dict[str, Any]:
-    values = {name: found.log_likelihood(part) for name, part in parts.items()}
-    per_step = {name: float(v.sum() / sum(parts[name].lengths)) for name, v in values.items()}
-    metrics: dict[str, Any] = {
-        "model": found.name,
-        "log_likelihood_per_step": {"train": per_step["train"], "valid": per_step.get("valid")},
-        "valid": _each(parts["valid"], values["valid"]) if "valid" in parts else [],
-        "comparison": {
-            name: {
-                "log_likelihood_per_step": one.metrics["log_likelihood_per_step"],
-                "difference": _difference(values["valid"], one, parts["valid"]),
-            }
-            for name, one in found.baselines.items()
-        },
-    }
-    if found.hierarchy.depth:
-        posterior = found.posterior(demos)
-        metrics["options"] = analysis.as_rows(analysis.option_use(posterior))
-        metrics["divergences"] = found.divergences(demos, posterior)
-        if found.spec.demonstrations.labels:
-            metrics["agreement"] = _agreement(found, parts)
-    return metrics
-
-
-def _each(demos: Demonstrations, values: np.ndarray) -> list[dict[str, Any]]:
-    return [
-        {"name": demo.name, "steps": len(demo), "log_likelihood": float(value)}
-        for demo, value in zip(demos, values, strict=True)
-    ]
-
-
-def _difference(ours: np.ndarray, baseline: Fit, valid: Demonstrations) -> dict[str, float]:
-    return analysis.paired(ours, baseline.log_likelihood(valid), np.array(valid.lengths, dtype=float))
-
-
-def _agreement(found: Fit, parts: dict[str, Demonstrations]) -> dict[str, Any]:
-    """NMI of each level's segments with the ground-truth labels."""
-    label = found.spec.demonstrations.labels
-    assert label is not None  # asked only where there are labels
-    scores: dict[str, Any] = {"labels": label}
-    for name, part in parts.items():
-        truth = [demo.labels[label] for demo in part]
-        levels = found.segment(part)
-        scores[name] = [
-            analysis.agreement([row[: len(demo)] for row, demo in zip(level, part, strict=True)], truth)
-            for level in levels
-        ]
-    return scores
-
-
-def _supervisor(demos: Demonstrations) -> dict[str, Any]:
-    said = demos.attributes.get("supervisor")
-    return {"supervisor": json.loads(str(said))} if said else {}
 
 
 @contextmanager

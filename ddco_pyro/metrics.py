@@ -1,0 +1,73 @@
+"""The numbers of a finished fit: likelihood, differences to the baselines, use of options, agreement with labels."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ddco_pyro import analysis
+from ddco_pyro.demonstrations import Demonstrations
+
+if TYPE_CHECKING:
+    from ddco_pyro.run import Fit
+
+
+def evaluate(found: Fit, parts: dict[str, Demonstrations], demos: Demonstrations) -> dict[str, Any]:
+    """What ``metrics.json`` says of a model: log-likelihood in nats per step of each part of the data, its paired
+    difference to every baseline, and with options their use, divergences and agreement with labels.
+    """
+    values = {name: found.log_likelihood(part) for name, part in parts.items()}
+    per_step = {name: float(v.sum() / sum(parts[name].lengths)) for name, v in values.items()}
+    metrics: dict[str, Any] = {
+        "model": found.name,
+        "log_likelihood_per_step": {"train": per_step["train"], "valid": per_step.get("valid")},
+        "valid": _each(parts["valid"], values["valid"]) if "valid" in parts else [],
+        "comparison": {
+            name: {
+                "log_likelihood_per_step": one.metrics["log_likelihood_per_step"],
+                "difference": _difference(values["valid"], one, parts["valid"]),
+            }
+            for name, one in found.baselines.items()
+        },
+    }
+    if found.hierarchy.depth:
+        posterior = found.posterior(demos)
+        metrics["options"] = analysis.as_rows(analysis.option_use(posterior))
+        metrics["divergences"] = found.divergences(demos, posterior)
+        if found.spec.demonstrations.labels:
+            metrics["agreement"] = _agreement(found, parts)
+    return metrics
+
+
+def _each(demos: Demonstrations, values: np.ndarray) -> list[dict[str, Any]]:
+    return [
+        {"name": demo.name, "steps": len(demo), "log_likelihood": float(value)}
+        for demo, value in zip(demos, values, strict=True)
+    ]
+
+
+def _difference(ours: np.ndarray, baseline: Fit, valid: Demonstrations) -> dict[str, float]:
+    return analysis.paired(ours, baseline.log_likelihood(valid), np.array(valid.lengths, dtype=float))
+
+
+def _agreement(found: Fit, parts: dict[str, Demonstrations]) -> dict[str, Any]:
+    """NMI of each level's segments with the ground-truth labels."""
+    label = found.spec.demonstrations.labels
+    assert label is not None  # asked only where there are labels
+    scores: dict[str, Any] = {"labels": label}
+    for name, part in parts.items():
+        truth = [demo.labels[label] for demo in part]
+        levels = found.segment(part)
+        scores[name] = [
+            analysis.agreement([row[: len(demo)] for row, demo in zip(level, part, strict=True)], truth)
+            for level in levels
+        ]
+    return scores
+
+
+def supervisor(demos: Demonstrations) -> dict[str, Any]:
+    """What the demonstrations' file says of how often their supervisor succeeded; nothing where it does not."""
+    said = demos.attributes.get("supervisor")
+    return {"supervisor": json.loads(str(said))} if said else {}
