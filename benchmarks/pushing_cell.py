@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +29,14 @@ from ddco_pyro.task import Task
 from ddco_pyro.training import Trainer, plan
 
 SETTINGS = Path(__file__).parent / "pushing_settings.json"  # written by the sweep
-SUPERVISOR = "scripted_noisy"
 POOL = 80  # demonstrations of a seed; a cell takes the first ones
 HELD_OUT = 40  # demonstrations, the same for every cell
 EPISODES = 20
 UPDATES = 3000  # gradient steps of a fit, whatever the method and the number of demonstrations
 
 # Seeds of the simulation. Those of development are used for nothing but the choice of hyper-parameters.
-TRAINING, DEVELOPMENT, HELD_OUT_SEED, EVALUATION = 100_000, 800_000, 900_000, 1_000
+TRAINING, DEVELOPMENT, HELD_OUT_SEED = 100_000, 800_000, 900_000
+EVALUATION, DEVELOPMENT_EPISODES = 2_000_000, 500_000
 
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "flat linear": ("pushing_flat_linear", {}),
@@ -48,6 +48,20 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 """Name of a method to its spec and what it changes there."""
 
+VARIANTS: dict[str, tuple[dict[str, Any], int]] = {
+    "base": ({}, UPDATES),
+    "hand 0.2 rad/s": ({"demonstrations.supervisor": "scripted_noisy"}, UPDATES),
+    "hand 0.4 rad/s": ({"demonstrations.supervisor": "scripted_noisy_0.4"}, UPDATES),
+    "exact hand": ({"demonstrations.supervisor": "scripted"}, UPDATES),
+    "planning supervisor": ({"demonstrations.supervisor": "supervisor_noisy"}, UPDATES),
+    "absolute observations": ({"observations": ["joint_angles", "box_pose", "goal"]}, UPDATES),
+    "std 0.5": ({"control.std": 0.5}, UPDATES),
+    "10000 gradient steps": ({}, 10_000),
+    "most likely options": ({"rollout.options": "most_likely"}, UPDATES),
+    "sampled controls": ({"rollout.control": "sample"}, UPDATES),
+}
+"""What can be changed for every method alike: the change to the spec, and the number of gradient steps."""
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -57,25 +71,35 @@ class Cell:
     options: int | None
     demonstrations: int
     seed: int
+    variant: str = "base"
 
     @property
     def name(self) -> str:
         """A file name."""
-        method = self.method.replace(" ", "-").replace(",", "").lower()
-        return f"{method}-k{self.options or 0}-n{self.demonstrations}-s{self.seed}"
+        words = (self.method, f"k{self.options or 0}", f"n{self.demonstrations}", f"s{self.seed}")
+        parts = words if self.variant == "base" else (*words, self.variant)
+        return "-".join(parts).replace(" ", "-").replace(",", "").replace("/", "-").lower()
+
+    @property
+    def fit(self) -> str:
+        """The name of the cell that has the same fit: variants of a rollout have that of the base."""
+        changes, updates = VARIANTS[self.variant]
+        same = updates == UPDATES and all(key.startswith("rollout.") for key in changes)
+        return replace(self, variant="base").name if same else self.name
 
 
 def spec_of(cell: Cell, settings: Mapping[str, Any] | None = None) -> Spec:
     """The spec of a cell, with the method's chosen ``settings`` (as the sweep found them, where none are given)."""
     file, overrides = METHODS[cell.method]
+    variant, updates = VARIANTS[cell.variant]
     chosen = json.loads(SETTINGS.read_text())["chosen"][cell.method] if settings is None else settings
-    changed = {**overrides, **chosen, "seed": cell.seed, "demonstrations.count": cell.demonstrations}
+    changed = {**overrides, **chosen, **variant, "seed": cell.seed, "demonstrations.count": cell.demonstrations}
     if cell.options is not None:
         changed["hierarchy.levels.0.count"] = cell.options
     spec = with_overrides(load_spec(Path(__file__).parents[1] / "specs" / f"{file}.yaml"), changed)
     stages = len(plan(spec, 1 if spec.hierarchy else 0))
     trained = cell.demonstrations - round_tune(cell.demonstrations, spec.training.tune_fraction)
-    epochs = int(np.ceil(UPDATES / stages / np.ceil(trained / spec.training.batch_size)))
+    epochs = int(np.ceil(updates / stages / np.ceil(trained / spec.training.batch_size)))
     return with_overrides(spec, {"training.epochs": epochs})
 
 
@@ -84,23 +108,30 @@ def round_tune(count: int, fraction: float) -> int:
     return max(1, round(count * fraction))
 
 
-def demonstrations(folder: Path, first: int, count: int) -> Demonstrations:
+def demonstrations(folder: Path, supervisor: str, first: int, count: int) -> Demonstrations:
     """Demonstrations of one goal each from seeds ``first`` on; kept in a file."""
-    path = folder / "demonstrations" / f"{first}.hdf5"
+    path = folder / "demonstrations" / supervisor / f"{first}.hdf5"
     if not path.exists():
-        episodes = [run_episode(pushing.single, SUPERVISOR, first + number) for number in range(count)]
+        episodes = [run_episode(pushing.single, supervisor, first + number) for number in range(count)]
         Demonstrations(tuple(one.record for one in episodes)).write(path)
     return Demonstrations.read(path)
 
 
-def pool(folder: Path, seed: int, development: bool = False) -> Demonstrations:
-    """All demonstrations of a training seed."""
-    return demonstrations(folder, (DEVELOPMENT if development else TRAINING) + 1000 * seed, POOL)
+def pool(folder: Path, spec: Spec, development: bool = False) -> Demonstrations:
+    """All demonstrations of a spec's supervisor and training seed."""
+    first = (DEVELOPMENT if development else TRAINING) + 1000 * spec.seed
+    return demonstrations(folder, recorded(spec), first, POOL)
 
 
-def held_out(folder: Path, development: bool = False) -> Demonstrations:
-    """Demonstrations that nothing is trained on; others for development."""
-    return demonstrations(folder, HELD_OUT_SEED + 1000 * development, HELD_OUT)
+def held_out(folder: Path, spec: Spec, development: bool = False) -> Demonstrations:
+    """Demonstrations of a spec's supervisor that nothing is trained on; others for development."""
+    return demonstrations(folder, recorded(spec), HELD_OUT_SEED + 1000 * development, HELD_OUT)
+
+
+def recorded(spec: Spec) -> str:
+    """The supervisor whose demonstrations a spec learns from."""
+    assert spec.demonstrations.supervisor is not None  # every pushing spec names one
+    return spec.demonstrations.supervisor
 
 
 def fit(spec: Spec, demos: Demonstrations, checkpoint: Path) -> tuple[Hierarchy, float]:
@@ -131,23 +162,23 @@ def per_step(hierarchy: Hierarchy, demos: Demonstrations) -> float:
 
 def fitted(cell: Cell, folder: Path) -> Hierarchy:
     """The hierarchy of a cell, fitted unless it has been already."""
-    path, spec = folder / "models" / f"{cell.name}.safetensors", spec_of(cell)
-    demos = pool(folder, cell.seed)
+    spec = spec_of(cell)
+    path = folder / "models" / f"{cell.fit}.safetensors"
+    demos = pool(folder, spec)
     demos = demos.select(demos.names[: cell.demonstrations])
     if path.exists():
         hierarchy = build_hierarchy(spec, Dimensions.of(demos))
         hierarchy.load_state_dict(read_tensors(path)[0])
         return hierarchy.eval()
     hierarchy, seconds = fit(spec, demos, path.with_suffix(".checkpoint"))
-    likelihood = {"train": per_step(hierarchy, demos), "held_out": per_step(hierarchy, held_out(folder))}
+    likelihood = {"train": per_step(hierarchy, demos), "held_out": per_step(hierarchy, held_out(folder, spec))}
     found = {
-        **asdict(cell),
         "parameters": sum(one.numel() for one in hierarchy.parameters()),
         "std": spec.control.std,
         "seconds": seconds,
         "log_likelihood_per_step": likelihood,
     }
-    write_text(folder / "fits" / f"{cell.name}.json", json.dumps(found, indent=1) + "\n")
+    write_text(folder / "fits" / f"{cell.fit}.json", json.dumps(found, indent=1) + "\n")
     write_tensors(path, hierarchy.state_dict(), {})
     return hierarchy
 

@@ -66,7 +66,7 @@ def main() -> None:
     ours = [(one.observations["joint_angles"], one.choices[:, 0]) for one in episodes]
     sides = np.concatenate([one.observations["goal_from_box"][:, 0] > 0 for one in episodes])
     options = np.concatenate([choices for _, choices in ours])
-    demos = pool(arguments.runs, arguments.seed)[: arguments.demonstrations]
+    demos = pool(arguments.runs, spec_of(cell))[: arguments.demonstrations]
     shown = [(one.observations["joint_angles"], 1 + (one.observations["goal_from_box"][:, 0] > 0)) for one in demos]
     figure = draw(
         {

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +34,10 @@ def rows_of(cells: Sequence[Cell], folder: Path) -> list[Row]:
     """What is known of the cells that have been rolled out."""
     found = []
     for cell in cells:
-        rollout, fit = (folder / part / f"{cell.name}.json" for part in ("rollouts", "fits"))
+        rollout, fit = folder / "rollouts" / f"{cell.name}.json", folder / "fits" / f"{cell.fit}.json"
         if not rollout.exists():
             continue
-        row: Row = json.loads(fit.read_text())
+        row: Row = asdict(cell) | json.loads(fit.read_text())
         row |= {f"log_likelihood_{part}": value for part, value in row.pop("log_likelihood_per_step").items()}
         row |= _means(json.loads(rollout.read_text()), "")
         limited = folder / "limited" / f"{cell.name}.json"
@@ -234,10 +235,36 @@ def _sigma(rows: Sequence[Row]) -> list[str]:
     return [f"Log-likelihoods are at σ = {', '.join(map(str, values))} of the controls' own spread, for every method."]
 
 
+def describe_variants(rows: Sequence[Row]) -> list[str]:
+    """The table of what was changed, for every method alike."""
+    head = "Likelihoods are comparable only between methods of the same variant: its demonstrations or σ are its own."
+    return [head, "", *table(rows, GOALS, "variant", "demonstrations", "method"), "", *_sigma(rows)]
+
+
+def draw_variants(figure: Figure, rows: Sequence[Row], supervisor: float | None) -> None:
+    """Goals of every method, one group of bars for each variant; a panel for each number of demonstrations."""
+    del supervisor
+    panels = grouped(rows, "demonstrations")
+    for axes, ((count,), own) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
+        names = [variant for (variant,) in grouped(own, "variant")]
+        methods = grouped(own, "method")
+        height = 0.8 / len(methods)
+        for place, ((method,), ours) in enumerate(methods.items()):
+            found = {variant: over_seeds(one, "goals") for (variant,), one in grouped(ours, "variant").items()}
+            at = [names.index(variant) + place * height for variant in found]
+            means, halves = [f[0] for f in found.values()], [f[1] for f in found.values()]
+            axes.barh(at, means, height, xerr=halves, color=COLOURS[method], label=method, error_kw={"lw": 1})
+        axes.set_yticks(np.arange(len(names)) + 0.4 - height / 2, names, fontsize=8)
+        axes.invert_yaxis()
+        axes.set(xlabel="goals in 2000 steps", title=f"{count} demonstrations", xlim=(0, None))
+    figure.axes[0].legend(fontsize=7)
+
+
 Describe = Callable[[Sequence[Row]], list[str]]
 Draw = Callable[[Figure, Sequence[Row], float | None], None]
 STUDIES: dict[str, tuple[Describe, Draw]] = {
     "sample_complexity": (describe_complexity, draw_complexity),
     "number_of_options": (describe_options, draw_options),
     "augmentation": (describe_augmentation, draw_augmentation),
+    "variants": (describe_variants, draw_variants),
 }

@@ -5,12 +5,15 @@
         [--demonstrations 20 40 80] [--options 1 2 4 8] [--methods "flat MLP" "DDCO MLP"]
     python benchmarks/pushing_studies.py number_of_options
     python benchmarks/pushing_studies.py augmentation
+    python benchmarks/pushing_studies.py variants [--variants "exact hand" "std 0.5"]
 
-``sweep`` chooses every method's learning rate by held-out likelihood on demonstrations of development seeds, and writes
-``pushing_settings.json`` beside this file. A study writes NAME.csv, NAME.png and NAME.md from all cells that are done;
-it goes through the grid one seed after the other. ``--limited`` adds rollouts with at most 250 steps for each goal.
-``--demonstrations``, ``--options`` and ``--methods`` run a part of the grid; what is written has every cell of the grid
-that is done, and says of how many seeds. ``--summarize`` runs nothing.
+``sweep`` chooses every method's learning rate by held-out likelihood on demonstrations of development seeds, then its
+execution (mean or sampled controls; most likely or sampled options) by goals in development episodes, and writes
+``pushing_settings.json`` beside this file. ``variants`` changes one thing at a time for every method alike. A study
+writes NAME.csv, NAME.png and NAME.md from all cells that are done; it goes through the grid one seed after the other.
+``--limited`` adds rollouts with at most 250 steps for each goal. ``--demonstrations``, ``--options``, ``--methods`` and
+``--variants`` run a part of the grid; what is written has every cell of the grid that is done, and says of how many
+seeds. ``--summarize`` runs nothing.
 """
 
 from __future__ import annotations
@@ -26,17 +29,35 @@ from typing import Any
 
 import numpy as np
 import torch
+from ddco_tasks import pushing
 from joblib import Parallel, delayed
-from pushing_cell import METHODS, SETTINGS, Cell, fit, held_out, per_step, pool, run, spec_of
-from pushing_results import write
+from pushing_cell import (
+    DEVELOPMENT_EPISODES,
+    METHODS,
+    SETTINGS,
+    VARIANTS,
+    Cell,
+    fit,
+    held_out,
+    per_step,
+    pool,
+    run,
+    spec_of,
+    summary,
+)
+from pushing_results import grouped, write
 
 from ddco_pyro.files import write_text
+from ddco_pyro.hierarchy import Hierarchy
+from ddco_pyro.lockstep import play
+from ddco_pyro.spec import Spec
 
 COUNTS = (5, 10, 20, 40, 80)
 OPTIONS = (1, 2, 3, 4, 5, 6, 7, 8)
-SWEPT = {"training.optimizer.lr": (2e-3, 5e-3, 1e-2)}
-SWEPT_DEMONSTRATIONS, SWEPT_SEEDS = 40, (0,)
-OWN_OPTIONS = {"DDCO linear": 5, "DDCO MLP": 2}  # what the specs say
+RATES = (2e-3, 5e-3, 1e-2)
+EXECUTIONS = tuple(itertools.product(("mean", "sample"), ("sample", "most_likely")))
+SWEPT_DEMONSTRATIONS, SWEPT_SEEDS, SWEPT_EPISODES = 40, (0, 1), 12
+OWN_OPTIONS = {"DDCO linear": 5, "DDCO MLP": 2, "hybrid MLP": 2}  # what the specs say
 
 
 def sample_complexity(seed: int) -> list[Cell]:
@@ -55,52 +76,85 @@ def augmentation(seed: int) -> list[Cell]:
     return [Cell(name, k, 40, seed) for name, k in itertools.product(("DDCO MLP", "hybrid MLP"), OPTIONS)]
 
 
+def variants(seed: int) -> list[Cell]:
+    """One thing changed at a time, for the methods with perceptrons."""
+    methods = ("flat MLP", "flat MLP, equal parameters", "DDCO MLP")
+    grid = itertools.product(VARIANTS, (40, 80), methods)
+    cells = [Cell(name, OWN_OPTIONS.get(name), count, seed, variant) for variant, count, name in grid]
+    return [one for one in cells if one.options or one.variant != "most likely options"]
+
+
 STUDIES: dict[str, Callable[[int], list[Cell]]] = {
     "sample_complexity": sample_complexity,
     "number_of_options": number_of_options,
     "augmentation": augmentation,
+    "variants": variants,
 }
 
 
-def try_setting(name: str, values: tuple[float, ...], seed: int, folder: Path) -> dict[str, Any]:
-    """Held-out likelihood of a method with some hyper-parameters on the demonstrations of a development seed."""
+def candidate(name: str, rate: float, seed: int, folder: Path) -> tuple[Cell, Spec, Hierarchy]:
+    """A method fitted with a learning rate to the demonstrations of a development seed."""
     torch.set_num_threads(1)
-    settings = dict(zip(SWEPT, values, strict=True))
-    label = "-".join(str(value) for value in values)
     cell = Cell(name, OWN_OPTIONS.get(name), SWEPT_DEMONSTRATIONS, seed)
-    path = folder / "sweep" / f"{cell.name}-{label}.json"
-    if path.exists():
-        found: dict[str, Any] = json.loads(path.read_text())
-        return found
-    demos = pool(folder, seed, development=True)
+    spec = spec_of(cell, {"training.optimizer.lr": rate})
+    demos = pool(folder, spec, development=True)
     demos = demos.select(demos.names[:SWEPT_DEMONSTRATIONS])
-    hierarchy, seconds = fit(spec_of(cell, settings), demos, path.with_suffix(".checkpoint"))
-    value = per_step(hierarchy, held_out(folder, development=True))
-    found = {"method": name, "settings": settings, "seed": seed, "held_out": value, "seconds": seconds}
-    write_text(path, json.dumps(found, indent=1) + "\n")
+    hierarchy, _ = fit(spec, demos, folder / "sweep" / f"{cell.name}-{rate}.checkpoint")
+    return cell, spec, hierarchy
+
+
+def try_rate(name: str, rate: float, seed: int, folder: Path) -> dict[str, Any]:
+    """Held-out likelihood with a learning rate."""
+    _, spec, hierarchy = candidate(name, rate, seed, folder)
+    value = per_step(hierarchy, held_out(folder, spec, development=True))
+    return {"method": name, "rate": rate, "seed": seed, "held_out": value}
+
+
+def try_executions(name: str, rate: float, seed: int, folder: Path) -> list[dict[str, Any]]:
+    """Goals in development episodes with every execution; a flat policy has no options to be sampled."""
+    cell, spec, hierarchy = candidate(name, rate, seed, folder)
+    first, found = DEVELOPMENT_EPISODES + 1000 * seed, []
+    for control, options in EXECUTIONS if cell.options else EXECUTIONS[::2]:
+        rollout = spec.rollout.model_copy(update={"control": control, "options": options})
+        episodes = play(pushing.task, hierarchy, rollout, range(first, first + SWEPT_EPISODES))
+        goals = float(np.mean(summary(episodes)["goals"]))
+        found.append({"method": name, "control": control, "options": options, "seed": seed, "goals": goals})
     return found
 
 
 def sweep(folder: Path, jobs: int) -> None:
-    """Choose every method's hyper-parameters from the same grid."""
-    grid = list(itertools.product(METHODS, itertools.product(*SWEPT.values()), SWEPT_SEEDS))
-    rows = Parallel(n_jobs=jobs)(delayed(try_setting)(*one, folder) for one in grid)
-    chosen: dict[str, dict[str, Any]] = {}
-    for name in METHODS:
-        held: dict[tuple[float, ...], list[float]] = {}
-        for row in rows:
-            if row["method"] == name:
-                held.setdefault(tuple(row["settings"].values()), []).append(row["held_out"])
-        chosen[name] = dict(zip(SWEPT, max(held, key=lambda values: np.mean(held[values])), strict=True))
-    command = "python benchmarks/pushing_studies.py sweep"
-    write_text(SETTINGS, json.dumps({"command": command, "chosen": chosen, "tried": rows}, indent=1) + "\n")
+    """Choose every method's learning rate and execution from the same grids."""
+    for seed in SWEPT_SEEDS:
+        spec = spec_of(Cell("flat MLP", None, SWEPT_DEMONSTRATIONS, seed), {})
+        pool(folder, spec, development=True)
+        held_out(folder, spec, development=True)
+    grid = list(itertools.product(METHODS, RATES, SWEPT_SEEDS))
+    rates = Parallel(n_jobs=jobs)(delayed(try_rate)(*one, folder) for one in grid)
+    chosen = {name: {"training.optimizer.lr": best(rates, name, "held_out", "rate")[0]} for name in METHODS}
+    pairs = [(name, *own.values(), seed, folder) for name, own in chosen.items() for seed in SWEPT_SEEDS]
+    executions = list(itertools.chain(*Parallel(n_jobs=jobs)(delayed(try_executions)(*one) for one in pairs)))
+    for name, own in chosen.items():
+        control, options = best(executions, name, "goals", "control", "options")
+        own |= {"rollout.control": control, "rollout.options": options}
+    found = {"command": "python benchmarks/pushing_studies.py sweep", "chosen": chosen, "rates": rates}
+    write_text(SETTINGS, json.dumps(found | {"executions": executions}, indent=1) + "\n")
 
 
-def prepare(seeds: Sequence[int], folder: Path) -> None:
+def best(rows: Sequence[dict[str, Any]], name: str, measure: str, *keys: str) -> tuple[Any, ...]:
+    """The values of ``keys`` with the highest mean of a measure over seeds, for a method."""
+    means = {
+        values: np.mean([row[measure] for row in own])
+        for values, own in grouped([row for row in rows if row["method"] == name], *keys).items()
+    }
+    return max(means, key=means.__getitem__)
+
+
+def prepare(cells: Sequence[Cell], folder: Path) -> None:
     """Collect all demonstrations first, so that no two cells collect the same."""
-    held_out(folder)
-    for seed in seeds:
-        pool(folder, seed)
+    for cell in cells:
+        spec = spec_of(cell)
+        held_out(folder, spec)
+        pool(folder, spec)
 
 
 def main() -> None:
@@ -111,6 +165,7 @@ def main() -> None:
     parser.add_argument("--demonstrations", type=int, nargs="+", default=COUNTS)
     parser.add_argument("--options", type=int, nargs="+", default=OPTIONS)
     parser.add_argument("--methods", nargs="+", default=tuple(METHODS), choices=METHODS)
+    parser.add_argument("--variants", nargs="+", default=tuple(VARIANTS), choices=VARIANTS)
     parser.add_argument("--limited", action="store_true")
     parser.add_argument("--summarize", action="store_true")
     parser.add_argument("--jobs", type=int, default=-1)
@@ -119,23 +174,21 @@ def main() -> None:
     arguments = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"
     if arguments.study == "sweep":
-        held_out(arguments.runs, development=True)
-        for seed in SWEPT_SEEDS:
-            pool(arguments.runs, seed, development=True)
         sweep(arguments.runs, arguments.jobs)
         return
-    seeds = range(arguments.seeds)
-    cells = [cell for seed in seeds for cell in STUDIES[arguments.study](seed)]
+    cells = [cell for seed in range(arguments.seeds) for cell in STUDIES[arguments.study](seed)]
     if not arguments.summarize:
-        prepare(seeds, arguments.runs)
-        work(cells_of(arguments, cells), arguments)
+        asked = cells_of(arguments, cells)
+        prepare(asked, arguments.runs)
+        work(asked, arguments)
     write(arguments.study, cells, arguments.runs, arguments.out, command_of(arguments))
 
 
 def command_of(arguments: argparse.Namespace) -> str:
     """The command that runs what was asked for."""
     parts = ["python", "benchmarks/pushing_studies.py", arguments.study, "--seeds", str(arguments.seeds)]
-    for name, everything in (("demonstrations", COUNTS), ("options", OPTIONS), ("methods", tuple(METHODS))):
+    whole = {"demonstrations": COUNTS, "options": OPTIONS, "methods": tuple(METHODS), "variants": tuple(VARIANTS)}
+    for name, everything in whole.items():
         asked = tuple(getattr(arguments, name))
         parts += [f"--{name}", *map(str, asked)] if asked != everything else []
     return shlex.join(parts + ["--limited"] * arguments.limited)
@@ -148,7 +201,8 @@ def cells_of(arguments: argparse.Namespace, cells: Sequence[Cell]) -> list[Cell]
         for cell in cells
         if cell.method in arguments.methods
         and cell.demonstrations in arguments.demonstrations
-        and (arguments.study == "sample_complexity" or cell.options in arguments.options)
+        and cell.variant in arguments.variants
+        and (arguments.study in ("sample_complexity", "variants") or cell.options in arguments.options)
     ]
 
 

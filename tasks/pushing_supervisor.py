@@ -20,6 +20,7 @@ from .pushing_planner import Planner
 from .pushing_rules import Scene
 
 HAND = 0.2  # rad/s: standard deviation of what a disturbed hand adds to the velocity of each joint
+SHAKIER = (0.3, 0.4)  # rad/s: more of that, for demonstrations that show more ways back
 HAND_MEMORY = 0.8  # of that, from one step to the next: white noise of the same reach would kick the box about
 
 STEP = rules.FULL_ADVANCE  # how far ahead of itself the tip aims
@@ -135,4 +136,5 @@ POLICIES = {
     "supervisor_every_step_noisy": policy(_every_step, HAND),
     "scripted": policy(WayPoints),
     "scripted_noisy": policy(WayPoints, HAND),
+    **{f"scripted_noisy_{noise}": policy(WayPoints, noise) for noise in SHAKIER},
 }
