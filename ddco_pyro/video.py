@@ -41,9 +41,14 @@ def captioned(episode: Episode, t: int) -> np.ndarray:
     if len(active):
         cv2.rectangle(frame, (0, 0), (frame.shape[1] - 1, frame.shape[0] - 1), option_rgb(active[0]), 2 * BORDER)
     text = "end" if t >= len(episode.choices) else f"t={t}" + "".join(f"  h{d}={h}" for d, h in enumerate(active, 1))
-    cv2.putText(frame, text, (12, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 3, cv2.LINE_AA)
-    cv2.putText(frame, text, (12, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (20, 20, 20), 1, cv2.LINE_AA)
+    for across, down in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        _write(frame, text, (12 + across, 26 + down), (255, 255, 255))
+    _write(frame, text, (12, 26), (20, 20, 20))
     return frame
+
+
+def _write(frame: np.ndarray, text: str, place: tuple[int, int], colour: tuple[int, int, int]) -> None:
+    cv2.putText(frame, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, 1, cv2.LINE_AA)
 
 
 def _even(frame: np.ndarray) -> np.ndarray:

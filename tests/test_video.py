@@ -46,3 +46,13 @@ def test_an_episode_without_options_has_no_border(episode):
     scripted = Episode(0, episode.record, {}, np.zeros((3, 0), int), episode.frames)
     assert (captioned(scripted, 0)[-1] == 0).all()
     assert (captioned(scripted, 0) == 255).any()
+
+
+def test_the_light_edge_of_the_text_hugs_its_ink(episode):
+    """A heavier font is also wider: drawn beneath, it would run ahead of the text."""
+    scripted = Episode(0, episode.record, {}, np.zeros((3, 0), int), [np.full((60, 200, 3), 128, np.uint8)] * 4)
+    frame = captioned(scripted, 2)[..., 0]
+    ink, edge = (np.argwhere(mask).T for mask in (frame < 60, frame > 200))
+    for axis in (0, 1):
+        assert 0 <= ink[axis].min() - edge[axis].min() <= 2
+        assert 0 <= edge[axis].max() - ink[axis].max() <= 2
