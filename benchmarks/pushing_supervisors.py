@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from ddco_tasks import pushing
 from ddco_tasks.pushing_planner import Planner
-from ddco_tasks.pushing_supervisor import HAND, WayPoints, policy
+from ddco_tasks.pushing_supervisor import SHAKIER, WayPoints, policy
 from joblib import Parallel, delayed
 from scipy import stats
 from sklearn.model_selection import GroupKFold
@@ -45,6 +45,7 @@ MINDS = {
     "plain planner, every step": lambda: Planner("every_step", repeatable=False),
 }
 OBSERVATIONS = ("joint_angles", "tip", "box_from_tip", "goal_from_box", "goal")
+HANDS = (0.0, SHAKIER[0])  # rad/s: exact, and as in the demonstrations of the studies
 FOLDS = 5
 
 
@@ -106,7 +107,7 @@ def measure_supervisors(arguments: argparse.Namespace) -> dict[str, Any]:
 def measure_predictability(arguments: argparse.Namespace) -> dict[str, Any]:
     """How well the controls of each mind can be predicted, with an exact and an inexact hand."""
     results = {}
-    for mind, noise in itertools.product(arguments.minds, (0.0, HAND)):
+    for mind, noise in itertools.product(arguments.minds, HANDS):
         seeds = range(arguments.demonstrations)
         found = Parallel(n_jobs=arguments.jobs)(delayed(demonstrate)(mind, noise, seed) for seed in seeds)
         row = predictability([record for record, _ in found])
