@@ -21,9 +21,9 @@ from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.encoding import encode
 from ddco_pyro.files import read_tensors, write_tensors, write_text
 from ddco_pyro.hierarchy import Hierarchy
-from ddco_pyro.inference import log_likelihood
 from ddco_pyro.lockstep import Played, play
 from ddco_pyro.rollout import run_episode
+from ddco_pyro.run import log_likelihoods
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.task import Task
 from ddco_pyro.training import Trainer, plan
@@ -31,6 +31,7 @@ from ddco_pyro.training import Trainer, plan
 SETTINGS = Path(__file__).parent / "pushing_settings.json"  # written by the sweep
 POOL = 80  # demonstrations of a seed; a cell takes the first ones
 HELD_OUT = 40  # demonstrations, the same for every cell
+LABELS = ("side", "phase", "skill")  # of the supervisor: goal left or right, approach or push, both
 EPISODES = 20
 UPDATES = 3000  # gradient steps of a fit, whatever the method and the number of demonstrations
 
@@ -114,7 +115,7 @@ def demonstrations(folder: Path, supervisor: str, first: int, count: int) -> Dem
     if not path.exists():
         episodes = [run_episode(pushing.single, supervisor, first + number) for number in range(count)]
         Demonstrations(tuple(one.record for one in episodes)).write(path)
-    return Demonstrations.read(path)
+    return Demonstrations.read(path, labels=LABELS)
 
 
 def pool(folder: Path, spec: Spec, development: bool = False) -> Demonstrations:
@@ -154,10 +155,7 @@ def fit(spec: Spec, demos: Demonstrations, checkpoint: Path) -> tuple[Hierarchy,
 
 def per_step(hierarchy: Hierarchy, demos: Demonstrations) -> float:
     """Log-likelihood per step, nats, at the spec's σ."""
-    with torch.no_grad():
-        pieces = encode(demos, hierarchy.encoder, hierarchy.scaling).pieces()
-        total = sum(float(log_likelihood(hierarchy.tabulate(one), one.lengths).sum()) for _, one in pieces)
-    return total / sum(demos.lengths)
+    return float(log_likelihoods(hierarchy, demos).sum() / sum(demos.lengths))
 
 
 def fitted(cell: Cell, folder: Path) -> Hierarchy:

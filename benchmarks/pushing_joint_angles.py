@@ -1,9 +1,11 @@
 """Trajectories in joint-angle space: the supervisor's by the goal's side, a fitted hierarchy's by its active option.
 
-    python benchmarks/pushing_joint_angles.py [--demonstrations 40] [--seed 0] [--runs DIR] [--out DIR]
+    python benchmarks/pushing_joint_angles.py [--demonstrations 40] [--seed 0] [--seeds 5] [--options 2 4] [--runs DIR]
+        [--out DIR]
 
-After the paper's figure of backhand and forehand (SM 1.1). The hierarchy is a cell of ``pushing_studies.py``, which is
-fitted if it has not been. Writes ``joint_angles.png`` and ``joint_angles.json``: how often option and side agree.
+After the paper's figure of backhand and forehand (SM 1.1). The hierarchies are cells of ``pushing_studies.py``, which
+are fitted if they have not been. Writes ``joint_angles.png``, and ``joint_angles.json``: how far option and side agree
+in rollouts, and how far the segments of held-out demonstrations agree with the supervisor's side, phase and both.
 """
 
 from __future__ import annotations
@@ -18,12 +20,13 @@ import torch
 from ddco_tasks import pushing
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from pushing_cell import EVALUATION, Cell, fitted, pool, spec_of
+from pushing_cell import EVALUATION, LABELS, Cell, fitted, held_out, pool, spec_of
 from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.colours import option_colour
 from ddco_pyro.files import whole_file, write_text
 from ddco_pyro.lockstep import play
+from ddco_pyro.run import Fit
 
 EPISODES = 3
 SIDES = ("goal on the left (backhand)", "goal on the right (forehand)")
@@ -50,11 +53,27 @@ def draw(panels: dict[str, tuple[Sequence[Coloured], dict[int, str]]]) -> Figure
     return figure
 
 
+def agreement(options: int, seed: int, arguments: argparse.Namespace) -> dict[str, float]:
+    """NMI of the most likely segments of the held-out demonstrations with the supervisor's labels, and with the side
+    alone in the steps in which it pushes.
+    """
+    cell = Cell("DDCO MLP", options, arguments.demonstrations, seed)
+    spec = spec_of(cell)
+    demos = held_out(arguments.runs, spec)
+    (found,) = Fit(arguments.runs, spec, fitted(cell, arguments.runs)).segment(demos)
+    labels = {name: np.concatenate([one.labels[name] for one in demos]) for name in LABELS}
+    chosen, pushes = found[found >= 0], labels["phase"] == 1
+    score = {name: float(normalized_mutual_info_score(one, chosen)) for name, one in labels.items()}
+    return score | {"side_while_pushing": float(normalized_mutual_info_score(labels["side"][pushes], chosen[pushes]))}
+
+
 def main() -> None:
     """Draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--demonstrations", type=int, default=40)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="whose rollouts are drawn")
+    parser.add_argument("--seeds", type=int, default=5, help="whose segments are compared")
+    parser.add_argument("--options", type=int, nargs="+", default=(2, 4))
     parser.add_argument("--runs", type=Path, default=Path("runs/pushing-studies"))
     parser.add_argument("--out", type=Path, default=Path("docs/results/pushing"))
     arguments = parser.parse_args()
@@ -78,7 +97,11 @@ def main() -> None:
         figure.savefig(temporary, dpi=110, format="png")
     found = {
         "command": "python benchmarks/pushing_joint_angles.py"
-        f" --demonstrations {arguments.demonstrations} --seed {arguments.seed}",
+        f" --demonstrations {arguments.demonstrations} --seed {arguments.seed} --seeds {arguments.seeds}"
+        f" --options {' '.join(map(str, arguments.options))}",
+        "segments_nmi": {
+            str(k): [agreement(k, seed, arguments) for seed in range(arguments.seeds)] for k in arguments.options
+        },
         "goals": [one.outcome["goals"] for one in episodes],
         "nmi_option_side": float(normalized_mutual_info_score(sides, options)),
         "goal_on_the_right_given_option": {int(o): float(sides[options == o].mean()) for o in np.unique(options)},
