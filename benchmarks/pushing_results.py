@@ -149,6 +149,25 @@ def describe_complexity(rows: Sequence[Row]) -> list[str]:
     lines = [*table(rows, GOALS, "method", "demonstrations"), "", *_sigma(rows), ""]
     for other in ("flat MLP", "flat MLP, equal parameters"):
         lines += _differences(rows, "DDCO MLP", other)
+        lines += _with_half(rows, "DDCO MLP", other)
+    return lines
+
+
+def _with_half(rows: Sequence[Row], ours: str, theirs: str) -> list[str]:
+    """Goals of one method minus another's with twice the demonstrations, over seeds."""
+    goals = {(row["method"], row["demonstrations"], row["seed"]): row["goals"] for row in rows}
+    lines = []
+    for count in sorted({row["demonstrations"] for row in rows}):
+        pairs = [
+            {"goals": goals[ours, count // 2, seed] - value}
+            for (method, twice, seed), value in goals.items()
+            if (method, twice) == (theirs, count) and (ours, count // 2, seed) in goals and count % 2 == 0
+        ]
+        if pairs:
+            lines.append(
+                f"- {ours} with {count // 2} demonstrations minus {theirs} with {count}, paired by seed "
+                f"({len(pairs)}): {cell_text(pairs, 'goals')} goals."
+            )
     return lines
 
 
