@@ -24,6 +24,7 @@ from pushing_cell import EVALUATION, LABELS, Cell, fitted, held_out, pool, spec_
 from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.colours import option_colour
+from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.files import whole_file, write_text
 from ddco_pyro.lockstep import play
 from ddco_pyro.run import Fit
@@ -53,18 +54,35 @@ def draw(panels: dict[str, tuple[Sequence[Coloured], dict[int, str]]]) -> Figure
     return figure
 
 
-def agreement(options: int, seed: int, arguments: argparse.Namespace) -> dict[str, float]:
-    """NMI of the most likely segments of the held-out demonstrations with the supervisor's labels, and with the side
-    alone in the steps in which it pushes.
-    """
+def segments(options: int, seed: int, arguments: argparse.Namespace) -> tuple[Demonstrations, np.ndarray]:
+    """The held-out demonstrations, and the option of the most likely path at each step, one after the other."""
     cell = Cell("DDCO MLP", options, arguments.demonstrations, seed)
     spec = spec_of(cell)
     demos = held_out(arguments.runs, spec)
     (found,) = Fit(arguments.runs, spec, fitted(cell, arguments.runs)).segment(demos)
-    labels = {name: np.concatenate([one.labels[name] for one in demos]) for name in LABELS}
-    chosen, pushes = found[found >= 0], labels["phase"] == 1
-    score = {name: float(normalized_mutual_info_score(one, chosen)) for name, one in labels.items()}
-    return score | {"side_while_pushing": float(normalized_mutual_info_score(labels["side"][pushes], chosen[pushes]))}
+    return demos, found[found >= 0]
+
+
+def together(demos: Demonstrations, label: str) -> np.ndarray:
+    """A label of the supervisor at each step, one demonstration after the other."""
+    return np.concatenate([one.labels[label] for one in demos])
+
+
+def agreement(options: int, seed: int, arguments: argparse.Namespace) -> dict[str, float]:
+    """NMI of the most likely segments of the held-out demonstrations with the supervisor's labels, and with the side
+    alone in the steps in which it pushes.
+    """
+    demos, chosen = segments(options, seed, arguments)
+    score = {name: float(normalized_mutual_info_score(together(demos, name), chosen)) for name in LABELS}
+    side, pushes = together(demos, "side"), together(demos, "phase") == 1
+    return score | {"side_while_pushing": float(normalized_mutual_info_score(side[pushes], chosen[pushes]))}
+
+
+def pushing_steps(arguments: argparse.Namespace) -> Coloured:
+    """Joint angles and option of the steps of the held-out demonstrations in which the supervisor pushes."""
+    demos, chosen = segments(2, arguments.seed, arguments)
+    pushes = together(demos, "phase") == 1
+    return np.concatenate([one.observations["joint_angles"] for one in demos])[pushes], chosen[pushes]
 
 
 def main() -> None:
@@ -87,10 +105,12 @@ def main() -> None:
     options = np.concatenate([choices for _, choices in ours])
     demos = pool(arguments.runs, spec_of(cell))[: arguments.demonstrations]
     shown = [(one.observations["joint_angles"], 1 + (one.observations["goal_from_box"][:, 0] > 0)) for one in demos]
+    names = {number: f"option {number}" for number in np.unique(options)}
     figure = draw(
         {
             f"{len(demos)} demonstrations": (shown, dict(enumerate(SIDES, 1))),
-            f"DDCO MLP, {EPISODES} episodes": (ours, {number: f"option {number}" for number in np.unique(options)}),
+            "held-out demonstrations, pushing steps": ([pushing_steps(arguments)], names),
+            f"DDCO MLP, {EPISODES} episodes": (ours, names),
         }
     )
     with whole_file(arguments.out / "joint_angles.png") as temporary:

@@ -214,7 +214,7 @@ def describe_options(rows: Sequence[Row]) -> list[str]:
         found = stats.spearmanr(*means.values())
         lines.append(
             f"- {method}: Spearman's rank correlation over k of mean goals and mean held-out log-likelihood "
-            f"{found.statistic:.2f} (p = {found.pvalue:.2f}, {len(means['goals'])} values of k)."
+            f"{found.statistic:.2f} (p = {found.pvalue:.2g}, {len(means['goals'])} values of k)."
         )
     return [*lines, "", *_sigma(rows)]
 

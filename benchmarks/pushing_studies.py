@@ -52,7 +52,7 @@ from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.lockstep import play
 from ddco_pyro.spec import Spec
 
-COUNTS = (5, 10, 20, 40, 80)
+COUNTS = (5, 20, 40, 80)
 OPTIONS = (1, 2, 3, 4, 5, 6, 7, 8)
 RATES = (2e-3, 5e-3, 1e-2)
 EXECUTIONS = tuple(itertools.product(("mean", "sample"), ("sample", "most_likely")))

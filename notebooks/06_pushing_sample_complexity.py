@@ -46,3 +46,10 @@ for method in dict.fromkeys(row["method"] for row in rows):
 axes.set(xlabel="demonstrations", ylabel="goals in 2000 steps")
 axes.legend(fontsize=8)
 plt.show()
+
+# %% [markdown]
+# What else matters? One thing changed at a time, for every method alike
+# (`python benchmarks/pushing_studies.py variants`).
+
+# %%
+Image(str(RESULTS / "variants.png"))
