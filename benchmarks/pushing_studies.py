@@ -41,6 +41,7 @@ from pushing_cell import (
     held_out,
     per_step,
     pool,
+    recorded,
     run,
     spec_of,
     summary,
@@ -151,8 +152,8 @@ def best(rows: Sequence[dict[str, Any]], name: str, measure: str, *keys: str) ->
 
 def prepare(cells: Sequence[Cell], folder: Path) -> None:
     """Collect all demonstrations first, so that no two cells collect the same."""
-    for cell in cells:
-        spec = spec_of(cell)
+    specs = [spec_of(cell) for cell in cells]
+    for spec in {(recorded(one), one.seed): one for one in specs}.values():
         held_out(folder, spec)
         pool(folder, spec)
 
