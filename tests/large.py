@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import tempfile
 import zlib
 from pathlib import Path
 from typing import NamedTuple
@@ -33,13 +32,18 @@ class Ended(NamedTuple):
     peak: int
 
 
+SMALL = """
+import resource, subprocess, sys
+status = subprocess.run(sys.argv[1:]).returncode
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+sys.exit(status)
+"""
+"""A process counts the memory of the one that started it: this one has little."""
+
+
 def measured(*arguments: object, **environment: str) -> Ended:
     """Run a command in a process of its own."""
-    with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
-        process = subprocess.Popen(
-            [COMMAND, *map(str, arguments)], stdout=out, stderr=err, env={**os.environ, **environment}
-        )
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        out.seek(0), err.seek(0)
-        return Ended(process.returncode, out.read(), err.read(), 1024 * usage.ru_maxrss)
+    command = [sys.executable, "-c", SMALL, COMMAND, *map(str, arguments)]
+    ended = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **environment})
+    out, _, peak = ended.stdout.rstrip().rpartition("\n")
+    return Ended(ended.returncode, out, ended.stderr, 1024 * int(peak))
