@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import sys
 import time
 import traceback
@@ -120,6 +121,9 @@ def fit(
     console.log_likelihoods(fitted.metrics)
     console.warnings(degeneracies(fitted.spec, fitted.metrics))
     print(f"report: {write_report(fitted, demonstrations(found))}")
+    if found.hierarchy and found.demonstrations.path:
+        file = shlex.quote(found.demonstrations.path)
+        print(f"next: ddco-pyro segment {shlex.quote(str(folder))} {file} --html segments.html")
 
 
 @app.command(epilog="Example: ddco-pyro select specs/mine.yaml --set selection.grid.hierarchy.levels.0.count=[1,2,4,8]")

@@ -47,7 +47,7 @@ def _frequency(found: Inspection) -> str:
 
 def _range(one: Field) -> str:
     low, high = one.minimum[np.isfinite(one.minimum)], one.maximum[np.isfinite(one.maximum)]
-    return f"{low.min():.4g} to {high.max():.4g}" if len(low) and len(high) else "-"
+    return f"{float(low.min()):.4g} to {float(high.max()):.4g}" if len(low) and len(high) else "-"
 
 
 def _notes(one: Field) -> str:

@@ -9,9 +9,10 @@ from pathlib import Path
 import torch
 
 from ddco_pyro.collect import OnDemonstration, collect
-from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.demonstrations import Demonstrations, extent
 from ddco_pyro.encoding import Shapes
 from ddco_pyro.hierarchy import Hierarchy
+from ddco_pyro.memory import refuse_too_much
 from ddco_pyro.networks import ShapeError
 from ddco_pyro.spec import BaselineSpec, Spec, SpecError, own_networks
 from ddco_pyro.task import find_task
@@ -134,12 +135,21 @@ def parts(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
 def demonstrations(spec: Spec, on_demonstration: OnDemonstration | None = None) -> Demonstrations:
     """The spec's demonstrations: read from its file, collected from its task's supervisor where there is none.
 
-    :raises DemonstrationsError: the file is missing or wrong, or lacks an observation or label that the spec names.
+    :raises DemonstrationsError: the file is missing or wrong, lacks an observation or label that the spec names, or a
+        fit to it would take more memory than is allowed.
     """
     own = spec.demonstrations
     path = Path(own.path) if own.path else None
     if spec.demonstrated_task is not None and (path is None or not path.exists()):
         path = collect(spec.demonstrated_task, own, path, on_demonstration)
     assert path is not None  # a spec has a task or a file
+    _refuse_what_is_larger_than_memory(spec, path)
     labels = (own.labels,) if own.labels else ()
     return Demonstrations.read(path, [one.key for one in spec.observations], labels)
+
+
+def _refuse_what_is_larger_than_memory(spec: Spec, path: Path) -> None:
+    found = extent(path, [one.key for one in spec.observations])
+    needed = found.fit({f"obs/{one.key}" for one in spec.observations if one.differences})
+    remedy = "leave observations out, make its demonstrations fewer or equally long, or scale pictures down"
+    refuse_too_much(needed, f"{path}: a fit to {', '.join(one.key for one in spec.observations)}", remedy)

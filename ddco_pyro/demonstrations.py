@@ -20,6 +20,7 @@ from ddco_pyro.hdf5 import (
     DemonstrationsError,
     array_at,
     attributes_of,
+    dataset_at,
     datasets,
     member,
     names_in_mask,
@@ -28,6 +29,7 @@ from ddco_pyro.hdf5 import (
     opened,
     written,
 )
+from ddco_pyro.memory import PROGRAM, Extent, refuse_too_much
 from ddco_pyro.sources.recording import Recording, of_array
 
 
@@ -136,9 +138,12 @@ class Demonstrations(Sequence[Demonstration]):
 
         :param observations: the keys to read; all of them if None.
         :param labels: names of the ground-truth labels to read.
-        :raises DemonstrationsError: the file cannot be read or does not hold what was asked for.
+        :raises DemonstrationsError: the file cannot be read, does not hold what was asked for, or holds more than fits
+            into memory.
         """
         with opened(path) as file:
+            needed = PROGRAM + _extent(file, observations, labels).size
+            refuse_too_much(needed, "reading it", "read only some observations, or scale pictures down")
             return cls(*_read(file, observations, labels))
 
     def write(self, path: str | Path) -> None:
@@ -253,14 +258,48 @@ def _unknown(name: str, names: Sequence[str]) -> str:
 # --- HDF5 -------------------------------------------------------------------------------------------------------------
 
 
-def _read(
-    file: h5py.File, observations: Sequence[str] | None, labels: Sequence[str]
-) -> tuple[tuple[Demonstration, ...], dict[str, tuple[str, ...]], dict[str, Attribute]]:
+def extent(path: str | Path, observations: Sequence[str]) -> Extent:
+    """How much there is of these observations and of the controls, by the file's headers alone.
+
+    :raises DemonstrationsError: the file cannot be read or does not hold them.
+    """
+    with opened(path) as file:
+        return _extent(file, observations, ())
+
+
+def _extent(file: h5py.File, observations: Sequence[str] | None, labels: Sequence[str]) -> Extent:
+    return Extent.of(
+        {
+            "actions": dataset_at(group, "actions", f"{name}: "),
+            **_datasets(group, "obs", observations, name),
+            **_datasets(group, "labels", labels, name),
+        }
+        for name, group in _groups(file)
+    )
+
+
+def _datasets(group: h5py.Group, folder: str, keys: Sequence[str] | None, name: str) -> dict[str, h5py.Dataset]:
+    """The datasets ``keys`` of a folder of a demonstration, by their place; all of them if None."""
+    if keys is not None and not keys:
+        return {}
+    members = member(group, folder, h5py.Group, f"{name}: ")
+    names = datasets(members) if keys is None else keys
+    return {f"{folder}/{key}": dataset_at(members, key, f"{name}: {folder}/") for key in names}
+
+
+def _groups(file: h5py.File) -> list[tuple[str, h5py.Group]]:
+    """The demonstrations of a file with their names, in order."""
     data = member(file, "data", h5py.Group, "")
     names = sorted((name for name in data if isinstance(data.get(name), h5py.Group)), key=natural)
     if not names:
         raise DemonstrationsError("the group 'data' holds no demonstrations; at least one is needed")
-    demonstrations = tuple(_read_one(data[name], name, observations, labels) for name in names)
+    return [(name, data[name]) for name in names]
+
+
+def _read(
+    file: h5py.File, observations: Sequence[str] | None, labels: Sequence[str]
+) -> tuple[tuple[Demonstration, ...], dict[str, tuple[str, ...]], dict[str, Attribute]]:
+    demonstrations = tuple(_read_one(group, name, observations, labels) for name, group in _groups(file))
     masks = member(file, "mask", h5py.Group, "") if "mask" in file else {}
     return demonstrations, {mask: names_in_mask(masks, mask) for mask in masks}, attributes_of(file)
 

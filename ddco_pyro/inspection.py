@@ -21,7 +21,8 @@ class Field:
     """One array over all demonstrations that have it: ``actions``, ``obs/<key>`` or ``labels/<name>``.
 
     :param shape: of one step.
-    :param minimum: smallest finite value of each dimension, flattened; empty where there is none.
+    :param minimum: smallest finite value of each dimension, flattened, of the array's own type; empty where there is
+        none, infinite where none is finite.
     :param nan: number of NaN.
     :param infinite: number of infinite values.
     :param constant: dimensions (flattened) that have one value in the whole file.
@@ -83,8 +84,9 @@ class Field:
         else:
             low = high = values
         if len(values):
-            self.minimum = np.minimum(self.minimum, low.min(0))
-            self.maximum = np.maximum(self.maximum, high.max(0))
+            low, high = low.min(0), high.max(0)
+            self.minimum = np.minimum(self.minimum, low) if len(self.minimum) else low
+            self.maximum = np.maximum(self.maximum, high) if len(self.maximum) else high
 
 
 @dataclass(frozen=True)
@@ -182,9 +184,8 @@ def _add(fields: dict[str, Field], place: str, column: Column, name: str, steps:
         return
     known = fields.get(place)
     if known is None:
-        size = int(np.prod(column.shape[1:], dtype=np.int64))
-        ends = np.full(size, np.inf), np.full(size, -np.inf)
-        known = fields[place] = Field(place, tuple(column.shape[1:]), str(column.dtype), *ends)
+        none = np.zeros(0)
+        known = fields[place] = Field(place, tuple(column.shape[1:]), str(column.dtype), none, none)
     if known.shape != tuple(column.shape[1:]):
         problems.append(
             f"{name}: {place} has shape {list(column.shape[1:])} at each step, but {list(known.shape)} elsewhere"

@@ -106,7 +106,8 @@ def _validation(found: Inspection) -> Iterator[str]:
     if used:
         yield f"  # held out: as mask/{' and mask/'.join(used)} in the file say"
     else:
-        fraction = max(0.2 if len(found.lengths) < MANY else 0.1, 1.5 / len(found.lengths))  # one at least
+        number = len(found.lengths)
+        fraction = max(0.2 if number < MANY else 0.1, (1.5 if number > LEAST else 1) / number)  # one at least
         yield f"  valid_fraction: {fraction:.2g}               # of the demonstrations, held out"
     others = [name for name in found.masks if name not in ("train", "valid")]
     if others:

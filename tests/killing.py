@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 COMMAND = Path(sys.executable).with_name("ddco-pyro")
@@ -34,29 +38,70 @@ def whole(arguments: Sequence[object], folder: Path, cache: Path) -> float:
     return time.monotonic() - start
 
 
-def until_done(arguments: Sequence[object], folder: Path, cache: Path, kills: int, seconds: float, seed: int) -> int:
-    """Run a command again and again, killing it (SIGKILL) at random moments, ``kills`` times at most; how often it was.
+@dataclass(frozen=True)
+class Killed:
+    """How often a command was killed, together with the processes it started and alone."""
+
+    together: int
+    alone: int
+
+    @property
+    def total(self) -> int:
+        return self.together + self.alone
+
+
+Kept = Callable[[Path], set[object] | None]
+"""What is safe in a folder, one thing each: it may only become more. None where all is done and it is put away."""
+
+
+def until_done(
+    arguments: Sequence[object],
+    folder: Path,
+    cache: Path,
+    kills: int,
+    seconds: float,
+    seed: int,
+    kept: Kept = lambda folder: None,
+) -> Killed:
+    """Run a command again and again, killing it (SIGKILL) at random moments, ``kills`` times at most.
+
+    Half of the time all its processes die, as when a machine loses power; else it alone, and its helpers are orphans.
+    Nothing that is kept is lost or made again.
 
     :param seconds: how long it takes undisturbed: moments lie within.
     """
-    choose, killed = random.Random(seed), 0
-    while True:
-        process = subprocess.Popen(
-            [COMMAND, *map(str, arguments)],
-            cwd=folder,
-            env=environment(cache),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        )
-        try:
-            limit = choose.uniform(0, seconds) if killed < kills else 600
-            _, err = process.communicate(timeout=limit)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)  # its helpers too: a machine that loses power spares none
-            process.communicate()
-            assert killed < kills, "it hangs"
-            killed += 1
-            continue
-        assert process.returncode == 0, err.decode()
-        return killed
+    choose, killed, safe = random.Random(seed), Counter[bool](), set[object]()
+    groups = []
+    try:
+        while True:
+            with tempfile.TemporaryFile("w+") as err:  # not a pipe: orphans would keep it open
+                process = subprocess.Popen(
+                    [COMMAND, *map(str, arguments)],
+                    cwd=folder,
+                    env=environment(cache),
+                    stdout=subprocess.DEVNULL,
+                    stderr=err,
+                    start_new_session=True,
+                )
+                groups.append(process.pid)
+                limit = choose.uniform(0, seconds) if killed.total() < kills else 600
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(timeout=limit)
+                running = process.poll() is None
+                if running:
+                    assert killed.total() < kills, "it hangs"
+                    alone = choose.random() < 0.5
+                    killed[alone] += 1
+                    process.kill() if alone else os.killpg(process.pid, signal.SIGKILL)
+                    process.wait()
+                now = kept(folder)
+                assert now is None or safe <= now, f"lost or made again: {safe - now}"
+                safe = now or set()
+                if not running:
+                    err.seek(0)
+                    assert process.returncode == 0, err.read()
+                    return Killed(killed[False], killed[True])
+    finally:
+        for group in groups:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(group, signal.SIGKILL)

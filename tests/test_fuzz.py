@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import resource
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -51,23 +52,25 @@ def check_specs(base: dict[str, Any], path: Path, seeds: range) -> None:
         assert found.status == 0 or all(line.startswith("ddco-pyro: ") for line in found.err.splitlines()), seed
         assert (found.err == "") == (found.status == 0), f"seed {seed}: {found.err}"
         ended[found.status] += 1
+    print(f"{len(seeds)} damaged specs: {ended[0]} read, {ended[2]} refused")
     assert min(ended.values()) > 0
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 2 * 2**20
 
 
 def check_files(folder: Path, seeds: range) -> None:
-    worker, ended = Worker(), set()
+    worker, ended = Worker(), Counter[str]()
     try:
         for seed in seeds:
             path = folder / f"{seed}.hdf5"
             damaged_file(path, seed)
             found = worker.try_file(path)
             assert set(found) <= {"fine", "refused"}, f"seed {seed}: {found}"
-            ended |= set(found)
+            ended.update(found)
             path.unlink()
     finally:
         worker.close()
-    assert ended == {"fine", "refused"}
+    print(f"{len(seeds)} damaged files, each read, looked at and imported: {dict(ended)}")
+    assert set(ended) == {"fine", "refused"}
 
 
 def test_damaged_specs(base: dict[str, Any], tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ How ``fixtures/`` was made: ``fixtures/write_robomimic.py`` and ``fixtures/write
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
 from pathlib import Path
@@ -24,6 +25,7 @@ from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.errors import BadInput
 from ddco_pyro.importing import Choice, import_demonstrations
 from ddco_pyro.inspection import inspect
+from ddco_pyro.sources.video import _frames
 
 FIXTURES = Path(__file__).parent / "fixtures"
 ROBOMIMIC, LEROBOT = FIXTURES / "robomimic.hdf5", FIXTURES / "lerobot"
@@ -98,11 +100,28 @@ def test_lerobot_without_its_videos(out: Path) -> None:
         assert (file.attrs["control_frequency"], file.attrs["robot_type"]) == (10, "point")
 
 
+no_file_is_left_open = pytest.mark.filterwarnings(
+    "error::ResourceWarning", "error::pytest.PytestUnraisableExceptionWarning"
+)
+
+
+@no_file_is_left_open
 def test_lerobots_videos_frame_by_frame(out: Path) -> None:
     import_demonstrations(LEROBOT, out, choice=Choice(("images/top",)))
     for episode, demo in enumerate(Demonstrations.read(out)):
         brightness = demo.observations["images/top"].mean((1, 2, 3))
         np.testing.assert_allclose(brightness, 40 * episode + 5 * np.arange(len(demo)), atol=1.5)
+
+
+@no_file_is_left_open
+def test_a_video_need_not_be_read_to_its_end() -> None:
+    video = next((LEROBOT / "videos").rglob("*.mp4"))
+    frames = _frames(video, 0.0, 20, 10.0, (16, 32))
+    assert next(frames).shape == (16, 32, 3)
+    frames.close()
+    with pytest.raises(DemonstrationsError, match="has 26 frames from second 0 on, and 99 are needed"):
+        list(_frames(video, 0.0, 99, 10.0, (16, 32)))
+    gc.collect()
 
 
 @pytest.fixture
@@ -125,6 +144,17 @@ def test_lerobot_splits_and_subtasks(dataset: Path, out: Path) -> None:
 
 def remove_video(dataset: Path) -> None:
     next((dataset / "videos").rglob("*.mp4")).unlink()
+
+
+def no_video(dataset: Path) -> None:
+    next((dataset / "videos").rglob("*.mp4")).write_bytes(b"nothing")
+
+
+def small_video(dataset: Path) -> None:
+    info = dataset / "meta" / "info.json"
+    said = json.loads(info.read_text())
+    said["features"]["observation.images.top"]["shape"][:2] = [11, 12]
+    info.write_text(json.dumps(said))
 
 
 def older(dataset: Path) -> None:
@@ -150,6 +180,8 @@ def no_json(dataset: Path) -> None:
     ("change", "message"),
     [
         (remove_video, r"file-000\.mp4: the video is missing; leave its observation out with --observation"),
+        (no_video, r"file-000\.mp4: cannot be decoded: .*Invalid data found"),
+        (small_video, r"file-000\.mp4: is \d+ x \d+, and meta/info\.json says 11 x 12"),
         (older, r"is a LeRobot dataset v2\.1, and v3\.x can be read; convert it with LeRobot's own script first"),
         (cut, r"demo_0: cannot be read, or is damaged"),
         (no_rows, r"the rows of episode 0 are missing or not together"),

@@ -7,17 +7,20 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+import selecting
 import toy_task
-from killing import until_done, whole
+import yaml
+from killing import Kept, Killed, until_done, whole
 from random_demonstrations import demonstrations
 
+from ddco_pyro.files import read_tensors
 from ddco_pyro.importing import import_demonstrations
 
 HERE = Path(__file__).parent
@@ -55,13 +58,54 @@ def same_run(one: Path, other: Path) -> None:
     assert metrics[0] | aside == metrics[1] | aside
 
 
+def same_selection(one: Path, other: Path) -> None:
+    """Equal folds, scores, choice, and fit of what was chosen."""
+    for name in ("spec.yaml", "folds.json", "selection.json", "selection.md"):
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+    scores = [selecting.kept(folder) for folder in (one, other)]
+    for found in [*scores[0].values(), *scores[1].values()]:
+        del found["seconds"]
+    assert scores[0] == scores[1]
+    same_run(one / "fit", other / "fit")
+
+
+def same_segments(one: Path, other: Path) -> None:
+    """Equal labels, and the same table and page beside."""
+    same_hdf5(one, other)
+    for name in ("a.csv", "a.html"):
+        assert one.with_name(name).read_bytes() == other.with_name(name).read_bytes()
+
+
+def parts(result: str) -> Kept:
+    """The parts of a file that is made little by little."""
+    return lambda folder: None if (folder / result).exists() else written(folder.glob(f".{result}.parts/*.hdf5"))
+
+
+def written(paths: Iterable[Path]) -> set[object]:
+    """Files, each with the moment at which it was written."""
+    return {(path.name, path.stat().st_ino, path.stat().st_mtime_ns) for path in paths}
+
+
+def epochs(folder: Path) -> set[object]:
+    """The epochs of every model that need not be trained again."""
+    found: set[object] = set()
+    for path in folder.rglob("checkpoints/latest.safetensors"):
+        history = json.loads(read_tensors(path)[1]["progress"])["history"]
+        found |= {(path.parts[-3], number) for number in range(len(history))}
+    return found
+
+
 @dataclass(frozen=True)
 class Case:
-    """A command, the name of what it writes, and how two of those are compared."""
+    """A command, the name of what it writes, how two of those are compared, what it keeps on the way, and files that
+    are in its folder from the beginning.
+    """
 
     arguments: tuple[object, ...]
     result: str
     same: Callable[[Path, Path], None]
+    kept: Kept
+    inputs: tuple[Path, ...] = (HERE / "toy_task.py",)
 
 
 @pytest.fixture(scope="module")
@@ -72,28 +116,42 @@ def cases(tmp_path_factory: pytest.TempPathFactory, toy_run) -> dict[str, Case]:
     short = [one for key in ("training.epochs=25", "compare_with=[flat]") for one in ("--set", key)]
     shutil.copytree(toy_run.folder, folder / "run")
     import_demonstrations(_toy_demonstrations(folder), folder / "toy.hdf5")
+    data = selecting.data_at(folder)
+    data["selection"] = data["selection"] | {"folds": 3}
+    (folder / "grid.yaml").write_text(yaml.safe_dump(data))
+    tables = ("--csv", "a.csv", "--html", "a.html")
     return {
         "collect": Case(
             ("collect", folder / "toy.yaml", "--out", "demos.hdf5", "--set", "demonstrations.count=40"),
             "demos.hdf5",
             same_hdf5,
+            parts("demos.hdf5"),
         ),
-        "import": Case(("import", folder / "source.hdf5", "--out", "imported.hdf5"), "imported.hdf5", same_hdf5),
-        "fit": Case(("fit", folder / "toy.yaml", "--out", "fitted", "--resume", *short), "fitted", same_run),
-        "segment": Case(
-            (
-                "segment",
-                folder / "run",
-                folder / "toy.hdf5",
-                "--out",
-                "labelled.hdf5",
-                "--csv",
-                "a.csv",
-                "--html",
-                "a.html",
-            ),
-            "labelled.hdf5",
+        "import": Case(
+            ("import", folder / "source.hdf5", "--out", "imported.hdf5"),
+            "imported.hdf5",
             same_hdf5,
+            parts("imported.hdf5"),
+        ),
+        "fit": Case(("fit", folder / "toy.yaml", "--out", "fitted", "--resume", *short), "fitted", same_run, epochs),
+        "select": Case(
+            ("select", folder / "grid.yaml", "--out", "selected", "--jobs", "2"),
+            "selected",
+            same_selection,
+            lambda folder: written(folder.glob("selected/folds/*.json")) | epochs(folder),
+        ),
+        "segment": Case(
+            ("segment", folder / "run", folder / "toy.hdf5", "--out", "labelled.hdf5", *tables),
+            "labelled.hdf5",
+            same_segments,
+            lambda folder: None,
+        ),
+        "segment in place": Case(
+            ("segment", folder / "run", "toy.hdf5", *tables),
+            "toy.hdf5",
+            same_segments,
+            lambda folder: None,
+            (folder / "toy.hdf5",),
         ),
     }
 
@@ -107,17 +165,17 @@ def _toy_demonstrations(folder: Path) -> Path:
     return path
 
 
-def check(case: Case, tmp_path: Path, kills: int, seed: int) -> int:
+def check(case: Case, tmp_path: Path, kills: int, seed: int) -> Killed:
     """Undisturbed and killed again and again, each in a folder and with a cache of its own."""
     folders = [tmp_path / name for name in ("whole", "killed")]
     for folder in folders:
         folder.mkdir()
-        shutil.copy(HERE / "toy_task.py", folder)
+        for path in case.inputs:
+            shutil.copy(path, folder)
     seconds = whole(case.arguments, folders[0], tmp_path / "cache-whole")
-    killed = until_done(case.arguments, folders[1], tmp_path / "cache-killed", kills, seconds, seed)
+    killed = until_done(case.arguments, folders[1], tmp_path / "cache-killed", kills, seconds, seed, case.kept)
     case.same(folders[0] / case.result, folders[1] / case.result)
-    left = [path.name for path in folders[1].rglob("*") if path.name.endswith((".tmp", ".parts"))]
-    assert not [name for name in left if case.result in name or case.result == "fitted"], left
+    assert not [path for path in folders[1].rglob("*") if path.name.endswith((".tmp", ".parts"))]
     return killed
 
 
@@ -126,12 +184,12 @@ def test_killed_and_called_again(cases: dict[str, Case], tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["collect", "import", "fit", "segment"])
+@pytest.mark.parametrize("name", ["collect", "import", "fit", "select", "segment", "segment in place"])
 def test_killed_at_very_many_moments(cases: dict[str, Case], tmp_path: Path, name: str) -> None:
-    killed = round_ = 0
-    while killed < 13:  # four commands: 52 moments; a moment that comes after the end kills nothing
-        folder = tmp_path / str(round_)
+    found: list[Killed] = []
+    while sum(one.total for one in found) < 10:  # sixty in all; a moment that comes after the end kills nothing
+        folder = tmp_path / str(len(found))
         folder.mkdir()
-        killed += check(cases[name], folder, kills=5, seed=round_)
-        round_ += 1
-    print(f"{name}: killed {killed} times")
+        found.append(check(cases[name], folder, kills=5, seed=len(found)))
+    together, alone = sum(one.together for one in found), sum(one.alone for one in found)
+    print(f"{name}: killed {together + alone} times, {alone} of them without its helpers")

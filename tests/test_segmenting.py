@@ -197,6 +197,10 @@ def test_lerobot_subtasks(lerobot_run, tmp_path):
         np.testing.assert_array_equal(
             source.recording("demo_2").labels["subtask"].array(), found.segments[2].levels["phase"].options
         )
+    time = (out / "meta" / "info.json").stat().st_mtime_ns
+    again = call("segment", lerobot_run.folder, LEROBOT, "--lerobot", out, "--level", "phase")
+    assert (again.status, again.out) == (0, f"{out}\n")
+    assert (out / "meta" / "info.json").stat().st_mtime_ns == time  # it is this very copy
     for wrong, message in (
         ([LEROBOT, "--lerobot", out], "annotated: is there already; choose another --lerobot"),
         ([out, "--lerobot", tmp_path / "twice"], "has subtasks already; name a dataset without them"),

@@ -38,9 +38,21 @@ def test_what_it_writes_is_fitted_as_it_is(path: Path, tmp_path: Path) -> None:
     assert call("init", path, "--out", spec).out == f"{spec}: fit it with: ddco-pyro fit {spec} --out runs/spec\n"
     ended = call("fit", spec, "--out", tmp_path / "run", "--set", "training.epochs=1")
     assert ended.status == 0, ended.err
+    assert ended.out.splitlines()[-1] == f"next: ddco-pyro segment {tmp_path / 'run'} '{path}' --html segments.html"
+    looked = call("inspect", path).out.splitlines()[-1]
+    assert looked == f"next: ddco-pyro init '{path}' --out 'my demos: 1'.yaml"
     fit = ddco_pyro.load(tmp_path / "run")
     assert list(fit.baselines) == ["flat"]
     assert "agreement" in fit.metrics  # with the labels in the file
+
+
+def test_three_demonstrations_are_enough(tmp_path: Path) -> None:
+    demonstrations(3).write(tmp_path / "demos.hdf5")
+    assert call("init", tmp_path / "demos.hdf5", "--out", tmp_path / "spec.yaml").status == 0
+    ended = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--set", "training.epochs=1")
+    assert ended.status == 0, ended.err
+    numbers = ddco_pyro.load(tmp_path / "run").metrics["demonstrations"]
+    assert [numbers[part] for part in ("train", "tune", "valid")] == [1, 1, 1]
 
 
 def test_it_says_what_it_leaves_out(path: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import sys
 from enum import StrEnum
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import typer
@@ -50,7 +51,7 @@ def inspect(
         print(f"\nto fit to it, import it first: ddco-pyro import {file} --out demos.hdf5")
         return
     try:
-        print(f"\n{starting_spec(found, file)}", end="")
+        print(f"\n{starting_spec(found, file)}\nnext: ddco-pyro init {quote(str(file))} --out {quote(file.stem)}.yaml")
     except DemonstrationsError as error:
         print(f"\nno spec to start with: {str(error).removeprefix(f'{file}: ')}")
 

@@ -84,12 +84,13 @@ def _annotate(
     from ddco_pyro.sources.lerobot import LeRobot
 
     assert isinstance(source, LeRobot)
-    check_target(source, out)
-    levels = [one.name for one in fit.spec.hierarchy.levels] if fit.spec.hierarchy else []
-    if level is not None and level not in levels:
-        raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(levels)})")
+    counts = {one.name: one.count for one in fit.spec.hierarchy.levels} if fit.spec.hierarchy else {}
+    if level is not None and level not in counts:
+        raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(counts)})")
+    chosen = level or next(iter(counts), "")
+    check_target(source, out, chosen, counts.get(chosen, 0))
     found = segments(fit, source, on_demonstration)
-    annotate(source, out, found, level or levels[0])
+    annotate(source, out, found, chosen)
     print(out)
     return found
 

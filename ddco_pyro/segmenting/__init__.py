@@ -13,6 +13,7 @@ from ddco_pyro.encoding import STEPS_AT_ONCE, encode
 from ddco_pyro.errors import BadInput
 from ddco_pyro.hdf5 import DemonstrationsError, nearest
 from ddco_pyro.inference import most_likely_path, posterior
+from ddco_pyro.memory import INFERENCE, PROGRAM, Extent, refuse_too_much
 from ddco_pyro.run import Fit
 from ddco_pyro.sources import Recording, Source
 
@@ -84,13 +85,42 @@ def segments(
 def _groups(source: Source, fit: Fit) -> Iterator[list[Demonstration]]:
     """Demonstrations of about so many steps together as the networks take at once."""
     group: list[Demonstration] = []
+    before = 0
     for name in source.names:
-        demo = _demonstration(source.recording(name), fit)
-        if group and (len(group) + 1) * max(len(demo), *map(len, group)) > STEPS_AT_ONCE:
+        recording = source.recording(name)
+        at_once = _steps_at_once(recording, fit, before)
+        demo = _demonstration(recording, fit)
+        if group and (len(group) + 1) * max(len(demo), *map(len, group)) > at_once:
             yield group
             group = []
         group.append(demo)
+        before += len(demo)
     yield group
+
+
+GROUP_BYTES = 5e8
+"""Demonstrations are segmented together while they take no more than this."""
+
+FOUND = 40
+"""Bytes that are kept of a segmented step for each level."""
+
+
+def _steps_at_once(recording: Recording, fit: Fit, before: int) -> int:
+    """How many steps like these can be segmented together.
+
+    :param before: steps that were segmented before: their options are in memory.
+    :raises DemonstrationsError: this demonstration alone takes more memory than is allowed.
+    """
+    known = recording.observations
+    seen = {f"obs/{key}": known[key] for key in fit.hierarchy.encoder.shapes if key in known}
+    found = Extent.of([{"actions": recording.actions, **seen}])
+    (steps,) = found.lengths
+    each = found.size / max(steps, 1) + found.step(
+        {f"obs/{one.key}" for one in fit.spec.observations if one.differences}
+    )
+    needed = PROGRAM + steps * (each + INFERENCE) + FOUND * fit.hierarchy.depth * (before + steps)
+    refuse_too_much(needed, f"{recording.name}: segmenting its {steps} steps", "divide it, or the file")
+    return int(min(STEPS_AT_ONCE, GROUP_BYTES / (each + INFERENCE)))
 
 
 def _demonstration(recording: Recording, fit: Fit) -> Demonstration:

@@ -23,6 +23,10 @@ ROOM = 0.03
 """A segment is written upon if it takes more than this part of the longest demonstration."""
 
 
+MOST_BOXES = 100_000
+"""Segments that a page shows, about: more are slow in any browser, and take much memory to write."""
+
+
 @dataclass(frozen=True)
 class Box:
     """One segment on the page: where it lies, in percent of the longest demonstration, and what it says."""
@@ -37,15 +41,17 @@ class Box:
 
 def write_page(path: Path, found: Segmented, run: str, file: str) -> None:
     """Write the page, whole or not at all; whatever comes from files is escaped."""
-    longest = max(len(one) for one in found.segments)
+    shown = list(_first(found))
+    longest = max(len(one) for one in shown)
     page = {
         "run": run,
         "file": file,
         "levels": [_level(name, count, found) for name, count in found.counts.items()],
         "demonstrations": [
             {"name": one.name, "steps": _steps(len(one), found), "rows": list(_rows(one, found, longest))}
-            for one in found.segments
+            for one in shown
         ],
+        "all": len(found),
         "longest": _steps(longest, found),
     }
     environment = jinja2.Environment(
@@ -56,6 +62,16 @@ def write_page(path: Path, found: Segmented, run: str, file: str) -> None:
         lstrip_blocks=True,
     )
     write_text(path, environment.get_template("page.html.j2").render(page))
+
+
+def _first(found: Segmented) -> Iterator[Segments]:
+    """As many demonstrations as the page shows: about :data:`MOST_BOXES` segments, one demonstration at least."""
+    boxes = 0
+    for one in found.segments:
+        if boxes >= MOST_BOXES:
+            return
+        boxes += sum(int(level.boundaries.sum()) for level in one.levels.values())
+        yield one
 
 
 def _steps(steps: int, found: Segmented) -> str:

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from ddco_pyro.data import demonstrations, dimensions
 from ddco_pyro.errors import Failed
-from ddco_pyro.files import write_text
+from ddco_pyro.files import only_one, write_text
 from ddco_pyro.selection import choice as choosing
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.selection import grid, parallel, plot, scoring, table
@@ -84,7 +84,13 @@ def select(spec: Spec, folder: Path, watcher: Watcher, workers: Workers = HERE, 
     demonstrations and ``stop_early``; neither on the workers nor on interruptions.
 
     :raises SelectionFailed: every candidate has failed in some fold.
+    :raises Busy: another process is at work on the folder.
     """
+    with only_one(folder):
+        return _select(spec, folder, watcher, workers, stop_early)
+
+
+def _select(spec: Spec, folder: Path, watcher: Watcher, workers: Workers, stop_early: bool) -> Selection:
     demos = demonstrations(grid.wide(spec), watcher.collected)
     folds = dividing.divide(demos, spec.selection.folds, spec.seed)
     dividing.keep(folds, folder / "folds.json")

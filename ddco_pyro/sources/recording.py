@@ -37,8 +37,11 @@ class Column:
 
     def array(self) -> np.ndarray:
         """The whole array."""
-        blocks = list(self.blocks())
-        return np.concatenate(blocks) if blocks else np.zeros(self.shape, self.dtype)
+        whole, at = np.zeros(self.shape, self.dtype), 0
+        for block in self.blocks():
+            whole[at : at + len(block)] = block
+            at += len(block)
+        return whole
 
 
 @dataclass(frozen=True)

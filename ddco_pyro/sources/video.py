@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 import imageio_ffmpeg
 import numpy as np
@@ -36,19 +39,36 @@ def video_column(path: Path, start: float, steps: int, size: tuple[int, int], fr
 def _frames(path: Path, start: float, steps: int, frequency: float, size: tuple[int, int]) -> Iterator[np.ndarray]:
     if not path.is_file():
         raise DemonstrationsError(f"{path}: the video is missing; leave its observation out with --observation")
-    seek = ["-ss", f"{max(start - 0.5 / frequency, 0):.6f}"]  # half a frame early: the next frame is the one meant
-    frames = imageio_ffmpeg.read_frames(str(path), input_params=seek, output_params=["-frames:v", str(steps)])
+    seek = f"{max(start - 0.5 / frequency, 0):.6f}"  # half a frame early: the next frame is the one meant
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-ss", seek, "-i", str(path)]
+    command += ["-frames:v", str(steps), "-f", "image2pipe", "-c:v", "ppm", "-"]
     seen = 0
-    try:
-        width, height = next(frames)["size"]
-        if (height, width) != size:
-            raise DemonstrationsError(f"{path}: is {height} x {width}, and meta/info.json says {size[0]} x {size[1]}")
-        for frame in frames:
-            seen += 1
-            yield np.frombuffer(frame, np.uint8).reshape(*size, 3)
-    except (OSError, RuntimeError, StopIteration) as error:
-        raise DemonstrationsError(f"{path}: cannot be decoded: {' '.join(str(error).split())[:200]}") from error
-    finally:
-        frames.close()
+    with tempfile.TemporaryFile() as said:
+        with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=said) as process:
+            assert process.stdout is not None
+            try:
+                for frame in _pictures(process.stdout):
+                    if frame.shape[:2] != size:
+                        found, told = (" x ".join(map(str, one)) for one in (frame.shape[:2], size))
+                        raise DemonstrationsError(f"{path}: is {found}, and meta/info.json says {told}")
+                    seen += 1
+                    yield frame
+            finally:
+                process.kill()  # where it was not read to its end
+        said.seek(0)
+        reason = said.read().decode(errors="replace").split()
+    if seen == 0 and reason:
+        raise DemonstrationsError(f"{path}: cannot be decoded: {' '.join(reason)[:200]}")
     if seen != steps:
         raise DemonstrationsError(f"{path}: has {seen} frames from second {start:g} on, and {steps} are needed")
+
+
+def _pictures(stream: IO[bytes]) -> Iterator[np.ndarray]:
+    """Pictures in PPM, one after the other: P6, width and height, 255, the pixels."""
+    while stream.readline():
+        width, height = map(int, stream.readline().split())
+        stream.readline()
+        pixels = stream.read(height * width * 3)
+        if len(pixels) < height * width * 3:
+            return
+        yield np.frombuffer(pixels, np.uint8).reshape(height, width, 3)

@@ -1,0 +1,251 @@
+"""Files that are larger than memory: streamed where that can be, else refused before they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import toy_task
+import yaml
+from large import measured, zeros
+from random_demonstrations import demonstrations as random_demonstrations
+from test_cli import call
+
+from ddco_pyro.data import demonstrations
+from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.errors import BadInput
+from ddco_pyro.inspection import inspect
+from ddco_pyro.memory import Extent, allowed
+from ddco_pyro.spec import parse_spec
+
+GIGABYTE = 10**9
+LIMIT = 2 * GIGABYTE
+
+
+def large(path: Path, number: int, steps: int, size: int = 1000) -> Path:
+    """Demonstrations of as many numbers, all zero, compressed; controls that are not."""
+    random = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        for index in range(number):
+            group = file.create_group(f"data/demo_{index}")
+            zeros(group, "obs/state", (steps, size), (min(steps, 1000), size))
+            group["obs/arm"] = random.normal(size=(steps, 2))
+            group["actions"] = random.normal(size=(steps, 2))
+    return path
+
+
+def toy_like(path: Path, number: int, steps: int) -> Path:
+    """What the toy run was fitted to, much of it."""
+    with h5py.File(path, "w") as file:
+        for index in range(number):
+            group = file.create_group(f"data/demo_{index}")
+            zeros(group, "obs/offsets", (steps, 4), (steps, 4))
+            zeros(group, "obs/visited", (steps, 1), (steps, 1))
+            zeros(group, "actions", (steps, 2), (steps, 2))
+    return path
+
+
+def spec_of(path: Path, *observations: str) -> Path:
+    spec = path.with_suffix(".yaml")
+    data = yaml.safe_load(toy_task.SPEC)
+    del data["task"], data["rollout"], data["compare_with"]
+    data |= {"demonstrations": {"path": str(path)}, "observations": list(observations)}
+    spec.write_text(yaml.safe_dump(data))
+    return spec
+
+
+# --- before anything is read ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def eight(tmp_path: Path) -> Path:
+    """8 GB in a file of a few megabytes."""
+    return large(tmp_path / "eight.hdf5", 10, 100_000)
+
+
+def test_a_fit_to_what_is_larger_than_memory_is_refused(eight: Path, tmp_path: Path) -> None:
+    spec = spec_of(eight, "state")
+    for command in (["check", spec], ["fit", spec, "--out", tmp_path / "run"], ["select", spec, "--out", tmp_path]):
+        ended = call(*command)
+        assert (ended.status, ended.err.count("\n")) == (2, 1)
+        assert ended.err.startswith(
+            f"ddco-pyro: {eight}: a fit to state takes about 29.2 GB of memory, and 2 are allowed;"
+        )
+        assert "leave observations out" in ended.err
+        assert ended.err.endswith("or allow more with DDCO_PYRO_MEMORY=29.2\n")
+    assert not (tmp_path / "run").exists()
+    assert call("check", spec_of(eight, "arm")).status == 0  # what is not asked for does not count
+
+
+def test_reading_what_is_larger_than_memory_is_refused(eight: Path) -> None:
+    with pytest.raises(DemonstrationsError, match=r"eight.hdf5: reading it takes about 8.7 GB of memory, and 2 are"):
+        Demonstrations.read(eight)
+    assert Demonstrations.read(eight, ["arm"]).lengths == (100_000,) * 10
+
+
+def test_more_can_be_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "demos.hdf5"
+    random_demonstrations(4).write(path)
+    spec = parse_spec(yaml.safe_load(spec_of(path, "pose").read_text()))
+    assert demonstrations(spec).names == ("demo_0", "demo_1", "demo_2", "demo_3")
+    monkeypatch.setenv("DDCO_PYRO_MEMORY", "0.5")
+    with pytest.raises(DemonstrationsError, match=r"and 0\.5 are allowed"):
+        demonstrations(spec)
+    for wrong in ("much", "-1", "0", "nan"):
+        monkeypatch.setenv("DDCO_PYRO_MEMORY", wrong)
+        with pytest.raises(BadInput, match=rf"DDCO_PYRO_MEMORY={wrong}: has to be a positive number of GB"):
+            allowed()
+
+
+@pytest.mark.parametrize(
+    ("lengths", "observations", "differences", "measured"),
+    [((500,) * 200, 100, True, 1058), ((500,) * 200, 200, True, 1577), ((20_000,) * 5, 4, True, 740)],
+)
+def test_the_estimate_is_near_what_was_measured(
+    lengths: tuple[int, ...], observations: int, differences: bool, measured: int
+) -> None:
+    """Most memory of `fit` with the spec that `init` wrote, MB, as getrusage said; controls of 3 dimensions."""
+    size = 8 * sum(lengths) * (observations + 3)
+    found = Extent(lengths, size, {"actions": 3, "obs/state": observations}, {}).fit(
+        {"obs/state"} if differences else ()
+    )
+    assert found / 1e6 * 1.024**-2 == pytest.approx(measured, rel=0.1)
+
+
+def test_a_demonstration_that_cannot_be_segmented_is_refused(toy_run, tmp_path: Path) -> None:
+    path = toy_like(tmp_path / "long.hdf5", 2, 1_000_000)
+    ended = call("segment", toy_run.folder, path)
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert ended.err.startswith(f"ddco-pyro: {path}: demo_0: segmenting its 1000000 steps takes about")
+    assert "divide it" in ended.err
+
+
+# --- what no block of it can be read ----------------------------------------------------------------------------------
+
+
+def one_step(group: h5py.Group) -> None:
+    zeros(group, "obs/state", (3, 10**8), (1, 10**6), "u1")
+
+
+def one_chunk(group: h5py.Group) -> None:
+    zeros(group, "obs/state", (3, 10**6), (300, 10**6), "u1")
+
+
+def nothing_stored(group: h5py.Group) -> None:
+    group.create_dataset("obs/state", (3, 10**9), "f8", chunks=(1, 10**6), compression="gzip")
+
+
+def virtual(group: h5py.Group) -> None:
+    layout = h5py.VirtualLayout((10**12,), "f8")
+    layout[:1000] = h5py.VirtualSource(".", "small", (1000,))
+    group.file["small"] = np.zeros(1000)
+    group.create_virtual_dataset("obs/state", layout)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (one_step, "obs/state takes 100 MB at each step, and at most 67 can be read; write less in a step"),
+        (one_chunk, "obs/state is stored in chunks of 300 MB, and at most 268 can be read; write smaller chunks"),
+        (nothing_stored, "obs/state claims 24000000000 bytes, but the file holds 0; write it again"),
+        (virtual, "obs/state claims 8000000000000 bytes, but the files hold"),
+    ],
+)
+def test_what_cannot_be_read_in_blocks(make: Callable[[h5py.Group], None], message: str, tmp_path: Path) -> None:
+    path = tmp_path / "demos.hdf5"
+    with h5py.File(path, "w") as file:
+        for number in range(3):
+            group = file.create_group(f"data/demo_{number}")
+            group["actions"] = np.zeros((3, 2))
+            make(group)
+            if make is virtual:
+                break
+    assert message in " ".join(inspect(path).problems)
+    for command in (["init", path, "--out", tmp_path / "a.yaml"], ["import", path, "--out", tmp_path / "b.hdf5"]):
+        ended = call(*command)
+        assert (ended.status, ended.err.count("\n")) == (2, 1)
+    with pytest.raises(DemonstrationsError, match=message[:20]):
+        Demonstrations.read(path)
+
+
+def test_a_mask_of_everything(tmp_path: Path) -> None:
+    path = tmp_path / "demos.hdf5"
+    random_demonstrations(4).write(path)
+    with h5py.File(path, "r+") as file:
+        zeros(file, "mask/valid", (10**9,), (10**7,), "S1")
+    with pytest.raises(DemonstrationsError, match="mask/valid takes 1000 MB, and no list of names is that long"):
+        inspect(path)
+
+
+# --- what is streamed -------------------------------------------------------------------------------------------------
+
+
+def test_looking_does_not_take_more_than_a_block(tmp_path: Path) -> None:
+    small, path = large(tmp_path / "small.hdf5", 3, 100), large(tmp_path / "large.hdf5", 3, 20_000)
+    base, found = measured("inspect", small), measured("inspect", path)
+    assert (base.status, found.status) == (0, 0)
+    assert "3 demonstrations of 20000 to 20000 steps" in found.out
+    assert found.peak - base.peak < 150e6  # of 480 MB
+
+
+def test_a_page_of_very_many_segments_shows_the_first(toy_run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = toy_like(tmp_path / "demos.hdf5", 9, 50)
+    monkeypatch.setattr("ddco_pyro.segmenting.page.MOST_BOXES", 1)
+    assert call("segment", toy_run.folder, path, "--html", tmp_path / "a.html").status == 0
+    text = (tmp_path / "a.html").read_text()
+    assert text.count('class="demonstration"') == 1
+    assert "The first 1 of 9 demonstrations" in text
+
+
+@pytest.mark.slow
+def test_eight_gigabytes_are_looked_at(eight: Path, tmp_path: Path) -> None:
+    ended = measured("inspect", eight)
+    print(f"inspect of 8 GB: {ended.peak / 1e6:.0f} MB at most")
+    assert ended.status == 0
+    assert "10 demonstrations of 100000 to 100000 steps" in ended.out
+    assert ended.peak < LIMIT
+    ended = measured("init", eight, "--out", tmp_path / "spec.yaml")
+    assert (ended.status, ended.peak < LIMIT) == (0, True)
+    assert "# - state   # is constant" in (tmp_path / "spec.yaml").read_text()
+
+
+@pytest.mark.slow
+def test_a_file_that_really_has_more_than_memory(tmp_path: Path, toy_run, toy_spec) -> None:
+    """2.6 GB of noise for pictures, which no network sees: all goes through, and is right."""
+    path, number, steps = tmp_path / "demos.hdf5", 26, 500
+    originals = list(demonstrations(toy_spec))
+    random = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        for index in range(number):
+            group = file.create_group(f"data/demo_{index}")
+            one = originals[index % len(originals)]
+            rows = np.resize(np.arange(len(one)), steps)
+            group["obs/offsets"], group["obs/visited"] = (
+                one.observations["offsets"][rows],
+                one.observations["visited"][rows],
+            )
+            group["actions"] = one.actions[rows]
+            group.create_dataset("obs/camera", data=random.integers(0, 256, (steps, 250, 267, 3), dtype=np.uint8))
+    assert path.stat().st_size > 2.6 * GIGABYTE
+    peaks = {}
+
+    def run(*arguments: object) -> str:
+        ended = measured(*arguments)
+        assert ended.status == 0, ended.err
+        peaks[arguments[0]] = ended.peak
+        return ended.out
+
+    assert "26 demonstrations of 500 to 500 steps" in run("inspect", path)
+    run("init", path, "--out", tmp_path / "spec.yaml")
+    run("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--set", "training.epochs=2")
+    run("segment", toy_run.folder, path, "--html", tmp_path / "a.html")
+    run("import", path, "--out", tmp_path / "imported.hdf5")
+    print({name: f"{peak / 1e6:.0f} MB" for name, peak in peaks.items()})
+    assert max(peaks.values()) < LIMIT
+    with h5py.File(path) as file, h5py.File(tmp_path / "imported.hdf5") as imported:
+        for name in ("demo_0", "demo_25"):
+            for key in ("actions", "obs/camera", "labels/option"):
+                np.testing.assert_array_equal(imported[f"data/{name}/{key}"], file[f"data/{name}/{key}"])
