@@ -198,6 +198,7 @@ def draw(summaries: dict[str, Any], path: Path) -> None:
             left.set_yticks(range(len(summary)), list(summary))
             left.set_ylim(len(summary) - 0.5, -0.5)
             left.set(title=name, xlabel="held-out nats per step")
+            left.locator_params(axis="x", nbins=5)
             middle.set(xlabel="NMI of pairs of seeds", xlim=(-0.02, 1.02))
             right.set(xlabel="P(meta-policy selects an option)", xlim=(-0.02, 1.02))
         keep(figure, path, "Quality and structure of fits from different seeds, for each way to train", "")
