@@ -155,19 +155,17 @@ def describe_complexity(rows: Sequence[Row]) -> list[str]:
 
 def _with_half(rows: Sequence[Row], ours: str, theirs: str) -> list[str]:
     """Goals of one method minus another's with twice the demonstrations, over seeds."""
-    goals = {(row["method"], row["demonstrations"], row["seed"]): row["goals"] for row in rows}
+    found = {(row["method"], row["demonstrations"], row["seed"]): row for row in rows}
     lines = []
     for count in sorted({row["demonstrations"] for row in rows}):
         pairs = [
-            {"goals": goals[ours, count // 2, seed] - value}
-            for (method, twice, seed), value in goals.items()
-            if (method, twice) == (theirs, count) and (ours, count // 2, seed) in goals and count % 2 == 0
+            (found[ours, count // 2, seed], row)
+            for (method, twice, seed), row in found.items()
+            if (method, twice) == (theirs, count) and (ours, count // 2, seed) in found and count % 2 == 0
         ]
         if pairs:
-            lines.append(
-                f"- {ours} with {count // 2} demonstrations minus {theirs} with {count}, paired by seed "
-                f"({len(pairs)}): {cell_text(pairs, 'goals')} goals."
-            )
+            what = f"{ours} with {count // 2} demonstrations minus {theirs} with {count}"
+            lines.append(f"- {what}, paired by seed ({len(pairs)}): {_goals(pairs)}.")
     return lines
 
 
@@ -175,17 +173,26 @@ def _differences(rows: Sequence[Row], ours: str, theirs: str) -> list[str]:
     """Goals and held-out log-likelihood of one method minus another's on the same demonstrations, over seeds."""
     lines = []
     for (count,), own in grouped(rows, "demonstrations").items():
-        pairs = [pair for pair in grouped(own, "seed").values() if {ours, theirs} <= {row["method"] for row in pair}]
-        by_name = [{row["method"]: row for row in pair} for pair in pairs]
-        measures = ("goals", "log_likelihood_held_out")
-        differences = [{key: pair[ours][key] - pair[theirs][key] for key in measures} for pair in by_name]
-        if differences:
-            goals, likelihood = cell_text(differences, "goals"), cell_text(differences, measures[1], "{:.3f}")
+        by_name = [{row["method"]: row for row in pair} for pair in grouped(own, "seed").values()]
+        pairs = [(pair[ours], pair[theirs]) for pair in by_name if {ours, theirs} <= set(pair)]
+        if pairs:
+            likelihood = _difference(pairs, "log_likelihood_held_out", "{:.3f}")
             lines.append(
-                f"- {ours} minus {theirs}, {count} demonstrations, paired by seed ({len(pairs)}): {goals} goals, "
+                f"- {ours} minus {theirs}, {count} demonstrations, paired by seed ({len(pairs)}): {_goals(pairs)}, "
                 f"{likelihood} held-out nats/step."
             )
     return lines
+
+
+def _goals(pairs: Sequence[tuple[Row, Row]]) -> str:
+    """The differences in goals, without and (where it was measured) with a limit."""
+    limited = _difference(pairs, "limited_goals")
+    return f"{_difference(pairs, 'goals')} goals" + (f" ({limited} with the limit)" if limited != "-" else "")
+
+
+def _difference(pairs: Sequence[tuple[Row, Row]], measure: str, form: str = "{:.1f}") -> str:
+    both = [(ours[measure], theirs[measure]) for ours, theirs in pairs]
+    return cell_text([{measure: one - other} for one, other in both if None not in (one, other)], measure, form)
 
 
 def draw_complexity(figure: Figure, rows: Sequence[Row], supervisor: float | None) -> None:
@@ -202,7 +209,7 @@ def draw_complexity(figure: Figure, rows: Sequence[Row], supervisor: float | Non
         axes.set(xscale="log", xlabel="demonstrations", ylabel=label)
         axes.set_xticks(counts, [str(count) for count in counts])
         axes.minorticks_off()
-    figure.axes[0].legend(fontsize=7, loc="center left", bbox_to_anchor=(0.0, 0.75))
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), fontsize=7, loc="outside lower center", ncols=6)
 
 
 def describe_options(rows: Sequence[Row]) -> list[str]:
