@@ -36,8 +36,8 @@ Image(RESULTS / "stability.png")
 Markdown((RESULTS / "stability.md").read_text())
 
 # %% [markdown]
-# What the paper found, a variance halved by VQ and layer-wise training and segments that agree more, is seen on pushing.
-# On the needle and Meta-World segments agree more too, the variances are no smaller; see the p-values for how well a
-# ratio of two variances of ten seeds is known. On the needle a meta-policy that is trained jointly from random parameters
-# keeps more of the control to itself than any other: the beginning of what the paper calls high-fitting. None of the
-# fits is degenerate.
+# What the paper found, a variance halved by VQ and layer-wise training and segments that agree more, is seen on
+# pushing. On the needle and Meta-World segments agree more too, the variances are no smaller; see the p-values for how
+# well a ratio of two variances of ten seeds is known. On the needle a meta-policy that is trained jointly from random
+# parameters keeps more of the control to itself than any other: the beginning of what the paper calls high-fitting.
+# None of the fits is degenerate.
