@@ -84,7 +84,8 @@ def write(study: str, cells: Sequence[Cell], folder: Path, out: Path, command: s
     write_text(out / f"{study}.csv", text.getvalue())
     describe, draw = STUDIES[study]
     supervisor = _supervisor(out)
-    head = [f"Command: `{command}`", "", _protocol(supervisor), ""]
+    whole = "What commands with other parts of the grid have measured is in the table, too."
+    head = [f"Command: `{command}`. {whole}", "", _protocol(supervisor), ""]
     write_text(out / f"{study}.md", "\n".join([*head, *describe(rows)]) + "\n")
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
