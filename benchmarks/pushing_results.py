@@ -283,7 +283,7 @@ def draw_variants(figure: Figure, rows: Sequence[Row], supervisor: float | None)
             axes.barh(at, means, height, xerr=halves, color=COLOURS[method], label=method, error_kw={"lw": 1})
         axes.set_yticks(np.arange(len(names)) + 0.4 - height / 2, names, fontsize=8)
         axes.invert_yaxis()
-        axes.set(xlabel="goals in 2000 steps", title=f"{count} demonstrations", xlim=(0, None))
+        axes.set(xlabel="goals in 2000 steps", title=f"{count} demonstrations", xlim=(0, 35))
     figure.axes[0].legend(fontsize=7)
 
 
