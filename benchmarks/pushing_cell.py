@@ -121,18 +121,12 @@ def demonstrations(folder: Path, supervisor: str, first: int, count: int) -> Dem
 def pool(folder: Path, spec: Spec, development: bool = False) -> Demonstrations:
     """All demonstrations of a spec's supervisor and training seed."""
     first = (DEVELOPMENT if development else TRAINING) + 1000 * spec.seed
-    return demonstrations(folder, recorded(spec), first, POOL)
+    return demonstrations(folder, spec.demonstrations.supervisor, first, POOL)
 
 
 def held_out(folder: Path, spec: Spec, development: bool = False) -> Demonstrations:
     """Demonstrations of a spec's supervisor that nothing is trained on; others for development."""
-    return demonstrations(folder, recorded(spec), HELD_OUT_SEED + 1000 * development, HELD_OUT)
-
-
-def recorded(spec: Spec) -> str:
-    """The supervisor whose demonstrations a spec learns from."""
-    assert spec.demonstrations.supervisor is not None  # every pushing spec names one
-    return spec.demonstrations.supervisor
+    return demonstrations(folder, spec.demonstrations.supervisor, HELD_OUT_SEED + 1000 * development, HELD_OUT)
 
 
 def fit(spec: Spec, demos: Demonstrations, checkpoint: Path) -> tuple[Hierarchy, float]:

@@ -69,13 +69,18 @@ def together(demos: Demonstrations, label: str) -> np.ndarray:
 
 
 def agreement(options: int, seed: int, arguments: argparse.Namespace) -> dict[str, float]:
-    """NMI of the most likely segments of the held-out demonstrations with the supervisor's labels, and with the side
-    alone in the steps in which it pushes.
+    """NMI of the most likely segments of the held-out demonstrations with the supervisor's labels, with the side alone
+    in the steps in which it pushes and in those in which it approaches, and there with the way the shoulder turns.
     """
     demos, chosen = segments(options, seed, arguments)
-    score = {name: float(normalized_mutual_info_score(together(demos, name), chosen)) for name in LABELS}
     side, pushes = together(demos, "side"), together(demos, "phase") == 1
-    return score | {"side_while_pushing": float(normalized_mutual_info_score(side[pushes], chosen[pushes]))}
+    turns = np.concatenate([one.actions[:, 0] for one in demos]) > 0
+    pairs = {name: (together(demos, name), chosen) for name in LABELS} | {
+        "side_while_pushing": (side[pushes], chosen[pushes]),
+        "side_while_approaching": (side[~pushes], chosen[~pushes]),
+        "shoulder_while_approaching": (turns[~pushes], chosen[~pushes]),
+    }
+    return {name: float(normalized_mutual_info_score(*pair)) for name, pair in pairs.items()}
 
 
 def pushing_steps(arguments: argparse.Namespace) -> Coloured:
@@ -122,6 +127,7 @@ def main() -> None:
         "segments_nmi": {
             str(k): [agreement(k, seed, arguments) for seed in range(arguments.seeds)] for k in arguments.options
         },
+        "pushing_share": float(np.mean(together(held_out(arguments.runs, spec_of(cell)), "phase"))),
         "goals": [one.outcome["goals"] for one in episodes],
         "nmi_option_side": float(normalized_mutual_info_score(sides, options)),
         "goal_on_the_right_given_option": {int(o): float(sides[options == o].mean()) for o in np.unique(options)},

@@ -1,4 +1,5 @@
-"""The studies of planar pushing (paper §5.1): each fits and rolls out many small cells, and can be stopped and resumed.
+"""The studies of planar pushing (paper §5.1): each fits and rolls out many small cells, and can be stopped and resumed
+(but for the sweep of settings before them).
 
     python benchmarks/pushing_studies.py sweep
     python benchmarks/pushing_studies.py sample_complexity [--seeds 5] [--limited] [--jobs 2] [--runs DIR] [--out DIR]
@@ -41,7 +42,6 @@ from pushing_cell import (
     held_out,
     per_step,
     pool,
-    recorded,
     run,
     spec_of,
     summary,
@@ -153,7 +153,7 @@ def best(rows: Sequence[dict[str, Any]], name: str, measure: str, *keys: str) ->
 def prepare(cells: Sequence[Cell], folder: Path) -> None:
     """Collect all demonstrations first, so that no two cells collect the same."""
     specs = [spec_of(cell) for cell in cells]
-    for spec in {(recorded(one), one.seed): one for one in specs}.values():
+    for spec in {(one.demonstrations.supervisor, one.seed): one for one in specs}.values():
         held_out(folder, spec)
         pool(folder, spec)
 
