@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from ddco_pyro.networks import Inputs, InputShape, ShapeError, build
 from ddco_pyro.networks.conv import POOLED
@@ -126,6 +127,16 @@ def test_networks_of_different_steps_differ():
     inputs.vector[:] = inputs.vector[:, :1]
     found = network(inputs)
     assert all(not torch.allclose(found[:, t], found[:, 0]) for t in range(1, LONGEST))
+
+
+@pytest.mark.parametrize(("trajectories", "steps", "start"), [(2, 60, 0), (2, 59, 0), (2, 7, 40), (1, 1, 7), (1, 1, 99)])
+def test_each_step_costs_one_network_however_many_there_are(trajectories, steps, start):
+    width, longest = 16, 60
+    network = make(InputShape(FEATURES, {}, longest), network="per_timestep", hidden=[width])
+    with FlopCounterMode(display=False) as counter:
+        network(make_inputs(trajectories, steps, start))
+    multiplications = COPIES * (FEATURES * width + width * OUTPUTS)
+    assert counter.get_total_flops() == 2 * trajectories * steps * multiplications
 
 
 # --- images -----------------------------------------------------------------------------------------------------------
