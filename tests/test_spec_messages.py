@@ -90,6 +90,9 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"observations": ["a", "a"]}, "observations.1.key: 'a' is given twice; keep one"),
     ({"control.std": -0.1}, "control.std: must be a positive number or {learn: true}, got -0.1"),
     ({"control.std": "0.1"}, "control.std: must be a positive number or {learn: true}, got '0.1'"),
+    ({"control.std": [0.1]}, "control.std: must be a positive number or {learn: true}, got [0.1]"),
+    ({"control.std": {}}, "control.std.learn: missing; it has to be given"),
+    ({"control.std": {"learn": True, "floor": -1}}, "control.std.floor: must be greater than 0, got -1"),
     ({"control.std": {"learn": False}}, "control.std.learn: must be true, got false"),
     (
         {"control.std": {"learn": True, "flor": 1}},
@@ -100,6 +103,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "control.scale: must be standardize, none, or a list of positive numbers, got 'standardise' "
         "(did you mean standardize?)",
     ),
+    ({"control.scale": 3}, "control.scale: must be standardize, none, or a list of positive numbers, got 3"),
+    ({"control.scale": []}, "control.scale: must have at least 1 item(s), got []"),
     ({"control.scale": [1.0, 0.0]}, "control.scale.1: must be greater than 0, got 0.0"),
     (
         {"training.optimizer.name": "Adam"},

@@ -69,9 +69,7 @@ def _follows_from_another(error: ErrorDetails, errors: list[ErrorDetails]) -> bo
 
 
 def _lines_of(error: ErrorDetails, model: type[BaseModel]) -> Iterator[str]:
-    parts = [str(part) for part in error["loc"]]
-    allowed = "".join(part[1:-1] for part in parts if re.fullmatch("<.+>", part))
-    parts = [part for part in parts if part != "[key]" and not re.fullmatch("<.*>", part)]
+    parts = [str(part) for part in error["loc"] if part != "[key]"]
     path = ".".join(parts)
     if error["type"] == "spec":
         for below, text in error["ctx"]["problems"]:
@@ -79,18 +77,18 @@ def _lines_of(error: ErrorDetails, model: type[BaseModel]) -> Iterator[str]:
     elif error["type"] == "extra_forbidden":
         yield f"{path}: unknown key; {_suggestion(parts, model)}"
     else:
-        yield f"{path or 'spec'}: {_text(error, allowed)}"
+        yield f"{path or 'spec'}: {_text(error)}"
 
 
-def _text(error: ErrorDetails, allowed: str) -> str:
-    """What is wrong in words; ``allowed`` is what the key takes where it takes more than one type."""
+def _text(error: ErrorDetails) -> str:
+    """What is wrong in words."""
     kind = "invalid_key" if "[key]" in error["loc"] else error["type"]
     context = {
         key: f"{value:.15g}" if isinstance(value, float) else value for key, value in error.get("ctx", {}).items()
     }
     names = re.findall(r"'([^']*)'", context.get("expected", ""))
     context["names"] = " or ".join(names) or "true"
-    expected = f"must be {allowed}" if allowed else _MESSAGES.get(kind, error["msg"]).format(**context)
+    expected = _MESSAGES.get(kind, error["msg"]).format(**context)
     return expected if kind == "missing" else f"{expected}, got {show(error['input'])}{nearest(error['input'], names)}"
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import Field, TypeAdapter
 
-from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Seed, Share, Text, bare
+from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Seed, Share, Text, bare, nested
 
 
 class DemonstrationsSpec(Model):
@@ -52,27 +52,29 @@ class LearnedStd(Model):
     """Lower bound, in scaled units."""
 
 
-_STD = "<a positive number or {learn: true}>"
-_STD_LEARNED = "<>"
-_SCALE_NAME = "<standardize, none, or a list of positive numbers>"
-_SCALE_SIZES = "<>"
+Std = Annotated[
+    Positive | LearnedStd, nested((Mapping,), LearnedStd.model_validate, "a positive number or {learn: true}")
+]
+
+ScaleName = Literal["standardize", "none"]
+Scales = Annotated[Items[Positive], Field(min_length=1)]
+Scale = Annotated[
+    ScaleName | Scales,
+    nested(
+        (list, tuple),
+        TypeAdapter(Scales, config=Model.model_config).validate_python,
+        "standardize, none, or a list of positive numbers",
+        get_args(ScaleName),
+    ),
+]
 
 
 class ControlSpec(Model):
     """The distribution of the control, a_t ~ N(π(s_t), σ²)."""
 
-    std: Annotated[
-        Annotated[Positive, Tag(_STD)] | Annotated[LearnedStd, Tag(_STD_LEARNED)],
-        Discriminator(lambda value: _STD_LEARNED if isinstance(value, Mapping | LearnedStd) else _STD),
-    ] = 0.1
+    std: Std = 0.1
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``."""
-    scale: Annotated[
-        Annotated[Literal["standardize", "none"], Tag(_SCALE_NAME)]
-        | Annotated[Items[Positive], Field(min_length=1), Tag(_SCALE_SIZES)],
-        Discriminator(
-            lambda value: _SCALE_SIZES if isinstance(value, Sequence) and not isinstance(value, str) else _SCALE_NAME
-        ),
-    ] = "standardize"
+    scale: Scale = "standardize"
     """``standardize`` (by the training demonstrations), ``none``, or one positive number for each control dimension,
     by which it is divided."""
 
