@@ -10,8 +10,8 @@ import torch
 
 from ddco_pyro.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.encoding import STEPS_AT_ONCE, encode
-from ddco_pyro.errors import BadInput
-from ddco_pyro.hdf5 import DemonstrationsError, nearest
+from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.hdf5 import DemonstrationsError
 from ddco_pyro.inference import most_likely_path, posterior
 from ddco_pyro.memory import INFERENCE, PROGRAM, Extent, refuse_too_much
 from ddco_pyro.run import Fit

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from ddco_pyro.errors import BadInput
+from ddco_pyro.errors import BadInput, nearest
 
 
 class SpecError(BadInput):
@@ -97,12 +97,6 @@ def show(value: Any) -> str:
     text = {None: "null", True: "true", False: "false"}.get(value) if value is None or isinstance(value, bool) else None
     text = text or repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def nearest(given: Any, names: Iterable[str]) -> str:
-    """A question whether one of the names was meant, or nothing where none is close."""
-    close = difflib.get_close_matches(str(given), list(names), n=1)
-    return f" (did you mean {close[0]}?)" if close else ""
 
 
 def _suggestion(parts: list[str], whole: type[BaseModel]) -> str:

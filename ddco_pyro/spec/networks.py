@@ -8,7 +8,8 @@ from typing import Any
 
 from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer, model_validator
 
-from ddco_pyro.spec.messages import invalid, nearest
+from ddco_pyro.errors import nearest
+from ddco_pyro.spec.messages import invalid
 from ddco_pyro.spec.types import Count, Emission, Items, Model, Share
 
 CUSTOM = "module:Class"

@@ -7,7 +7,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WrapValidator
 
-from ddco_pyro.spec.messages import invalid, nearest, show
+from ddco_pyro.errors import nearest
+from ddco_pyro.spec.messages import invalid, show
 
 T = TypeVar("T")
 Items = Annotated[tuple[T, ...], Field(strict=False)]  # strict would refuse the lists that YAML gives
