@@ -99,9 +99,8 @@ class Level(nn.Module):
         self.count = spec.count
         with _named(f"{place}.policy"):
             self.policy = Caller(
-                spec.policy, spec.policy.emits or _default(options_below), options_below, shape, control, control_size,
-                spec.count,
-            )  # fmt: skip
+                spec.policy, spec.policy.emits, options_below, shape, control, control_size, spec.count
+            )
         with _named(f"{place}.termination"):
             self.termination = build(spec.termination, shape, 1, spec.count)
 
@@ -113,10 +112,6 @@ def _named(place: str) -> Iterator[None]:
         yield
     except ShapeError as error:
         raise ShapeError(f"{place}: {error}") from error
-
-
-def _default(options_below: int) -> tuple[Emits, ...]:
-    return ("options",) if options_below else ("control",)
 
 
 class Hierarchy(nn.Module):
