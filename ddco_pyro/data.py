@@ -98,7 +98,8 @@ def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
         try:
             build_hierarchy(baseline_spec(spec, baseline), dimensions)
         except SpecError as error:  # what it shares with the spec is in order: it is about its own network
-            raise SpecError(f"compare_with.{number}.{str(error).removeprefix('baseline.')}") from error
+            problems = (problem.removeprefix("baseline.") for problem in error.problems)
+            raise SpecError(*(f"compare_with.{number}.{problem}" for problem in problems)) from error
     return hierarchy
 
 

@@ -18,7 +18,7 @@ from ddco_pyro.ahmm import Tables
 from ddco_pyro.encoding import Batch, ControlScaling, ObservationEncoder, Shapes
 from ddco_pyro.networks import Inputs, InputShape, ShapeError, build
 from ddco_pyro.outputs import Decision, Outputs
-from ddco_pyro.spec import ControlSpec, LearnedStd, LevelSpec, NetworkSpec, Spec
+from ddco_pyro.spec import ControlSpec, LearnedStd, LevelSpec, NetworkSpec, Spec, SpecError
 
 INITIAL_STD = 0.5
 """A learned standard deviation starts here, in scaled units."""
@@ -110,6 +110,8 @@ def _named(place: str) -> Iterator[None]:
     """Errors about a network say where in the spec it stands."""
     try:
         yield
+    except SpecError as error:
+        raise SpecError(*(f"{place}.{problem}" for problem in error.problems)) from error
     except ShapeError as error:
         raise ShapeError(f"{place}: {error}") from error
 
@@ -178,7 +180,9 @@ def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
     assert spec.baseline is not None  # a spec has one or the other
     policy = spec.baseline.policy
     if spec.baseline.kind == "per_timestep":
-        policy = NetworkSpec(network="per_timestep", hidden=policy.hidden, dropout=policy.dropout)
+        policy = NetworkSpec(
+            network="per_timestep", hidden=getattr(policy, "hidden", ()), dropout=getattr(policy, "dropout", 0.0)
+        )
     return policy, ("control",)
 
 

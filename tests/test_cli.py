@@ -151,6 +151,7 @@ def test_help_has_examples():
 # --- what does not ----------------------------------------------------------------------------------------------------
 
 OWN = "hierarchy.levels.0.policy.network=test_networks:Own"
+WITH_MEMORY = "{network: 'test_networks:WithMemory', options: {how: over time}}"
 
 
 def with_set(*overrides):
@@ -172,7 +173,11 @@ GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
         (["check", "SPEC", *with_set("task=toi")], "no task is registered as 'toi'"),
         (
             ["check", "SPEC", "--allow-code", *with_set(OWN, "hierarchy.levels.0.policy.options={gian: 1}")],
-            r"hierarchy\.levels\.0\.policy: network 'test_networks:Own' .*unexpected keyword argument 'gian'",
+            r"hierarchy\.levels\.0\.policy\.options\.gian: unknown option \(did you mean 'gain'\?\); .*: gain",
+        ),
+        (
+            ["check", "SPEC", "--allow-code", *with_set(f"hierarchy.levels.0.policy={WITH_MEMORY}")],
+            r"hierarchy\.levels\.0\.policy: network .*; networks with a memory are not supported yet",
         ),
         (
             ["check", "SPEC", *with_set("control.scale=[1, 2, 3]")],
@@ -238,8 +243,8 @@ WRONG = "{network: 'test_networks:Wrong', options: {how: joined}}"
 @pytest.mark.parametrize(
     ("override", "place", "shapes"),
     [
-        (f"hierarchy.levels.0.policy={WRONG}", "hierarchy.levels.0.policy", ("[1, 2, 4]", "[1, 2, 2, 2]")),
-        (f"compare_with=[{{kind: flat, policy: {WRONG}}}]", "compare_with.0.policy", ("[1, 2, 2]", "[1, 2, 1, 2]")),
+        (f"hierarchy.levels.0.policy={WRONG}", "hierarchy.levels.0.policy", ("[2, 3, 4]", "[2, 3, 2, 2]")),
+        (f"compare_with=[{{kind: flat, policy: {WRONG}}}]", "compare_with.0.policy", ("[2, 3, 2]", "[2, 3, 1, 2]")),
     ],
 )
 def test_an_own_network_of_another_shape_is_refused_before_any_work(spec, tmp_path, cache, override, place, shapes):

@@ -96,8 +96,8 @@ WRONG = {"network": "test_networks:Wrong", "options": {"how": "swapped"}}
         ),
         (
             {"baseline": None, "hierarchy": {"levels": [LEVEL | {"termination": WRONG}]}},
-            r"^hierarchy\.levels\.0\.termination: network 'test_networks:Wrong' gives shape \[1, 2, 1, 2\]; .*, "
-            r"here \[1, 2, 2, 1\]$",
+            r"^hierarchy\.levels\.0\.termination: network 'test_networks:Wrong' gives shape \[2, 3, 1, 2\]; .*, "
+            r"here \[2, 3, 2, 1\]$",
         ),
     ],
 )

@@ -6,9 +6,10 @@ import re
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -24,6 +25,7 @@ from ddco_pyro.spec import (
     spec_schema,
     with_overrides,
 )
+from ddco_pyro.spec.keypaths import edited
 
 EXAMPLE = """\
 task: needle
@@ -80,7 +82,7 @@ def test_defaults() -> None:
     assert (spec.inference.engine, spec.rollout.seed, spec.baseline, spec.compare_with) == ("fused", 1000, None, ())
     assert spec.hierarchy is not None
     assert spec.hierarchy.levels[0].termination.network == "linear"
-    assert spec.hierarchy.levels[0].termination.hidden == ()
+    assert spec.hierarchy.levels[0].termination.settings == {}
 
 
 def test_higher_levels_select_from_below_unless_told_otherwise() -> None:
@@ -226,7 +228,7 @@ def test_another_network_drops_the_settings_of_the_old_one() -> None:
     path = "hierarchy.levels.0.policy"
     linear = with_overrides(parse_spec(data), {f"{path}.network": "linear"})
     assert linear.hierarchy is not None
-    assert linear.hierarchy.levels[0].policy.hidden == ()
+    assert linear.hierarchy.levels[0].policy.settings == {}
     with pytest.raises(SpecError, match="hidden: does not apply to network 'linear'"):
         with_overrides(parse_spec(data), {f"{path}.hidden": [3], f"{path}.network": "linear"})
 
@@ -313,6 +315,36 @@ def test_all_defaults_are_written() -> None:
     assert written["training"]["optimizer"] == {"name": "adam", "lr": 1e-3, "momentum": 0.9, "weight_decay": 0.0}
     assert written["hierarchy"]["levels"][0]["termination"] == {"network": "linear"}
     assert set(written) == set(Spec.model_fields)
+
+
+@settings(deadline=None)
+@given(specs())
+def test_the_schema_accepts_what_is_accepted(data: dict[str, Any]) -> None:
+    jsonschema.Draft202012Validator(spec_schema()).validate(data)
+
+
+@pytest.mark.parametrize(
+    "network", [{"network": "mpl"}, {"hidden": [0]}, {"hiden": [3]}, {"dropout": 1}, {"network": "conv", "kernel": 1.5}]
+)
+@pytest.mark.parametrize(
+    "place", ["hierarchy.levels.0.policy", "hierarchy.levels.0.termination", "hierarchy.meta_policy"]
+)
+def test_the_schema_refuses_networks_that_are_refused(place: str, network: dict[str, Any]) -> None:
+    validator = jsonschema.Draft202012Validator(spec_schema())
+    validator.validate(SMALL)
+    wrong = edited(SMALL, {place: network})
+    with pytest.raises(SpecError):
+        parse_spec(wrong)
+    assert not validator.is_valid(wrong)
+
+
+def test_the_schema_says_which_networks_have_a_setting() -> None:
+    for name in ("NetworkSpec", "PolicySpec", "MetaPolicySpec"):
+        properties = spec_schema()["$defs"][name]["properties"]
+        assert properties["network"]["anyOf"][0] == {"enum": ["linear", "mlp", "per_timestep", "conv"]}
+        assert properties["filters"]["description"].endswith(" For ``conv``.")
+        assert properties["hidden"]["description"].endswith(" For ``mlp``, ``per_timestep``, ``conv``.")
+        assert properties["hidden"]["default"] == [64]
 
 
 def described(schema: dict[str, Any]) -> list[str]:

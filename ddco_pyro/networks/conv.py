@@ -20,10 +20,10 @@ class Conv(nn.Module):
         shape: InputShape,
         outputs: int,
         copies: int,
-        hidden: tuple[int, ...] = (64,),
-        dropout: float = 0.0,
-        filters: int = 64,
-        kernel: int = 5,
+        hidden: tuple[int, ...],
+        dropout: float,
+        filters: int,
+        kernel: int,
     ) -> None:
         super().__init__()
         if not shape.images:

@@ -13,9 +13,7 @@ from ddco_pyro.networks.stacked import StackedLinear, stacked_mlp
 class PerTimestep(nn.Module):
     """K × T perceptrons; step t is read by the t-th, steps past the longest demonstration by the last."""
 
-    def __init__(
-        self, shape: InputShape, outputs: int, copies: int, hidden: tuple[int, ...] = (64,), dropout: float = 0.0
-    ) -> None:
+    def __init__(self, shape: InputShape, outputs: int, copies: int, hidden: tuple[int, ...], dropout: float) -> None:
         super().__init__()
         refuse_images(shape)
         self.copies, self.steps = copies, shape.steps

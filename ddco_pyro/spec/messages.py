@@ -77,11 +77,11 @@ def _lines_of(error: ErrorDetails, model: type[BaseModel]) -> Iterator[str]:
     elif error["type"] == "extra_forbidden":
         yield f"{path}: unknown key; {_suggestion(parts, model)}"
     else:
-        yield f"{path or 'spec'}: {_text(error)}"
+        yield f"{path or 'spec'}: {in_words(error)}"
 
 
-def _text(error: ErrorDetails) -> str:
-    """What is wrong in words."""
+def in_words(error: ErrorDetails) -> str:
+    """What is wrong with a value, without saying where it is."""
     kind = "invalid_key" if "[key]" in error["loc"] else error["type"]
     context = {
         key: f"{value:.15g}" if isinstance(value, float) else value for key, value in error.get("ctx", {}).items()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ddco_pyro.spec.messages import SpecError
-from ddco_pyro.spec.networks import NETWORK_KEYS
+from ddco_pyro.spec.networks import SETTINGS
 from ddco_pyro.spec.whole import Spec
 
 
@@ -36,7 +36,7 @@ def _own(data: Any, place: str) -> Iterator[tuple[str, str]]:
             below = f"{place}.{key}" if place else str(key)
             if str(key).rpartition(".")[2] == "network":  # the keys of a selection's grid are key paths
                 names = value if isinstance(value, list | tuple) else [value]
-                yield from ((below, name) for name in names if isinstance(name, str) and name not in NETWORK_KEYS)
+                yield from ((below, name) for name in names if isinstance(name, str) and name not in SETTINGS)
             elif key != "options":  # keyword arguments of such a network
                 yield from _own(value, below)
     elif isinstance(data, list | tuple):
