@@ -175,6 +175,13 @@ def test_conv_reads_images_without_any_vector():
     assert not torch.allclose(network(alone)[0, 0], network(alone)[0, 1])
 
 
+def test_an_image_may_be_called_as_a_layer_is():
+    network = make(InputShape(FEATURES, {"0": PIXELS}), network="conv", filters=2, hidden=[3])
+    _, arrays = network.numpy_form()
+    shapes = sorted(parameter.shape for parameter in network.parameters())
+    assert sorted(array.shape for array in arrays.values()) == shapes
+
+
 # --- a user's own -----------------------------------------------------------------------------------------------------
 
 

@@ -158,13 +158,11 @@ class NumpyNetworks:
     def _network(
         self, kind: Mapping[str, Any], name: str, vector: np.ndarray, step: int, images: Mapping[str, np.ndarray]
     ) -> np.ndarray:
-        """[K, outputs] of K networks."""
+        """[K, outputs] of K perceptrons, those of this step, over the vector and the convolutions of the images."""
         copies = kind["copies"]
-        values = np.broadcast_to(vector, (copies, 1, len(vector)))
-        if kind["network"] == "conv":
-            maps = [self._convolved(kind, f"{name}.{key}", images[key]) for key in kind["images"]]
-            values = np.concatenate([values, *(one[:, None] for one in maps)], axis=2)
-        first = min(step, kind["steps"] - 1) * copies if kind["network"] == "per_timestep" else 0
+        maps = [self._convolved(kind, f"{name}.image.{key}", images[key])[:, None] for key in kind["images"]]
+        values = np.concatenate([np.broadcast_to(vector, (copies, 1, len(vector))), *maps], axis=2)
+        first = min(step, kind["steps"] - 1) * copies
         for layer in range(kind["layers"]):
             weight, bias = self._weights[f"{name}.{layer}.weight"], self._weights[f"{name}.{layer}.bias"]
             values = values @ weight[first : first + copies] + bias[first : first + copies]

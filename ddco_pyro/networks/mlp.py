@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from ddco_pyro.networks.inputs import Inputs, InputShape, ShapeError
+from ddco_pyro.networks.numpy_form import NumpyForm, perceptrons
 from ddco_pyro.networks.stacked import stacked_mlp
 
 
@@ -20,6 +21,10 @@ class Mlp(nn.Module):
         """[N, T, K, outputs]."""
         found: Tensor = self.layers(inputs.vector.flatten(0, 1).unsqueeze(0))
         return found.transpose(0, 1).reshape(*inputs.batch, *found.shape[::2])
+
+    def numpy_form(self) -> NumpyForm:
+        """What the numpy runner has to know of it."""
+        return perceptrons(self.layers)
 
 
 class Linear(Mlp):

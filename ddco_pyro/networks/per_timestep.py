@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from ddco_pyro.networks.inputs import Inputs, InputShape
 from ddco_pyro.networks.mlp import refuse_images
+from ddco_pyro.networks.numpy_form import NumpyForm, perceptrons
 from ddco_pyro.networks.stacked import StackedLinear, stacked_mlp
 
 
@@ -27,3 +28,8 @@ class PerTimestep(nn.Module):
         for layer in self.layers:
             values = layer(values, maps.flatten()) if isinstance(layer, StackedLinear) else layer(values)
         return values.unflatten(0, maps.shape).permute(2, 0, 1, 3)
+
+    def numpy_form(self) -> NumpyForm:
+        """What the numpy runner has to know of it."""
+        about, arrays = perceptrons(self.layers)
+        return about | {"copies": self.copies, "steps": self.steps}, arrays
