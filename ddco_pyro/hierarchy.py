@@ -123,6 +123,7 @@ class Hierarchy(nn.Module):
     :param control_size: A, the number of control dimensions.
     :param steps: the longest demonstration, for per-timestep networks.
     :raises ShapeError: where a network cannot read these observations.
+    :raises SpecError: where a user's network does not take its options.
     """
 
     def __init__(self, spec: Spec, shapes: Shapes, control_size: int, steps: int) -> None:

@@ -340,12 +340,14 @@ sys.argv = {arguments!r}
 from ddco_pyro.cli import main
 try:
     main()
-except SystemExit:
+finally:
     print(sorted(name for name in ("h5py", "pyro", "sklearn", "torch") if name in sys.modules))
 """
 
 
-@pytest.mark.parametrize("arguments", [["ddco-pyro", "--help"], ["ddco-pyro", "check", "nowhere.yaml"]])
+@pytest.mark.parametrize(
+    "arguments", [["ddco-pyro", "--help"], ["ddco-pyro", "check", "--schema"], ["ddco-pyro", "check", "nowhere.yaml"]]
+)
 def test_help_and_refusals_load_nothing_heavy(arguments):
     """Loading torch, pyro and scikit-learn takes seconds."""
     ended = subprocess.run([sys.executable, "-c", LIGHT.format(arguments=arguments)], capture_output=True, text=True)

@@ -66,15 +66,12 @@ def _annotation(network: type[nn.Module], parameter: Parameter) -> Any:
 
 
 def _typed(value: Any, annotation: Any) -> Any:
-    """The value as this type. Nothing is converted but what JSON, as YAML, has no type for: a list may be a tuple."""
+    """The value as this type. Read as JSON, because strict types take a list for a tuple there alone."""
     if annotation is Any:
         return value
     try:
         adapter = TypeAdapter(annotation)
-    except (
-        PydanticUserError,
-        NameError,
-    ):  # a class of which pydantic knows nothing, or a name inside that does not exist
+    except (PydanticUserError, NameError):  # a class that pydantic cannot make, or an unknown name within the type
         return value
     return adapter.validate_json(to_json(value, inf_nan_mode="constants"), strict=True)
 
