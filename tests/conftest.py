@@ -1,4 +1,7 @@
-"""Fixtures that several test files share: one thread, a cache of their own, and a fitted run of the toy task."""
+"""Fixtures that several test files share: one thread, a cache of their own, and a fitted run of the toy task.
+
+No test depends on how busy the machine is, and every run draws the same examples.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,15 @@ import pytest
 import torch
 import toy_task
 import yaml
+from hypothesis import settings
 
 from ddco_pyro.run import fit
 from ddco_pyro.spec import parse_spec
 
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that run episodes
 torch.set_num_threads(1)
+settings.register_profile("deterministic", deadline=None, derandomize=True)
+settings.load_profile("deterministic")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from killing import HANGS
 from selecting import Told, data_at, kept, spec_at
 from test_cli import call
 
@@ -19,8 +20,6 @@ from ddco_pyro.selection import Workers, select
 from ddco_pyro.selection.parallel import BackendError
 
 distributed = pytest.importorskip("distributed")
-
-SECONDS = 60
 
 
 class Killing(Told):
@@ -54,8 +53,8 @@ def cluster(tmp_path_factory):
         subprocess.Popen([sys.executable, "-m", "dask", *command], env=environment, cwd=folder, **streams)
         for command in commands
     ]
-    with distributed.Client(address, timeout=SECONDS) as client:
-        client.wait_for_workers(2, timeout=SECONDS)
+    with distributed.Client(address, timeout=HANGS) as client:
+        client.wait_for_workers(2, timeout=HANGS)
     yield address, processes[1:]
     for process in processes:
         process.send_signal(signal.SIGKILL)
