@@ -174,9 +174,8 @@ GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
         ),
         (
             ["check", "SPEC", *with_set(OWN)],
-            r"hierarchy\.levels\.0\.policy\.network: 'test_networks:Own' is code that .*--allow-code",
+            r"hierarchy\.levels\.0\.policy\.network: would import user code \(test_networks:Own\); pass --allow-code",
         ),
-        (["fit", "SPEC", *with_set(OWN)], "'test_networks:Own' is code that would be executed"),
         (["check", "--foo"], "No such option: --foo; see ddco-pyro check --help"),
         (["fit"], "Missing argument 'SPEC'; see ddco-pyro fit --help"),
         (["chekc"], "No such command 'chekc'.*; see ddco-pyro --help"),
@@ -293,11 +292,12 @@ def test_debug_shows_the_traceback():
 
 def test_a_command_ends_with_its_status_and_finds_tasks_beside_it(spec):
     """The toy task is found in the working folder."""
-    process = start("check", spec)
+    beside = ("--allow-code", "--set", "task=toy_task:task")
+    process = start("check", spec, *beside)
     out, err = process.communicate(timeout=HANGS)
     assert (process.returncode, err) == (0, "")
     assert "hierarchy.meta_policy" in out
-    process = start("check", spec, "--set", "training.epoch=3")
+    process = start("check", spec, "--set", "training.epoch=3", *beside)
     out, err = process.communicate(timeout=HANGS)
     assert (process.returncode, out, err.count("\n")) == (2, "", 1)
 

@@ -16,6 +16,7 @@ import pytest
 import selecting
 import toy_task
 import yaml
+from killing import HANGS
 from random_demonstrations import demonstrations
 from test_cli import call
 
@@ -151,7 +152,7 @@ def test_who_waits_goes_on_when_the_other_has_ended(tmp_path: Path) -> None:
         other.join(0.2)
         order.append("first")
         shutil.rmtree(folder)
-    other.join(10)
+    other.join(HANGS)
     assert order == ["first", "second"]
 
 

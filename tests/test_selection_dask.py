@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import yaml
@@ -43,7 +42,7 @@ def cluster(tmp_path_factory):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent)}
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
     commands = [
         ["scheduler", "--host", address, "--no-dashboard", "--no-show"],
         *[["worker", address, "--no-nanny", "--nthreads", "1", "--no-dashboard", "--local-directory", folder]] * 2,

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer, model_validator
 
 from ddco_pyro.spec.messages import invalid, nearest
-from ddco_pyro.spec.types import Count, Emission, Items, Model, Share
+from ddco_pyro.spec.types import Count, Emission, Items, Model, NetworkName, Share
 
 CUSTOM = "module:Class"
 NETWORK_KEYS: dict[str, tuple[str, ...]] = {
@@ -31,7 +31,7 @@ def foreign_keys(network: Any) -> tuple[str, ...]:
 class NetworkSpec(Model):
     """A network from observations to the parameters of a distribution. Settings of other networks are refused."""
 
-    network: str = "mlp"
+    network: NetworkName = "mlp"
     """``linear``, ``mlp``, ``per_timestep``, ``conv``, or ``module:Class`` for a network of your own."""
     hidden: Items[Count] = Field(
         default_factory=lambda data: () if "hidden" in foreign_keys(data.get("network")) else (64,)

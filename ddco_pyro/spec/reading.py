@@ -11,6 +11,7 @@ import yaml
 
 from ddco_pyro.spec.keypaths import plain
 from ddco_pyro.spec.messages import SpecError, show
+from ddco_pyro.spec.user_code import refuse_user_code
 from ddco_pyro.spec.whole import Spec, parse_spec
 
 
@@ -38,10 +39,14 @@ for _yaml in (_Loader, _Dumper):
     _yaml.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.0123456789"))
 
 
-def load_spec(path: str | Path, overrides: Iterable[str] = ()) -> Spec:
+def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool = False) -> Spec:
     """The spec in a YAML file, after ``overrides`` such as ``"hierarchy.levels.0.count=3"`` (the value is YAML).
 
-    :raises SpecError: the file cannot be read, is not YAML, or is not a valid spec; one line for each problem.
+    Nothing that it names is imported here.
+
+    :param allow_code: whether it may name user code (``module:name``), which is imported where the spec is used.
+    :raises SpecError: the file cannot be read, is not YAML, is not a valid spec, or names code that is not allowed; one
+        line for each problem.
     """
     try:
         content = Path(path).read_bytes()
@@ -53,9 +58,12 @@ def load_spec(path: str | Path, overrides: Iterable[str] = ()) -> Spec:
             raise SpecError("the file is empty; it has to hold a spec")
         if not isinstance(data, dict):
             raise SpecError(f"the file holds {show(data)}, not a mapping (key: value)")
-        return parse_spec(data, dict(_parse_override(text) for text in overrides))
+        spec = parse_spec(data, dict(_parse_override(text) for text in overrides))
     except SpecError as error:
         raise SpecError(*(f"{path}: {problem}" for problem in error.problems)) from None
+    if not allow_code:
+        refuse_user_code(spec, path)
+    return spec
 
 
 def dump_spec(spec: Spec) -> str:
