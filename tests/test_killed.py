@@ -152,7 +152,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory, toy_run) -> dict[str, Case]:
             lambda folder: None,
         ),
         "segment in place": Case(
-            ("segment", folder / "run", "toy.hdf5", *tables),
+            ("segment", folder / "run", "toy.hdf5", "--in-place", *tables),
             "toy.hdf5",
             same_segments,
             lambda folder: None,

@@ -67,7 +67,7 @@ def test_a_full_disk_while_segmenting(toy_run, toy_spec, tmp_path: Path, size: i
     before = path.read_bytes()
     for more in ([], ["--csv", tmp_path / "a.csv"], ["--html", tmp_path / "a.html"]):
         with room(size):
-            ended = call("segment", toy_run.folder, path, *more)
+            ended = call("segment", toy_run.folder, path, "--in-place", *more)
         assert ended.status == 1
         assert "there is no room to write it" in ended.err.splitlines()[-1]
     assert path.read_bytes() == before
