@@ -14,7 +14,7 @@ from ddco_pyro.encoding import Shapes
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.memory import refuse_too_much
 from ddco_pyro.networks import ShapeError
-from ddco_pyro.spec import BaselineSpec, Spec, SpecError, own_networks
+from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code
 from ddco_pyro.task import find_task
 
 
@@ -71,7 +71,7 @@ def _refuse_giants(spec: Spec, dimensions: Dimensions) -> None:
             f"hierarchy.levels: the levels have {choices} joint choices, at most {MOST_CHOICES} can be summed over; "
             "lower count"
         )
-    if own_networks(spec):
+    if any(place.endswith(".network") for place in user_code(spec)):
         return  # its sizes are its own affair
     try:
         with torch.device("meta"):

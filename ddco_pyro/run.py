@@ -33,7 +33,7 @@ from ddco_pyro.inference.check import TRAJECTORIES as COMPARED
 from ddco_pyro.inference.check import EngineCheck, compare_engines
 from ddco_pyro.metrics import evaluate, supervisor
 from ddco_pyro.monitor import Monitor
-from ddco_pyro.spec import Spec, dump_spec, load_spec, own_networks, refuse_own_networks
+from ddco_pyro.spec import Spec, dump_spec, load_spec, user_code
 from ddco_pyro.training import Trainer, TrainingError, plan
 
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
@@ -82,8 +82,8 @@ class Fit:
     def baselines(self) -> dict[str, Fit]:
         """The baselines that were trained beside it, by name."""
         folders = [self.folder / "baselines" / baseline.kind for baseline in self.spec.compare_with]
-        own = bool(own_networks(self.spec))  # theirs are named in this spec too
-        return {folder.name: load(folder, own) for folder in folders if _finished(folder)}
+        allow_code = bool(user_code(self.spec))  # theirs is named in this spec too
+        return {folder.name: load(folder, allow_code) for folder in folders if _finished(folder)}
 
     def log_likelihood(self, demos: Demonstrations) -> np.ndarray:
         """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units."""
@@ -144,10 +144,10 @@ def model_name(spec: Spec) -> str:
 def load(folder: str | Path, allow_code: bool = False) -> Fit:
     """The fit in a run folder.
 
-    :param allow_code: import the networks of one's own (``module:Class``) that its spec names; nothing else in a run
-        is ever executed.
+    :param allow_code: import the user code (``module:name``) that its spec names; nothing else in a run is ever
+        executed.
     :raises RunError: the folder has no finished fit, or a damaged one.
-    :raises SpecError: its spec names a network of one's own, and that is not allowed.
+    :raises SpecError: its spec names user code, and that is not allowed.
     """
     folder = Path(folder)
     missing = [name for name in ("spec.yaml", "model.safetensors", "metrics.json") if not (folder / name).exists()]
@@ -156,8 +156,7 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
         if (folder / "folds.json").exists():
             what = f"a selection; the fit of what it chose is in {folder / 'fit'} once it is done"
         raise RunError(f"{folder}: {what} (it has no {missing[0]})")
-    spec = load_spec(folder / "spec.yaml")
-    refuse_own_networks(spec, folder / "spec.yaml", allow_code)
+    spec = load_spec(folder / "spec.yaml", allow_code=allow_code)
     try:
         return Fit(folder, spec, _read_model(spec, folder / "model.safetensors").eval())
     except BadInput:

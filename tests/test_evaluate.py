@@ -104,7 +104,7 @@ def changed(run, **changes):
 
 
 def test_an_unknown_scripted_policy_is_refused(toy_run):
-    message = r"^rollout\.policies: task 'toy_task:task' has no expert \(it has: supervisor, open_loop\)$"
+    message = r"^rollout\.policies: task 'toy' has no expert \(it has: supervisor, open_loop\)$"
     with pytest.raises(RunError, match=message):
         policies(changed(toy_run, **{"rollout.policies": ["open_loop", "expert"]}))
 

@@ -70,9 +70,43 @@ def test_they_are_the_fits_own(toy_run, toy_spec, file, at_once, monkeypatch):
         np.testing.assert_array_equal(one.labels["phase"], demo.labels["phase"])
 
 
+@pytest.mark.parametrize("option", ["--html", "--csv", "--parquet"])
+def test_a_page_or_a_table_leaves_the_file_alone(toy_run, file, tmp_path, option):
+    before, time = file.read_bytes(), file.stat().st_mtime_ns
+    out = tmp_path / "segments"
+    assert call("segment", toy_run.folder, file, option, out)[:2] == (0, f"{out}\n")
+    assert (file.read_bytes(), file.stat().st_mtime_ns) == (before, time)
+    assert {path.name for path in tmp_path.iterdir()} == {"demos.hdf5", "segments"}
+
+
+NOTHING = (
+    "ddco-pyro: name what to write: --html PAGE, --csv FILE or --parquet FILE; labels for each step go to --out FILE (a copy) "
+    "or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], NOTHING),
+        (["--level", "option"], NOTHING),
+        (["--in-place", "--out", "copy.hdf5"], "ddco-pyro: --out and --in-place exclude each other; keep one\n"),
+        (["--out", "FILE"], "ddco-pyro: --out FILE: is the file itself; to write labels into it, say --in-place\n"),
+        (["--lerobot", "folder"], "ddco-pyro: FILE: is no LeRobot dataset; --lerobot annotates a copy of one\n"),
+    ],
+)
+def test_what_to_write_has_to_be_said(toy_run, file, monkeypatch, options, message):
+    monkeypatch.chdir(file.parent)
+    before = file.read_bytes()
+    named = [option.replace("FILE", str(file)) for option in options]
+    assert call("segment", toy_run.folder, file, *named) == (2, "", message.replace(" FILE: ", f" {file}: "))
+    assert [path.name for path in file.parent.iterdir()] == ["demos.hdf5"]
+    assert file.read_bytes() == before
+
+
 def test_labels_go_into_the_file_and_are_read_from_there(toy_run, file):
     before = Demonstrations.read(file, labels=["phase"])
-    ended = call("segment", toy_run.folder, file)
+    ended = call("segment", toy_run.folder, file, "--in-place")
     assert (ended.status, ended.out) == (0, f"{file}: labels/option\n")
     after = Demonstrations.read(file, labels=["phase", "option", "option_boundary"])
     for one, demo, was in zip(look(toy_run.folder, file).segments, after, before, strict=True):
@@ -81,7 +115,7 @@ def test_labels_go_into_the_file_and_are_read_from_there(toy_run, file):
         np.testing.assert_array_equal(demo.labels["phase"], was.labels["phase"])
         np.testing.assert_array_equal(demo.actions, was.actions)
     time = file.stat().st_mtime_ns
-    assert call("segment", toy_run.folder, file).status == 0
+    assert call("segment", toy_run.folder, file, "--in-place").status == 0
     assert file.stat().st_mtime_ns == time  # it has these labels already
 
 
@@ -97,7 +131,7 @@ def test_labels_from_elsewhere_are_never_replaced(toy_run, file):
     with h5py.File(file, "r+") as opened:
         opened["data/demo_3/labels/option"] = np.zeros(len(opened["data/demo_3/actions"]), int)
     before = file.read_bytes()
-    ended = call("segment", toy_run.folder, file)
+    ended = call("segment", toy_run.folder, file, "--in-place")
     assert ended.status == 2
     assert "demo_3: labels/option is there already and was not written by ddco-pyro segment" in ended.err
     assert file.read_bytes() == before
@@ -208,7 +242,8 @@ def test_lerobot_subtasks(lerobot_run, tmp_path):
             [LEROBOT, "--lerobot", tmp_path / "x", "--level", "skil"],
             "there is no level 'skil' (there is: skill",
         ),
-        ([LEROBOT], "labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot"),
+        ([LEROBOT, "--in-place"], "labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot"),
+        ([LEROBOT, "--html", tmp_path / "y", "--out", tmp_path / "z"], "labels go into HDF5 files only"),
     ):
         ended = call("segment", lerobot_run.folder, *wrong)
         assert (ended.status, ended.err.count("\n")) == (2, 1)
@@ -246,13 +281,13 @@ def test_other_demonstrations_are_refused(toy_run, file, change, message):
     with h5py.File(file, "r+") as opened:
         for group in opened["data"].values():
             change(group)
-    ended = call("segment", toy_run.folder, file)
+    ended = call("segment", toy_run.folder, file, "--in-place")
     assert (ended.status, ended.err.count("\n")) == (2, 1)
     assert message in ended.err
 
 
 def test_a_policy_without_options_is_refused(toy_run, file):
-    ended = call("segment", toy_run.folder / "baselines" / "flat", file)
+    ended = call("segment", toy_run.folder / "baselines" / "flat", file, "--in-place")
     assert ended.status == 2
     assert "is a flat policy without options; name a run with a hierarchy" in ended.err
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+import resource
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,7 @@ from ddco_pyro.spec import (
     HierarchySpec,
     LearnedStd,
     LevelSpec,
+    NetworkSpec,
     Spec,
     SpecError,
     dump_spec,
@@ -26,6 +30,7 @@ from ddco_pyro.spec import (
     with_overrides,
 )
 from ddco_pyro.spec.keypaths import edited
+from ddco_pyro.spec.reading import read_yaml
 
 EXAMPLE = """\
 task: needle
@@ -168,6 +173,63 @@ def test_files_that_hold_no_spec(tmp_path: Path, text: str | bytes, message: str
     assert str(caught.value).startswith(f"{path}: ")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def levels_of(line: str, number: int = 12) -> str:
+    """Anchors of which each refers to the one before nine times."""
+    first = "x0: &x0 {a: 1}\n"
+    return first + "".join(
+        line.format(name=f"x{level}", nine=", ".join([f"*x{level - 1}"] * 9)) for level in range(1, number + 1)
+    )
+
+
+LISTS = levels_of("{name}: &{name} [{nine}]\n")
+MERGES = levels_of("{name}: &{name} {{<<: [{nine}]}}\n")
+CHAIN = "x0: &x0 [1]\n" + "".join(f"x{level}: &x{level} [*x{level - 1}]\n" for level in range(1, 300))
+
+
+def limited() -> None:
+    """No more than a minute's work and 4 GB."""
+    resource.setrlimit(resource.RLIMIT_CPU, (60, 60))
+    resource.setrlimit(resource.RLIMIT_AS, (4 * 10**9, 4 * 10**9))
+
+
+@pytest.mark.parametrize(("text", "column"), [(LISTS, 5), (MERGES, 14)], ids=["lists", "merge keys"])
+def test_aliases_that_expand_to_billions_are_refused_at_once(tmp_path: Path, text: str, column: int) -> None:
+    path = write(tmp_path, text)
+    command = [Path(sys.executable).with_name("ddco-pyro"), "check", path]
+    ended = subprocess.run(command, capture_output=True, text=True, preexec_fn=limited)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr == (
+        f"ddco-pyro: {path}: line 5, column {column}: not valid YAML: holds more than 10000 values where its "
+        "aliases are written out; refer to it less often\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"seed: [{'1, ' * 10_000}]", "line 1, column 7: not valid YAML: holds more than 10000 values"),
+        (CHAIN, "not valid YAML: nested too deeply"),
+        (CHAIN.replace("[1]", "{a: 1}").replace("[*", "{<<: *").replace("]", "}"), "not valid YAML: nested too deeply"),
+        ("a: &a [1, *a]", "not valid YAML: nested too deeply"),
+    ],
+    ids=["written out", "a chain", "a chain of merge keys", "itself"],
+)
+def test_too_much_and_too_deep(text: str, message: str) -> None:
+    with pytest.raises(SpecError, match=re.escape(message)):
+        read_yaml(text)
+
+
+def test_ordinary_aliases_and_merge_keys_are_read(tmp_path: Path) -> None:
+    anchored = EXAMPLE.replace("policy: {network: mlp", "policy: &mlp {network: mlp", 1).replace(
+        "meta_policy: {network: mlp, hidden: [64], emits: [options]}",
+        "meta_policy: {<<: *mlp, emits: [options]}\ncompare_with: [{kind: flat, policy: *mlp}]",
+    )
+    spec = load_spec(write(tmp_path, anchored))
+    assert spec.hierarchy is not None
+    assert spec.compare_with[0].policy == NetworkSpec(network="mlp", hidden=(64,), dropout=0.0)
+    assert spec.hierarchy.meta_policy.hidden == (64,)
 
 
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ task = Task("toy", Point, {"supervisor": Supervisor, "open_loop": OpenLoop}, out
 short = replace(task, name="short", load=lambda seed: Point(seed, 5), steps=5)
 
 SPEC = """
-task: toy_task:task
+task: toy
 demonstrations: {count: 12, labels: phase, valid_fraction: 0.25}
 observations: [offsets, visited]
 control: {std: 0.5}

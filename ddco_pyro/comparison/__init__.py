@@ -72,7 +72,7 @@ class Comparison:
 def compare(folders: Sequence[Path], allow_code: bool = False) -> Comparison:
     """The runs in these folders (a run's ``baselines/NAME`` is a run too), the best first.
 
-    :param allow_code: import the networks of one's own that their specs name.
+    :param allow_code: import the user code that their specs name.
     :raises CompareError: there are less than two, or one twice.
     :raises NotShared: they were not held out on the same data.
     :raises RunError: a folder is not a finished run.

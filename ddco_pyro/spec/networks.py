@@ -14,7 +14,7 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from ddco_pyro.errors import nearest
 from ddco_pyro.spec.messages import invalid
-from ddco_pyro.spec.types import Count, Emission, Items, Model, Share
+from ddco_pyro.spec.types import Count, Emission, Items, Model, NetworkName, Share
 
 USER_DEFINED = "module:Class"
 _USER_DEFINED_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
@@ -23,7 +23,7 @@ _USER_DEFINED_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
 class Network(Model):
     """A network without settings."""
 
-    network: str = "mlp"
+    network: NetworkName = "mlp"
     """The kind of network; ``module:Class`` for a network of your own."""
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, TypeAdapter
 
-from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Seed, Share, Text, bare, nested
+from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Seed, Share, TaskName, Text, bare, nested
 
 
 class DemonstrationsSpec(Model):
@@ -15,7 +15,7 @@ class DemonstrationsSpec(Model):
 
     path: Text | None = None
     """HDF5 file in robomimic's layout; without it they are collected in the task."""
-    task: Text | None = None
+    task: TaskName | None = None
     """Task in which they are collected, such as one whose episodes are single demonstrations; null: the spec's own."""
     count: int = Field(default=100, ge=2)
     """Number of demonstrations to collect."""

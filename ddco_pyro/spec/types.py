@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WrapValidator
@@ -18,6 +19,19 @@ Positive = Annotated[float, Field(gt=0, le=1e30)]  # networks are float32, which
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 Share = Annotated[float, Field(ge=0, lt=1)]
 Text = Annotated[str, Field(min_length=1)]
+TASKS = "ddco_pyro.tasks"
+"""The entry-point group under which installed packages register their tasks."""
+
+
+@dataclass(frozen=True)
+class Importable:
+    """Marks text that can name code to import, ``module:name``, or what is registered in a group of entry points."""
+
+    entry_points: str | None = None
+
+
+TaskName = Annotated[Text, Importable(TASKS)]
+NetworkName = Annotated[str, Importable()]
 Emission = Literal["options", "control"]
 
 

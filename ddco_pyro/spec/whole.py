@@ -19,13 +19,13 @@ from ddco_pyro.spec.settings import (
     SelectionSpec,
     TrainingSpec,
 )
-from ddco_pyro.spec.types import Items, Model, Seed, Text
+from ddco_pyro.spec.types import Items, Model, Seed, TaskName
 
 
 class Spec(Model):
     """Everything that determines a run."""
 
-    task: Text | None = None
+    task: TaskName | None = None
     """Name of a registered task, or ``module:name``."""
     demonstrations: DemonstrationsSpec = DemonstrationsSpec()
     """Where the demonstrations come from."""

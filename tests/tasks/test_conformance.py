@@ -10,9 +10,10 @@ import dm_env
 import numpy as np
 import pytest
 
-from ddco_pyro.task import ENTRY_POINTS, Policy, Task, find_task
+from ddco_pyro.spec.types import TASKS
+from ddco_pyro.task import Policy, Task, find_task
 
-NAMES = sorted(point.name for point in entry_points(group=ENTRY_POINTS))
+NAMES = sorted(point.name for point in entry_points(group=TASKS))
 MAX_STEPS = 200  # of an episode that these tests look at
 
 
