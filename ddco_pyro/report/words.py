@@ -120,7 +120,8 @@ def warning(finding: Finding, level: str) -> str:
         "dominating": f"{option} dominates: it is active in {share} of all steps.",
         "redundant": f"{option} does the same as option {finding.other}: over the time that one of them is active they "
         f"differ by {number(finding.value, 3)} nats per step.",
-        "never_persisting": f"{option} never persists: it lasts {number(finding.value)} steps on average.",
+        "never_persisting": f"{option} never persists: it lasts {number(finding.value)} steps on average and is "
+        f"selected {number(finding.selections, 1)} times in each demonstration that has it.",
         "high_fitting": f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its "
         "steps, past its options.",
     }[finding.kind]
