@@ -109,7 +109,7 @@ class TrainingSpec(Model):
     restarts: Count = 1
     """Independent initialisations; the best on the tuning demonstrations is kept."""
     tune_fraction: Fraction = 0.1
-    """Part of the training demonstrations held out to stop early and to choose among restarts."""
+    """Part of the training demonstrations set aside for tuning: to stop early and to choose among restarts."""
     patience: Count | None = 20
     """Epochs without improvement before a stage stops; null for never."""
     clip_gradient: Positive | None = None
