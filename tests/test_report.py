@@ -13,7 +13,7 @@ from ddco_pyro.report import film, words, write_report
 from ddco_pyro.report.activity import LevelActivity, activity, bins
 from ddco_pyro.report.plot_rows import order
 from ddco_pyro.report.plot_timing import shares, terminations
-from ddco_pyro.report.plot_trajectories import position_key, view
+from ddco_pyro.report.plot_trajectories import movement, position_key, view
 from ddco_pyro.rollout import paired_difference, summarize
 from ddco_pyro.run import fit, write_metrics
 from ddco_pyro.spec import parse_spec
@@ -324,5 +324,70 @@ def test_positions_are_seen_from_where_they_spread():
 
 
 @pytest.mark.parametrize(("size", "key"), [(2, None), (3, "place"), (7, "place")])
-def test_position_is_the_first_vector_of_three_numbers(size, key):
+def test_a_position_has_three_numbers_or_more(size, key):
     assert position_key(made(2, size)) == key
+
+
+def recorded(**keys):
+    """Demonstrations of these observations, key to an array [T, ...] for each demonstration."""
+    rows = [dict(zip(keys, values, strict=True)) for values in zip(*keys.values(), strict=True)]
+    return Demonstrations(
+        tuple(Demonstration(f"demo_{n}", row, np.zeros((len(row[next(iter(keys))]), 1))) for n, row in enumerate(rows))
+    )
+
+
+def reaches(number=6, steps=40):
+    """Smooth reaches from scattered starts by scattered ways: positions [T, 3] of each."""
+    rng, time = np.random.default_rng(0), np.linspace(0, 1, steps)[:, None]
+    eased = 10 * time**3 - 15 * time**4 + 6 * time**5
+    return [rng.normal(size=3) + eased * 2 * rng.normal(size=3) for _ in range(number)]
+
+
+def test_what_moves_is_drawn_whatever_comes_first():
+    """Before it in the alphabet: what is constant within each demonstration, in all of them, or only measured badly."""
+    rng, hands = np.random.default_rng(1), reaches()
+    steps = [np.ones((len(hand), 1)) for hand in hands]
+    demos = recorded(
+        base=[step * np.array([0.1, 0.2, 0.3]) for step in steps],
+        goal=[step * rng.normal(size=3) for step in steps],
+        guess=[step * rng.normal(size=3) + 1e-3 * rng.normal(size=(len(step), 3)) for step in steps],
+        hand=hands,
+    )
+    assert position_key(demos) == "hand"
+
+
+def test_what_goes_somewhere_is_drawn_rather_than_its_velocity_or_a_force():
+    rng, hands = np.random.default_rng(1), reaches()
+    demos = recorded(
+        force=[rng.normal(size=hand.shape) for hand in hands],
+        speed=[np.gradient(hand, axis=0) for hand in hands],
+        state=[np.hstack([hand, hand]) for hand in hands],  # the same, but three of its six numbers are not drawn
+        hand=hands,
+    )
+    assert position_key(demos) == "hand"
+
+
+def test_nothing_is_drawn_where_nothing_moves():
+    assert position_key(recorded(goal=[np.full((5, 3), 0.1), np.full((1, 3), 0.7)])) is None
+
+
+def test_movement_by_hand():
+    """Even steps along a straight line: 1; there and back: half as far for the way it goes."""
+    line = np.arange(5.0)[:, None] * np.array([1.0, 2.0, 2.0])
+    assert movement([line, line]) == pytest.approx(1)
+    assert movement([line[[0, 1, 2, 1, 0]]] * 2) == pytest.approx(0.5)
+    assert movement([np.hstack([line, line])] * 2) == pytest.approx(0.5)
+    within, between = 9 * 2.0, 3 * 4.0  # the variance of 0 to 4 is 2; that of a mean of -2 and one of 2 is 4
+    assert movement([line - 2, line + 2]) == pytest.approx(np.sqrt(within / (within + between)))
+    assert movement([np.array([[1.0, 2.0, 3.0]])]) == 0
+
+
+def test_the_spec_may_say_what_is_drawn(tmp_path, labelled):
+    demos = recorded(arm=reaches(steps=12), hand=reaches(steps=12))
+    found, demos = run(tmp_path, demos, labelled=False, observations=["arm", "hand"], report={"trajectory": "hand"},
+                       training={"epochs": 1, "initialize": "random"}, compare_with=[])  # fmt: skip
+    shown = " ".join(text(write_report(found, demos).read_text()).split())
+    assert "first three numbers of observation “hand”, in its own units" in shown
+    automatic = " ".join(text(labelled[1]).split())
+    assert "observation “place”, in its own units. Of those with three numbers or more it moves the most" in automatic
+    assert "report.trajectory in the spec names another" in automatic

@@ -166,6 +166,10 @@ def options(fit: Fit, demos: Demonstrations, metrics: Mapping[str, Any]) -> Figu
 
 
 PARTS = ("train", "tune", "valid")
+CHOSEN = (
+    "Of those with three numbers or more it moves the most within demonstrations; report.trajectory in the spec names "
+    "another. "
+)
 
 
 def _posteriors(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture:
@@ -202,14 +206,16 @@ def _rows(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str
 
 def _trajectories(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture | None:
     del metrics
-    key = plot_trajectories.position_key(demos)
+    named = fit.spec.report.trajectory
+    key = named or plot_trajectories.position_key(demos)
     if key is None:
         return None
     figure = plot_trajectories.draw(found, [demo.observations[key][:, :3] for demo in demos], key)
     shown = min(len(demos), plot_trajectories.MOST_TRAJECTORIES)
     caption = (
         f"{shown} demonstrations in space, coloured by the most likely option: first three numbers of observation "
-        f"“{key}”, in its own units. Circles: first steps. Seen from where the trajectories spread the most."
+        f"“{key}”, in its own units. {'' if named else CHOSEN}Circles: first steps. Seen from where the trajectories "
+        "spread the most."
     )
     alt = f"Trajectories of {key} in three dimensions, coloured by option"
     return keep(figure, fit.folder / "figures" / "trajectories.png", alt, caption)

@@ -145,3 +145,10 @@ class RolloutSpec(Model):
     """Whether options and terminations are sampled or the most likely ones."""
     policies: Items[Text] = ()
     """Scripted policies of the task that are rolled out beside, such as ``open_loop``."""
+
+
+class ReportSpec(Model):
+    """What the report shows."""
+
+    trajectory: Text | None = None
+    """Observation whose first three numbers are drawn as trajectories in space; null: the one that moves the most."""
