@@ -20,7 +20,7 @@ from ddco_pyro.report import (
     tables,
     words,
 )
-from ddco_pyro.report.activity import Activity, activity
+from ddco_pyro.report.activity import Activity
 from ddco_pyro.report.pictures import Picture, keep
 from ddco_pyro.run import Fit
 from ddco_pyro.spec import Spec, dump_spec
@@ -150,11 +150,9 @@ def learning(fit: Fit) -> Figures | None:
     return Figures([keep(plot_learning.draw(stages), fit.folder / "figures" / "learning.png", alt, caption)], text=text)
 
 
-def options(fit: Fit, demos: Demonstrations, metrics: Mapping[str, Any]) -> Figures | None:
+def options(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Figures:
     """Which option is active when."""
-    if fit.spec.hierarchy is None:
-        return None
-    found = activity(fit, demos)
+    assert fit.spec.hierarchy is not None  # or there is no activity
     makers = (_posteriors, _rows, _trajectories, _timing)
     pictures = [picture for make in makers if (picture := make(fit, demos, found, metrics)) is not None]
     names = [level.name for level in fit.spec.hierarchy.levels]
