@@ -79,7 +79,15 @@ def verdict(metrics: Mapping[str, Any]) -> str:
         return (
             f"{name} gives held-out demonstrations {value} nats per step; no other model was trained to compare with."
         )
-    clauses = [_clause(other, one["difference"], held_out) for other, one in metrics["comparison"].items()]
+    return explains(name, {method(other): one["difference"] for other, one in metrics["comparison"].items()}, held_out)
+
+
+def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out: int) -> str:
+    """One sentence on how much better than others a model explains held-out demonstrations.
+
+    :param differences: what the others are called to ``nats_per_step`` and ``standard_error`` of the paired difference.
+    """
+    clauses = [_clause(other, difference, held_out) for other, difference in differences.items()]
     text = f"{name} explains held-out demonstrations {_listed(clauses)}"
     return f"{text} ({held_out} held-out demonstration{'s' * (held_out != 1)}; ± is one standard error)."
 
@@ -88,10 +96,10 @@ def _clause(other: str, difference: Mapping[str, float], held_out: int) -> str:
     mean, error = difference["nats_per_step"], difference["standard_error"]
     direction = "better" if mean > 0 else "worse"
     if not math.isfinite(error):
-        return f"{number(abs(mean))} nats per step {direction} than {method(other)} (error unknown)"
+        return f"{number(abs(mean))} nats per step {direction} than {other} (error unknown)"
     if abs(mean) <= error * stats.t.ppf((1 + CONFIDENCE) / 2, held_out - 1):
-        return f"with no clear difference from {method(other)} ({signed(mean)} ± {number(error)} nats per step)"
-    return f"{number(abs(mean))} ± {number(error)} nats per step {direction} than {method(other)}"
+        return f"with no clear difference from {other} ({signed(mean)} ± {number(error)} nats per step)"
+    return f"{number(abs(mean))} ± {number(error)} nats per step {direction} than {other}"
 
 
 def _listed(items: list[str]) -> str:
