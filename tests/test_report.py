@@ -262,6 +262,35 @@ def test_runs_of_before_have_no_list(labelled, tmp_path):
     assert 'href="#segments' not in page
 
 
+def test_words_of_the_method_are_explained_where_they_stand(labelled, deep):
+    shown = " ".join(text(labelled[1]).split())
+    for explained in (
+        "DDCO: the hierarchy of options; flat: one policy without options.",
+        "“From clusters” trains",
+        "“Alone” trains",
+        "vq-1, level-1, meta-policy, joint, policy",
+        "how likely an active option is to end at a step (its termination condition, ψ in the paper)",
+        "given the whole demonstration (u in the paper)",
+        "A nat is the unit of log-likelihood",
+    ):
+        assert explained in shown
+    assert "per-timestep: a policy for each time step." in " ".join(text(deep[1]).split())
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("vq-1", "level 1 from clusters"),
+        ("level-2", "level 2 alone"),
+        ("meta-policy", "meta-policy alone"),
+        ("joint", "all together"),
+        ("policy", "policy"),
+    ],
+)
+def test_stages_in_words(name, said):
+    assert words.stage(name) == said
+
+
 def test_success_is_shown_with_trials_intervals_and_the_paired_comparison(deep):
     shown = " ".join(text(deep[1]).split())
     assert "DDCO 3 of 4 (30 to 95 %) 3.33 ± 1.53 [−0.46 to 7.13], n = 3" in shown
@@ -314,7 +343,7 @@ def test_names_are_escaped(tmp_path):
     assert "<i>" not in page
     assert "<img>" not in page
     assert "&lt;b&gt;&amp;run" in page
-    assert "stages named vq" not in page.lower()
+    assert "from clusters" not in page
 
 
 def comparison(mean, error, held_out=10):

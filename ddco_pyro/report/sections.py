@@ -108,7 +108,7 @@ def likelihood(fit: Fit, metrics: Mapping[str, Any]) -> Figures:
         "demonstrations; diamond: mean with one standard error, dots: single demonstrations."
     )
     picture = keep(plot_likelihood.draw(rows), fit.folder / "figures" / "likelihood.png", alt, caption)
-    return Figures([picture], tables.likelihood(rows))
+    return Figures([picture], tables.likelihood(rows), words.about(row.name for row in rows))
 
 
 def rollouts(fit: Fit, metrics: Mapping[str, Any]) -> Rollouts | None:
@@ -140,14 +140,20 @@ def learning(fit: Fit) -> Figures | None:
         "lines for each restart. A steep start may be cut off."
     )
     alt = "Learning curves of the stages " + ", ".join(stage.title for stage in stages)
-    text = ""
-    if any(": vq-" in stage.title for stage in stages):
-        text = (
-            "Stages named vq-d maximise another quantity: the log-likelihood with level d’s choices clamped to "
-            "clusters of the observations. It can be compared within its panel only. Stages named level-d train under "
-            "a uniform meta-policy."
-        )
+    names = list(dict.fromkeys(stage.name for stage in stages))
+    kinds = dict.fromkeys(name.partition("-")[0] for name in names)
+    text = " ".join([*(STAGES[kind] for kind in kinds if kind in STAGES), STAGE_NAMES.format(", ".join(names))])
     return Figures([keep(plot_learning.draw(stages), fit.folder / "figures" / "learning.png", alt, caption)], text=text)
+
+
+STAGES = {
+    "vq": "“From clusters” trains each option of a level on a cluster of steps of its own, so that options differ from "
+    "the beginning; it maximises another quantity, to be compared within its panel only.",
+    "level": "“Alone” trains a level’s options before anything selects among them: each is as likely as any other.",
+    "meta": "“Meta-policy alone” then trains the policy that selects the options.",
+    "joint": "“All together” trains everything once more.",
+}
+STAGE_NAMES = "In history.csv and on the console the stages are {}."
 
 
 def options(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Figures:
@@ -178,8 +184,9 @@ def _posteriors(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mappi
         for name in names
     ]
     caption = (
-        f"Probability u of each choice at each step of {len(names)} {'held-out ' if held_out else ''}demonstrations, "
-        "given the whole demonstration (stacked), and the most likely path under it."
+        f"Probability of each option at each step of {len(names)} {'held-out ' if held_out else ''}demonstrations, "
+        "given the whole demonstration (u in the paper), stacked; under it the path: the most likely sequence of "
+        "options."
     )
     if examples[0].labels is not None:
         caption += f" Boxes: ground-truth label “{fit.spec.demonstrations.labels}”."
@@ -222,8 +229,8 @@ def _trajectories(fit: Fit, demos: Demonstrations, found: Activity, metrics: Map
 def _timing(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture:
     del metrics
     caption = (
-        "Left: mean probability of each choice over all demonstrations. Right: mean termination probability of each "
-        "option, weighted by how likely it was active in the step before; left out where it hardly ever is."
+        "Left: mean probability of each option over all demonstrations. Right: how likely an active option is to end "
+        "at a step (its termination condition, ψ in the paper); left out where it is hardly ever active before."
     )
     if len(found.levels) > 1:
         caption += " Above the lowest level an option can end only where the one below it ends."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from scipy import stats
@@ -14,6 +14,24 @@ CONFIDENCE = 0.95
 """A difference is called one where this interval about it leaves out 0."""
 
 METHODS = {"ddco": "DDCO", "flat": "flat", "per_timestep": "per-timestep", "open_loop": "open loop"}
+
+ABOUT = {
+    "ddco": "the hierarchy of options",
+    "flat": "one policy without options",
+    "per_timestep": "a policy for each time step",
+}
+
+
+def about(names: Iterable[str]) -> str:
+    """A sentence on what the methods are."""
+    return "; ".join(f"{method(name)}: {ABOUT[name]}" for name in names if name in ABOUT) + "."
+
+
+def stage(name: str) -> str:
+    """What a stage of training is called in the page: ``vq-1`` is ``level 1 from clusters``."""
+    kind, _, level = name.partition("-")
+    whole = {"meta-policy": "meta-policy alone", "joint": "all together"}
+    return {"vq": f"level {level} from clusters", "level": f"level {level} alone"}.get(kind) or whole.get(name, name)
 
 
 def method(name: str) -> str:
