@@ -196,6 +196,7 @@ def compare(
     console.comparison(page.HEAD, [page.cells(row) for row in found.rows])
     if found.rollouts:
         console.comparison(page.ROLLOUT_HEAD, page.rollout_cells(found))
+    print(page.verdict(found))
     print(f"comparison: {comparison.write(found, out or Path('runs') / time.strftime('compare-%Y%m%d-%H%M%S'))}")
 
 

@@ -99,7 +99,7 @@ class Fitting(Collecting):
 
     def epoch(self, row: Mapping[str, Any]) -> None:
         """An epoch has ended; its row of the history."""
-        note = f"{row['stage']}: loss {-row['train']:.3f}, held out {row['tune']:.3f} nats/step"
+        note = f"{row['stage']}: training {row['train']:.3f}, tuning {row['tune']:.3f} nats/step"
         self.advance(self._done + 1, note)
 
     def trained(self, name: str) -> None:
@@ -154,8 +154,9 @@ def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy) -> None:
 
 
 def log_likelihoods(metrics: Mapping[str, Any]) -> None:
-    """Held-out log-likelihood of the model and of what it is compared with."""
-    table = Table("model", "train", "held out", "ours - this", title="log-likelihood, nats per step", show_edge=False)
+    """Log-likelihood of the model and of what it is compared with, in training and on what was held out."""
+    head = ("model", "training", "validation (held out)", "ours - this, validation")
+    table = Table(*head, title="log-likelihood, nats per step", show_edge=False)
     rows = {metrics["model"]: metrics, **metrics["comparison"]}
     for name, row in rows.items():
         values, difference = row["log_likelihood_per_step"], row.get("difference")

@@ -41,6 +41,12 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
     if missing:
         known = ", ".join(sorted(dimensions.shapes))
         raise SpecError(f"observations: there is no {', '.join(missing)} (there are: {known})")
+    drawn = spec.report.trajectory
+    shape = dimensions.shapes[drawn] if drawn else (3,)
+    if len(shape) != 1 or shape[0] < 3:
+        raise SpecError(
+            f"report.trajectory: {drawn!r} has shape {list(shape)} at each step; name a vector of three numbers or more"
+        )
     scale = spec.control.scale
     if isinstance(scale, tuple) and len(scale) != dimensions.control_size:
         raise SpecError(

@@ -15,19 +15,23 @@ if TYPE_CHECKING:
 
 
 def evaluate(found: Fit, parts: dict[str, Demonstrations], demos: Demonstrations) -> dict[str, Any]:
-    """What ``metrics.json`` says of a model: log-likelihood in nats per step of each part of the data, its paired
-    difference to every baseline, and with options their use, divergences and agreement with labels.
+    """What ``metrics.json`` says of a model: log-likelihood in nats per step of each part of the data and of each
+    demonstration, its paired difference to every baseline, and with options their use, divergences and agreement with
+    labels.
     """
-    values = {name: found.log_likelihood(part) for name, part in parts.items()}
+    methods = {found.name: found, **found.baselines}
+    by_method = {name: {part: fit.log_likelihood(parts[part]) for part in parts} for name, fit in methods.items()}
+    values = by_method[found.name]
     per_step = {name: float(v.sum() / sum(parts[name].lengths)) for name, v in values.items()}
     metrics: dict[str, Any] = {
         "model": found.name,
         "log_likelihood_per_step": {"train": per_step["train"], "valid": per_step.get("valid")},
         "valid": _each(parts["valid"], values["valid"]) if "valid" in parts else [],
+        "demonstrations_by_likelihood": _worst_first(found.name, parts, by_method),
         "comparison": {
             name: {
                 "log_likelihood_per_step": one.metrics["log_likelihood_per_step"],
-                "difference": _difference(values["valid"], one, parts["valid"]),
+                "difference": _difference(values["valid"], by_method[name]["valid"], parts["valid"]),
             }
             for name, one in found.baselines.items()
         },
@@ -48,8 +52,29 @@ def _each(demos: Demonstrations, values: np.ndarray) -> list[dict[str, Any]]:
     ]
 
 
-def _difference(ours: np.ndarray, baseline: Fit, valid: Demonstrations) -> dict[str, float]:
-    return analysis.paired(ours, baseline.log_likelihood(valid), np.array(valid.lengths, dtype=float))
+def _worst_first(
+    ours: str, parts: dict[str, Demonstrations], by_method: dict[str, dict[str, np.ndarray]]
+) -> list[dict[str, Any]]:
+    """Every demonstration with its part of the data and its log-likelihood per step under each method, by method; the
+    least likely under the method ``ours`` first.
+    """
+    rows = [
+        {
+            "name": demo.name,
+            "part": part,
+            "steps": len(demo),
+            "log_likelihood_per_step": {
+                name: float(values[part][row]) / len(demo) for name, values in by_method.items()
+            },
+        }
+        for part, demos in parts.items()
+        for row, demo in enumerate(demos)
+    ]
+    return sorted(rows, key=lambda row: row["log_likelihood_per_step"][ours])
+
+
+def _difference(ours: np.ndarray, theirs: np.ndarray, valid: Demonstrations) -> dict[str, float]:
+    return analysis.paired(ours, theirs, np.array(valid.lengths, dtype=float))
 
 
 def _agreement(found: Fit, parts: dict[str, Demonstrations]) -> dict[str, Any]:

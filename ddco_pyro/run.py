@@ -36,6 +36,9 @@ from ddco_pyro.monitor import Monitor
 from ddco_pyro.spec import Spec, dump_spec, load_spec, user_code
 from ddco_pyro.training import Trainer, TrainingError, plan
 
+TOLERANCE = 1e-4
+"""Relative; a log-likelihood computed again on another machine differs in the last digits of float32."""
+
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
 
 
@@ -84,6 +87,15 @@ class Fit:
         folders = [self.folder / "baselines" / baseline.kind for baseline in self.spec.compare_with]
         allow_code = bool(user_code(self.spec))  # theirs is named in this spec too
         return {folder.name: load(folder, allow_code) for folder in folders if _finished(folder)}
+
+    @cached_property
+    def held_out(self) -> dict[str, float]:
+        """log p(ξ) of each demonstration that was held out, by name, as it was then."""
+        return {one["name"]: one["log_likelihood"] for one in self.metrics["valid"]}
+
+    def was_held_out(self, name: str, log_likelihood: float) -> bool:
+        """Whether a demonstration is one of those that were held out: the same name, and as likely as it was then."""
+        return bool(np.isclose(self.held_out.get(name, np.nan), log_likelihood, rtol=TOLERANCE, atol=TOLERANCE))
 
     def log_likelihood(self, demos: Demonstrations) -> np.ndarray:
         """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units."""

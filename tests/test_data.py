@@ -11,7 +11,7 @@ from ddco_pyro.demonstrations import Demonstration, Demonstrations, Demonstratio
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 
 TASK = "toy_task:task"
-SIZE = Dimensions({"offsets": (4,), "camera": (8, 8, 3)}, control_size=2, steps=12)
+SIZE = Dimensions({"offsets": (4,), "camera": (8, 8, 3), "visited": (1,)}, control_size=2, steps=12)
 
 
 def spec(**changes):
@@ -81,6 +81,14 @@ WRONG = {"network": "test_networks:Wrong", "options": {"how": "swapped"}}
     [
         ({"observations": ["offsets", "pose", "jaw"]}, r"^observations: there is no pose, jaw \(there are: camera, of"),
         ({"control": {"scale": [1.0]}}, r"^control\.scale: has 1 numbers, but the control has 2 dimensions$"),
+        (
+            {"observations": ["visited"], "report": {"trajectory": "visited"}},
+            r"^report\.trajectory: 'visited' has shape \[1\] at each step; name a vector of three numbers or more$",
+        ),
+        (
+            {"observations": ["camera"], "report": {"trajectory": "camera"}},
+            r"^report\.trajectory: 'camera' has shape \[8, 8, 3\] at each step; name a vector",
+        ),
         ({"observations": ["camera"]}, r"^baseline\.policy: reads vectors, but camera are images"),
         (
             {"baseline": None, "hierarchy": {"levels": [LEVEL | {"policy": CONV}]}},

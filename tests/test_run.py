@@ -139,6 +139,23 @@ def test_log_likelihoods_can_be_computed_again(toy_run, parts):
     ]
 
 
+def test_every_demonstration_is_listed_worst_first(toy_run, demos, parts):
+    listed = toy_run.metrics["demonstrations_by_likelihood"]
+    methods = {"ddco": toy_run, **toy_run.baselines}
+    steps = dict(zip(demos.names, demos.lengths, strict=True))
+    values = {
+        name: dict(zip(demos.names, fitted.log_likelihood(demos) / demos.lengths, strict=True))
+        for name, fitted in methods.items()
+    }
+    assert [one["name"] for one in listed] == sorted(demos.names, key=values["ddco"].__getitem__)
+    for one in listed:
+        assert one["part"] == ("valid" if one["name"] in parts["valid"].names else "train")
+        assert one["steps"] == steps[one["name"]]
+        assert one["log_likelihood_per_step"] == pytest.approx({m: values[m][one["name"]] for m in methods})
+    flat = toy_run.baselines["flat"].metrics["demonstrations_by_likelihood"]
+    assert [one["name"] for one in flat] == sorted(demos.names, key=values["flat"].__getitem__)
+
+
 def test_comparisons_can_be_computed_again(toy_run, parts):
     loaded, valid = ddco_pyro.load(toy_run.folder), parts["valid"]
     steps = sum(valid.lengths)

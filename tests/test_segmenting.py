@@ -13,11 +13,12 @@ import numpy as np
 import pyarrow.parquet as parquet
 import pytest
 import yaml
+from sklearn.metrics import normalized_mutual_info_score
 from test_cli import call
 from test_run import Silent
 
 import ddco_pyro
-from ddco_pyro.data import demonstrations
+from ddco_pyro.data import demonstrations, parts
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.importing import import_demonstrations
 from ddco_pyro.run import fit
@@ -80,8 +81,8 @@ def test_a_page_or_a_table_leaves_the_file_alone(toy_run, file, tmp_path, option
 
 
 NOTHING = (
-    "ddco-pyro: name what to write: --html PAGE, --csv FILE or --parquet FILE; labels for each step go to --out FILE (a copy) "
-    "or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset\n"
+    "ddco-pyro: name what to write: --html PAGE, --csv FILE or --parquet FILE; labels for each step go to --out FILE "
+    "(a copy) or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset\n"
 )
 
 
@@ -172,6 +173,52 @@ def test_the_page_shows_every_segment(toy_run, file, tmp_path):
     assert [(int(o), int(a), int(b) + 1) for o, a, b in titles] == runs
     assert "http" not in text
     assert "<script" not in text
+
+
+def marked(page):
+    """Names on the page that are marked as held out."""
+    shown = re.findall(r'<div class="who">(\S+)\s*(<span class="held-out">held out</span>)?', page)
+    return {name for name, mark in shown if mark}
+
+
+def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy_spec, file, tmp_path):
+    page = tmp_path / "segments.html"
+    assert call("segment", toy_run.folder, file, "--html", page).status == 0
+    text = page.read_text()
+    split = parts(toy_spec, demonstrations(toy_spec))
+    assert marked(text) == set(split["valid"].names)
+    scores = {}
+    for name, part in split.items():
+        (path,) = toy_run.segment(part)
+        found = np.concatenate([row[: len(demo)] for row, demo in zip(path, part, strict=True)])
+        scores[name] = normalized_mutual_info_score(np.concatenate([demo.labels["phase"] for demo in part]), found)
+    assert (
+        f"label “phase”, as normalised mutual information: {scores['valid']:.2f} on 3 held-out demonstrations and "
+        f"{scores['train']:.2f} on 9 other demonstrations. 0 is no agreement"
+    ) in " ".join(text.split())
+    assert "3 of 12 demonstrations were held out when it was fitted" in text
+
+
+def test_other_demonstrations_of_the_same_names_are_not_marked(toy_run, toy_spec, file, tmp_path):
+    with h5py.File(file, "r+") as opened:
+        for group in opened["data"].values():
+            group["actions"][:] += 0.1
+    page = tmp_path / "segments.html"
+    assert call("segment", toy_run.folder, file, "--html", page).status == 0
+    text = page.read_text()
+    assert marked(text) == set()
+    assert re.search(r"mutual information: \d\.\d\d on 12 demonstrations\. 0 is", text)
+    assert "were held out" not in text
+
+
+def test_without_labels_the_page_says_nothing_of_agreement(toy_run, file, tmp_path):
+    with h5py.File(file, "r+") as opened:
+        for group in opened["data"].values():
+            del group["labels/phase"]
+    page = tmp_path / "segments.html"
+    assert call("segment", toy_run.folder, file, "--html", page).status == 0
+    assert "mutual information" not in page.read_text()
+    assert marked(page.read_text())
 
 
 def test_the_page_escapes_what_it_shows(toy_run, tmp_path, toy_spec):

@@ -52,18 +52,35 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Rows, the best first; the ``trajectories`` they were compared on, and rollouts paired by initial state."""
+    """Rows, the best first; the ``trajectories`` they were compared on and their ``steps``; rollouts paired by initial
+    state; and the run whose likelihood sorts the trajectories: the best with options, or the best.
+    """
 
     rows: Sequence[Row]
     trajectories: Sequence[str]
-    steps: int
+    steps: Sequence[int]
     rollouts: Sequence[dict[str, Any]]
+    sorted_by: str
+
+    @property
+    def worst_first(self) -> list[dict[str, Any]]:
+        """Every trajectory with its log-likelihood per step under each run, the least likely first."""
+        listed = [
+            {
+                "name": name,
+                "steps": steps,
+                "log_likelihood_per_step": {row.name: row.each[place] / steps for row in self.rows},
+            }
+            for place, (name, steps) in enumerate(zip(self.trajectories, self.steps, strict=True))
+        ]
+        return sorted(listed, key=lambda one: one["log_likelihood_per_step"][self.sorted_by])
 
     def as_data(self) -> dict[str, Any]:
         """The same as plain data."""
         return {
             "trajectories": list(self.trajectories),
-            "steps": self.steps,
+            "steps": sum(self.steps),
+            "demonstrations": self.worst_first,
             "rows": [vars(row) | {"each": list(row.each)} for row in self.rows],
             "rollouts": list(self.rollouts),
         }
@@ -87,11 +104,13 @@ def compare(folders: Sequence[Path], allow_code: bool = False) -> Comparison:
     best = int(values.sum(1).argmax())
     rows = [_row(0, one, values[best]) for one in held]
     ranked = sorted(rows, key=lambda row: row.difference)
+    with_options = {one.run for one in held if one.fit.spec.hierarchy}
     return Comparison(
         [Row(**vars(row) | {"rank": rank}) for rank, row in enumerate(ranked)],
         held[0].names,
-        sum(held[0].steps),
+        held[0].steps,
         paired_rollouts(fits, [row.name for row in ranked]),
+        next((row.name for row in ranked if row.name in with_options), ranked[0].name),
     )
 
 
@@ -115,7 +134,7 @@ def write(found: Comparison, folder: Path) -> Path:
     data = json.dumps(_finite(found.as_data()), indent=1) + "\n"
     write_text(folder / "compare.json", data)
     write_text(folder / "compare.md", page.markdown(found))
-    write_text(folder / "compare.html", page.html(found, picture))
+    write_text(folder / "compare.html", page.html(found, picture, folder))
     return folder / "compare.html"
 
 

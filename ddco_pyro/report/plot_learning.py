@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from ddco_pyro.report import words
 from ddco_pyro.report.pictures import INK, blank
-from ddco_pyro.report.words import method
 
 COLUMNS = 4
 TUNE = "#c2410c"
@@ -24,8 +24,14 @@ TUNE = "#c2410c"
 class Stage:
     """One stage of one model: for each restart an array of (epoch, train, tune) [E, 3], nats per step."""
 
-    title: str
+    model: str
+    name: str
     restarts: Sequence[np.ndarray]
+
+    @property
+    def title(self) -> str:
+        """Model and stage in words."""
+        return f"{words.method(self.model)}: {words.stage(self.name)}"
 
 
 def stages(histories: Mapping[str, Path]) -> list[Stage]:
@@ -42,7 +48,7 @@ def stages(histories: Mapping[str, Path]) -> list[Stage]:
             curves = [
                 np.array([[float(row[key]) for key in ("epoch", "train", "tune")] for row in r]) for r in restarts
             ]
-            found.append(Stage(f"{method(model)}: {stage}", curves))
+            found.append(Stage(model, stage, curves))
     return found
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from scipy import stats
@@ -14,6 +14,24 @@ CONFIDENCE = 0.95
 """A difference is called one where this interval about it leaves out 0."""
 
 METHODS = {"ddco": "DDCO", "flat": "flat", "per_timestep": "per-timestep", "open_loop": "open loop"}
+
+ABOUT = {
+    "ddco": "the hierarchy of options",
+    "flat": "one policy without options",
+    "per_timestep": "a policy for each time step",
+}
+
+
+def about(names: Iterable[str]) -> str:
+    """A sentence on what the methods are."""
+    return "; ".join(f"{method(name)}: {ABOUT[name]}" for name in names if name in ABOUT) + "."
+
+
+def stage(name: str) -> str:
+    """What a stage of training is called in the page: ``vq-1`` is ``level 1 from clusters``."""
+    kind, _, level = name.partition("-")
+    whole = {"meta-policy": "meta-policy alone", "joint": "all together"}
+    return {"vq": f"level {level} from clusters", "level": f"level {level} alone"}.get(kind) or whole.get(name, name)
 
 
 def method(name: str) -> str:
@@ -79,7 +97,15 @@ def verdict(metrics: Mapping[str, Any]) -> str:
         return (
             f"{name} gives held-out demonstrations {value} nats per step; no other model was trained to compare with."
         )
-    clauses = [_clause(other, one["difference"], held_out) for other, one in metrics["comparison"].items()]
+    return explains(name, {method(other): one["difference"] for other, one in metrics["comparison"].items()}, held_out)
+
+
+def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out: int) -> str:
+    """One sentence on how much better than others a model explains held-out demonstrations.
+
+    :param differences: what the others are called to ``nats_per_step`` and ``standard_error`` of the paired difference.
+    """
+    clauses = [_clause(other, difference, held_out) for other, difference in differences.items()]
     text = f"{name} explains held-out demonstrations {_listed(clauses)}"
     return f"{text} ({held_out} held-out demonstration{'s' * (held_out != 1)}; ± is one standard error)."
 
@@ -88,10 +114,10 @@ def _clause(other: str, difference: Mapping[str, float], held_out: int) -> str:
     mean, error = difference["nats_per_step"], difference["standard_error"]
     direction = "better" if mean > 0 else "worse"
     if not math.isfinite(error):
-        return f"{number(abs(mean))} nats per step {direction} than {method(other)} (error unknown)"
+        return f"{number(abs(mean))} nats per step {direction} than {other} (error unknown)"
     if abs(mean) <= error * stats.t.ppf((1 + CONFIDENCE) / 2, held_out - 1):
-        return f"with no clear difference from {method(other)} ({signed(mean)} ± {number(error)} nats per step)"
-    return f"{number(abs(mean))} ± {number(error)} nats per step {direction} than {method(other)}"
+        return f"with no clear difference from {other} ({signed(mean)} ± {number(error)} nats per step)"
+    return f"{number(abs(mean))} ± {number(error)} nats per step {direction} than {other}"
 
 
 def _listed(items: list[str]) -> str:
@@ -120,7 +146,8 @@ def warning(finding: Finding, level: str) -> str:
         "dominating": f"{option} dominates: it is active in {share} of all steps.",
         "redundant": f"{option} does the same as option {finding.other}: over the time that one of them is active they "
         f"differ by {number(finding.value, 3)} nats per step.",
-        "never_persisting": f"{option} never persists: it lasts {number(finding.value)} steps on average.",
+        "never_persisting": f"{option} never persists: it lasts {number(finding.value)} steps on average and is "
+        f"selected {number(finding.selections, 1)} times in each demonstration that has it.",
         "high_fitting": f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its "
         "steps, past its options.",
     }[finding.kind]

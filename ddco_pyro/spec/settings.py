@@ -111,7 +111,7 @@ class TrainingSpec(Model):
     restarts: Count = 1
     """Independent initialisations; the best on the tuning demonstrations is kept."""
     tune_fraction: Fraction = 0.1
-    """Part of the training demonstrations held out to stop early and to choose among restarts."""
+    """Part of the training demonstrations set aside for tuning: to stop early and to choose among restarts."""
     patience: Count | None = 20
     """Epochs without improvement before a stage stops; null for never."""
     clip_gradient: Positive | None = None
@@ -147,3 +147,10 @@ class RolloutSpec(Model):
     """Whether options and terminations are sampled or the most likely ones."""
     policies: Items[Text] = ()
     """Scripted policies of the task that are rolled out beside, such as ``open_loop``."""
+
+
+class ReportSpec(Model):
+    """What the report shows."""
+
+    trajectory: Text | None = None
+    """Observation whose first three numbers are drawn as trajectories in space; null: the one that moves the most."""

@@ -9,12 +9,13 @@ from pydantic import Field, ValidationError, model_validator
 
 from ddco_pyro.spec.hierarchy import Baseline, HierarchySpec
 from ddco_pyro.spec.keypaths import edited
-from ddco_pyro.spec.messages import SpecError, invalid, lines, show
+from ddco_pyro.spec.messages import SpecError, invalid, lines, nearest, show
 from ddco_pyro.spec.settings import (
     ControlSpec,
     DemonstrationsSpec,
     InferenceSpec,
     Observation,
+    ReportSpec,
     RolloutSpec,
     SelectionSpec,
     TrainingSpec,
@@ -47,6 +48,8 @@ class Spec(Model):
     """Cross-validation over a grid."""
     rollout: RolloutSpec = RolloutSpec()
     """How the fitted policy is tried in the task."""
+    report: ReportSpec = ReportSpec()
+    """What the report shows."""
     seed: Seed = 0
     """Seed of everything random that has no seed of its own."""
 
@@ -57,7 +60,12 @@ class Spec(Model):
 
     @model_validator(mode="after")
     def _consistent(self) -> Spec:
-        problems = [*self._choices(), *self._repeated_observations(), *self._nothing_held_out()]
+        problems = [
+            *self._choices(),
+            *self._repeated_observations(),
+            *self._unknown_trajectory(),
+            *self._nothing_held_out(),
+        ]
         if problems:
             raise invalid(*problems)
         if self.selection.grid:
@@ -83,6 +91,12 @@ class Spec(Model):
         for index, key in enumerate(keys):
             if key in keys[:index]:
                 yield f"observations.{index}.key", f"{key!r} is given twice; keep one"
+
+    def _unknown_trajectory(self) -> Iterator[tuple[str, str]]:
+        key, known = self.report.trajectory, [observation.key for observation in self.observations]
+        if key is not None and key not in known:
+            there = ", ".join(known)
+            yield "report.trajectory", f"there is no observation {key!r}{nearest(key, known)}; there is: {there}"
 
 
 def _grid_problems(spec: Spec) -> Iterator[tuple[str, str]]:
