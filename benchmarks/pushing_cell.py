@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from ddco_tasks import pushing
+from provenance import Record
 
 from ddco_pyro.data import Dimensions, build_hierarchy
 from ddco_pyro.demonstrations import Demonstrations
@@ -152,7 +153,7 @@ def per_step(hierarchy: Hierarchy, demos: Demonstrations) -> float:
     return float(log_likelihoods(hierarchy, demos).sum() / sum(demos.lengths))
 
 
-def fitted(cell: Cell, folder: Path) -> Hierarchy:
+def fitted(cell: Cell, folder: Path, made_by: Record) -> Hierarchy:
     """The hierarchy of a cell, fitted unless it has been already."""
     spec = spec_of(cell)
     path = folder / "models" / f"{cell.fit}.safetensors"
@@ -168,6 +169,7 @@ def fitted(cell: Cell, folder: Path) -> Hierarchy:
         "parameters": sum(one.numel() for one in hierarchy.parameters()),
         "std": spec.control.std,
         "seconds": seconds,
+        "made_by": made_by,
         "log_likelihood_per_step": likelihood,
     }
     write_text(folder / "fits" / f"{cell.fit}.json", json.dumps(found, indent=1) + "\n")
@@ -175,21 +177,28 @@ def fitted(cell: Cell, folder: Path) -> Hierarchy:
     return hierarchy
 
 
-def run(cell: Cell, folder: Path, limited: bool = False) -> None:
+def fit_made_by(cell: Cell, folder: Path) -> Record | None:
+    """What fitted a cell; None for a fit from before that was recorded."""
+    found: Record | None = json.loads((folder / "fits" / f"{cell.fit}.json").read_text()).get("made_by")
+    return found
+
+
+def run(cell: Cell, folder: Path, made_by: Record, limited: bool = False) -> None:
     """Fit and roll out a cell, and keep what came of it; nothing where it has been kept already.
 
+    :param made_by: the record of the study that does so.
     :param limited: at most 250 steps for each goal.
     """
     torch.set_num_threads(1)
     path = folder / ("limited" if limited else "rollouts") / f"{cell.name}.json"
     if path.exists():
         return
-    hierarchy = fitted(cell, folder)
+    hierarchy = fitted(cell, folder, made_by)
     first = EVALUATION + 1000 * cell.seed
     task: Task = pushing.limited if limited else pushing.task
     start = time.perf_counter()
     episodes = play(task, hierarchy, spec_of(cell).rollout, range(first, first + EPISODES))
-    found = {**summary(episodes), "seconds": time.perf_counter() - start}
+    found = {**summary(episodes), "seconds": time.perf_counter() - start, "made_by": made_by}
     write_text(path, json.dumps(found, indent=1) + "\n")
 
 

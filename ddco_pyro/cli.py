@@ -206,9 +206,15 @@ def rollout(
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each method; by default the spec's.")] = None,
     video: Annotated[bool, typer.Option("--video", help="Film the first episodes of each method.")] = False,
     jobs: Jobs = -1,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Where RUN holds these very rollouts, show them again.")
+    ] = False,
     allow_code: AllowCode = False,
 ) -> None:
-    """Roll the model, its baselines and the spec's scripted policies out from the same initial states."""
+    """Roll the model, its baselines and the spec's scripted policies out from the same initial states.
+
+    An unfinished rollout of as many episodes is continued.
+    """
     from ddco_pyro.data import demonstrations
     from ddco_pyro.evaluate import policies, roll_out
     from ddco_pyro.report import write_report
@@ -217,7 +223,7 @@ def rollout(
     fitted = load(run, allow_code)
     number = episodes or fitted.spec.rollout.episodes
     with console.Rolling(number * len(policies(fitted))) as progress:
-        results = roll_out(fitted, number, FILMED if video else 0, progress.episode, jobs)
+        results = roll_out(fitted, number, FILMED if video else 0, progress.episode, jobs, resume)
     console.successes(results)
     print(f"report: {write_report(fitted, demonstrations(fitted.spec))}")
 

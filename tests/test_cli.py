@@ -129,6 +129,8 @@ def test_rollout_and_report(run):
     for name, one in methods.items():
         assert re.search(rf"^ *{name} +│ +{one['measures']['success']['successes']}/2 \[", ended.out, re.MULTILINE)
     assert len(list((folder / "videos").glob("*.mp4"))) == 8
+    again = call("rollout", folder, "--episodes", 2, "--video", "--jobs", 1, "--resume")
+    assert (again.status, again.out, again.err) == (0, ended.out, "")  # nothing is rolled out, so no progress is shown
     (folder / "report.html").unlink()
     assert call("report", folder) == (0, f"report: {folder / 'report.html'}\n", "")
     assert "open_loop" in (folder / "report.html").read_text()
