@@ -10,11 +10,8 @@ from typing import Any
 from ddco_pyro.files import write_text
 from ddco_pyro.rollout import Episode, paired_difference, run_episodes, summarize
 from ddco_pyro.run import Fit, RunError, write_metrics
-from ddco_pyro.task import Policy, find_task
+from ddco_pyro.task import SUCCESS, Policy, Task, find_task
 from ddco_pyro.video import write_film
-
-SUCCESS = "success"
-"""The measure by which methods are compared."""
 
 OnEpisode = Callable[[str], None]
 
@@ -53,18 +50,19 @@ def roll_out(fit: Fit, episodes: int, film: int, on_episode: OnEpisode, jobs: in
                 write_film(fit.folder / "videos" / f"{name}-{episode.seed}.mp4", episode)
             on_episode(name)
     write_text(fit.folder / "rollouts.csv", _table(found))
-    results = {"seed": seeds.start, "episodes": episodes, "methods": _methods(found, fit.name)}
+    methods = _methods(find_task(str(fit.spec.task)), found, fit.name)
+    results = {"seed": seeds.start, "episodes": episodes, "methods": methods}
     write_metrics(fit.folder, fit.metrics | {"rollouts": results})
     return results
 
 
-def _methods(found: dict[str, list[Episode]], ours: str) -> dict[str, Any]:
+def _methods(task: Task, found: dict[str, list[Episode]], ours: str) -> dict[str, Any]:
     def successes(name: str) -> list[float]:
         return [episode.outcome[SUCCESS] for episode in found[name]]
 
     methods: dict[str, Any] = {}
     for name, episodes in found.items():
-        methods[name] = {"measures": summarize([episode.outcome for episode in episodes])}
+        methods[name] = {"measures": summarize(task, [episode.outcome for episode in episodes])}
         if name != ours and all(SUCCESS in episode.outcome for episode in episodes):
             methods[name]["against"] = paired_difference(successes(ours), successes(name))
     return methods
