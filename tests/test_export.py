@@ -260,7 +260,7 @@ def test_what_was_exported_before_is_replaced_by_what_agrees_alone(tmp_path, dam
 
 def test_what_else_is_in_a_folder_is_not_lost(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(BadInput, match=r": holds what was not exported \(notes\.txt\); choose another --out$"):
+    with pytest.raises(BadInput, match=r": holds what was not exported, such as notes\.txt; choose another --out$"):
         export(make("linear"), tmp_path)
     with pytest.raises(BadInput, match=r"notes\.txt: is a file; choose another --out$"):
         export(make("linear"), tmp_path / "notes.txt")

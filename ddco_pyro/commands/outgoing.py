@@ -98,14 +98,17 @@ def _annotate(
 def export(
     run: RunPath,
     out: Annotated[Path, typer.Option(help="The folder to write.", show_default=False)],
-    onnx: Annotated[bool, typer.Option("--onnx", help="Write ONNX too (pip install 'ddco-pyro[export]').")] = False,
+    onnx: Annotated[bool, typer.Option("--onnx", help="Write ONNX too (pip install 'ddco-pyro\\[export]').")] = False,
     allow_code: AllowCode = False,
 ) -> None:
     """Write the controller as files that need nothing of this library: numpy with a runner, torch.export, ONNX.
 
-    Every form is loaded again and acts in three episodes of made-up observations, by the loop of runner.py. It has to
-    choose the options that the run's controller chooses, with controls and probabilities within 1e-6 (relative where a
-    control is above 1), or nothing is written and what was there stays.
+    Every form is loaded again and acts in three episodes of made-up
+    observations, by the loop of runner.py. It has to choose the options
+    that the run's controller chooses, with probabilities within 1e-6 and
+    controls within 1e-6 of the largest of 1, their spread, and their
+    distance from their mean; else nothing is written and what was there
+    stays.
     """
     from ddco_pyro.export import export as write
     from ddco_pyro.run import load

@@ -64,7 +64,7 @@ def export(fit: Fit, folder: Path, onnx: bool = False) -> Exported:
         raise BadInput(f"{folder}: is a file; choose another --out")
     others = sorted(path.name for path in folder.iterdir() if path.name not in FILES) if folder.exists() else []
     if others:
-        raise BadInput(f"{folder}: holds what was not exported ({', '.join(others)}); choose another --out")
+        raise BadInput(f"{folder}: holds what was not exported, such as {others[0]}; choose another --out")
     with whole_folder(folder) as temporary:
         forms = _write(fit, temporary, onnx)
         return _compare(temporary, forms)

@@ -218,8 +218,13 @@ class TorchNetworks:
     def __call__(self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray]) -> Outputs:
         """The outputs of every network for one observation."""
         given = (features, np.array([step], np.int64), *images.values())
-        with self._torch.no_grad():
-            values = self._program(*(self._torch.tensor(one) for one in given))
+        threads = self._torch.get_num_threads()
+        self._torch.set_num_threads(1)  # networks are small: more threads only wait for one another
+        try:
+            with self._torch.no_grad():
+                values = self._program(*(self._torch.tensor(one) for one in given))
+        finally:
+            self._torch.set_num_threads(threads)
         return {name: one.numpy() for name, one in zip(self._outputs, values, strict=True)}
 
 
