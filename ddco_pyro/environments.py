@@ -60,7 +60,7 @@ class TaskEnvironment(gymnasium.Env[Observation, np.ndarray]):
         """One control step; the environment's end is a truncation where it says that more could follow."""
         step = self._environment.step(np.asarray(action))
         ended = step.last() and step.discount == 0
-        info = self.task.outcome(self._environment) if step.last() else {}
+        info = self.task.measured(self._environment) if step.last() else {}
         return _observation(step), float(step.reward or 0.0), bool(ended), bool(step.last() and not ended), info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]

@@ -13,11 +13,8 @@ from typing import Any
 from ddco_pyro.files import write_text
 from ddco_pyro.rollout import paired_difference, run_episodes, summarize
 from ddco_pyro.run import Fit, RunError, write_metrics
-from ddco_pyro.task import Policy, find_task
+from ddco_pyro.task import SUCCESS, Policy, Task, find_task
 from ddco_pyro.video import write_film
-
-SUCCESS = "success"
-"""The measure by which methods are compared."""
 
 OnEpisode = Callable[[str], None]
 
@@ -77,7 +74,11 @@ def roll_out(
         rolled.keep(name, outcomes)
     found = {name: rolled.outcomes[name] for name in methods}
     write_text(fit.folder / "rollouts.csv", _table(found, seeds))
-    results = {"seed": seeds.start, "episodes": episodes, "methods": _methods(found, fit.name)}
+    results = {
+        "seed": seeds.start,
+        "episodes": episodes,
+        "methods": _methods(find_task(str(fit.spec.task)), found, fit.name),
+    }
     write_metrics(fit.folder, fit.metrics | {"rollouts": results})
     rolled.end()
     return results
@@ -111,13 +112,13 @@ class _Unfinished:
         self._path.unlink(missing_ok=True)
 
 
-def _methods(found: Outcomes, ours: str) -> dict[str, Any]:
+def _methods(task: Task, found: Outcomes, ours: str) -> dict[str, Any]:
     def successes(name: str) -> list[float]:
         return [outcome[SUCCESS] for outcome in found[name]]
 
     methods: dict[str, Any] = {}
     for name, outcomes in found.items():
-        methods[name] = {"measures": summarize(outcomes)}
+        methods[name] = {"measures": summarize(task, outcomes)}
         if name != ours and all(SUCCESS in outcome for outcome in outcomes):
             methods[name]["against"] = paired_difference(successes(ours), successes(name))
     return methods

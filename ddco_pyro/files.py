@@ -8,6 +8,7 @@ import glob
 import json
 import os
 import platform
+import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -20,7 +21,7 @@ from torch import Tensor
 from ddco_pyro.errors import BadInput, Failed
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-_FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR}
+_FORBIDDEN = {errno.EACCES, errno.EBUSY, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR}
 
 
 class NoSpace(Failed):
@@ -51,8 +52,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary = Path(name)
         try:
             yield temporary
-            with temporary.open("rb") as written:
-                os.fsync(written.fileno())
+            _flush(temporary)
             temporary.chmod(0o644)
             temporary.replace(path)
         finally:
@@ -62,13 +62,46 @@ def whole_file(path: Path) -> Iterator[Path]:
 _TEMPORARY = ".tmp"
 
 
+def _flush(path: Path) -> None:
+    """See that what was written is on the disk."""
+    if path.is_file():
+        with path.open("rb") as written:
+            os.fsync(written.fileno())
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder beside ``path``, which takes the place of ``path`` once the block has ended without an error.
+
+    :raises NoSpace: the disk is full.
+    :raises NotWritable: nothing may be written there.
+    """
+    with _explained(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_stale(path)
+        prefix = f".{path.name}-{platform.node()}-{os.getpid()}-"
+        temporary = Path(tempfile.mkdtemp(prefix=prefix, suffix=_TEMPORARY, dir=path.parent))
+        try:
+            yield temporary
+            for file in temporary.rglob("*"):
+                _flush(file)
+            temporary.chmod(0o755)
+            before = temporary.with_name(f"{prefix}before{_TEMPORARY}")
+            if path.exists():
+                path.rename(before)
+            temporary.rename(path)
+            shutil.rmtree(before, ignore_errors=True)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
 def _remove_stale(path: Path) -> None:
-    """Remove what a process of this machine, killed while it wrote this very file, has left."""
+    """Remove what a process of this machine, killed while it wrote this very file or folder, has left."""
     prefix = f".{path.name}-{platform.node()}-"
     for old in path.parent.glob(f"{glob.escape(prefix)}*{_TEMPORARY}"):
         process = old.name.removeprefix(prefix).partition("-")[0]
         if process.isdecimal() and not Path(f"/proc/{process}").exists():
-            old.unlink(missing_ok=True)
+            shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
 
 
 def leftovers(folder: Path) -> list[Path]:

@@ -128,6 +128,7 @@ class Hierarchy(nn.Module):
 
     def __init__(self, spec: Spec, shapes: Shapes, control_size: int, steps: int) -> None:
         super().__init__()
+        self.steps = steps
         self.encoder = ObservationEncoder(spec.observations, shapes)
         self.scaling = ControlScaling(spec.control, control_size)
         shape = self.encoder.shape(steps)

@@ -310,10 +310,12 @@ def _train(
         hierarchy.scaling.fit(kept)
         return hierarchy
 
-    first = make()
-    batches = [encode(part, first.encoder, first.scaling) for part in parts]
-    few = batches[0].select(torch.arange(min(len(batches[0]), COMPARED)))
-    check = compare_engines(first(few.inputs), few.actions, first.scaling.log_volume, few.lengths)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(spec.seed)
+        first = make()
+        batches = [encode(part, first.encoder, first.scaling) for part in parts]
+        few = batches[0].select(torch.arange(min(len(batches[0]), COMPARED)))
+        check = compare_engines(first(few.inputs), few.actions, first.scaling.log_volume, few.lengths)
     if not check.agrees:
         raise TrainingError(
             f"the engines disagree (value {check.value:.1e}, gradient {check.gradient:.1e}): "

@@ -142,7 +142,7 @@ class Trainer:
     def _fresh(self) -> Hierarchy:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self._seed(self.progress.restart))
-            return self.make()
+            return self.make().eval()
 
     def _seed(self, *where: int) -> int:
         return int(np.random.SeedSequence([self.spec.seed, *where]).generate_state(1)[0])

@@ -8,10 +8,11 @@ import h5py
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+import toy_task
 
 from ddco_pyro.data import demonstrations, parts
 from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.report import film, words, write_report
+from ddco_pyro.report import film, tables, words, write_report
 from ddco_pyro.report.activity import LevelActivity, activity, bins
 from ddco_pyro.report.plot_rows import order
 from ddco_pyro.report.plot_timing import shares, terminations
@@ -99,7 +100,9 @@ OURS, THEIRS = [1.0, 1.0, 0.0, 1.0], [0.0, 1.0, 0.0, 0.0]
 
 def rollouts():
     def outcomes(successes):
-        return summarize([{"success": s, "accuracy_mm": 2.0 + n if s else np.nan} for n, s in enumerate(successes)])
+        return summarize(
+            toy_task.task, [{"success": s, "accuracy_mm": 2.0 + n if s else np.nan} for n, s in enumerate(successes)]
+        )
 
     methods = {
         "flat": {"measures": outcomes(THEIRS), "against": paired_difference(OURS, THEIRS)},
@@ -297,6 +300,21 @@ def test_success_is_shown_with_trials_intervals_and_the_paired_comparison(deep):
     assert "flat 1 of 4 (5 to 70 %) 3.00, n = 1" in shown
     assert "flat 2 0 4 0.5" in shown
     assert "DDCO succeeds in 3 of 4 episodes (30 to 95 %); flat in 1 of 4 (5 to 70 %)." in shown
+
+
+def test_a_column_is_of_one_kind_whatever_was_seen():
+    """A method that toppled 0 or 1 boxes in each episode beside one that toppled more, and one that grasped nothing."""
+    task = replace(toy_task.task, measures={"topples": "mean", "inserted": "rate", "accuracy_mm": "mean"})
+    seen = {
+        "flat": [{"topples": 0.0, "inserted": np.nan, "accuracy_mm": np.nan}] * 2,
+        "ddco": [{"topples": 3.0, "inserted": 1.0, "accuracy_mm": 1.0}] * 2,
+    }
+    found = tables.measures({name: {"measures": summarize(task, outcomes)} for name, outcomes in seen.items()})
+    assert found.head == ["Method", "Topples", "Inserted", "Accuracy (mm)"]
+    assert found.rows == [
+        ["flat", "0.00 ± 0.00 [0.00 to 0.00], n = 2", "0 of 0", "– (n = 0)"],
+        ["DDCO", "3.00 ± 0.00 [3.00 to 3.00], n = 2", "2 of 2 (34 to 100 %)", "1.00 ± 0.00 [1.00 to 1.00], n = 2"],
+    ]
 
 
 def test_warnings_are_in_words_with_their_numbers(labelled, deep):

@@ -11,12 +11,13 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
-from ddco_pyro.data import demonstrations
+from ddco_pyro.data import Dimensions, demonstrations
 from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.run import RunError, claim, fit
+from ddco_pyro.run import RunError, claim, fit, train
 from ddco_pyro.spec import dump_spec, load_spec, with_overrides
 
 
@@ -250,7 +251,23 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(toy_run, toy_spec, tmp_pat
     fit(toy_spec, folder, Silent())
     for name in ("model.safetensors", "history.csv", "baselines/flat/model.safetensors", "spec.yaml"):
         assert (folder / name).read_bytes() == (toy_run.folder / name).read_bytes()
+    for name in ("metrics.json", "baselines/flat/metrics.json"):
+        ours, theirs = (json.loads((one / name).read_text()) | {"seconds": ...} for one in (folder, toy_run.folder))
+        assert ours == theirs
     assert not list(folder.rglob("*.tmp"))
+
+
+def test_the_engines_are_compared_on_a_model_that_the_seed_decides(toy_spec, demos):
+    """With dropout, and whatever was drawn before; nothing is drawn from the global generator."""
+    spec = with_overrides(toy_spec, {"training.epochs": 1, "hierarchy.levels.0.policy.dropout": 0.5})
+    checks = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        before = torch.get_rng_state()
+        checks.append(train(spec, Dimensions.of(demos), demos, Silent()).check)
+        assert torch.equal(torch.get_rng_state(), before)
+    assert checks[0] == checks[1]
+    assert checks[0] != train(with_overrides(spec, {"seed": 1}), Dimensions.of(demos), demos, Silent()).check
 
 
 def test_a_finished_run_is_left_as_it_is(copied, toy_spec):

@@ -101,7 +101,15 @@ def frame(environment: Point) -> np.ndarray:
     return picture
 
 
-task = Task("toy", Point, {"supervisor": Supervisor, "open_loop": OpenLoop}, outcome, frame, (Path(__file__),))
+task = Task(
+    name="toy",
+    load=Point,
+    policies={"supervisor": Supervisor, "open_loop": OpenLoop},
+    outcome=outcome,
+    frame=frame,
+    sources=(Path(__file__),),
+    measures={"success": "rate", "error": "mean"},
+)
 short = replace(task, name="short", load=lambda seed: Point(seed, 5), steps=5)
 
 SPEC = """

@@ -6,9 +6,9 @@ import csv
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ddco_pyro.evaluate import SUCCESS
 from ddco_pyro.rollout import paired_difference, rate
 from ddco_pyro.run import Fit
+from ddco_pyro.task import SUCCESS
 
 Outcomes = Mapping[int, float]
 """Success (1) or not (0) by the seed of the initial state."""

@@ -24,21 +24,19 @@ class Table:
 def measures(methods: Mapping[str, Mapping[str, Any]]) -> Table:
     """Every measure of every method, as in the paper's table."""
     names = list(dict.fromkeys(name for one in methods.values() for name in one["measures"]))
-    rows = [
-        [method(key), *(_cell(one["measures"].get(name), methods, name) for name in names)]
-        for key, one in methods.items()
-    ]
+    rows = [[method(key), *(_cell(one["measures"].get(name)) for name in names)] for key, one in methods.items()]
     return Table(["Method", *map(measure, names)], rows)
 
 
-def _cell(found: Mapping[str, Any] | None, methods: Mapping[str, Mapping[str, Any]], name: str) -> str:
+def _cell(found: Mapping[str, Any] | None) -> str:
     if found is None:
         return "–"
-    if "mean" in found:
-        spread = "" if found["std"] is None else f" ± {number(found['std'])} [{interval(found['interval'])}]"
-        return f"{number(found['mean'])}{spread}, n = {found['trials']}"
-    has_mean = any("mean" in one["measures"].get(name, {}) for one in methods.values())
-    return "– (n = 0)" if has_mean and not found["trials"] else rate(found)
+    if "mean" not in found:
+        return rate(found)
+    if not found["trials"]:
+        return "– (n = 0)"
+    spread = "" if found["std"] is None else f" ± {number(found['std'])} [{interval(found['interval'])}]"
+    return f"{number(found['mean'])}{spread}, n = {found['trials']}"
 
 
 def against(methods: Mapping[str, Mapping[str, Any]], ours: str) -> Table | None:
