@@ -182,9 +182,7 @@ def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
     assert spec.baseline is not None  # a spec has one or the other
     policy = spec.baseline.policy
     if spec.baseline.kind == "per_timestep":
-        policy = NetworkSpec(
-            network="per_timestep", hidden=getattr(policy, "hidden", ()), dropout=getattr(policy, "dropout", 0.0)
-        )
+        policy = NetworkSpec(network="per_timestep", hidden=policy.hidden, dropout=policy.dropout)
     return policy, ("control",)
 
 

@@ -87,7 +87,7 @@ def test_defaults() -> None:
     assert (spec.inference.engine, spec.rollout.seed, spec.baseline, spec.compare_with) == ("fused", 1000, None, ())
     assert spec.hierarchy is not None
     assert spec.hierarchy.levels[0].termination.network == "linear"
-    assert spec.hierarchy.levels[0].termination.settings == {}
+    assert spec.hierarchy.levels[0].termination.hidden == ()
 
 
 def test_higher_levels_select_from_below_unless_told_otherwise() -> None:
@@ -290,7 +290,7 @@ def test_another_network_drops_the_settings_of_the_old_one() -> None:
     path = "hierarchy.levels.0.policy"
     linear = with_overrides(parse_spec(data), {f"{path}.network": "linear"})
     assert linear.hierarchy is not None
-    assert linear.hierarchy.levels[0].policy.settings == {}
+    assert linear.hierarchy.levels[0].policy.hidden == ()
     with pytest.raises(SpecError, match="hidden: does not apply to network 'linear'"):
         with_overrides(parse_spec(data), {f"{path}.hidden": [3], f"{path}.network": "linear"})
 

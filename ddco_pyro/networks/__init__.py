@@ -32,7 +32,7 @@ def build(spec: NetworkSpec, shape: InputShape, outputs: int, copies: int) -> nn
     if spec.network in CLASSES:
         return CLASSES[spec.network](shape, outputs, copies, **spec.settings)
     network_class = _imported(spec.network)
-    options = checked_options(network_class, spec.options)
+    options = checked_options(network_class, spec.settings)
     try:
         network = network_class(shape, outputs, copies, **options)
     except Exception as error:  # whatever the user's code raises

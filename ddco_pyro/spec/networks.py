@@ -10,7 +10,15 @@ import re
 from collections import Counter
 from typing import Any
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from ddco_pyro.errors import nearest
 from ddco_pyro.spec.messages import invalid
@@ -30,7 +38,7 @@ class Network(Model):
 class Perceptron(Network):
     """Settings of a multi-layer perceptron."""
 
-    hidden: Items[Count] = (64,)
+    hidden: Items[Count] = Field(default=(64,), validate_default=True)
     """Sizes of the hidden layers, first one first."""
     dropout: Share = 0.0
     """Probability with which a unit is dropped while training."""
@@ -79,7 +87,7 @@ def _describe_kinds(schema: dict[str, Any]) -> None:
 
 
 class NetworkSpec(UserDefined, Convolution):
-    """A network from observations to the parameters of a distribution. It has the settings of its kind alone."""
+    """A network from observations to the parameters of a distribution. Settings of other networks are refused."""
 
     model_config = ConfigDict(json_schema_extra=_describe_kinds)
 
@@ -98,15 +106,22 @@ class NetworkSpec(UserDefined, Convolution):
             raise invalid(("", f"no network is called {name!r}{nearest(name, names)}; use one of {', '.join(names)}"))
         return name
 
+    @field_validator("hidden")
+    @classmethod
+    def _hidden_layers(cls, hidden: tuple[int, ...], info: ValidationInfo) -> tuple[int, ...]:
+        return () if "hidden" in foreign_keys(info.data.get("network")) else hidden
+
     @model_validator(mode="after")
-    def _only_its_settings(self) -> NetworkSpec:
-        foreign = foreign_keys(self.network)
-        given = [key for key in foreign if key in self.model_fields_set]
+    def _settings_apply(self) -> NetworkSpec:
+        given = [key for key in foreign_keys(self.network) if key in self.model_fields_set]
         if given:
             raise invalid(*((key, f"does not apply to network {self.network!r}; leave it out") for key in given))
-        for key in foreign:
-            self.__dict__.pop(key, None)  # reading it is an error, and it is not written
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_foreign_keys(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields: dict[str, Any] = serialize(self)
+        return {key: value for key, value in fields.items() if key not in foreign_keys(self.network)}
 
 
 class PolicySpec(NetworkSpec):
