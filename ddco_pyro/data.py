@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from ddco_pyro.collect import OnDemonstration, collect
-from ddco_pyro.demonstrations import Demonstrations, extent
+from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError, extent
 from ddco_pyro.encoding import Shapes
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.memory import refuse_too_much
@@ -150,9 +150,21 @@ def demonstrations(spec: Spec, on_demonstration: OnDemonstration | None = None) 
     if spec.demonstrated_task is not None and (path is None or not path.exists()):
         path = collect(spec.demonstrated_task, own, path, on_demonstration)
     assert path is not None  # a spec has a task or a file
+    if not path.exists():
+        raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
     _refuse_what_is_larger_than_memory(spec, path)
     labels = (own.labels,) if own.labels else ()
     return Demonstrations.read(path, [one.key for one in spec.observations], labels)
+
+
+def _needed(spec: Spec) -> str:
+    """What to do about a file that is not there."""
+    labels = [spec.demonstrations.labels] if spec.demonstrations.labels else []
+    read = ["actions", *(f"obs/{one.key}" for one in spec.observations), *(f"labels/{name}" for name in labels)]
+    return (
+        "put it there, or fit to another with --set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, "
+        f"with {', '.join(read)} in each data/<demonstration>"
+    )
 
 
 def _refuse_what_is_larger_than_memory(spec: Spec, path: Path) -> None:

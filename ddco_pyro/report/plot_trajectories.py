@@ -12,7 +12,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from ddco_pyro.colours import option_colour
 from ddco_pyro.demonstrations import Demonstrations
-from ddco_pyro.report.activity import Activity
+from ddco_pyro.report.activity import Activity, LevelActivity
 from ddco_pyro.report.pictures import FAINT, INK, blank
 from ddco_pyro.report.strips import legend
 
@@ -65,17 +65,21 @@ def draw(found: Activity, positions: Sequence[np.ndarray], key: str) -> Figure:
     figure.set_layout_engine("none")  # it does not know how much room labels in space take
     turns = (0.0, TURN) if len(found.levels) == 1 else (0.0,)
     panels = [(level, turn) for level in reversed(found.levels) for turn in turns]
-    chosen = np.unique(np.linspace(0, len(positions) - 1, min(len(positions), MOST_TRAJECTORIES)).round().astype(int))
-    points = np.concatenate([positions[row] for row in chosen])
     for place, (level, turn) in zip(_places(len(panels), figure.get_figheight()), panels, strict=True):
         axes = figure.add_axes(place, projection="3d", proj_type="ortho")
-        for row in chosen:
-            _trajectory(axes, positions[row], level.path[row])
-        _frame(axes, points, key, turn)
+        panel(axes, level, positions, key, turn)
         axes.set_title(f"level “{level.name}”" + (f", turned by {turn:.0f}°" if turn else ""))
     choices = sorted({choice for level in found.levels for choice in level.choices})
     figure.legend(handles=legend(choices), loc="lower center", ncols=min(len(choices), 11), handlelength=1)
     return figure
+
+
+def panel(axes: Axes3D, level: LevelActivity, positions: Sequence[np.ndarray], key: str, turn: float = 0.0) -> None:
+    """One level over the positions [T_n, 3], of at most :data:`MOST_TRAJECTORIES` demonstrations."""
+    chosen = np.unique(np.linspace(0, len(positions) - 1, min(len(positions), MOST_TRAJECTORIES)).round().astype(int))
+    for row in chosen:
+        _trajectory(axes, positions[row], level.path[row])
+    _frame(axes, np.concatenate([positions[row] for row in chosen]), key, turn)
 
 
 def _places(count: int, height: float) -> list[tuple[float, float, float, float]]:
