@@ -25,7 +25,7 @@ from ddco_pyro.rollout import rate
 from ddco_pyro.run import fit
 from ddco_pyro.spec import load_spec
 
-LEARNED = ("flat", "per_timestep", "ddco")
+LEARNED = ("flat", "flat_equal", "per_timestep", "ddco")
 ORDER = ("open_loop", *LEARNED, "supervisor")
 
 
@@ -33,7 +33,7 @@ class Silent:
     """A fit's watcher that says nothing."""
 
     def collected(self, done: int, total: int) -> None: ...
-    def training(self, name: str, epochs: int) -> None: ...
+    def training(self, name: str, epochs: int | None) -> None: ...
     def epoch(self, row: dict[str, Any]) -> None: ...
     def trained(self, name: str) -> None: ...
 
@@ -52,11 +52,13 @@ def run_seed(seed: int, arguments: argparse.Namespace) -> None:
     metrics = fitted.metrics
     likelihood = {name: one["log_likelihood_per_step"] for name, one in metrics["comparison"].items()}
     likelihood["ddco"] = metrics["log_likelihood_per_step"]
+    training = {name: one["training"] for name, one in metrics["comparison"].items()} | {"ddco": metrics["training"]}
     kept = {
         "seed": seed,
         "overrides": arguments.set,
         "log_likelihood_per_step": likelihood,
         "difference": {name: one["difference"] for name, one in metrics["comparison"].items()},
+        "training": training,
         "methods": results["methods"],
         "options": metrics["options"],
         "seconds": metrics["seconds"],
@@ -88,6 +90,7 @@ def summarize(seeds: list[dict[str, Any]]) -> dict[str, Any]:
             for part in ("train", "valid"):
                 values = [one["log_likelihood_per_step"][name][part] for one in seeds]
                 summary[name][f"log_likelihood_{part}"] = over_seeds(values)
+            summary[name]["not_converged"] = sum(not one["training"][name]["converged"] for one in seeds)
     return summary
 
 
@@ -112,7 +115,8 @@ def table(summary: dict[str, Any], command: str) -> str:
         counts = [f"{p['successes']}/{p['trials']} [{p['interval'][0]:.0%}, {p['interval'][1]:.0%}]"
                   if p["trials"] else "-" for p in (one["success"], one["grasped"], one["inserted"])]  # fmt: skip
         cells = [name, counts[0], spread(one["success_over_seeds"], "{:.0%}"), counts[1], counts[2]]
-        cells += [spread(one["accuracy_mm"], "{:.1f}"), spread(one.get("log_likelihood_valid"), "{:.2f}")]
+        rising = f", {one['not_converged']} not converged" if one.get("not_converged") else ""
+        cells += [spread(one["accuracy_mm"], "{:.1f}"), spread(one.get("log_likelihood_valid"), "{:.2f}") + rising]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import jinja2
 
+from ddco_pyro.convergence import effort
 from ddco_pyro.report import words
 
 if TYPE_CHECKING:
     from ddco_pyro.comparison import Comparison, Row
     from ddco_pyro.report.pictures import Picture
 
-HEAD = ("rank", "run", "model", "parameters", "total", "se", "diff", "dse", "nats/step")
+HEAD = ("rank", "run", "model", "parameters", "total", "se", "diff", "dse", "nats/step", "gradient steps")
 ROLLOUT_HEAD = ("run", "succeeds", "other", "succeeds", "only run", "only other", "states", "p")
 
 
@@ -22,7 +23,8 @@ def cells(row: Row) -> list[str]:
     numbers = [words.number(value, 1) for value in (row.total, row.se, row.difference, row.dse)]
     if row.rank == 0:
         numbers[2:] = ["0", "0"]
-    return [str(row.rank), row.name, row.model, str(row.parameters), *numbers, words.number(row.per_step, 3)]
+    per_step = words.number(row.per_step, 3)
+    return [str(row.rank), row.name, row.model, str(row.parameters), *numbers, per_step, effort(row.training)]
 
 
 def rollout_cells(found: Comparison) -> list[list[str]]:
@@ -44,10 +46,12 @@ def rollout_cells(found: Comparison) -> list[list[str]]:
 
 def explanation(found: Comparison) -> str:
     """What the columns are."""
+    more = " A run that had not converged may rank higher with more epochs."
+    rising = any(row.training and not row.training["converged"] for row in found.rows)
     return (
         f"Held-out log-likelihood of {len(found.trajectories)} trajectories ({found.steps} steps), in nats. total: sum "
         "over trajectories; se: its standard error; diff: the best's total minus this one's, trajectory by trajectory; "
-        "dse: the standard error of that difference."
+        f"dse: the standard error of that difference.{more if rising else ''}"
     )
 
 

@@ -11,9 +11,10 @@ from ddco_pyro.files import write_text
 from ddco_pyro.report import sections
 from ddco_pyro.report.pictures import style
 from ddco_pyro.report.sections import degeneracies
+from ddco_pyro.report.words import unconverged
 from ddco_pyro.run import Fit
 
-__all__ = ["degeneracies", "write_report"]
+__all__ = ["degeneracies", "unconverged", "write_report"]
 
 
 def write_report(fit: Fit, demos: Demonstrations) -> Path:
