@@ -21,7 +21,7 @@ from matplotlib.axes import Axes
 from provenance import Record, record, sentence, text
 
 from ddco_pyro.analysis import paired
-from ddco_pyro.data import baseline_spec, demonstrations
+from ddco_pyro.data import Dimensions, baseline_spec, demonstrations
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.files import write_text
 from ddco_pyro.report.pictures import blank, keep, style
@@ -34,13 +34,19 @@ OUT = Path("docs/results")
 RUNS = Path("runs/learning_curve")
 RATE = 0.5  # of dropout, as in SM 2.5
 DROPOUT = {f"hierarchy.{place}.dropout": RATE for place in ("levels.0.policy", "levels.0.termination", "meta_policy")}
-COLOURS = {"ddco": "#1f3f70", "ddco, dropout": "#e76300", "flat": "#8a8a8a", "per_timestep": "#3d8f5f"}
+COLOURS = {
+    "ddco": "#1f3f70",
+    "ddco, dropout": "#e76300",
+    "flat": "#8a8a8a",
+    "flat_equal": "#c0a030",
+    "per_timestep": "#3d8f5f",
+}
 
 
-def models(spec: Spec) -> dict[str, Spec]:
+def models(spec: Spec, dimensions: Dimensions) -> dict[str, Spec]:
     """The spec, the same with dropout, and its baselines."""
     alone = with_overrides(spec, {"compare_with": []})
-    baselines = {one.kind: baseline_spec(spec, one) for one in spec.compare_with}
+    baselines = {one.kind: baseline_spec(spec, one, dimensions) for one in spec.compare_with}
     return {"ddco": alone, "ddco, dropout": with_overrides(alone, DROPOUT)} | baselines
 
 
@@ -150,7 +156,8 @@ def main() -> None:
     command = command_of(own)
     made_by = record(command)
     spec = load_spec(f"specs/{own.spec}.yaml", own.set)
-    folds, wanted = divide(demonstrations(spec), own.folds, spec.seed), models(spec)
+    folds = divide(demonstrations(spec), own.folds, spec.seed)
+    wanted = models(spec, folds.dimensions)
     for fold in range(own.folds):
         for count in own.counts:
             for name, model in wanted.items():

@@ -49,9 +49,11 @@ def run_seed(seed: int, arguments: argparse.Namespace, made_by: Record) -> None:
     metrics = fitted.metrics
     likelihood = {name: one["log_likelihood_per_step"] for name, one in metrics["comparison"].items()}
     likelihood[OURS] = metrics["log_likelihood_per_step"]
+    training = {name: one["training"] for name, one in metrics["comparison"].items()} | {OURS: metrics["training"]}
     kept = settings | {
         "log_likelihood_per_step": likelihood,
         "difference": {name: one["difference"] for name, one in metrics["comparison"].items()},
+        "training": training,
         "methods": rolled["methods"],
         "options": metrics["options"],
         "seconds": metrics["seconds"],
@@ -95,6 +97,8 @@ def _summary(name: str, seeds: list[Seed]) -> dict[str, Any]:
         values = [one["log_likelihood_per_step"].get(name, {}).get(part) for one in seeds]
         if None not in values:
             summary[f"log_likelihood_{part}"] = over_seeds(values)
+    if name in seeds[0]["training"]:
+        summary["not_converged"] = sum(not one["training"][name]["converged"] for one in seeds)
     return summary
 
 
@@ -149,10 +153,11 @@ def page(results: dict[str, Any], seeds: int, made_by: str) -> str:
     ]
     for name, one in results["methods"].items():
         success, percent = one["success"], "{:.0%}"
+        rising = f", {one['not_converged']} not converged" if one.get("not_converged") else ""
         cells = [name, spread(success, percent), span(success.get("range"), percent)]
         cells += [span(success.get("another"), percent)]
         cells += [spread(one[measure], percent) for measure in ("grasped", "inserted")]
-        cells += [spread(one["accuracy_mm"], "{:.1f}"), spread(one.get("log_likelihood_valid"), "{:.2f}")]
+        cells += [spread(one["accuracy_mm"], "{:.1f}"), spread(one.get("log_likelihood_valid"), "{:.2f}") + rising]
         lines.append(f"| {' | '.join(cells)} |")
     lines.append("")
     for name, one in results["differences"].items():

@@ -61,12 +61,12 @@ def check(
     if spec is None:
         raise SpecError("name a spec, such as: ddco-pyro check specs/needle.yaml")
     found = load_spec(spec, overrides, allow_code)
-    from ddco_pyro.data import check_networks, dimensions
+    from ddco_pyro.data import baselines, check_networks, dimensions
 
     size = dimensions(found)
     hierarchy = check_networks(found, size)
     print(dump_spec(found), end="")
-    console.dimensions(found, size, hierarchy)
+    console.dimensions(found, size, hierarchy, baselines(found, size))
 
 
 @app.command(epilog="Example: ddco-pyro collect specs/needle.yaml --out needle.hdf5")
@@ -105,7 +105,7 @@ def fit(
     found = load_spec(spec, overrides, allow_code)
     from ddco_pyro import run
     from ddco_pyro.data import check_networks, demonstrations, dimensions
-    from ddco_pyro.report import degeneracies, write_report
+    from ddco_pyro.report import degeneracies, unconverged, write_report
 
     check_networks(found, dimensions(found))  # before anything is collected, trained or written
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -119,7 +119,7 @@ def fit(
         print(f"interrupted; continue with: {again}", file=sys.stderr)
         raise typer.Exit(1) from None
     console.log_likelihoods(fitted.metrics)
-    console.warnings(degeneracies(fitted.spec, fitted.metrics))
+    console.warnings([*unconverged(fitted.metrics), *degeneracies(fitted.spec, fitted.metrics)])
     print(f"report: {write_report(fitted, demonstrations(found))}")
     if found.hierarchy and found.demonstrations.path:
         file = shlex.quote(found.demonstrations.path)
@@ -155,7 +155,7 @@ def select(
         raise SpecError("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
     from ddco_pyro import run, selection
     from ddco_pyro.data import demonstrations
-    from ddco_pyro.report import degeneracies, write_report
+    from ddco_pyro.report import degeneracies, unconverged, write_report
     from ddco_pyro.selection.table import HEAD, cells
 
     workers = selection.Workers(jobs, scheduler)
@@ -175,7 +175,7 @@ def select(
         print(f"interrupted; continue with: {again}", file=sys.stderr)
         raise typer.Exit(1) from None
     console.selection(made.choice, HEAD, [cells(row, made.choice) for row in made.choice.rows])
-    console.warnings(degeneracies(fitted.spec, fitted.metrics))
+    console.warnings([*unconverged(fitted.metrics), *degeneracies(fitted.spec, fitted.metrics)])
     print(f"selection: {folder / 'selection.json'}")
     print(f"report: {write_report(fitted, demonstrations(fitted.spec))}")
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import nn
 
 from ddco_pyro.collect import OnDemonstration, collect
 from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError, extent
@@ -16,6 +17,7 @@ from ddco_pyro.memory import refuse_too_much
 from ddco_pyro.networks import ShapeError
 from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code
 from ddco_pyro.task import find_task
+from ddco_pyro.widths import nearest_widths
 
 
 @dataclass(frozen=True)
@@ -80,18 +82,27 @@ def _refuse_giants(spec: Spec, dimensions: Dimensions) -> None:
     if any(place.endswith(".network") for place in user_code(spec)):
         return  # its sizes are its own affair
     try:
-        with torch.device("meta"):
-            hierarchy = Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps)
+        number = _counted(spec, dimensions)
     except ShapeError:
         return  # it is said better where the networks are made
     except (RuntimeError, MemoryError, TypeError):  # sizes that no tensor can have
-        parameters = "more parameters than a machine can count"
+        said = "more parameters than a machine can count"
     else:
-        number = sum(parameter.numel() for parameter in hierarchy.parameters())
         if number <= MOST_PARAMETERS:
             return
-        parameters = f"{number} parameters, more than {MOST_PARAMETERS}"
-    raise SpecError(f"the networks have {parameters}; lower count, hidden, filters or kernel, or scale the images down")
+        said = f"{number} parameters, more than {MOST_PARAMETERS}"
+    raise SpecError(f"the networks have {said}; lower count, hidden, filters or kernel, or scale the images down")
+
+
+def _counted(spec: Spec, dimensions: Dimensions) -> int:
+    """The number of parameters of the spec's networks, which are made without their numbers."""
+    with torch.device("meta"):
+        return parameters(Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps))
+
+
+def parameters(network: nn.Module) -> int:
+    """The number of trained parameters."""
+    return sum(parameter.numel() for parameter in network.parameters())
 
 
 def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
@@ -100,18 +111,42 @@ def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
     :raises SpecError: something in the spec does not fit the observations or the control.
     """
     hierarchy = build_hierarchy(spec, dimensions)
-    for number, baseline in enumerate(spec.compare_with):
-        try:
-            build_hierarchy(baseline_spec(spec, baseline), dimensions)
-        except SpecError as error:  # what it shares with the spec is in order: it is about its own network
-            problems = (problem.removeprefix("baseline.") for problem in error.problems)
-            raise SpecError(*(f"compare_with.{number}.{problem}" for problem in problems)) from error
+    baselines(spec, dimensions)
     return hierarchy
 
 
-def baseline_spec(spec: Spec, baseline: BaselineSpec) -> Spec:
-    """The spec of a baseline trained beside: the same but for the model."""
-    return spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": ()})
+def baselines(spec: Spec, dimensions: Dimensions) -> list[tuple[Spec, Hierarchy]]:
+    """The spec and the networks of each baseline that is trained beside.
+
+    :raises SpecError: a baseline's network does not fit the observations.
+    """
+    found = []
+    for number, baseline in enumerate(spec.compare_with):
+        try:
+            beside = baseline_spec(spec, baseline, dimensions)
+            found.append((beside, build_hierarchy(beside, dimensions)))
+        except SpecError as error:  # what it shares with the spec is in order: it is about its own network
+            problems = (problem.removeprefix("baseline.") for problem in error.problems)
+            raise SpecError(*(f"compare_with.{number}.{problem}" for problem in problems)) from error
+    return found
+
+
+def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) -> Spec:
+    """The spec of a baseline trained beside: the same but for the model.
+
+    :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
+    """
+    alone = spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": ()})
+    if baseline.kind != "flat_equal":
+        return alone
+
+    def resized(hidden: tuple[int, ...]) -> Spec:
+        policy = baseline.policy.model_copy(update={"hidden": hidden})
+        return alone.model_copy(update={"baseline": baseline.model_copy(update={"policy": policy})})
+
+    build_hierarchy(alone, dimensions)  # what is wrong with it is said here
+    target = parameters(build_hierarchy(spec, dimensions))
+    return resized(nearest_widths(baseline.policy.hidden, target, lambda hidden: _counted(resized(hidden), dimensions)))
 
 
 def dimensions(spec: Spec) -> Dimensions:

@@ -32,6 +32,8 @@ def evaluate(found: Fit, parts: dict[str, Demonstrations], demos: Demonstrations
             name: {
                 "log_likelihood_per_step": one.metrics["log_likelihood_per_step"],
                 "difference": _difference(values["valid"], by_method[name]["valid"], parts["valid"]),
+                "parameters": one.metrics["parameters"],
+                "training": one.metrics["training"],
             }
             for name, one in found.baselines.items()
         },

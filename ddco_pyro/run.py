@@ -22,7 +22,7 @@ from torch import Tensor
 from ddco_pyro import analysis
 from ddco_pyro.ahmm import Tables
 from ddco_pyro.controller import Controller
-from ddco_pyro.data import Dimensions, baseline_spec, build_hierarchy, demonstrations, parts
+from ddco_pyro.data import Dimensions, baseline_spec, build_hierarchy, demonstrations, parameters, parts
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.encoding import encode
 from ddco_pyro.errors import BadInput
@@ -34,7 +34,7 @@ from ddco_pyro.inference.check import EngineCheck, compare_engines
 from ddco_pyro.metrics import evaluate, supervisor
 from ddco_pyro.monitor import Monitor
 from ddco_pyro.spec import Spec, dump_spec, load_spec, user_code
-from ddco_pyro.training import Trainer, TrainingError, plan
+from ddco_pyro.training import Trainer, TrainingError
 
 TOLERANCE = 1e-4
 """Relative; a log-likelihood computed again on another machine differs in the last digits of float32."""
@@ -52,8 +52,8 @@ class Watcher(Protocol):
     def collected(self, done: int, total: int) -> None:
         """So many of the demonstrations have been collected."""
 
-    def training(self, name: str, epochs: int) -> None:
-        """A model begins to be trained, for at most so many epochs in all."""
+    def training(self, name: str, epochs: int | None) -> None:
+        """A model begins to be trained, for at most so many epochs in all; None for no limit."""
 
     def epoch(self, row: dict[str, Any]) -> None:
         """An epoch has ended; its row of the history."""
@@ -209,26 +209,28 @@ def fit(spec: Spec, folder: Path, watcher: Watcher) -> Fit:
 
 def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, clock: _Clock) -> Fit:
     split = parts(spec, demos)
+    dimensions = Dimensions.of(demos)
     with clock("training"):
         checkpoint = folder / "checkpoints" / "latest.safetensors"
-        trained = train(spec, Dimensions.of(demos), split["train"], watcher, checkpoint)
+        trained = train(spec, dimensions, split["train"], watcher, checkpoint)
     hierarchy = trained.hierarchy
     _write_history(folder, trained.history)
-    _write_model(folder, hierarchy, Dimensions.of(demos))
+    _write_model(folder, hierarchy, dimensions)
     found = Fit(folder, spec, hierarchy)
     with clock("baselines"):
         for baseline in spec.compare_with:
-            own = folder / "baselines" / baseline.kind
-            claim(own, baseline_spec(spec, baseline))
+            own, beside = folder / "baselines" / baseline.kind, baseline_spec(spec, baseline, dimensions)
+            claim(own, beside)
             if not _finished(own):
-                _fit(baseline_spec(spec, baseline), own, demos, watcher, _Clock())
+                _fit(beside, own, demos, watcher, _Clock())
     with clock("evaluation"):
         metrics = evaluate(found, split, demos)
     held_out = {"valid": len(split.get("valid", ()))}
     metrics |= {
         "engine_check": trained.check._asdict(),
         "demonstrations": trained.demonstrations | held_out | supervisor(demos),
-        "parameters": sum(parameter.numel() for parameter in hierarchy.parameters()),
+        "parameters": parameters(hierarchy),
+        "training": trained.training,
         "seconds": clock.seconds,
         "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
     }
@@ -272,14 +274,16 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
 
 @dataclass(frozen=True)
 class Trained:
-    """What training gave: the ``hierarchy``, the ``check`` of the engines before it, the ``history`` of its epochs, and
-    the numbers of ``demonstrations`` that it was trained and tuned on.
+    """What training gave: the ``hierarchy``, the ``check`` of the engines before it, the ``history`` of its epochs, the
+    numbers of ``demonstrations`` that it was trained and tuned on, and what it spent of its budget, ``training``
+    (:func:`ddco_pyro.convergence.summary`).
     """
 
     hierarchy: Hierarchy
     check: EngineCheck
     history: list[dict[str, Any]]
     demonstrations: dict[str, int]
+    training: dict[str, Any]
 
 
 def train(
@@ -321,12 +325,13 @@ def _train(
             f"the engines disagree (value {check.value:.1e}, gradient {check.gradient:.1e}): "
             "this is a defect; use inference.engine=enumerate and report it"
         )
-    stages = len(plan(spec, first.depth))
-    watcher.training(model_name(spec), stages * spec.training.epochs * spec.training.restarts)
+    training = spec.training
+    watcher.training(model_name(spec), None if training.epochs is None else training.epochs * training.restarts)
     trainer = Trainer(spec, make, batches[0], batches[1], checkpoint, list(kept.names), watcher.epoch)
     hierarchy = trainer.run()
     watcher.trained(model_name(spec))
-    return Trained(hierarchy, check, trainer.progress.history, {"train": len(kept), "tune": len(tune)})
+    counts = {"train": len(kept), "tune": len(tune)}
+    return Trained(hierarchy, check, trainer.progress.history, counts, trainer.summary)
 
 
 def _write_model(folder: Path, hierarchy: Hierarchy, dimensions: Dimensions) -> None:

@@ -89,7 +89,7 @@ def test_the_history_has_every_epoch(toy_run, watched):
 
 
 def test_the_watcher_is_told_what_goes_on(toy_run, watched):
-    assert watched.models == [("ddco", 24), "ddco", ("flat", 6), "flat", ("per_timestep", 6), "per_timestep"]
+    assert watched.models == [("ddco", 24), "ddco", ("flat", 24), "flat", ("per_timestep", 24), "per_timestep"]
     assert watched.demonstrations in ([(n, 12) for n in range(1, 13)], [])  # nothing where they are in the cache
 
 
@@ -231,7 +231,7 @@ def test_planted_skills_are_found(planted, tmp_path, toy_spec):
         "demonstrations": {"path": str(planted), "labels": "skill"},
         "observations": ["side", "place"],
     }
-    spec = with_overrides(toy_spec, given | {"compare_with": [], "training.epochs": 60} | LINEAR)
+    spec = with_overrides(toy_spec, given | {"compare_with": [], "training.epochs": 240} | LINEAR)
     found = fit(spec, tmp_path / "run", Silent())
     assert found.metrics["agreement"]["valid"] == [pytest.approx(1)]
     assert "supervisor" not in found.metrics["demonstrations"]

@@ -83,7 +83,7 @@ def test_defaults() -> None:
     spec = parse_spec(SMALL)
     assert (spec.control.std, spec.control.scale) == (0.1, "standardize")
     assert (spec.demonstrations.count, spec.demonstrations.supervisor) == (100, "supervisor")
-    assert (spec.training.epochs, spec.training.patience, spec.training.clip_gradient) == (200, 20, None)
+    assert (spec.training.epochs, spec.training.patience, spec.training.clip_gradient) == (800, 20, None)
     assert (spec.inference.engine, spec.rollout.seed, spec.baseline, spec.compare_with) == ("fused", 1000, None, ())
     assert spec.hierarchy is not None
     assert spec.hierarchy.levels[0].termination.network == "linear"
@@ -328,6 +328,10 @@ networks = st.one_of(
 )
 emissions = st.lists(st.sampled_from(["options", "control"]), min_size=1, unique=True)
 
+trainings = st.fixed_dictionaries({"patience": st.none() | counts, "clip_gradient": st.none() | positive}) | (
+    st.fixed_dictionaries({"epochs": st.none() | counts, "patience": counts})
+)
+
 
 @st.composite
 def hierarchies(draw: st.DrawFn) -> dict[str, Any]:
@@ -346,6 +350,9 @@ def specs(draw: st.DrawFn) -> dict[str, Any]:
     baselines = st.sampled_from(["flat", "per_timestep"]) | st.fixed_dictionaries(
         {"kind": st.just("flat"), "policy": networks}
     )
+    equal = st.just("flat_equal") | st.fixed_dictionaries(
+        {"kind": st.just("flat_equal"), "policy": st.fixed_dictionaries({"hidden": st.lists(counts, min_size=1)})}
+    )
     observation = texts | st.fixed_dictionaries({"key": texts}, optional={"differences": st.booleans()})
     names = st.lists(observation, min_size=1, max_size=3, unique_by=lambda o: o if isinstance(o, str) else o["key"])
     std = positive | st.fixed_dictionaries({"learn": st.just(True)}, optional={"floor": positive})
@@ -356,8 +363,12 @@ def specs(draw: st.DrawFn) -> dict[str, Any]:
         "observations": draw(names),
         "control": {"std": draw(std), "scale": draw(scale)},
         **model,
-        "compare_with": draw(st.lists(baselines, max_size=2)),
-        "training": {"patience": draw(st.none() | counts), "clip_gradient": draw(st.none() | positive)},
+        "compare_with": draw(st.lists(baselines | equal, max_size=2)),
+        "training": {
+            "epochs": draw(counts),
+            "patience": draw(st.none() | counts),
+            "clip_gradient": draw(st.none() | positive),
+        },
         "selection": {"grid": draw(st.sampled_from([{}, {"seed": [1, 2]}, {"control.std": [0.1, {"learn": True}]}]))},
         "rollout": {"policies": draw(st.lists(texts, max_size=2))},
         "seed": draw(st.integers(0, 2**32 - 1)),

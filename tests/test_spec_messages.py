@@ -81,7 +81,23 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"baseline": "flat"},
         "baseline: stands beside hierarchy; keep one of them (compare_with takes baselines to train beside)",
     ),
-    ({"compare_with": ["flt"]}, "compare_with.0.kind: must be flat or per_timestep, got 'flt' (did you mean 'flat'?)"),
+    (
+        {"compare_with": ["flt"]},
+        "compare_with.0.kind: must be flat or flat_equal or per_timestep, got 'flt' (did you mean 'flat'?)",
+    ),
+    (
+        {"compare_with": ["flat", {"kind": "flat_equal", "policy": {"network": "linear"}}]},
+        "compare_with.1.policy: flat_equal widens hidden layers, and network 'linear' has none; give it some, such as "
+        "{network: mlp, hidden: [64]}",
+    ),
+    (
+        {"hierarchy": None, "baseline": "flat_equal"},
+        "baseline: flat_equal takes its size from a hierarchy; list it in compare_with there, or say flat",
+    ),
+    (
+        {"training.epochs": None, "training.patience": None},
+        "training.epochs: null trains until training.patience, which is null too; give one of them",
+    ),
     ({"compare_with": [3]}, "compare_with.0: must be a mapping (key: value), got 3"),
     ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),
     ({"task": ""}, "task: must not be empty, got ''"),

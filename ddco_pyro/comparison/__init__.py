@@ -7,7 +7,7 @@ the held-out log-likelihood of a trajectory where arviz has the elpd of an obser
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,7 @@ class Row:
     dse: float
     per_step: float
     each: tuple[float, ...]
+    training: Mapping[str, Any] | None
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ def _row(rank: int, one: Held, best: np.ndarray) -> Row:
     return Row(
         rank, one.run, one.fit.name, int(one.fit.metrics["parameters"]), float(one.values.sum()), _error(one.values),
         float(difference.sum()), _error(difference), float(one.values.sum() / sum(one.steps)),
-        tuple(one.values.tolist()),
+        tuple(one.values.tolist()), one.fit.metrics.get("training"),
     )  # fmt: skip
 
 

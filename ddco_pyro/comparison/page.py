@@ -11,6 +11,7 @@ from urllib.parse import quote
 import numpy as np
 
 from ddco_pyro.analysis import paired
+from ddco_pyro.convergence import effort
 from ddco_pyro.report import words
 from ddco_pyro.report.demonstration_list import SHOWN
 from ddco_pyro.segmenting.timeline import anchor
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from ddco_pyro.comparison import Comparison, Row
     from ddco_pyro.report.pictures import Picture
 
-HEAD = ("rank", "run", "model", "parameters", "total", "se", "diff", "dse", "nats/step")
+HEAD = ("rank", "run", "model", "parameters", "total", "se", "diff", "dse", "nats/step", "gradient steps")
 ROLLOUT_HEAD = ("run", "succeeds", "other", "succeeds", "only run", "only other", "states", "p")
 
 
@@ -29,7 +30,8 @@ def cells(row: Row) -> list[str]:
     numbers = [words.number(value, 1) for value in (row.total, row.se, row.difference, row.dse)]
     if row.rank == 0:
         numbers[2:] = ["0", "0"]
-    return [str(row.rank), row.name, row.model, str(row.parameters), *numbers, words.number(row.per_step, 3)]
+    per_step = words.number(row.per_step, 3)
+    return [str(row.rank), row.name, row.model, str(row.parameters), *numbers, per_step, effort(row.training)]
 
 
 def rollout_cells(found: Comparison) -> list[list[str]]:
@@ -54,7 +56,8 @@ def verdict(found: Comparison) -> str:
     best, *others = found.rows
     lengths = np.array(found.steps, dtype=float)
     differences = {row.name: paired(np.array(best.each), np.array(row.each), lengths) for row in others}
-    return words.explains(best.name, differences, len(found.trajectories))
+    rising = [row.name for row in found.rows if row.training and not row.training["converged"]]
+    return words.explains(best.name, differences, len(found.trajectories), rising)
 
 
 def list_head(found: Comparison) -> list[str]:
@@ -86,10 +89,12 @@ def _links(found: Comparison, folder: Path) -> dict[str, str]:
 
 def explanation(found: Comparison) -> str:
     """What the columns are."""
+    more = " A run that had not converged may rank higher with more epochs."
+    rising = any(row.training and not row.training["converged"] for row in found.rows)
     return (
         f"Held-out log-likelihood of {len(found.trajectories)} trajectories ({sum(found.steps)} steps), in nats. "
         "total: sum over trajectories; se: its standard error; diff: the best's total minus this one's, trajectory by "
-        "trajectory; dse: the standard error of that difference."
+        f"trajectory; dse: the standard error of that difference.{more if rising else ''}"
     )
 
 

@@ -9,10 +9,11 @@ from ddco_pyro.files import write_text
 from ddco_pyro.report import activity, demonstration_list, sections
 from ddco_pyro.report.pictures import style
 from ddco_pyro.report.sections import degeneracies
+from ddco_pyro.report.words import unconverged
 from ddco_pyro.run import Fit
 from ddco_pyro.templates import render
 
-__all__ = ["degeneracies", "write_report"]
+__all__ = ["degeneracies", "unconverged", "write_report"]
 
 
 def write_report(fit: Fit, demos: Demonstrations) -> Path:

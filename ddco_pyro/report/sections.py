@@ -62,9 +62,12 @@ class Rollouts:
 
 @dataclass(frozen=True)
 class Warnings:
-    """Signs of a degenerate solution: each in words, with what usually helps."""
+    """Signs of a degenerate solution, each in words with what usually helps; None for a policy without options. Stages
+    of training that had not converged, likewise.
+    """
 
-    found: list[tuple[str, str]]
+    found: list[tuple[str, str]] | None
+    unconverged: list[tuple[str, str]]
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,8 @@ def header(fit: Fit, metrics: Mapping[str, Any]) -> Header:
         "Demonstrations": f"{counts['train']} for training, {counts['tune']} for tuning, {counts['valid']} held out",
         "Parameters": str(metrics["parameters"]),
     }
+    if "training" in metrics:
+        facts["Training"] = words.spent(metrics["training"])
     own = counts.get("supervisor", {}).get("success")
     if own and "successes" in own:
         facts["Supervisor’s own success"] = f"{words.rate(own, 'demonstrations')}, 95 % interval"
@@ -260,10 +265,11 @@ def _scores(found: Mapping[str, Any], level: int) -> str:
 
 
 def warnings(fit: Fit, metrics: Mapping[str, Any]) -> Warnings | None:
-    """Signs of a degenerate solution."""
+    """Signs of a degenerate solution, and of too short a training."""
+    unconverged = words.unconverged(metrics)
     if fit.spec.hierarchy is None:
-        return None
-    return Warnings(degeneracies(fit.spec, metrics))
+        return Warnings(None, unconverged) if unconverged else None
+    return Warnings(degeneracies(fit.spec, metrics), unconverged)
 
 
 def degeneracies(spec: Spec, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:

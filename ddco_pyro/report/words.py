@@ -13,7 +13,13 @@ from ddco_pyro.diagnostics import Finding
 CONFIDENCE = 0.95
 """A difference is called one where this interval about it leaves out 0."""
 
-METHODS = {"ddco": "DDCO", "flat": "flat", "per_timestep": "per-timestep", "open_loop": "open loop"}
+METHODS = {
+    "ddco": "DDCO",
+    "flat": "flat",
+    "flat_equal": "flat of equal size",
+    "per_timestep": "per-timestep",
+    "open_loop": "open loop",
+}
 
 ABOUT = {
     "ddco": "the hierarchy of options",
@@ -97,17 +103,61 @@ def verdict(metrics: Mapping[str, Any]) -> str:
         return (
             f"{name} gives held-out demonstrations {value} nats per step; no other model was trained to compare with."
         )
-    return explains(name, {method(other): one["difference"] for other, one in metrics["comparison"].items()}, held_out)
+    differences = {method(other): one["difference"] for other, one in metrics["comparison"].items()}
+    rising = [method(key) for key, one in trainings(metrics).items() if not one["converged"]]
+    return explains(name, differences, held_out, rising)
 
 
-def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out: int) -> str:
+def explains(
+    name: str, differences: Mapping[str, Mapping[str, float]], held_out: int, unconverged: Sequence[str] = ()
+) -> str:
     """One sentence on how much better than others a model explains held-out demonstrations.
 
     :param differences: what the others are called to ``nats_per_step`` and ``standard_error`` of the paired difference.
+    :param unconverged: those, it or others, that still rose when their training ended.
     """
     clauses = [_clause(other, difference, held_out) for other, difference in differences.items()]
     text = f"{name} explains held-out demonstrations {_listed(clauses)}"
-    return f"{text} ({held_out} held-out demonstration{'s' * (held_out != 1)}; ± is one standard error)."
+    text = f"{text} ({held_out} held-out demonstration{'s' * (held_out != 1)}; ± is one standard error)."
+    if not unconverged:
+        return text
+    return f"{text} {_capital(_listed(unconverged))} had not converged: more epochs can change this."
+
+
+def trainings(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """How the model and what it is compared with were trained, by name; runs of before do not say."""
+    rows = {metrics["model"]: metrics, **metrics["comparison"]}
+    return {name: row["training"] for name, row in rows.items() if "training" in row}
+
+
+def spent(training: Mapping[str, Any]) -> str:
+    """Epochs and gradient steps, and how many were allowed."""
+    took, allowed = training["spent"], training["budget"]
+    of = "" if allowed["epochs"] is None else f" of at most {allowed['epochs']} ({allowed['gradient_steps']})"
+    return f"{took['epochs']} epochs ({took['gradient_steps']} gradient steps){of}"
+
+
+RAISE = "Raise training.epochs: it is the budget of every model that is compared, whatever its number of stages."
+
+
+def unconverged(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Every stage that its budget ended too early, in words with its number, and what to do."""
+    return [
+        (_too_short(_capital(method(name)), stage, last=stage is training["stages"][-1]), RAISE)
+        for name, training in trainings(metrics).items()
+        for stage in training["stages"]
+        if not stage["converged"]
+    ]
+
+
+def _too_short(name: str, stage: Mapping[str, Any], last: bool) -> str:
+    verdict = f"{name} has not converged" if last else f"{name} had not converged before its later stages"
+    if not stage["epochs"]:
+        return f"{verdict}: the budget left no epoch for stage {stage['stage']}."
+    return (
+        f"{verdict}: its tuning log-likelihood rose by {number(stage['rising'])} nats per step over the last "
+        f"{stage['over']} epochs of stage {stage['stage']}, which the budget ended after {stage['epochs']}."
+    )
 
 
 def _clause(other: str, difference: Mapping[str, float], held_out: int) -> str:

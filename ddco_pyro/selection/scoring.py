@@ -23,6 +23,8 @@ class Score:
     """What came of one fold of one candidate: ``log_likelihood`` in nats and ``steps`` of each held-out demonstration
     in ``names``; or why there is none, ``failed``.
 
+    :param gradient_steps: that its training took.
+    :param converged: False where its last stage had not converged when its budget ended.
     :param final: False where another attempt could go otherwise (out of memory); such a score is not kept.
     """
 
@@ -32,6 +34,8 @@ class Score:
     steps: tuple[int, ...]
     log_likelihood: tuple[float, ...] = ()
     failed: str = ""
+    gradient_steps: int = 0
+    converged: bool = True
     final: bool = True
     seconds: float = 0.0
 
@@ -47,7 +51,7 @@ class Unwatched(Watcher):
     def collected(self, done: int, total: int) -> None:
         """Nothing."""
 
-    def training(self, name: str, epochs: int) -> None:
+    def training(self, name: str, epochs: int | None) -> None:
         """Nothing."""
 
     def epoch(self, row: dict[str, Any]) -> None:
@@ -79,7 +83,11 @@ def score(folds: Folds, candidate: Candidate, fold: int) -> Score:
     else:
         bad = [name for name, value in zip(held_out.names, values, strict=True) if not math.isfinite(value)]
         reason = f"the held-out log-likelihood of {', '.join(bad)} is not finite"
-        found = replace(empty, failed=reason) if bad else replace(empty, log_likelihood=values)
+        ended = {
+            "gradient_steps": trained.training["spent"]["gradient_steps"],
+            "converged": trained.training["converged"],
+        }
+        found = replace(empty, failed=reason) if bad else replace(empty, log_likelihood=values, **ended)
     return replace(found, seconds=time.perf_counter() - start)
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, TypeAdapter
+from pydantic import Field, TypeAdapter, model_validator
 
+from ddco_pyro.spec.messages import invalid
 from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Seed, Share, TaskName, Text, bare, nested
 
 
@@ -104,8 +105,10 @@ class TrainingSpec(Model):
     """Layer-wise training: whether a last stage trains all levels together, or what was discovered stays as it is."""
     optimizer: OptimizerSpec = OptimizerSpec()
     """The optimiser."""
-    epochs: Count = 200
-    """Passes over the training demonstrations in each stage, at most."""
+    epochs: Count | None = 800
+    """Passes over the training demonstrations in all stages together, at most: the same budget of gradient steps for
+    every model, whatever its number of stages. A stage may take an even share of what is left; null for no limit but
+    patience."""
     batch_size: Count = 16
     """Trajectories in each gradient step."""
     restarts: Count = 1
@@ -116,6 +119,12 @@ class TrainingSpec(Model):
     """Epochs without improvement before a stage stops; null for never."""
     clip_gradient: Positive | None = None
     """Largest norm of a gradient; null for no limit."""
+
+    @model_validator(mode="after")
+    def _ends(self) -> TrainingSpec:
+        if self.epochs is None and self.patience is None:
+            raise invalid(("epochs", "null trains until training.patience, which is null too; give one of them"))
+        return self
 
 
 class InferenceSpec(Model):

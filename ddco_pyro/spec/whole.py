@@ -81,6 +81,9 @@ class Spec(Model):
             yield "hierarchy", "missing; declare a hierarchy, or a baseline in its place"
         if self.hierarchy is not None and self.baseline is not None:
             yield "baseline", "stands beside hierarchy; keep one of them (compare_with takes baselines to train beside)"
+        alone = self.baseline
+        if alone and alone.kind == "flat_equal" and "hidden" not in alone.policy.model_fields_set:
+            yield "baseline", "flat_equal takes its size from a hierarchy; list it in compare_with there, or say flat"
 
     def _nothing_held_out(self) -> Iterator[tuple[str, str]]:
         if self.compare_with and self.demonstrations.valid_fraction == 0:
