@@ -13,7 +13,7 @@ import toy_task
 from ddco_pyro.data import demonstrations, parts
 from ddco_pyro.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.report import film, tables, words, write_report
-from ddco_pyro.report.activity import LevelActivity, activity, bins
+from ddco_pyro.report.activity import Activity, LevelActivity, activity, bins
 from ddco_pyro.report.plot_rows import order
 from ddco_pyro.report.plot_timing import shares, terminations
 from ddco_pyro.report.plot_trajectories import movement, position_key, view
@@ -430,9 +430,15 @@ def test_shares_and_terminations_are_weighted_means():
     np.testing.assert_allclose(terminations(level, gathered), expected)
 
 
-def test_rows_are_sorted_by_length_then_by_the_first_change(labelled):
-    found, _, demos = labelled
-    np.testing.assert_array_equal(order(activity(found, demos)), np.arange(len(demos)))
+def test_rows_are_sorted_by_length_then_by_the_first_change():
+    """Two levels, of which the lowest counts; a demonstration without a change comes after those of its length."""
+    paths = ["11222", "1222-", "12111", "1111-", "11111", "1121-", "1----"]
+    low = np.array([[-1 if step == "-" else int(step) for step in path] for path in paths])
+    high = np.array([[1, 2, 1, 1, 1]] * len(paths))
+    nothing = np.zeros((len(paths), 5, 3))
+    levels = tuple(LevelActivity(name, nothing, path, nothing) for name, path in (("low", low), ("high", high)))
+    found = order(Activity(levels, (low >= 0).sum(1)))
+    assert [paths[row] for row in found] == ["1----", "1222-", "1121-", "1111-", "12111", "11222", "11111"]
 
 
 def test_positions_are_seen_from_where_they_spread():
