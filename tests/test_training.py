@@ -104,6 +104,17 @@ def test_every_model_has_the_same_budget(tmp_path, model):
     assert trainer.summary["budget"] == trainer.summary["spent"] == {"epochs": 26, "gradient_steps": 26 * 3}
 
 
+def test_the_training_that_is_told_is_that_of_the_best_restart(tmp_path):
+    joint = {"initialize": "random", "layerwise": False, "patience": 2, "restarts": 3}
+    trainer = make_trainer(make_spec((2,), 4, **joint, **QUICK), random_demonstrations(), tmp_path)
+    trainer.run()
+    best = max(trainer.progress.history, key=lambda row: row["tune"])["restart"]
+    counts = [epochs_of(trainer, restart)["joint"] for restart in range(3)]
+    assert best != 2  # not simply the last
+    assert counts.count(counts[best]) == 1
+    assert trainer.summary["spent"]["epochs"] == counts[best]
+
+
 def test_without_a_budget_every_stage_trains_until_its_patience(tmp_path):
     trainer = make_trainer(make_spec((2,), epochs=None, patience=2, **QUICK), random_demonstrations(), tmp_path)
     trainer.run()
