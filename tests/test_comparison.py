@@ -12,6 +12,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 from scipy import stats
+from test_cli import call
 
 from ddco_pyro import load
 from ddco_pyro.comparison import CompareError, Comparison, Row, compare, page, write
@@ -300,6 +301,13 @@ def test_the_files_say_the_same(found, tmp_path):
     assert table[4 + len(found.rows) :] == page.list_cells(found)
     assert f'<p class="verdict">{page.verdict(found)}</p>' in path.read_text()
     assert (folder / "compare.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_command_ends_with_the_verdict(folders, found, tmp_path):
+    ended = call("compare", *folders, "--out", tmp_path / "x")
+    *_, verdict, place = ended.out.splitlines()
+    assert verdict == page.verdict(found)
+    assert place == f"comparison: {tmp_path / 'x' / 'compare.html'}"
 
 
 def test_a_single_trajectory_has_no_error(other, tmp_path):
