@@ -47,7 +47,9 @@ def _frequency(found: Inspection) -> str:
 
 def _range(one: Field) -> str:
     low, high = one.minimum[np.isfinite(one.minimum)], one.maximum[np.isfinite(one.maximum)]
-    return f"{float(low.min()):.4g} to {float(high.max()):.4g}" if len(low) and len(high) else "-"
+    if not len(low) or not len(high):
+        return "-"
+    return f"{float(low.min()) + 0.0:.4g} to {float(high.max()) + 0.0:.4g}"  # + 0.0: no minus zero
 
 
 def _notes(one: Field) -> str:
