@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from types import TracebackType
@@ -11,6 +12,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
+
+from ddco_pyro.control_dimensions import notes
 
 if TYPE_CHECKING:
     from ddco_pyro.data import Dimensions
@@ -153,15 +156,27 @@ def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy) -> None:
     _show(table)
 
 
+def control(size: Dimensions) -> None:
+    """What is odd about dimensions of the control, a line each."""
+    for note in notes(size.control):
+        Console().print(Text(note), soft_wrap=True)
+
+
 def log_likelihoods(metrics: Mapping[str, Any]) -> None:
     """Held-out log-likelihood of the model and of what it is compared with."""
     table = Table("model", "train", "held out", "ours - this", title="log-likelihood, nats per step", show_edge=False)
     rows = {metrics["model"]: metrics, **metrics["comparison"]}
     for name, row in rows.items():
         values, difference = row["log_likelihood_per_step"], row.get("difference")
-        shown = f"{difference['nats_per_step']:+.3f} ± {difference['standard_error']:.3f}" if difference else ""
+        shown = _difference(difference) if difference else ""
         table.add_row(name, *(_number(values[part]) for part in ("train", "valid")), shown)
     _show(table)
+
+
+def _difference(found: Mapping[str, float]) -> str:
+    error = found["standard_error"]
+    shown = f"{error:.3f}" if math.isfinite(error) else "unknown (one held out)"
+    return f"{found['nats_per_step']:+.3f} ± {shown}"
 
 
 def selection(choice: Choice, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -9,6 +9,7 @@ from rich.table import Table
 
 from ddco_pyro.hdf5 import printable
 from ddco_pyro.inspection import Field, Inspection
+from ddco_pyro.values import LARGEST
 
 WIDTH = 160
 """Columns where there is no terminal: names in a file that is read by a program are not to be cut."""
@@ -27,8 +28,8 @@ def show(found: Inspection) -> None:
     for one in found.fields.values():
         table.add_row(*map(_plain, (one.place, str(list(one.shape)), one.dtype, _range(one), _notes(one))))
     console.print(table)
-    for problem in found.problems:
-        console.print(f"problem: {printable(problem)}", markup=False, highlight=False, soft_wrap=True)
+    for line in (*found.notes, *(f"problem: {problem}" for problem in found.problems)):
+        console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
 
 
 def _plain(text: str) -> str:
@@ -56,6 +57,8 @@ def _notes(one: Field) -> str:
     notes = ["video" if one.video else "image"] if one.image else []
     if one.nan or one.infinite:
         notes.append(f"{one.nan} NaN, {one.infinite} infinite")
+    if one.huge:
+        notes.append(f"{one.huge} beyond ±{LARGEST:g}")
     constant = one.constant
     if constant and len(constant) == len(one.minimum):
         notes.append("constant")

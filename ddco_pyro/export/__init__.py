@@ -83,7 +83,8 @@ def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
     """What the runner has to know beside the weights."""
     encoder = hierarchy.encoder
     vectors = {one.key: one for one in encoder.specs}
-    scale = hierarchy.scaling.scale.numpy()
+    scaling = hierarchy.scaling
+    scale = scaling.scale.numpy()
     return {
         "observations": [
             {
@@ -95,6 +96,7 @@ def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
             for key, shape in [*((key, encoder.shapes[key]) for key in vectors), *encoder.images.items()]
         ],
         "levels": [level.count for level in hierarchy.option_levels()],
+        "varying": scaling.varying.tolist(),
         "scale": scale.tolist(),
         "control": control.control,
         "options": control.options,

@@ -107,9 +107,10 @@ class Runner:
     def _control(self, outputs: Outputs, generator: np.random.Generator) -> np.ndarray:
         """The mean of the lowest level whose choice is an option, else of the meta-policy, or a sample around it."""
         level, actor = next(((d, h - 1) for d, h in enumerate(self.choices) if h > 0), (len(self.choices), 0))
-        found: np.ndarray = outputs[f"control_{level}"][actor]
-        if self.about["control"] == "sample":
-            found = found + np.array(self.about["std"][level]) * generator.standard_normal(len(found))
+        found: np.ndarray = outputs[f"control_{level}"][actor].copy()
+        if self.about["control"] == "sample":  # dimensions that never varied in the demonstrations stay as they are
+            std, varying = np.array(self.about["std"][level]), self.about["varying"]
+            found[varying] += std * generator.standard_normal(len(varying))
         return found
 
 
@@ -148,7 +149,9 @@ class NumpyNetworks:
             if one["choices"]:
                 found[f"selection_{level}"] = _selection(logits, one)
             if mean.shape[1]:
-                found[f"control_{level}"] = mean.astype(np.float64) * weights["scale"] + weights["shift"]
+                varying = mean.astype(np.float64) * weights["scale"] + weights["shift"]
+                constant = np.tile(weights["constant"], (len(varying), 1))
+                found[f"control_{level}"] = np.concatenate([varying, constant], axis=1)[:, weights["order"]]
             if level < depth:
                 raw = self._network(self._about["terminations"][level], f"end_{level}", vector, step, images)[:, 0]
                 bound = np.float32(self._about["termination_bound"])
@@ -224,7 +227,8 @@ def replay(controller: Runner, episodes: Mapping[str, np.ndarray]) -> tuple[floa
     Differences are in the control's own units, but in its spread where that is above 1: networks are float32.
     """
     largest, seconds = 0.0, []
-    unit = np.maximum(1.0, controller.about["scale"])
+    unit = np.ones(episodes["controls_0"].shape[1])
+    unit[controller.about["varying"]] = np.maximum(1.0, controller.about["scale"])
     for number, seed in enumerate(episodes["seeds"]):
         controller.reset(int(seed))
         for step in range(len(episodes[f"controls_{number}"])):

@@ -8,7 +8,7 @@ import jinja2
 
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.files import write_text
-from ddco_pyro.report import sections
+from ddco_pyro.report import dimensions, sections
 from ddco_pyro.report.pictures import style
 from ddco_pyro.report.sections import degeneracies
 from ddco_pyro.run import Fit
@@ -26,6 +26,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
         page = {
             "header": sections.header(fit, metrics),
             "likelihood": sections.likelihood(fit, metrics),
+            "dimensions": dimensions.section(metrics, {name: one.metrics for name, one in fit.baselines.items()}),
             "rollouts": sections.rollouts(fit, metrics),
             "learning": sections.learning(fit),
             "options": sections.options(fit, demos, metrics),
