@@ -196,8 +196,8 @@ def refuse_overflow(demonstrations: Demonstrations, encoder: ObservationEncoder,
             step, column = np.argwhere(sizes > LARGEST_SCALED)[0]
             place = places[column] if column < len(places) else "actions"
             raise DemonstrationsError(
-                f"{demo.name}: {place} at step {step} is {sizes[step, column]:.2g} once it is scaled, and networks take "
-                f"at most {LARGEST_SCALED:g}; repair it, or leave {demo.name} out (demonstrations.exclude)"
+                f"{demo.name}: {place} at step {step} is {sizes[step, column]:.2g} once it is scaled, and networks "
+                f"take at most {LARGEST_SCALED:g}; repair it, or leave {demo.name} out (demonstrations.exclude)"
             )
 
 

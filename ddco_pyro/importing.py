@@ -214,5 +214,5 @@ def _check_values(recording: Recording) -> None:
     for place, column in recording.columns():
         if not all(bool(usable(block).all()) for block in column.blocks()):
             raise DemonstrationsError(
-                f"{recording.name}: {place} has values that are NaN, infinite or beyond ±{LARGEST:g}; repair them first"
+                f"{recording.name}: {place} has NaN or infinite values, or some beyond ±{LARGEST:g}; repair them first"
             )
