@@ -67,6 +67,7 @@ def check(
     hierarchy = check_networks(found, size)
     print(dump_spec(found), end="")
     console.dimensions(found, size, hierarchy, baselines(found, size))
+    console.control(size)
 
 
 @app.command(epilog="Example: ddco-pyro collect specs/needle.yaml --out needle.hdf5")

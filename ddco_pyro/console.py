@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from types import TracebackType
@@ -12,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 from rich.text import Text
 
+from ddco_pyro.control_dimensions import notes
 from ddco_pyro.convergence import effort
 
 if TYPE_CHECKING:
@@ -174,6 +176,12 @@ def _baseline(spec: Spec) -> str:
     return f"{spec.baseline.kind}, {f'hidden: {hidden}' if hidden else spec.baseline.policy.network}"
 
 
+def control(size: Dimensions) -> None:
+    """What is odd about dimensions of the control, a line each."""
+    for note in notes(size.control):
+        Console().print(Text(note), soft_wrap=True)
+
+
 def log_likelihoods(metrics: Mapping[str, Any]) -> None:
     """Log-likelihood of the model and of what it is compared with, in training and on what was held out."""
     head = ("model", "training", "validation (held out)", "ours - this, validation", "gradient steps")
@@ -181,10 +189,16 @@ def log_likelihoods(metrics: Mapping[str, Any]) -> None:
     rows = {metrics["model"]: metrics, **metrics["comparison"]}
     for name, row in rows.items():
         values, difference = row["log_likelihood_per_step"], row.get("difference")
-        shown = f"{difference['nats_per_step']:+.3f} ± {difference['standard_error']:.3f}" if difference else ""
+        shown = _difference(difference) if difference else ""
         numbers = [_number(values[part]) for part in ("train", "valid")]
         table.add_row(name, *numbers, shown, effort(row.get("training")))
     _show(table)
+
+
+def _difference(found: Mapping[str, float]) -> str:
+    error = found["standard_error"]
+    shown = f"{error:.3f}" if math.isfinite(error) else "unknown (one held out)"
+    return f"{found['nats_per_step']:+.3f} ± {shown}"
 
 
 def selection(choice: Choice, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from torch import nn
 
 from ddco_pyro.collect import OnDemonstration, collect
+from ddco_pyro.control_dimensions import ControlDimension, all_constant, control_dimensions
 from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError, extent
 from ddco_pyro.encoding import Shapes
 from ddco_pyro.hierarchy import Hierarchy
@@ -22,16 +24,31 @@ from ddco_pyro.widths import nearest_widths
 
 @dataclass(frozen=True)
 class Dimensions:
-    """Shapes of the observations by name, control dimensions A, and the longest demonstration where it is known."""
+    """Shapes of the observations by name, control dimensions A, and the longest demonstration where it is known.
+
+    :param constant: the control dimensions that are constant in all demonstrations, and their values: they are no part
+        of the model.
+    :param control: what each control dimension does in the demonstrations; empty where that is not known.
+    """
 
     shapes: Shapes
     control_size: int
     steps: int
+    constant: Mapping[int, float] = field(default_factory=dict)
+    control: tuple[ControlDimension, ...] = field(default=(), compare=False)
 
     @classmethod
     def of(cls, demonstrations: Demonstrations) -> Dimensions:
-        """The dimensions of these demonstrations."""
-        return cls(demonstrations.observation_shapes, demonstrations.control_size, max(demonstrations.lengths))
+        """The dimensions of these demonstrations.
+
+        :raises DemonstrationsError: every dimension of the control is constant.
+        """
+        control = control_dimensions(demo.actions for demo in demonstrations)
+        constant = {one.number: one.minimum for one in control if one.constant}
+        if len(constant) == len(control):
+            raise DemonstrationsError(all_constant(control))
+        shapes, size = demonstrations.observation_shapes, demonstrations.control_size
+        return cls(shapes, size, max(demonstrations.lengths), constant, control)
 
 
 def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
@@ -56,7 +73,7 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
         )
     _refuse_giants(spec, dimensions)
     try:
-        return Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps)
+        return Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps, dimensions.constant)
     except ShapeError as error:
         raise SpecError(str(error)) from error
 
@@ -189,7 +206,7 @@ def demonstrations(spec: Spec, on_demonstration: OnDemonstration | None = None) 
         raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
     _refuse_what_is_larger_than_memory(spec, path)
     labels = (own.labels,) if own.labels else ()
-    return Demonstrations.read(path, [one.key for one in spec.observations], labels)
+    return Demonstrations.read(path, [one.key for one in spec.observations], labels, own.exclude)
 
 
 def _needed(spec: Spec) -> str:
@@ -203,7 +220,7 @@ def _needed(spec: Spec) -> str:
 
 
 def _refuse_what_is_larger_than_memory(spec: Spec, path: Path) -> None:
-    found = extent(path, [one.key for one in spec.observations])
+    found = extent(path, [one.key for one in spec.observations], spec.demonstrations.exclude)
     needed = found.fit({f"obs/{one.key}" for one in spec.observations if one.differences})
     remedy = "leave observations out, make its demonstrations fewer or equally long, or scale pictures down"
     refuse_too_much(needed, f"{path}: a fit to {', '.join(one.key for one in spec.observations)}", remedy)

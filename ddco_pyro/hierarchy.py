@@ -6,8 +6,9 @@ A baseline is a hierarchy without option levels whose meta-policy emits control.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import Literal
 
 import torch
@@ -122,24 +123,32 @@ class Hierarchy(nn.Module):
     :param shapes: shapes of the observations by name, without time.
     :param control_size: A, the number of control dimensions.
     :param steps: the longest demonstration, for per-timestep networks.
+    :param constant: the control dimensions that are no part of the model, and the values that are emitted for them.
     :raises ShapeError: where a network cannot read these observations.
     :raises SpecError: where a user's network does not take its options.
     """
 
-    def __init__(self, spec: Spec, shapes: Shapes, control_size: int, steps: int) -> None:
+    def __init__(
+        self,
+        spec: Spec,
+        shapes: Shapes,
+        control_size: int,
+        steps: int,
+        constant: Mapping[int, float] = MappingProxyType({}),
+    ) -> None:
         super().__init__()
         self.steps = steps
         self.encoder = ObservationEncoder(spec.observations, shapes)
-        self.scaling = ControlScaling(spec.control, control_size)
-        shape = self.encoder.shape(steps)
+        self.scaling = ControlScaling(spec.control, control_size, constant)
+        shape, size = self.encoder.shape(steps), len(self.scaling.varying)
         levels, below = [], 0
         for number, level in enumerate(spec.hierarchy.levels if spec.hierarchy else ()):
-            levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, spec.control, control_size))
+            levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, spec.control, size))
             below = level.count
         self.levels = nn.ModuleList(levels)
         network, emits = _meta_policy(spec)
         with _named("hierarchy.meta_policy" if levels else "baseline.policy"):
-            self.meta_policy = Caller(network, emits, below, shape, spec.control, control_size, copies=1)
+            self.meta_policy = Caller(network, emits, below, shape, spec.control, size, copies=1)
 
     @property
     def depth(self) -> int:

@@ -23,8 +23,9 @@ from ddco_pyro import analysis
 from ddco_pyro.ahmm import Tables
 from ddco_pyro.controller import Controller
 from ddco_pyro.data import Dimensions, baseline_spec, build_hierarchy, demonstrations, parameters, parts
+from ddco_pyro.decomposition import Decomposition, decompose
 from ddco_pyro.demonstrations import Demonstrations
-from ddco_pyro.encoding import encode
+from ddco_pyro.encoding import Batch, encode, refuse_overflow
 from ddco_pyro.errors import BadInput
 from ddco_pyro.files import leftovers, only_one, read_tensors, write_tensors, write_text
 from ddco_pyro.hierarchy import Hierarchy
@@ -101,6 +102,14 @@ class Fit:
         """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units."""
         return log_likelihoods(self.hierarchy, demos)
 
+    def decompose(self, demos: Demonstrations) -> Decomposition:
+        """What each control dimension and choosing options add to log p(ξ) of each demonstration."""
+        scaling = self.hierarchy.scaling
+        with torch.no_grad():
+            return Decomposition.joined(
+                decompose(self.hierarchy(batch.inputs), batch, scaling) for batch in _batches(self.hierarchy, demos)
+            )
+
     def posterior(self, demos: Demonstrations) -> Posterior:
         """u, v and w of §4.1 for every level."""
         parts = [posterior(*part) for part in _tables(self.hierarchy, demos)]
@@ -144,8 +153,14 @@ def log_likelihoods(hierarchy: Hierarchy, demos: Demonstrations) -> np.ndarray:
 def _tables(hierarchy: Hierarchy, demos: Demonstrations) -> Iterator[tuple[Tables, Tensor]]:
     """Tables and lengths of the demonstrations, some at a time."""
     with torch.no_grad():
-        for _, batch in encode(demos, hierarchy.encoder, hierarchy.scaling).pieces():
+        for batch in _batches(hierarchy, demos):
             yield hierarchy.tabulate(batch), batch.lengths
+
+
+def _batches(hierarchy: Hierarchy, demos: Demonstrations) -> Iterator[Batch]:
+    """The demonstrations as the networks see them, some at a time."""
+    for _, batch in encode(demos, hierarchy.encoder, hierarchy.scaling).pieces():
+        yield batch
 
 
 def model_name(spec: Spec) -> str:
@@ -180,8 +195,12 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
 def _read_model(spec: Spec, path: Path) -> Hierarchy:
     tensors, metadata = read_tensors(path)
     shapes = {key: tuple(shape) for key, shape in json.loads(metadata["shapes"]).items()}
-    dimensions = Dimensions(shapes, int(metadata["control_size"]), int(metadata["steps"]))
-    hierarchy = build_hierarchy(spec, dimensions)
+    size = int(metadata["control_size"])
+    whole = {"scaling.varying": torch.arange(size), "scaling.constant": torch.empty(0, dtype=torch.float64)}
+    tensors = whole | tensors  # models of before had every dimension in them
+    others = sorted(set(range(size)) - set(tensors["scaling.varying"].tolist()))
+    constant = dict(zip(others, tensors["scaling.constant"].tolist(), strict=True))
+    hierarchy = build_hierarchy(spec, Dimensions(shapes, size, int(metadata["steps"]), constant))
     hierarchy.load_state_dict(tensors)
     return hierarchy
 
@@ -212,7 +231,7 @@ def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, cloc
     dimensions = Dimensions.of(demos)
     with clock("training"):
         checkpoint = folder / "checkpoints" / "latest.safetensors"
-        trained = train(spec, dimensions, split["train"], watcher, checkpoint)
+        trained = train(spec, dimensions, split["train"], watcher, checkpoint, split.get("valid"))
     hierarchy = trained.hierarchy
     _write_history(folder, trained.history)
     _write_model(folder, hierarchy, dimensions)
@@ -229,6 +248,7 @@ def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, cloc
     metrics |= {
         "engine_check": trained.check._asdict(),
         "demonstrations": trained.demonstrations | held_out | supervisor(demos),
+        "control_dimensions": [dimension.as_data() for dimension in dimensions.control],
         "parameters": parameters(hierarchy),
         "training": trained.training,
         "seconds": clock.seconds,
@@ -287,16 +307,23 @@ class Trained:
 
 
 def train(
-    spec: Spec, dimensions: Dimensions, demos: Demonstrations, watcher: Watcher, checkpoint: Path | None = None
+    spec: Spec,
+    dimensions: Dimensions,
+    demos: Demonstrations,
+    watcher: Watcher,
+    checkpoint: Path | None = None,
+    held_out: Demonstrations | None = None,
 ) -> Trained:
     """Train the spec's model on these demonstrations, of which ``training.tune_fraction`` are used to tune.
 
     :param checkpoint: where training is kept to be continued; None for nowhere.
+    :param held_out: demonstrations that will be evaluated; whether they can be is known before training.
+    :raises DemonstrationsError: a number is too large for networks.
     :raises TrainingError: a log-likelihood is not finite, or the engines disagree.
     """
     kept, tune = demos.split(spec.training.tune_fraction, spec.seed)
     with one_thread():
-        return _train(spec, dimensions, (kept, tune), watcher, checkpoint)
+        return _train(spec, dimensions, (kept, tune), watcher, checkpoint, held_out)
 
 
 def _train(
@@ -305,6 +332,7 @@ def _train(
     parts: tuple[Demonstrations, Demonstrations],
     watcher: Watcher,
     checkpoint: Path | None,
+    held_out: Demonstrations | None,
 ) -> Trained:
     kept, tune = parts
 
@@ -317,9 +345,17 @@ def _train(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(spec.seed)
         first = make()
+        if held_out is not None:
+            refuse_overflow(held_out, first.encoder, first.scaling)
         batches = [encode(part, first.encoder, first.scaling) for part in parts]
         few = batches[0].select(torch.arange(min(len(batches[0]), COMPARED)))
-        check = compare_engines(first(few.inputs), few.actions, first.scaling.log_volume, few.lengths)
+        outputs = first(few.inputs)
+        if not all(bool(torch.isfinite(leaf).all()) for leaf in outputs.leaves() if leaf is not None):
+            raise TrainingError(
+                "before any training a network gives values that are NaN or infinite; look at its code, or at the "
+                "ranges of the observations (ddco-pyro inspect)"
+            )
+        check = compare_engines(outputs, few.actions, first.scaling.log_volume, few.lengths)
     if not check.agrees:
         raise TrainingError(
             f"the engines disagree (value {check.value:.1e}, gradient {check.gradient:.1e}): "

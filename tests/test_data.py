@@ -21,7 +21,9 @@ def spec(**changes):
 
 @pytest.fixture
 def path(tmp_path):
-    records = [Demonstration(f"demo_{n}", {"offsets": np.zeros((n, 7))}, np.zeros((n, 3))) for n in (4, 9)]
+    records = [
+        Demonstration(f"demo_{n}", {"offsets": np.zeros((n, 7))}, np.arange(3.0 * n).reshape(n, 3)) for n in (4, 9)
+    ]
     Demonstrations(tuple(records)).write(tmp_path / "demos.hdf5")
     return tmp_path / "demos.hdf5"
 
@@ -29,6 +31,60 @@ def path(tmp_path):
 def test_dimensions_come_from_the_file(path):
     for given in (spec(demonstrations={"path": str(path)}), spec(task=None, demonstrations={"path": str(path)})):
         assert dimensions(given) == Dimensions({"offsets": (7,)}, 3, 9)
+
+
+def test_what_never_changes_is_constant(path):
+    """In all demonstrations: dimension 1 changes from one to the other, within neither."""
+    with h5py.File(path, "r+") as file:
+        for name, value in (("demo_4", 1.0), ("demo_9", 2.0)):
+            file[f"data/{name}/actions"][:, 1:] = [value, -0.25]
+    found = dimensions(spec(demonstrations={"path": str(path)}))
+    assert (found.constant, found.control_size) == ({2: -0.25}, 3)
+    assert [one.note for one in found.control[1:]] == [
+        "takes two values, 1 and 2",
+        "constant (-0.25): no part of the model, emitted as it is",
+    ]
+    hierarchy = check_networks(spec(control={"scale": [4.0, 2.0, 8.0]}), found)
+    assert hierarchy.scaling.scale.tolist() == [4.0, 2.0]
+    with pytest.raises(SpecError, match=r"control.scale: has 2 numbers, but the control has 3 dimensions"):
+        check_networks(spec(control={"scale": [4.0, 2.0]}), found)
+
+
+def test_a_control_that_never_changes_is_refused(path):
+    with h5py.File(path, "r+") as file:
+        for group in file["data"].values():
+            group["actions"][:] = [0.5, -0.0, 1]
+    with pytest.raises(
+        DemonstrationsError, match=r"^actions: every dimension is constant \(0.5, 0, 1\) in all demonst"
+    ):
+        dimensions(spec(demonstrations={"path": str(path)}))
+
+
+def test_demonstrations_can_be_left_out(path):
+    """Nothing of them is looked at: they may hold NaN, and other shapes than the rest."""
+    with h5py.File(path, "r+") as file:
+        file["data/demo_4/actions"][2] = np.nan
+        file["mask/valid"] = [b"demo_4", b"demo_9"]
+    left = spec(demonstrations={"path": str(path), "exclude": ["demo_4"]})
+    found = demonstrations(left)
+    assert (found.names, dict(found.masks)) == (("demo_9",), {"valid": ("demo_9",)})
+    with pytest.raises(
+        DemonstrationsError, match=r"demo_4: actions is nan at step 2, index \[0\]; repair it, or leave "
+    ):
+        demonstrations(spec(demonstrations={"path": str(path)}))
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["demo_9", "demo_04"], r"exclude: there is no demonstration 'demo_04' \(did you mean 'demo_4'\?\)$"),
+        (["demo_4", "demo_9"], r"demonstrations.exclude: leaves every demonstration out; keep some$"),
+    ],
+)
+def test_leaving_out_the_wrong_ones_is_refused(path, names, message):
+    for ask in (demonstrations, dimensions):
+        with pytest.raises(DemonstrationsError, match=message):
+            ask(spec(demonstrations={"path": str(path), "exclude": names}))
 
 
 def test_dimensions_come_from_the_task_where_there_is_no_file_yet(tmp_path):

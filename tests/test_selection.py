@@ -54,9 +54,9 @@ def test_restarts_are_chosen_inside_the_training_part(tmp_path, monkeypatch):
     spec = spec_at(tmp_path, grid={"training.restarts": [2]}, folds=3)
     seen = []
 
-    def spied(spec, dimensions, demos, watcher, checkpoint=None):
+    def spied(spec, dimensions, demos, watcher, checkpoint=None, held_out=None):
         seen.append(set(demos.names))
-        return train(spec, dimensions, demos, watcher, checkpoint)
+        return train(spec, dimensions, demos, watcher, checkpoint, held_out)
 
     monkeypatch.setattr(scoring, "train", spied)
     made = select(spec, tmp_path / "run", Told(), ONE)

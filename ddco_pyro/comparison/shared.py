@@ -32,11 +32,12 @@ def held_out(fits: Sequence[Fit]) -> list[Held]:
     """Every run on the held-out demonstrations that all of them share.
 
     :raises NotShared: a run held nothing out, its demonstrations are no longer those it was fitted to, or the others
-        held out others.
+        held out others, or score other dimensions of the control.
     """
     own = [_own(fit) for fit in fits]
     for fit, demos in zip(fits[1:], own[1:], strict=True):
         _check_same(fits[0], own[0], fit, demos)
+        _check_dimensions(fits[0], fit)
     return [_held(fit, demos.select(own[0].names)) for fit, demos in zip(fits, own, strict=True)]
 
 
@@ -62,6 +63,19 @@ def _check_same(first: Fit, ours: Demonstrations, second: Fit, theirs: Demonstra
         different = _different(mine, yours)
         if different:
             raise NotShared(f"{lead}: {mine.name} has other {different}; fit both to the same demonstrations")
+
+
+def _check_dimensions(first: Fit, second: Fit) -> None:
+    """Both likelihoods are densities of the same control dimensions: constant ones are no part of a model."""
+    ours, theirs = (set(one.hierarchy.scaling.varying.tolist()) for one in (first, second))
+    if ours != theirs:
+        dimension = min(ours ^ theirs)
+        scored, left = (first, second) if dimension in ours else (second, first)
+        raise NotShared(
+            f"{first.folder} and {second.folder} score different things: control dimension {dimension} is in the "
+            f"likelihood of {scored.folder} and not in that of {left.folder}; fit both to the same demonstrations, "
+            "with the same version"
+        )
 
 
 def _different(mine: Demonstration, yours: Demonstration) -> str:

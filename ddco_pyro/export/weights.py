@@ -17,6 +17,7 @@ def weights_and_networks(hierarchy: Hierarchy) -> tuple[Arrays, dict[str, Any]]:
     encoder, scaling = hierarchy.encoder, hierarchy.scaling
     arrays: Arrays = {"mean": encoder.mean.numpy(), "deviation": encoder.std.numpy()}
     arrays |= {"scale": scaling.scale.numpy(), "shift": scaling.shift.numpy()}
+    arrays |= {"constant": scaling.constant.numpy(), "order": scaling.order.numpy()}
     levels = hierarchy.option_levels()
     networks = {f"caller_{number}": one.network for number, one in enumerate(hierarchy.callers())}
     networks |= {f"end_{number}": one.termination for number, one in enumerate(levels)}

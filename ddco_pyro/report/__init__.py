@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.files import write_text
-from ddco_pyro.report import activity, demonstration_list, sections
+from ddco_pyro.report import activity, demonstration_list, dimensions, sections
 from ddco_pyro.report.pictures import style
 from ddco_pyro.report.sections import degeneracies
 from ddco_pyro.report.words import unconverged
@@ -28,6 +28,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
         page = {
             "header": sections.header(fit, metrics),
             "likelihood": sections.likelihood(fit, metrics),
+            "dimensions": dimensions.section(metrics, {name: one.metrics for name, one in fit.baselines.items()}),
             "rollouts": sections.rollouts(fit, metrics),
             "learning": sections.learning(fit),
             "options": sections.options(fit, demos, active, metrics) if active else None,

@@ -121,7 +121,7 @@ def explains(
     text = f"{text} ({held_out} held-out demonstration{'s' * (held_out != 1)}; ± is one standard error)."
     if not unconverged:
         return text
-    return f"{text} {_capital(_listed(unconverged))} had not converged: more epochs can change this."
+    return f"{text} {_capital(_listed(list(unconverged)))} had not converged: more epochs can change this."
 
 
 def trainings(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:

@@ -152,7 +152,7 @@ def _demonstration(recording: Recording, fit: Fit) -> Demonstration:
                 f"there is: {there}"
             )
         _check_shape(f"{recording.name}: obs/{key}", known[key].shape[1:], tuple(shape))
-    _check_shape(f"{recording.name}: actions", recording.actions.shape[1:], (len(fit.hierarchy.scaling.scale),))
+    _check_shape(f"{recording.name}: actions", recording.actions.shape[1:], (fit.hierarchy.scaling.size,))
     labels = {
         key: one.array() for key, one in recording.labels.items() if one.dtype.kind in "iub" and len(one.shape) == 1
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,21 +23,21 @@ class FoldError(BadInput):
 
 @dataclass(frozen=True)
 class Folds:
-    """Demonstrations ``demos`` and, for each fold, the names of those that are ``held_out``."""
+    """Demonstrations ``demos`` and, for each fold, the names of those that are ``held_out``.
+
+    :param dimensions: the dimensions of all the demonstrations, so that networks and what they score are the same in
+        every fold, and in the fit that follows.
+    """
 
     demos: Demonstrations
     held_out: tuple[tuple[str, ...], ...]
+    dimensions: Dimensions
 
     def split(self, fold: int) -> tuple[Demonstrations, Demonstrations]:
         """The demonstrations to train with in a fold, and those to score on."""
         out = set(self.held_out[fold])
         train = [name for name in self.demos.names if name not in out]
         return self.demos.select(train), self.demos.select(self.held_out[fold])
-
-    @property
-    def dimensions(self) -> Dimensions:
-        """The dimensions of all the demonstrations, so that networks are the same in every fold."""
-        return Dimensions.of(self.demos)
 
 
 def divide(demos: Demonstrations, folds: int, seed: int) -> Folds:
@@ -47,7 +47,8 @@ def divide(demos: Demonstrations, folds: int, seed: int) -> Folds:
     :raises FoldError: there are fewer demonstrations than folds, or too few to train and tune with.
     """
     used = demos.split(0.5, seed)[0] if demos.masks.keys() & {"train", "valid"} else demos
-    return Folds(used, tuple(tuple(used.names[row] for row in rows) for rows in assign(len(used), folds, seed)))
+    held_out = tuple(tuple(used.names[row] for row in rows) for rows in assign(len(used), folds, seed))
+    return Folds(used, held_out, replace(Dimensions.of(demos), steps=max(used.lengths)))
 
 
 def assign(count: int, folds: int, seed: int) -> list[list[int]]:

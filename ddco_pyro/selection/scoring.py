@@ -11,7 +11,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from ddco_pyro.errors import Failed
+from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.files import write_text
 from ddco_pyro.run import Watcher, log_likelihoods, one_thread, train
 from ddco_pyro.selection.folds import Folds
@@ -73,9 +73,9 @@ def score(folds: Folds, candidate: Candidate, fold: int) -> Score:
     empty = Score(candidate.number, fold, held_out.names, held_out.lengths)
     try:
         with threadpool_limits(1), one_thread():
-            trained = train(candidate.spec, folds.dimensions, training, Unwatched())
+            trained = train(candidate.spec, folds.dimensions, training, Unwatched(), held_out=held_out)
             values = tuple(float(value) for value in log_likelihoods(trained.hierarchy, held_out))
-    except Failed as error:
+    except (BadInput, Failed) as error:
         found = replace(empty, failed=str(error))
     except Exception as error:  # whatever it is, the other folds go on and the user is told
         reason = f"unexpected {type(error).__name__}: {' '.join(str(error).split())}"

@@ -26,6 +26,8 @@ class DemonstrationsSpec(Model):
     """Which of the task's scripted policies is recorded."""
     valid_fraction: Share = 0.1
     """Part of the demonstrations held out for validation, where the file has no ``mask/valid``; 0 for none."""
+    exclude: Items[Text] = ()
+    """Names of demonstrations that are left out, whatever they hold."""
     labels: Text | None = None
     """Name of ground-truth labels in the file; the discovered options are compared with them (NMI)."""
 
