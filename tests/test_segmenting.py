@@ -80,8 +80,8 @@ def test_a_page_or_a_table_leaves_the_file_alone(toy_run, file, tmp_path, option
 
 
 NOTHING = (
-    "ddco-pyro: name what to write: --html PAGE, --csv FILE or --parquet FILE; labels for each step go to --out FILE (a copy) "
-    "or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset\n"
+    "ddco-pyro: name what to write: --html PAGE, --csv FILE or --parquet FILE; labels for each step go to --out FILE "
+    "(a copy) or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset\n"
 )
 
 
