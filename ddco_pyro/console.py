@@ -247,12 +247,12 @@ def successes(results: Mapping[str, Any]) -> None:
     measures = list(dict.fromkeys(name for one in methods.values() for name in one["measures"]))
     table = Table("method", *measures, title=f"{results['episodes']} episodes each", show_edge=False)
     for name, one in methods.items():
-        table.add_row(name, *(_measure(one["measures"][measure]) for measure in measures))
+        table.add_row(name, *(_measure(one["measures"].get(measure)) for measure in measures))
     _show(table)
 
 
-def _measure(one: Mapping[str, Any]) -> str:
-    if one["trials"] == 0:
+def _measure(one: Mapping[str, Any] | None) -> str:
+    if one is None or one["trials"] == 0:
         return "-"
     if "successes" in one:
         low, high = one["interval"]

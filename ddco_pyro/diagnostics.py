@@ -99,7 +99,7 @@ def _of_pairs(level: int, use: Use, alike: Alike) -> list[Finding]:
         Finding("redundant", level, second, float(one["divergence"]), first)
         for one in alike
         for first, second in [one["options"]]
-        if {first, second} <= used and one["divergence"] < SMALLEST_DIVERGENCE
+        if {first, second} <= used and one["divergence"] is not None and one["divergence"] < SMALLEST_DIVERGENCE
     ]
 
 

@@ -16,7 +16,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
 from torch import Tensor
 
 from ddco_pyro import analysis
@@ -34,6 +33,7 @@ from ddco_pyro.inference.check import TRAJECTORIES as COMPARED
 from ddco_pyro.inference.check import EngineCheck, compare_engines
 from ddco_pyro.metrics import evaluate, supervisor
 from ddco_pyro.monitor import Monitor
+from ddco_pyro.records import read_metrics, refit
 from ddco_pyro.spec import Spec, dump_spec, load_spec, user_code
 from ddco_pyro.training import Trainer, TrainingError
 
@@ -73,9 +73,12 @@ class Fit:
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """The contents of ``metrics.json``."""
-        found: dict[str, Any] = json.loads((self.folder / "metrics.json").read_text())
-        return found
+        """The contents of ``metrics.json``.
+
+        :raises Damaged: it lacks something that a reader needs.
+        """
+        hierarchy = self.spec.hierarchy
+        return read_metrics(self.folder, [level.count for level in hierarchy.levels] if hierarchy else [])
 
     @property
     def name(self) -> str:
@@ -173,7 +176,8 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
 
     :param allow_code: import the user code (``module:name``) that its spec names; nothing else in a run is ever
         executed.
-    :raises RunError: the folder has no finished fit, or a damaged one.
+    :raises RunError: the folder has no finished fit, or its model is of another spec.
+    :raises Damaged: the model or ``metrics.json`` is damaged.
     :raises SpecError: its spec names user code, and that is not allowed.
     """
     folder = Path(folder)
@@ -185,15 +189,17 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
         raise RunError(f"{folder}: {what} (it has no {missing[0]})")
     spec = load_spec(folder / "spec.yaml", allow_code=allow_code)
     try:
-        return Fit(folder, spec, _read_model(spec, folder / "model.safetensors").eval())
+        found = Fit(folder, spec, _read_model(spec, folder / "model.safetensors").eval())
     except BadInput:
         raise
-    except (SafetensorError, KeyError, ValueError, RuntimeError) as error:
-        raise RunError(f"{folder}: model.safetensors is damaged, or of another spec than spec.yaml") from error
+    except (KeyError, ValueError, RuntimeError) as error:
+        raise RunError(f"{folder / 'model.safetensors'}: is of another spec than spec.yaml; {refit(folder)}") from error
+    _ = found.metrics  # whoever loads a run is told that they are damaged, before any work
+    return found
 
 
 def _read_model(spec: Spec, path: Path) -> Hierarchy:
-    tensors, metadata = read_tensors(path)
+    tensors, metadata = read_tensors(path, refit(path.parent))
     shapes = {key: tuple(shape) for key, shape in json.loads(metadata["shapes"]).items()}
     size = int(metadata["control_size"])
     whole = {"scaling.varying": torch.arange(size), "scaling.constant": torch.empty(0, dtype=torch.float64)}
@@ -259,8 +265,8 @@ def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, cloc
 
 
 def _finished(folder: Path) -> bool:
-    """Whether the run is complete: its metrics are written last."""
-    return (folder / "metrics.json").exists()
+    """Whether the run is complete: its metrics are written last. What was damaged and removed is made again."""
+    return all((folder / name).exists() for name in ("model.safetensors", "metrics.json"))
 
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
@@ -280,7 +286,7 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     if folder.exists() and not folder.is_dir():
         raise RunError(f"{folder}: is a file; choose another --out")
     if path.exists():
-        if path.read_text() != text:
+        if path.read_bytes() != text.encode():
             raise RunError(f"{folder}: holds a run of another spec; choose another --out or remove it")
         if not resume and _finished(folder) and (folder / "report.html").exists():  # what `fit` writes last
             raise RunError(

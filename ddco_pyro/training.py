@@ -232,7 +232,8 @@ class Trainer:
     def _load(self) -> None:
         if self.checkpoint is None or not self.checkpoint.exists():
             return
-        tensors, metadata = read_tensors(self.checkpoint)
+        remedy = "remove it and do the same again: training begins anew"
+        tensors, metadata = read_tensors(self.checkpoint, remedy)
         self.progress = Progress(**json.loads(metadata["progress"]))
         self._saved = {"optimizer": {}}
         for name, value in tensors.items():

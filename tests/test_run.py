@@ -17,6 +17,7 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.data import Dimensions, demonstrations
 from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.files import Damaged
 from ddco_pyro.run import RunError, claim, fit, train
 from ddco_pyro.spec import dump_spec, load_spec, with_overrides
 
@@ -272,9 +273,9 @@ def test_the_engines_are_compared_on_a_model_that_the_seed_decides(toy_spec, dem
 
 def test_a_finished_run_is_left_as_it_is(copied, toy_spec):
     metrics = copied / "metrics.json"
-    metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"rollouts": "kept"}))
+    metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"note": "kept"}))
     before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in copied.rglob("*") if path.is_file()}
-    assert fit(toy_spec, copied, Interrupting(1)).metrics["rollouts"] == "kept"
+    assert fit(toy_spec, copied, Interrupting(1)).metrics["note"] == "kept"
     assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in before} == before
 
 
@@ -323,11 +324,15 @@ def test_a_damaged_model_is_not_loaded(copied):
     content = model.read_bytes()
     for damaged in (b"", content[:40], content[:-8], b"\xff" * 100):
         model.write_bytes(damaged)
-        with pytest.raises(RunError, match=r"run: model\.safetensors is damaged, or of another spec than spec\.yaml$"):
+        with pytest.raises(
+            Damaged, match=r"run/model\.safetensors: is damaged: .*; remove it and fit again: ddco-pyro fit"
+        ):
             ddco_pyro.load(copied)
 
 
 def test_a_model_of_another_spec_is_not_loaded(copied, toy_spec):
     (copied / "spec.yaml").write_text(dump_spec(with_overrides(toy_spec, {"hierarchy.levels.0.count": 3})))
-    with pytest.raises(RunError, match=r"of another spec than spec\.yaml$"):
+    with pytest.raises(
+        RunError, match=r"run/model\.safetensors: is of another spec than spec\.yaml; remove it and fit"
+    ):
         ddco_pyro.load(copied)

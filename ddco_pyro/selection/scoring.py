@@ -12,7 +12,8 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.files import write_text
+from ddco_pyro.files import Damaged, write_text
+from ddco_pyro.records import read_record
 from ddco_pyro.run import Watcher, log_likelihoods, one_thread, train
 from ddco_pyro.selection.folds import Folds
 from ddco_pyro.selection.grid import Candidate
@@ -103,10 +104,16 @@ def keep(folder: Path, found: Score) -> None:
 
 
 def kept(folder: Path, candidate: int, fold: int) -> Score | None:
-    """The score kept from before, if there is one."""
+    """The score kept from before, if there is one.
+
+    :raises Damaged: it cannot be read.
+    """
     path = path_of(folder, candidate, fold)
     if not path.exists():
         return None
-    data: dict[str, Any] = json.loads(path.read_text())
-    data |= {key: tuple(value) for key, value in data.items() if isinstance(value, list)}
-    return Score(**data)
+    remedy = "remove it and do the same again: this fold alone is trained anew"
+    found = read_record(path, Score, remedy)
+    lengths = (len(found.steps), len(found.names) if found.failed else len(found.log_likelihood))
+    if (found.candidate, found.fold) != (candidate, fold) or {*lengths} != {len(found.names)} or 0 in found.steps:
+        raise Damaged(path, "is not the score of this candidate and fold", remedy)
+    return found
