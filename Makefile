@@ -9,12 +9,12 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 DEMO := .venv/.demo
 DEV := .venv/.dev
-# What is installed is not compiled beforehand: that takes twice as long as all the rest, and most of it is never used.
+# Python compiles what it imports, and keeps it; doing that beforehand for all takes twice as long as the rest of the installation.
 PIP := $(BIN)/pip install -q --no-compile -c constraints.txt
 # A torch wheel without the several GB of CUDA packages. Where this page cannot be reached pip takes torch from its usual index.
 TORCH_CPU := https://download.pytorch.org/whl/cpu/torch/
-# Measured, with that wheel: on disk, and to download.
-SIZE := 1.8 GB (0.6 GB to download)
+# Measured with that wheel: on disk once it has been used, and to download.
+SIZE := 1.9 GB (0.6 GB to download)
 
 .NOTPARALLEL:
 .PHONY: demo test bench docs lint format clean dev .venv python opengl

@@ -161,7 +161,7 @@ def page(results: dict[str, Any], seeds: int, made_by: str) -> str:
         lines.append(f"| {' | '.join(cells)} |")
     lines.append("")
     for name, one in results["differences"].items():
-        success = spread(one["success"], "{:+.0%}")
+        success = spread(one["success"], "{:+.1%}")
         likelihood = spread(one["log_likelihood_valid"], "{:+.2f}")
         lines.append(f"- {OURS} minus {name}, paired by seed: success {success}, {likelihood} held-out nats/step.")
     return "\n".join(lines) + "\n"
@@ -192,7 +192,7 @@ def draw(methods: dict[str, Any], path: Path) -> None:
         axes.plot(one.get("mean", one["rate"]), place, "|", ms=16, mew=2, color="#1f3f70")
         axes.plot(values, [place] * len(values), "o", ms=4, color="#1f3f70", alpha=0.7)
     axes.set(yticks=range(len(methods)), yticklabels=list(methods), xlim=(-0.02, 1.02))
-    axes.set_xlabel("success rate (dots: training seeds; bar: 95 % interval of the mean over them, or of episodes)")
+    axes.set_xlabel("success rate (dots: training seeds; bar: 95 % interval)")
     axes.invert_yaxis()
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=120, format="png")

@@ -159,9 +159,12 @@ def main() -> None:
     made_by = record(command)
     settings = {"folds": own.folds, "most": own.most}
     path = OUT / "selection_planted.json"
-    kept = json.loads(path.read_text())["results"] if path.exists() else {"draws": []} | settings
+    stored = json.loads(path.read_text()) if path.exists() else {"results": {"draws": []} | settings}
+    kept = stored["results"]
     if any(kept[key] != value for key, value in settings.items()):
         raise SystemExit(f"{path}: was made with other --folds or --most; remove it first")
+    for row in kept["draws"]:
+        row.setdefault("made_by", stored["provenance"][0])  # draws that were adopted as a whole
     done = {(row["seed"], row["options"]): row for row in kept["draws"]}
     wanted = list(product(range(FIRST_SEED, FIRST_SEED + own.draws), own.options))
     for seed, options in wanted:
