@@ -15,16 +15,19 @@ from typing import NamedTuple
 from unittest import mock
 
 import h5py
+import jsonschema
 import pytest
 import toy_task
+import typer
 import yaml
 from killing import HANGS, struck
 
 import ddco_pyro
-from ddco_pyro.cli import main
+from ddco_pyro.cli import app, main
 from ddco_pyro.spec import dump_spec, load_spec
 
 HERE = Path(__file__).parent
+ROOT = HERE.parent
 COMMAND = Path(sys.executable).with_name("ddco-pyro")
 
 
@@ -90,11 +93,40 @@ def test_check_shows_defaults_shapes_and_parameters(spec):
     ]
 
 
-def test_check_prints_the_schema():
+@pytest.fixture(scope="module")
+def refusals():
+    """What an editor with the schema that ``check`` prints has against a spec: the first key of each error."""
     ended = call("check", "--schema")
+    assert (ended.status, ended.err) == (0, "")
     schema = json.loads(ended.out)
-    assert (ended.status, ended.err, schema["type"]) == (0, "", "object")
-    assert set(schema["properties"]) >= {"task", "hierarchy", "training"}
+    validator = jsonschema.validators.validator_for(schema)
+    validator.check_schema(schema)
+    return lambda data: [next(iter(error.path), None) for error in validator(schema).iter_errors(data)]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "specs").glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_printed_schema_accepts_every_spec_short_and_resolved(refusals, path):
+    assert refusals(yaml.safe_load(path.read_text())) == []
+    assert refusals(yaml.safe_load(dump_spec(load_spec(path)))) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "place"),
+    [
+        ({"observation": ["offsets"]}, None),
+        ({"seed": "many"}, "seed"),
+        ({"training": {"epoch": 3}}, "training"),
+        ({"training": {"epochs": 0}}, "training"),
+        ({"control": {"std": -1}}, "control"),
+        ({"hierarchy": {"levels": [{"count": 0}]}}, "hierarchy"),
+        ({"inference": {"engine": "fast"}}, "inference"),
+    ],
+)
+def test_the_printed_schema_refuses_what_check_refuses(refusals, tmp_path, change, place):
+    data = yaml.safe_load(toy_task.SPEC) | change
+    assert refusals(data) == [place]
+    (tmp_path / "wrong.yaml").write_text(yaml.safe_dump(data))
+    assert call("check", tmp_path / "wrong.yaml").status == 2
 
 
 def test_collect_prints_the_file(spec, tmp_path):
@@ -136,12 +168,21 @@ def test_rollout_and_report(run):
     assert "open_loop" in (folder / "report.html").read_text()
 
 
-def test_help_has_examples():
-    for command in ("check", "collect", "fit", "select", "compare", "rollout", "report"):
-        ended = call(command, "--help")
-        assert (ended.status, ended.err) == (0, "")
-        assert f"Example: ddco-pyro {command}" in ended.out
-    assert call() == call("--help")
+COMMANDS = typer.main.get_command(app).commands
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_help_has_an_example_that_can_be_typed(command):
+    ended = call(command, "--help")
+    assert (ended.status, ended.err) == (0, "")
+    (example,) = re.findall(rf"Example: ddco-pyro {command} (.*)", " ".join(ended.out.split()))
+    assert COMMANDS[command].make_context(command, shlex.split(example)).params
+
+
+def test_nothing_at_all_is_help():
+    ended = call()
+    assert ended == call("--help")
+    assert [command for command in COMMANDS if f" {command} " not in ended.out] == []
 
 
 # --- what does not ----------------------------------------------------------------------------------------------------
