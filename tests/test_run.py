@@ -292,6 +292,7 @@ def test_claiming_a_folder(tmp_path, toy_spec):
     assert (folder / "spec.yaml").read_text() == dump_spec(toy_spec)
     (folder / ".spec.yaml-killed.tmp").touch()  # what a killed process left
     claim(folder, toy_spec, resume=False)
+    (folder / "model.safetensors").touch()
     (folder / "metrics.json").touch()
     claim(folder, toy_spec, resume=False)  # killed before its report
     (folder / "report.html").touch()
