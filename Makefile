@@ -41,7 +41,8 @@ lint: $(DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	@$(BIN)/python benchmarks/provenance.py
+	$(BIN)/lint-imports
+	@$(BIN)/python studies/provenance.py
 
 format: $(DEV)
 	$(BIN)/ruff check --fix .

@@ -27,7 +27,7 @@ from IPython.display import Image, Markdown
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
 from ddco_pyro import load_spec
-from ddco_pyro.console import Selecting
+from ddco_pyro.cli.console import Selecting
 from ddco_pyro.selection import Workers, select
 
 RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))

@@ -28,10 +28,11 @@ from IPython.display import Image, Markdown
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
 from ddco_pyro import Demonstrations, load_spec
-from ddco_pyro.collect import collect
-from ddco_pyro.console import Fitting
-from ddco_pyro.report import words, write_report
-from ddco_pyro.run import fit
+from ddco_pyro.cli.console import Fitting
+from ddco_pyro.drawing import words
+from ddco_pyro.fitting.run import fit
+from ddco_pyro.report import write_report
+from ddco_pyro.simulation.collect import collect
 from ddco_pyro.spec import DemonstrationsSpec
 
 RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.selection.scoring import Score, Unwatched
 from ddco_pyro.spec import parse_spec
 

@@ -6,14 +6,14 @@ import itertools
 
 import pytest
 
-from ddco_pyro import console
+from ddco_pyro.cli import console
 
 
 @pytest.fixture
 def clock(monkeypatch):
     """Every look at the clock finds it four seconds later."""
     ticks = itertools.count(0, 4)
-    monkeypatch.setattr("ddco_pyro.console.time.monotonic", lambda: float(next(ticks)))
+    monkeypatch.setattr("ddco_pyro.cli.console.time.monotonic", lambda: float(next(ticks)))
 
 
 def test_plain_lines_come_now_and_then_and_at_the_end(clock, capsys):

@@ -10,11 +10,11 @@ import torch
 from oracle import brute_force
 from scipy import stats
 
-from ddco_pyro.controller import Controller
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.encoding import encode
-from ddco_pyro.hierarchy import Hierarchy
-from ddco_pyro.observing import ObservationError
+from ddco_pyro.acting.controller import Controller
+from ddco_pyro.acting.window import ObservationError
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import parse_spec
 
 STATE = {"state": np.array([0.5, -1.0, 2.0])}

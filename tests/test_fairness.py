@@ -16,14 +16,14 @@ from test_selection_choice import candidate
 
 import ddco_pyro
 from ddco_pyro.comparison import compare, write
-from ddco_pyro.data import demonstrations
-from ddco_pyro.evaluate import roll_out
+from ddco_pyro.fitting.prepare import demonstrations
+from ddco_pyro.fitting.rollouts import roll_out
+from ddco_pyro.fitting.widths import nearest_widths
 from ddco_pyro.report import unconverged, write_report
 from ddco_pyro.selection import Workers, select
 from ddco_pyro.selection.choice import as_data, choose
 from ddco_pyro.selection.table import HEAD, cells, markdown
 from ddco_pyro.spec import dump_spec
-from ddco_pyro.widths import nearest_widths
 
 BASELINES = ["flat", "flat_equal", "per_timestep"]
 

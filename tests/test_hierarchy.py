@@ -8,11 +8,11 @@ import torch
 from oracle import brute_force
 from torch.distributions import Normal
 
-from ddco_pyro.encoding import Batch
-from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
-from ddco_pyro.networks import Inputs
-from ddco_pyro.outputs import TERMINATION_BOUND
+from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.outputs import TERMINATION_BOUND
 from ddco_pyro.spec import parse_spec
 
 SHAPES = {"state": (3,)}

@@ -9,9 +9,9 @@ import pytest
 import torch
 from sklearn.metrics import adjusted_rand_score
 
-from ddco_pyro.encoding import Batch
-from ddco_pyro.initialize import POOLED, Clusters
-from ddco_pyro.networks import Inputs
+from ddco_pyro.fitting.clusters import POOLED, Clusters
+from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.networks import Inputs
 
 LENGTHS = (7, 4, 6)
 PLACES = np.array([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])

@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 import toy_task
 
-from ddco_pyro.data import demonstrations, parts
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.report import film, tables, words, write_report
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.drawing import words
+from ddco_pyro.fitting.prepare import demonstrations, parts
+from ddco_pyro.fitting.run import fit, write_metrics
+from ddco_pyro.report import film, tables, write_report
 from ddco_pyro.report.activity import Activity, LevelActivity, activity, bins
 from ddco_pyro.report.plot_rows import order
 from ddco_pyro.report.plot_timing import shares, terminations
 from ddco_pyro.report.plot_trajectories import movement, position_key, view
-from ddco_pyro.rollout import paired_difference, summarize
-from ddco_pyro.run import fit, write_metrics
+from ddco_pyro.simulation.episodes import paired_difference, summarize
 from ddco_pyro.spec import parse_spec
 
 LINEAR = {"network": "linear"}
@@ -63,7 +64,7 @@ def run(folder, demos, **changes):
 def coarse():
     """Small pictures are drawn faster."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ddco_pyro.report.pictures.DOTS_PER_INCH", 40)
+        patch.setattr("ddco_pyro.drawing.pictures.DOTS_PER_INCH", 40)
         yield
 
 

@@ -18,12 +18,12 @@ from test_cli import call
 from test_run import Silent
 
 import ddco_pyro
-from ddco_pyro.data import demonstrations, parts
-from ddco_pyro.demonstrations import Demonstrations
-from ddco_pyro.importing import import_demonstrations
-from ddco_pyro.run import fit
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.importing import import_demonstrations
+from ddco_pyro.data.sources import open_source
+from ddco_pyro.fitting.prepare import demonstrations, parts
+from ddco_pyro.fitting.run import fit
 from ddco_pyro.segmenting import Segmented, segments
-from ddco_pyro.sources import open_source
 from ddco_pyro.spec import parse_spec
 
 LEROBOT = Path(__file__).parent / "fixtures" / "lerobot"

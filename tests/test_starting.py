@@ -13,10 +13,10 @@ from scipy import stats
 from test_cli import call
 
 import ddco_pyro
-from ddco_pyro.demonstrations import Demonstration, Demonstrations, DemonstrationsError
-from ddco_pyro.inspection import inspect
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.data.inspection import inspect
+from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.spec import load_spec
-from ddco_pyro.starting import starting_spec
 
 
 @pytest.fixture

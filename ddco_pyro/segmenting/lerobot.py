@@ -12,10 +12,10 @@ import numpy as np
 import pyarrow
 from pyarrow import parquet
 
+from ddco_pyro.data.files import whole_folder, write_text
+from ddco_pyro.data.sources.lerobot import SUBTASK, LeRobot
 from ddco_pyro.errors import BadInput
-from ddco_pyro.files import whole_folder, write_text
 from ddco_pyro.segmenting import Segmented
-from ddco_pyro.sources.lerobot import SUBTASK, LeRobot
 
 FEATURE = {"dtype": "int64", "shape": [1], "names": None}
 

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ddco_tasks import pushing
+from ddco_tasks.pushing import environment as pushing
 
-from ddco_pyro.data import check_networks, dimensions
-from ddco_pyro.demonstrations import Demonstrations
-from ddco_pyro.lockstep import play
-from ddco_pyro.rollout import run_episode
-from ddco_pyro.run import fit
+from ddco_pyro.acting.lockstep import play
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.fitting.prepare import check_networks, dimensions
+from ddco_pyro.fitting.run import fit
 from ddco_pyro.selection.scoring import Unwatched
+from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import Spec, load_spec
 
 SPECS = sorted((Path(__file__).parents[2] / "specs").glob("pushing*.yaml"))
