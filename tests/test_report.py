@@ -48,7 +48,7 @@ def run(folder, demos, **changes):
         "demonstrations": {"path": str(folder / "demos.hdf5"), "valid_fraction": 0.3, **labels},
         "observations": ["place"],
         "hierarchy": {"levels": [level], "meta_policy": LINEAR},
-        "training": {"epochs": 3, "optimizer": {"lr": 0.05}},
+        "training": {"epochs": 12, "optimizer": {"lr": 0.05}},
         "compare_with": [{"kind": "flat", "policy": LINEAR}],
     }
     spec = parse_spec({key: value for key, value in (data | changes).items() if value is not None})
@@ -80,7 +80,7 @@ def deep(tmp_path_factory):
         made(size=2),
         labelled=False,
         hierarchy={"levels": [lower, upper], "meta_policy": {**LINEAR, "emits": ["options", "control"]}},
-        training={"epochs": 2, "restarts": 2},
+        training={"epochs": 12, "restarts": 2},
         compare_with=[{"kind": "flat", "policy": LINEAR}, {"kind": "per_timestep"}],
     )
     write_metrics(found.folder, found.metrics | {"rollouts": rollouts(), "options": unused(found.metrics["options"])})
@@ -167,8 +167,10 @@ def test_a_baseline_has_no_options(labelled):
     before = found.baselines["flat"].metrics
     page = write_report(found.baselines["flat"], demos).read_text()
     assert found.baselines["flat"].metrics == before
-    assert ids(page) == ["likelihood", "learning", "particulars"]
-    assert "no other model was trained to compare with" in page
+    assert ids(page) == ["likelihood", "learning", "warnings", "particulars"]
+    assert "no other model was trained to compare with. Flat had not converged: more epochs can change this." in page
+    assert "<strong>Flat has not converged: " in page
+    assert "sign of a degenerate solution" not in page
 
 
 def test_numbers_are_those_of_the_metrics(labelled):
