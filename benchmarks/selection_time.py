@@ -30,7 +30,7 @@ from provenance import record, text
 
 OUT = Path("docs/results")
 GRID = "selection.grid.hierarchy.levels.0.count=[1, 2, 3, 4, 5, 6, 7, 8]"
-SHORT = ("selection.grid.hierarchy.levels.0.count=[2, 3, 4, 5]", "selection.folds=4", "training.epochs=25")
+SHORT = ("selection.grid.hierarchy.levels.0.count=[2, 3, 4, 5]", "selection.folds=4", "training.epochs=100")
 
 
 def one_fold() -> dict[str, Any]:

@@ -66,7 +66,7 @@ hierarchy:
   levels:
     - {{count: 4, policy: {{network: linear}}, termination: {{network: linear}}}}
   meta_policy: {{network: linear}}
-training: {{initialize: vq_controls, optimizer: {{lr: 1.0e-2}}, epochs: 100}}
+training: {{initialize: vq_controls, optimizer: {{lr: 1.0e-2}}, epochs: 400}}
 compare_with: [flat]
 """
 RUNS.mkdir(parents=True, exist_ok=True)

@@ -90,7 +90,7 @@ def planted_spec(path: Path, folds: int, most: int, seed: int) -> Spec:
         "training": {
             "initialize": "vq",
             "layerwise": False,
-            "epochs": 40,
+            "epochs": 80,
             "patience": 10,
             "batch_size": 20,
             "optimizer": {"lr": 0.05},

@@ -351,7 +351,7 @@ def test_a_command_ends_with_its_status_and_finds_tasks_beside_it(spec):
 
 
 def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
-    longer = with_set("compare_with=[]", "training.epochs=60", "training.patience=null")
+    longer = with_set("compare_with=[]", "training.epochs=240", "training.patience=null")
     folder = tmp_path / "cut"
     interrupt = "os.kill(os.getpid(), signal.SIGINT)"
     status, err = struck(["fit", spec, "--out", folder, *longer], HERE, "Fitting.epoch", 100, interrupt)

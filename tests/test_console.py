@@ -40,6 +40,18 @@ def test_a_fit_that_stops_early_says_so(clock, capsys):
     ]
 
 
+def test_where_nobody_knows_how_far_it_goes_there_is_no_time_left(clock, capsys):
+    with console.Fitting() as progress:
+        progress.training("ddco", None)
+        for _ in range(3):
+            progress.epoch({"stage": "level-1", "train": 1.25, "tune": -0.5})
+        progress.trained("ddco")
+    assert capsys.readouterr().err.splitlines() == [
+        "training ddco: 3  level-1: loss -1.250, held out -0.500 nats/step",
+        "training ddco: done after 3, 16 s",
+    ]
+
+
 def test_markup_in_names_is_text(clock, capsys):
     with console.Rolling(1) as progress:
         progress.episode("[bold]own[/bold]")

@@ -113,7 +113,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory, toy_run) -> dict[str, Case]:
     folder = tmp_path_factory.mktemp("inputs")
     (folder / "toy.yaml").write_text(toy_task.SPEC.replace("task: toy", "task: toy_task:task"))
     demonstrations(300).write(folder / "source.hdf5")
-    short = [one for key in ("training.epochs=25", "compare_with=[flat]") for one in ("--set", key)]
+    short = [one for key in ("training.epochs=100", "compare_with=[flat]") for one in ("--set", key)]
     shutil.copytree(toy_run.folder, folder / "run")
     import_demonstrations(_toy_demonstrations(folder), folder / "toy.hdf5")
     data = selecting.data_at(folder)

@@ -215,7 +215,7 @@ def test_everything_is_checked_before_any_work(tmp_path):
 def written(folder):
     """A spec file of a selection that takes a while."""
     data = data_at(folder)
-    data |= {"training": data["training"] | {"epochs": 4, "patience": None}}
+    data |= {"training": data["training"] | {"epochs": 16, "patience": None}}
     (folder / "spec.yaml").write_text(yaml.safe_dump(data))
     return folder / "spec.yaml"
 

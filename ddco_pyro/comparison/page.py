@@ -56,8 +56,8 @@ def verdict(found: Comparison) -> str:
     best, *others = found.rows
     lengths = np.array(found.steps, dtype=float)
     differences = {row.name: paired(np.array(best.each), np.array(row.each), lengths) for row in others}
-    rising = [row.name for row in found.rows if row.training and not row.training["converged"]]
-    return words.explains(best.name, differences, len(found.trajectories), rising)
+    rising = words.rising(row.name for row in found.rows if row.training and not row.training["converged"])
+    return f"{words.explains(best.name, differences, len(found.trajectories))}{rising}"
 
 
 def list_head(found: Comparison) -> list[str]:

@@ -27,11 +27,11 @@ STEPS_PER_BATCH = 1000
 LINEAR_BELOW = 2000
 """With fewer steps than this in all, options have linear policies: hidden layers fit what will not come again."""
 
-GRADIENT_STEPS = 4800
+GRADIENT_STEPS = 6000
 """A model may take about so many gradient steps in all: about a minute of one core, and enough for a hierarchy and for
 the policies beside it to stop by :data:`PATIENCE` on the files of docs/decisions.md."""
 
-EPOCHS = (200, 1600)
+EPOCHS = (200, 2000)
 """Fewest and most epochs of a model."""
 
 PATIENCE = 50

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from scipy import stats
@@ -91,7 +91,20 @@ def _capital(text: str) -> str:
 
 
 def verdict(metrics: Mapping[str, Any]) -> str:
-    """One sentence on how well the model explains held-out demonstrations, with the error of that."""
+    """How well the model explains held-out demonstrations, with the error of that, and who would have needed more
+    epochs.
+    """
+    names = (method(name) for name, training in trainings(metrics).items() if not training["converged"])
+    return f"{_explained(metrics)}{rising(names)}"
+
+
+def rising(names: Iterable[str]) -> str:
+    """A sentence, after a space, on those whose training ended while they still rose; nothing where there are none."""
+    listed = list(names)
+    return f" {_capital(_listed(listed))} had not converged: more epochs can change this." if listed else ""
+
+
+def _explained(metrics: Mapping[str, Any]) -> str:
     name, held_out = _capital(method(metrics["model"])), len(metrics["valid"])
     if not held_out:
         value = number(metrics["log_likelihood_per_step"]["train"])
@@ -102,24 +115,17 @@ def verdict(metrics: Mapping[str, Any]) -> str:
             f"{name} gives held-out demonstrations {value} nats per step; no other model was trained to compare with."
         )
     differences = {method(other): one["difference"] for other, one in metrics["comparison"].items()}
-    rising = [method(key) for key, one in trainings(metrics).items() if not one["converged"]]
-    return explains(name, differences, held_out, rising)
+    return explains(name, differences, held_out)
 
 
-def explains(
-    name: str, differences: Mapping[str, Mapping[str, float]], held_out: int, unconverged: Sequence[str] = ()
-) -> str:
+def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out: int) -> str:
     """One sentence on how much better than others a model explains held-out demonstrations.
 
     :param differences: what the others are called to ``nats_per_step`` and ``standard_error`` of the paired difference.
-    :param unconverged: those, it or others, that still rose when their training ended.
     """
     clauses = [_clause(other, difference, held_out) for other, difference in differences.items()]
     text = f"{name} explains held-out demonstrations {_listed(clauses)}"
-    text = f"{text} ({held_out} held-out demonstration{'s' * (held_out != 1)}; ± is one standard error)."
-    if not unconverged:
-        return text
-    return f"{text} {_capital(_listed(list(unconverged)))} had not converged: more epochs can change this."
+    return f"{text} ({held_out} held-out demonstration{'s' * (held_out != 1)}; ± is one standard error)."
 
 
 def trainings(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
@@ -139,23 +145,22 @@ RAISE = "Raise training.epochs: it is the budget of every model that is compared
 
 
 def unconverged(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Every stage that its budget ended too early, in words with its number, and what to do."""
-    return [
-        (_too_short(_capital(method(name)), stage, last=stage is training["stages"][-1]), RAISE)
-        for name, training in trainings(metrics).items()
-        for stage in training["stages"]
-        if not stage["converged"]
-    ]
+    """Every model of which the budget ended a stage too early, in words with the numbers, and what to do."""
+    found = []
+    for name, training in trainings(metrics).items():
+        stages = [_too_short(stage) for stage in training["stages"] if not stage["converged"]]
+        if stages:
+            who = method(name)
+            verdict = f"Earlier stages of {who} had" if training["converged"] else f"{_capital(who)} has"
+            found.append((f"{verdict} not converged: the budget ended {_listed(stages)}.", RAISE))
+    return found
 
 
-def _too_short(name: str, stage: Mapping[str, Any], last: bool) -> str:
-    verdict = f"{name} has not converged" if last else f"{name} had not converged before its later stages"
+def _too_short(stage: Mapping[str, Any]) -> str:
+    text = f"stage {stage['stage']} after {stage['epochs']} epochs"
     if not stage["epochs"]:
-        return f"{verdict}: the budget left no epoch for stage {stage['stage']}."
-    return (
-        f"{verdict}: its tuning log-likelihood rose by {number(stage['rising'])} nats per step over the last "
-        f"{stage['over']} epochs of stage {stage['stage']}, which the budget ended after {stage['epochs']}."
-    )
+        return text
+    return f"{text} (tuning log-likelihood up by {number(stage['rising'])} nats per step over the last {stage['over']})"
 
 
 def _clause(other: str, difference: Mapping[str, float], held_out: int) -> str:

@@ -31,8 +31,8 @@ def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def short(path: Path, demonstrations: Path) -> Spec:
-    """The spec, on these demonstrations, for two epochs."""
-    return load_spec(path, [f"demonstrations.path={demonstrations}", "training.epochs=2"])
+    """The spec, on these demonstrations, for six epochs in all."""
+    return load_spec(path, [f"demonstrations.path={demonstrations}", "training.epochs=6"])
 
 
 def test_all_specs_are_here() -> None:
