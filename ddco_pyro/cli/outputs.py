@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +16,13 @@ if TYPE_CHECKING:
     from ddco_pyro.data.sources import Source
     from ddco_pyro.fitting.run import Fit
     from ddco_pyro.segmenting import Segmented
+
+
+class LeRobotFormat(StrEnum):
+    """The first version of LeRobot that reads it."""
+
+    LANGUAGE = "0.6"
+    SUBTASK_INDEX = "0.4"
 
 
 def segment(
@@ -36,6 +44,10 @@ def segment(
         Path | None,
         typer.Option(help="A copy of the LeRobot dataset with options as subtasks.", show_default=False),
     ] = None,
+    lerobot_format: Annotated[
+        LeRobotFormat,
+        typer.Option("--lerobot-format", help="Subtasks as LeRobot reads them from 0.6 on, or in 0.4 and 0.5."),
+    ] = LeRobotFormat.LANGUAGE,
     level: Annotated[
         str | None, typer.Option(help="The level that gives the subtasks; the lowest by default.", show_default=False)
     ] = None,
@@ -64,7 +76,7 @@ def segment(
         if labelled and source.format != "robomimic":
             raise BadInput(f"{demos}: labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot")
         if lerobot:
-            found = _annotate(fit, source, lerobot, level, progress.collected)
+            found = _annotate(fit, source, lerobot, (level, lerobot_format.value), progress.collected)
         else:
             found = segments(fit, source, progress.collected)
     if csv:
@@ -94,24 +106,29 @@ def _labelled(demos: Path, out: Path | None, in_place: bool) -> Path | None:
 
 
 def _annotate(
-    fit: Fit, source: Source, out: Path, level: str | None, on_demonstration: Callable[[int, int], None]
+    fit: Fit, source: Source, out: Path, how: tuple[str | None, str], on_demonstration: Callable[[int, int], None]
 ) -> Segmented:
-    """The segments of a LeRobot dataset, after a copy with a level's options as subtasks was written."""
+    """The segments of a LeRobot dataset, after a copy with a level's options as subtasks was written.
+
+    :param how: the level, the lowest where it is None, and the format.
+    """
     from ddco_pyro.segmenting import segments
 
     if source.format != "lerobot":
         raise BadInput(f"{source.files[0]}: is no LeRobot dataset; --lerobot annotates a copy of one")
     from ddco_pyro.data.sources.lerobot import LeRobot
     from ddco_pyro.segmenting.lerobot import annotate, check_target
+    from ddco_pyro.segmenting.lerobot_forms import FORMS, subtask_names
 
     assert isinstance(source, LeRobot)
+    level, form = how[0], FORMS[how[1]]
     counts = {one.name: one.count for one in fit.spec.hierarchy.levels} if fit.spec.hierarchy else {}
     if level is not None and level not in counts:
         raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(counts)})")
     chosen = level or next(iter(counts), "")
-    check_target(source, out, chosen, counts.get(chosen, 0))
+    check_target(source, out, subtask_names(chosen, counts.get(chosen, 0)), form)
     found = segments(fit, source, on_demonstration)
-    annotate(source, out, found, chosen)
+    annotate(source, out, found, chosen, form)
     print(out)
     return found
 
