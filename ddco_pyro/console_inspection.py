@@ -9,6 +9,7 @@ from rich.table import Table
 
 from ddco_pyro.hdf5 import printable
 from ddco_pyro.inspection import Field, Inspection
+from ddco_pyro.values import LARGEST
 
 WIDTH = 160
 """Columns where there is no terminal: names in a file that is read by a program are not to be cut."""
@@ -27,8 +28,8 @@ def show(found: Inspection) -> None:
     for one in found.fields.values():
         table.add_row(*map(_plain, (one.place, str(list(one.shape)), one.dtype, _range(one), _notes(one))))
     console.print(table)
-    for problem in found.problems:
-        console.print(f"problem: {printable(problem)}", markup=False, highlight=False, soft_wrap=True)
+    for line in (*found.notes, *(f"problem: {problem}" for problem in found.problems)):
+        console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
 
 
 def _plain(text: str) -> str:
@@ -47,13 +48,17 @@ def _frequency(found: Inspection) -> str:
 
 def _range(one: Field) -> str:
     low, high = one.minimum[np.isfinite(one.minimum)], one.maximum[np.isfinite(one.maximum)]
-    return f"{float(low.min()):.4g} to {float(high.max()):.4g}" if len(low) and len(high) else "-"
+    if not len(low) or not len(high):
+        return "-"
+    return f"{float(low.min()) + 0.0:.4g} to {float(high.max()) + 0.0:.4g}"  # + 0.0: no minus zero
 
 
 def _notes(one: Field) -> str:
     notes = ["video" if one.video else "image"] if one.image else []
     if one.nan or one.infinite:
         notes.append(f"{one.nan} NaN, {one.infinite} infinite")
+    if one.huge:
+        notes.append(f"{one.huge} beyond ±{LARGEST:g}")
     constant = one.constant
     if constant and len(constant) == len(one.minimum):
         notes.append("constant")

@@ -3,33 +3,52 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from torch import nn
 
 from ddco_pyro.collect import OnDemonstration, collect
-from ddco_pyro.demonstrations import Demonstrations, extent
+from ddco_pyro.control_dimensions import ControlDimension, all_constant, control_dimensions
+from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError, extent
 from ddco_pyro.encoding import Shapes
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.memory import refuse_too_much
 from ddco_pyro.networks import ShapeError
-from ddco_pyro.spec import BaselineSpec, Spec, SpecError, own_networks
+from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code
 from ddco_pyro.task import find_task
+from ddco_pyro.widths import nearest_widths
 
 
 @dataclass(frozen=True)
 class Dimensions:
-    """Shapes of the observations by name, control dimensions A, and the longest demonstration where it is known."""
+    """Shapes of the observations by name, control dimensions A, and the longest demonstration where it is known.
+
+    :param constant: the control dimensions that are constant in all demonstrations, and their values: they are no part
+        of the model.
+    :param control: what each control dimension does in the demonstrations; empty where that is not known.
+    """
 
     shapes: Shapes
     control_size: int
     steps: int
+    constant: Mapping[int, float] = field(default_factory=dict)
+    control: tuple[ControlDimension, ...] = field(default=(), compare=False)
 
     @classmethod
     def of(cls, demonstrations: Demonstrations) -> Dimensions:
-        """The dimensions of these demonstrations."""
-        return cls(demonstrations.observation_shapes, demonstrations.control_size, max(demonstrations.lengths))
+        """The dimensions of these demonstrations.
+
+        :raises DemonstrationsError: every dimension of the control is constant.
+        """
+        control = control_dimensions(demo.actions for demo in demonstrations)
+        constant = {one.number: one.minimum for one in control if one.constant}
+        if len(constant) == len(control):
+            raise DemonstrationsError(all_constant(control))
+        shapes, size = demonstrations.observation_shapes, demonstrations.control_size
+        return cls(shapes, size, max(demonstrations.lengths), constant, control)
 
 
 def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
@@ -41,6 +60,12 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
     if missing:
         known = ", ".join(sorted(dimensions.shapes))
         raise SpecError(f"observations: there is no {', '.join(missing)} (there are: {known})")
+    drawn = spec.report.trajectory
+    shape = dimensions.shapes[drawn] if drawn else (3,)
+    if len(shape) != 1 or shape[0] < 3:
+        raise SpecError(
+            f"report.trajectory: {drawn!r} has shape {list(shape)} at each step; name a vector of three numbers or more"
+        )
     scale = spec.control.scale
     if isinstance(scale, tuple) and len(scale) != dimensions.control_size:
         raise SpecError(
@@ -48,7 +73,7 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
         )
     _refuse_giants(spec, dimensions)
     try:
-        return Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps)
+        return Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps, dimensions.constant)
     except ShapeError as error:
         raise SpecError(str(error)) from error
 
@@ -71,21 +96,30 @@ def _refuse_giants(spec: Spec, dimensions: Dimensions) -> None:
             f"hierarchy.levels: the levels have {choices} joint choices, at most {MOST_CHOICES} can be summed over; "
             "lower count"
         )
-    if own_networks(spec):
+    if any(place.endswith(".network") for place in user_code(spec)):
         return  # its sizes are its own affair
     try:
-        with torch.device("meta"):
-            hierarchy = Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps)
+        number = _counted(spec, dimensions)
     except ShapeError:
         return  # it is said better where the networks are made
     except (RuntimeError, MemoryError, TypeError):  # sizes that no tensor can have
-        parameters = "more parameters than a machine can count"
+        said = "more parameters than a machine can count"
     else:
-        number = sum(parameter.numel() for parameter in hierarchy.parameters())
         if number <= MOST_PARAMETERS:
             return
-        parameters = f"{number} parameters, more than {MOST_PARAMETERS}"
-    raise SpecError(f"the networks have {parameters}; lower count, hidden, filters or kernel, or scale the images down")
+        said = f"{number} parameters, more than {MOST_PARAMETERS}"
+    raise SpecError(f"the networks have {said}; lower count, hidden, filters or kernel, or scale the images down")
+
+
+def _counted(spec: Spec, dimensions: Dimensions) -> int:
+    """The number of parameters of the spec's networks, which are made without their numbers."""
+    with torch.device("meta"):
+        return parameters(Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps))
+
+
+def parameters(network: nn.Module) -> int:
+    """The number of trained parameters."""
+    return sum(parameter.numel() for parameter in network.parameters())
 
 
 def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
@@ -94,17 +128,42 @@ def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
     :raises SpecError: something in the spec does not fit the observations or the control.
     """
     hierarchy = build_hierarchy(spec, dimensions)
-    for number, baseline in enumerate(spec.compare_with):
-        try:
-            build_hierarchy(baseline_spec(spec, baseline), dimensions)
-        except SpecError as error:  # what it shares with the spec is in order: it is about its own network
-            raise SpecError(f"compare_with.{number}.{str(error).removeprefix('baseline.')}") from error
+    baselines(spec, dimensions)
     return hierarchy
 
 
-def baseline_spec(spec: Spec, baseline: BaselineSpec) -> Spec:
-    """The spec of a baseline trained beside: the same but for the model."""
-    return spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": ()})
+def baselines(spec: Spec, dimensions: Dimensions) -> list[tuple[Spec, Hierarchy]]:
+    """The spec and the networks of each baseline that is trained beside.
+
+    :raises SpecError: a baseline's network does not fit the observations.
+    """
+    found = []
+    for number, baseline in enumerate(spec.compare_with):
+        try:
+            beside = baseline_spec(spec, baseline, dimensions)
+            found.append((beside, build_hierarchy(beside, dimensions)))
+        except SpecError as error:  # what it shares with the spec is in order: it is about its own network
+            problems = (problem.removeprefix("baseline.") for problem in error.problems)
+            raise SpecError(*(f"compare_with.{number}.{problem}" for problem in problems)) from error
+    return found
+
+
+def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) -> Spec:
+    """The spec of a baseline trained beside: the same but for the model.
+
+    :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
+    """
+    alone = spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": ()})
+    if baseline.kind != "flat_equal":
+        return alone
+
+    def resized(hidden: tuple[int, ...]) -> Spec:
+        policy = baseline.policy.model_copy(update={"hidden": hidden})
+        return alone.model_copy(update={"baseline": baseline.model_copy(update={"policy": policy})})
+
+    build_hierarchy(alone, dimensions)  # what is wrong with it is said here
+    target = parameters(build_hierarchy(spec, dimensions))
+    return resized(nearest_widths(baseline.policy.hidden, target, lambda hidden: _counted(resized(hidden), dimensions)))
 
 
 def dimensions(spec: Spec) -> Dimensions:
@@ -143,13 +202,25 @@ def demonstrations(spec: Spec, on_demonstration: OnDemonstration | None = None) 
     if spec.demonstrated_task is not None and (path is None or not path.exists()):
         path = collect(spec.demonstrated_task, own, path, on_demonstration)
     assert path is not None  # a spec has a task or a file
+    if not path.exists():
+        raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
     _refuse_what_is_larger_than_memory(spec, path)
     labels = (own.labels,) if own.labels else ()
-    return Demonstrations.read(path, [one.key for one in spec.observations], labels)
+    return Demonstrations.read(path, [one.key for one in spec.observations], labels, own.exclude)
+
+
+def _needed(spec: Spec) -> str:
+    """What to do about a file that is not there."""
+    labels = [spec.demonstrations.labels] if spec.demonstrations.labels else []
+    read = ["actions", *(f"obs/{one.key}" for one in spec.observations), *(f"labels/{name}" for name in labels)]
+    return (
+        "put it there, or fit to another with --set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, "
+        f"with {', '.join(read)} in each data/<demonstration>"
+    )
 
 
 def _refuse_what_is_larger_than_memory(spec: Spec, path: Path) -> None:
-    found = extent(path, [one.key for one in spec.observations])
+    found = extent(path, [one.key for one in spec.observations], spec.demonstrations.exclude)
     needed = found.fit({f"obs/{one.key}" for one in spec.observations if one.differences})
     remedy = "leave observations out, make its demonstrations fewer or equally long, or scale pictures down"
     refuse_too_much(needed, f"{path}: a fit to {', '.join(one.key for one in spec.observations)}", remedy)

@@ -14,6 +14,7 @@ from typing import Any, overload
 import h5py
 import numpy as np
 
+from ddco_pyro.errors import nearest
 from ddco_pyro.files import whole_file
 from ddco_pyro.hdf5 import (
     Attribute,
@@ -25,12 +26,12 @@ from ddco_pyro.hdf5 import (
     member,
     names_in_mask,
     natural,
-    nearest,
     opened,
     written,
 )
 from ddco_pyro.memory import PROGRAM, Extent, refuse_too_much
 from ddco_pyro.sources.recording import Recording, of_array
+from ddco_pyro.values import LARGEST, usable
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,8 @@ class Demonstration:
     :param actions: [T, A], the controls, float64.
     :param labels: name to [T], ground-truth segments, int64.
     :param attributes: what is known of the whole demonstration, such as its seed.
-    :raises DemonstrationsError: no steps, unequal lengths, NaN or infinite numbers, anything but numbers.
+    :raises DemonstrationsError: no steps, unequal lengths, anything but numbers, or numbers that are NaN, infinite or
+        beyond :data:`ddco_pyro.values.LARGEST`.
     """
 
     name: str
@@ -55,14 +57,14 @@ class Demonstration:
             raise DemonstrationsError(
                 f"{self.name!r} cannot be the name of a demonstration; it must not be empty or have a /"
             )
-        actions = _numbers(self.actions, f"{self.name}: actions")
+        actions = _numbers(self.actions, self.name, "actions")
         if actions.ndim != 2 or actions.shape[1] == 0:
             raise DemonstrationsError(
                 f"{self.name}: actions has shape {actions.shape}, it has to be [steps, dimensions]"
             )
         if len(actions) == 0:
             raise DemonstrationsError(f"{self.name}: actions has no steps; remove this demonstration")
-        observations = {key: _numbers(one, f"{self.name}: obs/{key}") for key, one in self.observations.items()}
+        observations = {key: _numbers(one, self.name, f"obs/{key}") for key, one in self.observations.items()}
         labels = {key: _integers(one, f"{self.name}: labels/{key}") for key, one in self.labels.items()}
         for where, array in [
             *((f"obs/{key}", one) for key, one in observations.items()),
@@ -79,18 +81,21 @@ class Demonstration:
         return len(self.actions)
 
 
-def _numbers(array: Any, where: str) -> np.ndarray:
-    """Numbers as float64, or as they are if uint8; everything finite."""
-    array = np.asarray(array)
+def _numbers(array: Any, name: str, place: str) -> np.ndarray:
+    """Numbers as float64, or as they are if uint8; everything finite and at most :data:`ddco_pyro.values.LARGEST`."""
+    array, where = np.asarray(array), f"{name}: {place}"
     if array.dtype == np.uint8:
         return array
     if array.dtype.kind not in "fiub":
         raise DemonstrationsError(f"{where} holds {array.dtype}, it has to hold real numbers")
-    finite = np.isfinite(array)
-    if not finite.all():
-        place = np.argwhere(~finite)[0].tolist()
+    good = usable(array)
+    if not good.all():
+        place = np.argwhere(~good)[0].tolist()
+        value = float(array[tuple(place)])
+        at = f" at step {place[0]}, index {place[1:]}" if place else ""
+        limit = f", and at most {LARGEST:g} can be used" if np.isfinite(value) else ""
         raise DemonstrationsError(
-            f"{where} is {array[tuple(place)]} at index {place}; repair or remove this demonstration"
+            f"{where} is {value:g}{at}{limit}; repair it, or leave {name} out (demonstrations.exclude)"
         )
     return array.astype(np.float64)
 
@@ -132,19 +137,24 @@ class Demonstrations(Sequence[Demonstration]):
 
     @classmethod
     def read(
-        cls, path: str | Path, observations: Sequence[str] | None = None, labels: Sequence[str] = ()
+        cls,
+        path: str | Path,
+        observations: Sequence[str] | None = None,
+        labels: Sequence[str] = (),
+        exclude: Sequence[str] = (),
     ) -> Demonstrations:
         """The demonstrations in an HDF5 file, ``demo_2`` before ``demo_10``.
 
         :param observations: the keys to read; all of them if None.
         :param labels: names of the ground-truth labels to read.
+        :param exclude: names of demonstrations that are left out, of masks too; nothing of them is read.
         :raises DemonstrationsError: the file cannot be read, does not hold what was asked for, or holds more than fits
             into memory.
         """
         with opened(path) as file:
-            needed = PROGRAM + _extent(file, observations, labels).size
+            needed = PROGRAM + _extent(file, observations, labels, exclude).size
             refuse_too_much(needed, "reading it", "read only some observations, or scale pictures down")
-            return cls(*_read(file, observations, labels))
+            return cls(*_read(file, observations, labels, exclude))
 
     def write(self, path: str | Path) -> None:
         """Write an HDF5 file, whole or not at all."""
@@ -258,23 +268,25 @@ def _unknown(name: str, names: Sequence[str]) -> str:
 # --- HDF5 -------------------------------------------------------------------------------------------------------------
 
 
-def extent(path: str | Path, observations: Sequence[str]) -> Extent:
+def extent(path: str | Path, observations: Sequence[str], exclude: Sequence[str] = ()) -> Extent:
     """How much there is of these observations and of the controls, by the file's headers alone.
 
     :raises DemonstrationsError: the file cannot be read or does not hold them.
     """
     with opened(path) as file:
-        return _extent(file, observations, ())
+        return _extent(file, observations, (), exclude)
 
 
-def _extent(file: h5py.File, observations: Sequence[str] | None, labels: Sequence[str]) -> Extent:
+def _extent(
+    file: h5py.File, observations: Sequence[str] | None, labels: Sequence[str], exclude: Sequence[str]
+) -> Extent:
     return Extent.of(
         {
             "actions": dataset_at(group, "actions", f"{name}: "),
             **_datasets(group, "obs", observations, name),
             **_datasets(group, "labels", labels, name),
         }
-        for name, group in _groups(file)
+        for name, group in _groups(file, exclude)
     )
 
 
@@ -287,21 +299,28 @@ def _datasets(group: h5py.Group, folder: str, keys: Sequence[str] | None, name: 
     return {f"{folder}/{key}": dataset_at(members, key, f"{name}: {folder}/") for key in names}
 
 
-def _groups(file: h5py.File) -> list[tuple[str, h5py.Group]]:
-    """The demonstrations of a file with their names, in order."""
+def _groups(file: h5py.File, exclude: Sequence[str]) -> list[tuple[str, h5py.Group]]:
+    """The demonstrations of a file with their names, in order, without those that are left out."""
     data = member(file, "data", h5py.Group, "")
     names = sorted((name for name in data if isinstance(data.get(name), h5py.Group)), key=natural)
     if not names:
         raise DemonstrationsError("the group 'data' holds no demonstrations; at least one is needed")
-    return [(name, data[name]) for name in names]
+    for name in exclude:
+        if name not in names:
+            raise DemonstrationsError(f"demonstrations.exclude: {_unknown(name, names)}")
+    if len(set(exclude)) == len(names):
+        raise DemonstrationsError("demonstrations.exclude: leaves every demonstration out; keep some")
+    return [(name, data[name]) for name in names if name not in exclude]
 
 
 def _read(
-    file: h5py.File, observations: Sequence[str] | None, labels: Sequence[str]
+    file: h5py.File, observations: Sequence[str] | None, labels: Sequence[str], exclude: Sequence[str]
 ) -> tuple[tuple[Demonstration, ...], dict[str, tuple[str, ...]], dict[str, Attribute]]:
-    demonstrations = tuple(_read_one(group, name, observations, labels) for name, group in _groups(file))
+    demonstrations = tuple(_read_one(group, name, observations, labels) for name, group in _groups(file, exclude))
     masks = member(file, "mask", h5py.Group, "") if "mask" in file else {}
-    return demonstrations, {mask: names_in_mask(masks, mask) for mask in masks}, attributes_of(file)
+    members = {mask: names_in_mask(masks, mask) for mask in masks}
+    kept = {mask: tuple(name for name in names if name not in exclude) for mask, names in members.items()}
+    return demonstrations, kept, attributes_of(file)
 
 
 def _read_one(group: h5py.Group, name: str, observations: Sequence[str] | None, labels: Sequence[str]) -> Demonstration:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.networks import Inputs, InputShape
 from ddco_pyro.spec import ControlSpec, ObservationSpec
 
@@ -22,7 +23,9 @@ MLP-64 options over 50 × 2000 steps a gradient step takes 0.6 of the time that 
 
 @dataclass(frozen=True)
 class Batch:
-    """N demonstrations padded to T steps: ``inputs``; ``actions`` [N, T, A] in scaled units; ``lengths`` [N]."""
+    """N demonstrations padded to T steps: ``inputs``; ``actions`` [N, T, A'] in scaled units, of the control dimensions
+    that vary; ``lengths`` [N].
+    """
 
     inputs: Inputs
     actions: Tensor
@@ -104,22 +107,40 @@ class ObservationEncoder(nn.Module):
 
 
 class ControlScaling(nn.Module):
-    """Controls in the units of their own spread, z = (a - shift) / scale, and back."""
+    """The A' of A control dimensions that vary, in units of their own spread, z = (a - shift) / scale, and back.
+
+    Nothing but this knows of the others: they are constant, no part of the model, and put back into what it emits.
+
+    :param size: A.
+    :param constant: the constant dimensions and their values, in the control's own units.
+    """
 
     shift: Tensor
     scale: Tensor
+    varying: Tensor
+    constant: Tensor
+    order: Tensor
 
-    def __init__(self, spec: ControlSpec, size: int) -> None:
+    def __init__(self, spec: ControlSpec, size: int, constant: Mapping[int, float] = MappingProxyType({})) -> None:
         super().__init__()
         self.standardize = spec.scale == "standardize"
+        varying = [dimension for dimension in range(size) if dimension not in constant]
         declared = spec.scale if isinstance(spec.scale, tuple) else (1.0,) * size
-        self.register_buffer("shift", torch.zeros(size, dtype=torch.float64))
-        self.register_buffer("scale", torch.tensor(declared, dtype=torch.float64))
+        self.register_buffer("shift", torch.zeros(len(varying), dtype=torch.float64))
+        self.register_buffer("scale", torch.tensor([declared[one] for one in varying], dtype=torch.float64))
+        self.register_buffer("varying", torch.tensor(varying, dtype=torch.int64))
+        self.register_buffer("constant", torch.tensor([constant[one] for one in sorted(constant)], dtype=torch.float64))
+        self.register_buffer("order", torch.tensor([*varying, *sorted(constant)]).argsort(), persistent=False)
+
+    @property
+    def size(self) -> int:
+        """A, the number of control dimensions, constant ones among them."""
+        return len(self.order)
 
     def fit(self, demonstrations: Demonstrations) -> None:
         """Where the spec says ``standardize``: take mean and spread of these demonstrations' controls."""
         if self.standardize:
-            rows = np.concatenate([demo.actions for demo in demonstrations])
+            rows = np.concatenate([demo.actions[:, self.varying.numpy()] for demo in demonstrations])
             spread = rows.std(0)
             self.shift.copy_(torch.as_tensor(rows.mean(0)))
             self.scale.copy_(torch.as_tensor(np.where(spread > 1e-9, spread, 1.0)))
@@ -130,21 +151,54 @@ class ControlScaling(nn.Module):
         return self.scale.log().sum()
 
     def scaled(self, actions: np.ndarray) -> np.ndarray:
-        """[T, A] in the control's own units to scaled ones."""
-        found: np.ndarray = (actions - self.shift.numpy()) / self.scale.numpy()
+        """[T, A] in the control's own units to [T, A'] in scaled ones."""
+        found: np.ndarray = (actions[:, self.varying.numpy()] - self.shift.numpy()) / self.scale.numpy()
         return found
 
+    def emitted(self, actions: Tensor) -> Tensor:
+        """[..., A'] scaled to [..., A] in the control's own units, the constant dimensions put back."""
+        varying = actions.double() * self.scale + self.shift
+        return torch.cat([varying, self.constant.expand(*varying.shape[:-1], -1)], dim=-1)[..., self.order]
+
     def unscaled(self, actions: Tensor) -> np.ndarray:
-        """[..., A] scaled to the control's own units."""
-        found: np.ndarray = (actions.double() * self.scale + self.shift).numpy()
+        """The same as an array."""
+        found: np.ndarray = self.emitted(actions).numpy()
         return found
+
+
+LARGEST_SCALED = 1e12
+"""No feature or control may be larger, once it is scaled: float32 has to hold the square of what networks make of it,
+divided by that of a small σ, and ends at 3e38."""
 
 
 def encode(demonstrations: Demonstrations, encoder: ObservationEncoder, scaling: ControlScaling) -> Batch:
-    """All demonstrations as one padded batch."""
+    """All demonstrations as one padded batch.
+
+    :raises DemonstrationsError: a number is too large for networks.
+    """
+    refuse_overflow(demonstrations, encoder, scaling)
     inputs = encoder.inputs(demo.observations for demo in demonstrations)
     actions = _pad([scaling.scaled(demo.actions) for demo in demonstrations]).float()
     return Batch(inputs, actions, torch.tensor([len(demo) for demo in demonstrations]))
+
+
+def refuse_overflow(demonstrations: Demonstrations, encoder: ObservationEncoder, scaling: ControlScaling) -> None:
+    """See that networks can take every feature and control.
+
+    :raises DemonstrationsError: a number is larger than :data:`LARGEST_SCALED` once it is scaled.
+    """
+    places = np.repeat([f"obs/{spec.key}" for spec in encoder.specs], encoder.sizes)
+    for demo in demonstrations:
+        features = (encoder.features(demo.observations) - encoder.mean.numpy()) / encoder.std.numpy()
+        controls = scaling.scaled(demo.actions)
+        sizes = np.abs(np.concatenate([features, controls], axis=1))
+        if (sizes > LARGEST_SCALED).any():
+            step, column = np.argwhere(sizes > LARGEST_SCALED)[0]
+            place = places[column] if column < len(places) else "actions"
+            raise DemonstrationsError(
+                f"{demo.name}: {place} at step {step} is {sizes[step, column]:.2g} once it is scaled, and networks "
+                f"take at most {LARGEST_SCALED:g}; repair it, or leave {demo.name} out (demonstrations.exclude)"
+            )
 
 
 def _pad(sequences: Sequence[np.ndarray]) -> Tensor:

@@ -6,8 +6,9 @@ A baseline is a hierarchy without option levels whose meta-policy emits control.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import Literal
 
 import torch
@@ -18,7 +19,7 @@ from ddco_pyro.ahmm import Tables
 from ddco_pyro.encoding import Batch, ControlScaling, ObservationEncoder, Shapes
 from ddco_pyro.networks import Inputs, InputShape, ShapeError, build
 from ddco_pyro.outputs import Decision, Outputs
-from ddco_pyro.spec import ControlSpec, LearnedStd, LevelSpec, NetworkSpec, Spec
+from ddco_pyro.spec import ControlSpec, LearnedStd, LevelSpec, NetworkSpec, Spec, SpecError
 
 INITIAL_STD = 0.5
 """A learned standard deviation starts here, in scaled units."""
@@ -99,9 +100,8 @@ class Level(nn.Module):
         self.count = spec.count
         with _named(f"{place}.policy"):
             self.policy = Caller(
-                spec.policy, spec.policy.emits or _default(options_below), options_below, shape, control, control_size,
-                spec.count,
-            )  # fmt: skip
+                spec.policy, spec.policy.emits, options_below, shape, control, control_size, spec.count
+            )
         with _named(f"{place}.termination"):
             self.termination = build(spec.termination, shape, 1, spec.count)
 
@@ -111,12 +111,10 @@ def _named(place: str) -> Iterator[None]:
     """Errors about a network say where in the spec it stands."""
     try:
         yield
+    except SpecError as error:
+        raise SpecError(*(f"{place}.{problem}" for problem in error.problems)) from error
     except ShapeError as error:
         raise ShapeError(f"{place}: {error}") from error
-
-
-def _default(options_below: int) -> tuple[Emits, ...]:
-    return ("options",) if options_below else ("control",)
 
 
 class Hierarchy(nn.Module):
@@ -125,23 +123,32 @@ class Hierarchy(nn.Module):
     :param shapes: shapes of the observations by name, without time.
     :param control_size: A, the number of control dimensions.
     :param steps: the longest demonstration, for per-timestep networks.
+    :param constant: the control dimensions that are no part of the model, and the values that are emitted for them.
     :raises ShapeError: where a network cannot read these observations.
+    :raises SpecError: where a user's network does not take its options.
     """
 
-    def __init__(self, spec: Spec, shapes: Shapes, control_size: int, steps: int) -> None:
+    def __init__(
+        self,
+        spec: Spec,
+        shapes: Shapes,
+        control_size: int,
+        steps: int,
+        constant: Mapping[int, float] = MappingProxyType({}),
+    ) -> None:
         super().__init__()
         self.steps = steps
         self.encoder = ObservationEncoder(spec.observations, shapes)
-        self.scaling = ControlScaling(spec.control, control_size)
-        shape = self.encoder.shape(steps)
+        self.scaling = ControlScaling(spec.control, control_size, constant)
+        shape, size = self.encoder.shape(steps), len(self.scaling.varying)
         levels, below = [], 0
         for number, level in enumerate(spec.hierarchy.levels if spec.hierarchy else ()):
-            levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, spec.control, control_size))
+            levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, spec.control, size))
             below = level.count
         self.levels = nn.ModuleList(levels)
         network, emits = _meta_policy(spec)
         with _named("hierarchy.meta_policy" if levels else "baseline.policy"):
-            self.meta_policy = Caller(network, emits, below, shape, spec.control, control_size, copies=1)
+            self.meta_policy = Caller(network, emits, below, shape, spec.control, size, copies=1)
 
     @property
     def depth(self) -> int:

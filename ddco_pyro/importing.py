@@ -11,10 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ddco_pyro.errors import BadInput
-from ddco_pyro.hdf5 import Attribute, DemonstrationsError, nearest, opened
+from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.hdf5 import Attribute, DemonstrationsError, opened
 from ddco_pyro.parts import Parts, discard, parts_of
 from ddco_pyro.sources import Column, Format, Recording, Source, open_source
+from ddco_pyro.values import LARGEST, usable
 
 FREQUENCY = "control_frequency"
 IDENTITY = "imported"
@@ -211,5 +212,7 @@ def _check(recording: Recording, first: Recording) -> None:
 
 def _check_values(recording: Recording) -> None:
     for place, column in recording.columns():
-        if column.dtype.kind == "f" and not all(bool(np.isfinite(block).all()) for block in column.blocks()):
-            raise DemonstrationsError(f"{recording.name}: {place} has NaN or infinite values; repair them first")
+        if not all(bool(usable(block).all()) for block in column.blocks()):
+            raise DemonstrationsError(
+                f"{recording.name}: {place} has NaN or infinite values, or some beyond ±{LARGEST:g}; repair them first"
+            )

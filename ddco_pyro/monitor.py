@@ -49,13 +49,14 @@ class Monitor:
             return self._filter.predict(self._chain(self._outputs, torch.zeros(1, 1, size)).steps()[0])
 
     def _scaled(self, control: np.ndarray | None) -> Tensor:
-        size = len(self.hierarchy.scaling.scale)
+        size = self.hierarchy.scaling.size
         if control is None or np.shape(control) != (size,):
             got = "none" if control is None else f"one of shape {np.shape(control)}"
             raise ObservationError(
                 f"the control applied since the last observation is needed, shape ({size},); got {got}"
             )
-        return torch.as_tensor(self.hierarchy.scaling.scaled(np.asarray(control, float))).float().reshape(1, 1, -1)
+        scaled = self.hierarchy.scaling.scaled(np.asarray(control, float)[None])
+        return torch.as_tensor(scaled).float().reshape(1, 1, -1)
 
     def _chain(self, outputs: Outputs, actions: Tensor) -> Chain:
         return complete(outputs.tables(actions, self.hierarchy.scaling.log_volume), torch.tensor([1]))

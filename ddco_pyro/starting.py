@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ddco_pyro.control_dimensions import all_constant
 from ddco_pyro.hdf5 import DemonstrationsError
-from ddco_pyro.inspection import Field, Inspection
+from ddco_pyro.inspection import Field, Inspection, inspect
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.spec.reading import read_yaml
 
@@ -26,18 +27,28 @@ STEPS_PER_BATCH = 1000
 LINEAR_BELOW = 2000
 """With fewer steps than this in all, options have linear policies: hidden layers fit what will not come again."""
 
-GRADIENT_STEPS = 600
-"""A stage may take about so many gradient steps, and at least :data:`EPOCHS` epochs."""
+GRADIENT_STEPS = 4800
+"""A model may take about so many gradient steps in all: about a minute of one core, and enough for a hierarchy and for
+the policies beside it to stop by :data:`PATIENCE` on the files of docs/decisions.md."""
 
-EPOCHS = (50, 400)
-"""Fewest and most epochs of a stage."""
+EPOCHS = (200, 1600)
+"""Fewest and most epochs of a model."""
+
+PATIENCE = 50
+"""Epochs without improvement before a stage stops; with 20 flat policies stopped too early (docs/decisions.md)."""
 
 
 def starting_spec(found: Inspection, path: str | Path) -> str:
     """The text of a spec for what was found, commented, with ``path`` as its file.
 
+    Demonstrations with values that cannot be used are left out where they are few; else the observations with such
+    values are. What was left out is said in a comment.
+
     :raises DemonstrationsError: nothing can be fitted to it; the line says why.
     """
+    excluded = _few_affected(found)
+    if excluded:
+        found = inspect(found.path, exclude=excluded)
     if len(found.lengths) < LEAST:
         raise DemonstrationsError(
             f"{found.path}: holds {len(found.lengths)} demonstrations that can be read, and a fit needs {LEAST}: to "
@@ -47,9 +58,27 @@ def starting_spec(found: Inspection, path: str | Path) -> str:
     wrong = _unusable(found, actions) if actions else "is missing"
     if actions is None or wrong:
         raise DemonstrationsError(f"{found.path}: actions {wrong}; repair them first (ddco-pyro inspect {found.path})")
+    if all(one.constant for one in found.control):
+        raise DemonstrationsError(f"{found.path}: {all_constant(found.control)}")
     text = "\n".join(_lines(found, str(path))) + "\n"
     parse_spec(read_yaml(text))  # what is written can be read
     return text
+
+
+MOST_EXCLUDED = 0.2
+"""Part of the demonstrations that may be left out for the sake of an observation; of more, the observation is."""
+
+
+def _few_affected(found: Inspection) -> list[str]:
+    """The demonstrations to leave out so that no key has to be: those with values that cannot be used, if they are few
+    and enough are left; a key that is affected in many, or is not in all, is not to be saved.
+    """
+    most = MOST_EXCLUDED * len(found.lengths)
+    keys = [one for one in (found.actions, *found.observations) if one and found.everywhere(one)]
+    names = {name for one in keys if len(one.affected) <= most for name in one.affected}
+    left = [set(found.masks[mask]) - names for mask in ("train", "valid") if mask in found.masks]
+    few = len(names) <= most and len(found.lengths) - len(names) >= LEAST and all(left)
+    return [name for name in found.lengths if name in names] if few else []
 
 
 def _lines(found: Inspection, path: str) -> Iterator[str]:
@@ -59,14 +88,15 @@ def _lines(found: Inspection, path: str) -> Iterator[str]:
     yield "# Every key explained: ddco-pyro check --schema"
     yield "demonstrations:"
     yield f"  path: {_text(path)}"
+    if found.excluded:
+        names = ", ".join(map(_text, found.excluded))
+        yield f"  exclude: [{names}]   # NaN, infinite or huge values; where: ddco-pyro inspect"
     yield from _validation(found)
     yield from _labels(found)
     yield from _observations(found)
     yield "control:"
     yield "  std: {learn: true, floor: 0.01}   # in units of each dimension's own spread"
-    still = found.actions.constant if found.actions else []
-    if still:
-        yield f"  # constant in this file: dimension {', '.join(map(str, still))}"
+    yield from (f"  # {note}" for note in found.notes)
     yield "hierarchy:"
     yield "  levels:"
     yield "    - name: option"
@@ -79,10 +109,13 @@ def _lines(found: Inspection, path: str) -> Iterator[str]:
     yield "  initialize: vq_controls           # clusters of observations and controls; vq: of observations alone"
     yield "  optimizer: {name: adam, lr: 3.0e-3}"
     batch = _batch(lengths)
-    yield f"  epochs: {_epochs(lengths, batch)}                       # of each stage, at most: it stops early"
+    yield f"  epochs: {_epochs(lengths, batch)}                      # of all stages together, at most"
+    yield f"  patience: {PATIENCE}                      # a stage stops after so many epochs without improvement"
     yield f"  batch_size: {batch}                    # demonstrations in a gradient step"
-    yield "# Is the hierarchy worth it? One policy without options, trained beside it."
-    yield f"compare_with: [{{kind: flat, policy: {_network(found)}}}]"
+    yield "# Is the hierarchy worth it? Policies without options, trained beside it with the same budget."
+    yield "compare_with:"
+    yield f"  - {{kind: flat, policy: {_network(found)}}}"
+    yield f"  - {{kind: flat_equal, policy: {_network(found)}}}   # as wide as gives it the hierarchy's parameters"
 
 
 def _text(value: str) -> str:
@@ -150,8 +183,8 @@ def _unusable(found: Inspection, one: Field) -> str:
     """Why an array cannot be used; nothing where it can."""
     if not one.numeric:
         return f"holds {one.dtype}, not numbers"
-    if one.nan or one.infinite:
-        return f"has {one.nan} NaN and {one.infinite} infinite values"
+    if one.unusable:
+        return f"has {one.unusable}"
     if not found.everywhere(one):
         return f"is in {one.demonstrations} of {len(found.lengths)} demonstrations"
     if 0 in found.lengths.values():

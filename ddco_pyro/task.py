@@ -18,8 +18,7 @@ import dm_env
 import numpy as np
 
 from ddco_pyro.errors import BadInput
-
-ENTRY_POINTS = "ddco_pyro.tasks"
+from ddco_pyro.spec.types import TASKS
 
 SUCCESS = "success"
 """The measure by which methods are compared."""
@@ -112,7 +111,7 @@ def find_task(name: str) -> Task:
 
     :raises UnknownTask: names what is registered.
     """
-    registered = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+    registered = {point.name: point for point in entry_points(group=TASKS)}
     if name in registered:
         found: Any = registered[name].load()
     elif ":" in name:

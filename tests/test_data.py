@@ -11,7 +11,7 @@ from ddco_pyro.demonstrations import Demonstration, Demonstrations, Demonstratio
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 
 TASK = "toy_task:task"
-SIZE = Dimensions({"offsets": (4,), "camera": (8, 8, 3)}, control_size=2, steps=12)
+SIZE = Dimensions({"offsets": (4,), "camera": (8, 8, 3), "visited": (1,)}, control_size=2, steps=12)
 
 
 def spec(**changes):
@@ -21,7 +21,9 @@ def spec(**changes):
 
 @pytest.fixture
 def path(tmp_path):
-    records = [Demonstration(f"demo_{n}", {"offsets": np.zeros((n, 7))}, np.zeros((n, 3))) for n in (4, 9)]
+    records = [
+        Demonstration(f"demo_{n}", {"offsets": np.zeros((n, 7))}, np.arange(3.0 * n).reshape(n, 3)) for n in (4, 9)
+    ]
     Demonstrations(tuple(records)).write(tmp_path / "demos.hdf5")
     return tmp_path / "demos.hdf5"
 
@@ -29,6 +31,60 @@ def path(tmp_path):
 def test_dimensions_come_from_the_file(path):
     for given in (spec(demonstrations={"path": str(path)}), spec(task=None, demonstrations={"path": str(path)})):
         assert dimensions(given) == Dimensions({"offsets": (7,)}, 3, 9)
+
+
+def test_what_never_changes_is_constant(path):
+    """In all demonstrations: dimension 1 changes from one to the other, within neither."""
+    with h5py.File(path, "r+") as file:
+        for name, value in (("demo_4", 1.0), ("demo_9", 2.0)):
+            file[f"data/{name}/actions"][:, 1:] = [value, -0.25]
+    found = dimensions(spec(demonstrations={"path": str(path)}))
+    assert (found.constant, found.control_size) == ({2: -0.25}, 3)
+    assert [one.note for one in found.control[1:]] == [
+        "takes two values, 1 and 2",
+        "constant (-0.25): no part of the model, emitted as it is",
+    ]
+    hierarchy = check_networks(spec(control={"scale": [4.0, 2.0, 8.0]}), found)
+    assert hierarchy.scaling.scale.tolist() == [4.0, 2.0]
+    with pytest.raises(SpecError, match=r"control.scale: has 2 numbers, but the control has 3 dimensions"):
+        check_networks(spec(control={"scale": [4.0, 2.0]}), found)
+
+
+def test_a_control_that_never_changes_is_refused(path):
+    with h5py.File(path, "r+") as file:
+        for group in file["data"].values():
+            group["actions"][:] = [0.5, -0.0, 1]
+    with pytest.raises(
+        DemonstrationsError, match=r"^actions: every dimension is constant \(0.5, 0, 1\) in all demonst"
+    ):
+        dimensions(spec(demonstrations={"path": str(path)}))
+
+
+def test_demonstrations_can_be_left_out(path):
+    """Nothing of them is looked at: they may hold NaN, and other shapes than the rest."""
+    with h5py.File(path, "r+") as file:
+        file["data/demo_4/actions"][2] = np.nan
+        file["mask/valid"] = [b"demo_4", b"demo_9"]
+    left = spec(demonstrations={"path": str(path), "exclude": ["demo_4"]})
+    found = demonstrations(left)
+    assert (found.names, dict(found.masks)) == (("demo_9",), {"valid": ("demo_9",)})
+    with pytest.raises(
+        DemonstrationsError, match=r"demo_4: actions is nan at step 2, index \[0\]; repair it, or leave "
+    ):
+        demonstrations(spec(demonstrations={"path": str(path)}))
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["demo_9", "demo_04"], r"exclude: there is no demonstration 'demo_04' \(did you mean 'demo_4'\?\)$"),
+        (["demo_4", "demo_9"], r"demonstrations.exclude: leaves every demonstration out; keep some$"),
+    ],
+)
+def test_leaving_out_the_wrong_ones_is_refused(path, names, message):
+    for ask in (demonstrations, dimensions):
+        with pytest.raises(DemonstrationsError, match=message):
+            ask(spec(demonstrations={"path": str(path), "exclude": names}))
 
 
 def test_dimensions_come_from_the_task_where_there_is_no_file_yet(tmp_path):
@@ -62,8 +118,13 @@ def test_demonstrations_may_come_from_another_task(tmp_path):
 def test_a_file_that_is_not_there_and_cannot_be_collected_is_an_error(tmp_path):
     missing = {"path": str(tmp_path / "none.hdf5")}
     for read in (demonstrations, dimensions):
-        with pytest.raises(DemonstrationsError, match=r"none\.hdf5: there is no such file; check the path$"):
-            read(spec(task=None, demonstrations=missing))
+        with pytest.raises(DemonstrationsError) as refused:
+            read(spec(task=None, demonstrations=missing | {"labels": "phase"}, observations=["offsets", "visited"]))
+        assert str(refused.value) == (
+            f"demonstrations.path: {missing['path']}: there is no such file; put it there, or fit to another with "
+            "--set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, with actions, obs/offsets, "
+            "obs/visited, labels/phase in each data/<demonstration>"
+        )
 
 
 def test_labels_that_are_not_there_are_an_error(path):
@@ -81,6 +142,14 @@ WRONG = {"network": "test_networks:Wrong", "options": {"how": "swapped"}}
     [
         ({"observations": ["offsets", "pose", "jaw"]}, r"^observations: there is no pose, jaw \(there are: camera, of"),
         ({"control": {"scale": [1.0]}}, r"^control\.scale: has 1 numbers, but the control has 2 dimensions$"),
+        (
+            {"observations": ["visited"], "report": {"trajectory": "visited"}},
+            r"^report\.trajectory: 'visited' has shape \[1\] at each step; name a vector of three numbers or more$",
+        ),
+        (
+            {"observations": ["camera"], "report": {"trajectory": "camera"}},
+            r"^report\.trajectory: 'camera' has shape \[8, 8, 3\] at each step; name a vector",
+        ),
         ({"observations": ["camera"]}, r"^baseline\.policy: reads vectors, but camera are images"),
         (
             {"baseline": None, "hierarchy": {"levels": [LEVEL | {"policy": CONV}]}},
@@ -96,8 +165,8 @@ WRONG = {"network": "test_networks:Wrong", "options": {"how": "swapped"}}
         ),
         (
             {"baseline": None, "hierarchy": {"levels": [LEVEL | {"termination": WRONG}]}},
-            r"^hierarchy\.levels\.0\.termination: network 'test_networks:Wrong' gives shape \[1, 2, 1, 2\]; .*, "
-            r"here \[1, 2, 2, 1\]$",
+            r"^hierarchy\.levels\.0\.termination: network 'test_networks:Wrong' gives shape \[2, 3, 1, 2\]; .*, "
+            r"here \[2, 3, 2, 1\]$",
         ),
     ],
 )

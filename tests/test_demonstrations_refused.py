@@ -87,12 +87,12 @@ REFUSED: list[tuple[str, Callable[[h5py.File], None], str]] = [
     (
         "NaN",
         replace("data/demo_1/actions", NAN),
-        "demo_1: actions is nan at index [1, 1]; repair or remove this demonstration",
+        "demo_1: actions is nan at step 1, index [1]; repair it, or leave demo_1 out (demonstrations.exclude)",
     ),
     (
         "infinite",
         replace("data/demo_1/obs/pose", np.full((4, 3), -np.inf)),
-        "demo_1: obs/pose is -inf at index [0, 0]; repair or remove this demonstration",
+        "demo_1: obs/pose is -inf at step 0, index [0]; repair it, or leave demo_1 out (demonstrations.exclude)",
     ),
     ("text", replace("data/demo_1/actions", [["a"]] * 4), "demo_1: actions holds object, it has to hold real numbers"),
     (

@@ -72,8 +72,42 @@ def test_what_a_fit_would_refuse_is_said(path: Path) -> None:
         "demo_4: actions is missing; there is: labels/phase, obs/camera, obs/fixed, obs/goal, obs/pose",
         "mask/valid: there is no demonstration 'demo_9'",
         "obs/goal cannot be used in 1 of 4 demonstrations",
-        "obs/pose has 1 NaN and 1 infinite values",
+        "obs/pose has 1 NaN and 1 infinite values, the first in demo_1 at step 2; 2 of 4 demonstrations are affected",
     ]
+
+
+@pytest.mark.parametrize("block", [1, 10**9])
+def test_values_that_cannot_be_used_have_a_place(path: Path, block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the blocks; and a number that no network takes is one of them."""
+    monkeypatch.setattr("ddco_pyro.sources.recording.BLOCK_BYTES", block)
+    with h5py.File(path, "r+") as file:
+        file["data/demo_3/obs/pose"][[2, 4], 1] = np.nan, 1e300
+        file["data/demo_4/obs/pose"][:, 2] = -2e30
+        file["data/demo_4/obs/goal"][2] = np.inf
+        file["data/demo_3/labels/phase"][0] = 2**40
+    found = inspect(path)
+    pose, goal = found.fields["obs/pose"], found.fields["obs/goal"]
+    assert (pose.nan, pose.infinite, pose.huge) == (1, 0, 1 + 3)
+    assert (pose.first, pose.affected) == (("demo_3", 2), ["demo_3", "demo_4"])
+    assert (goal.first, goal.affected) == (("demo_4", 2), ["demo_4"])
+    assert found.affected == ["demo_3", "demo_4"]
+    assert found.problems == [
+        "obs/goal has 0 NaN and 2 infinite values, the first in demo_4 at step 2; 1 of 5 demonstrations is affected",
+        "obs/pose has 1 NaN and 0 infinite values and 4 beyond ±1e+30, the first in demo_3 at step 2; 2 of 5 "
+        "demonstrations are affected",
+    ]
+    assert "1 NaN, 0 infinite; 4 beyond ±1e+30" in call("inspect", path).out
+    assert inspect(path, exclude=["demo_3", "demo_4"]).problems == []
+
+
+def test_demonstrations_that_are_left_out_do_not_count(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["data/demo_1/actions"][:, 1] = 7
+    found, rest = inspect(path), inspect(path, exclude=["demo_1"])
+    assert found.notes == ["control dimension 1: takes two values, 0.5 and 7"]
+    assert rest.notes == ["control dimension 1: constant (0.5): no part of the model, emitted as it is"]
+    assert list(rest.lengths) == ["demo_0", "demo_2", "demo_3", "demo_4"]
+    assert rest.masks == {"valid": (), "20_percent": ("demo_0",)}
 
 
 def test_a_place_that_holds_nothing_known_is_refused(tmp_path: Path) -> None:

@@ -90,6 +90,48 @@ def test_it_says_what_it_leaves_out(path: Path, tmp_path: Path) -> None:
     assert "# - camera   # an image" in text
 
 
+def broken(path: Path, number: int, names: list[str], key: str = "obs/pose", **masks: tuple[str, ...]) -> str:
+    """The spec for so many demonstrations, of which those named have a NaN."""
+    demonstrations(number, masks).write(path)
+    with h5py.File(path, "r+") as file:
+        for name in names:
+            file[f"data/{name}/{key}"][1, 1] = np.nan
+    return starting_spec(inspect(path), path)
+
+
+@pytest.mark.parametrize("key", ["obs/pose", "actions"])
+def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path, key: str) -> None:
+    """Two of ten, which are 20 %; what is said of the rest is said of eight."""
+    written = write(tmp_path, text := broken(path, 10, ["demo_2", "demo_9"], key))
+    spec = load_spec(written)
+    assert spec.demonstrations.exclude == ("demo_2", "demo_9")
+    assert [one.key for one in spec.observations] == ["pose"]
+    assert "# NaN, infinite or huge values; where: ddco-pyro inspect" in text
+    assert text.startswith("# A starting spec for 8 demonstrations of 3 to 6 steps.")
+    ended = call("fit", written, "--out", tmp_path / "run", "--set", "training.epochs=1")
+    assert ended.status == 0, ended.err
+    numbers = ddco_pyro.load(tmp_path / "run").metrics["demonstrations"]
+    assert sum(numbers[part] for part in ("train", "tune", "valid")) == 8
+
+
+def test_of_many_broken_demonstrations_the_key_is_left_out(path: Path) -> None:
+    text = broken(path, 9, ["demo_2", "demo_8"])
+    assert "exclude" not in text
+    assert "# - pose   # has 2 NaN and 0 infinite values" in text
+    assert "- camera" in text
+    assert "exclude" not in broken(path, 10, ["demo_2"], valid=("demo_2",))  # nothing would be held out
+    with pytest.raises(DemonstrationsError, match="actions has 1 NaN and 0 infinite values; repair them first"):
+        broken(path, 4, ["demo_1"], "actions")  # a quarter
+
+
+def test_a_control_that_never_changes_is_refused(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        for group in file["data"].values():
+            group["actions"][:] = 1.5
+    with pytest.raises(DemonstrationsError, match=r"actions: every dimension is constant \(1.5, 1.5\)"):
+        starting_spec(inspect(path), path)
+
+
 def test_masks_of_the_file_decide_what_is_held_out(path: Path, tmp_path: Path) -> None:
     assert load_spec(write(tmp_path, starting_spec(inspect(path), path))).demonstrations.valid_fraction == 0.25
     demonstrations(6, {"train": ("demo_0",), "valid": ("demo_1",), "better": ("demo_2",)}).write(path)

@@ -9,7 +9,8 @@ import pytest
 import toy_task
 
 from ddco_pyro.rollout import run_episode
-from ddco_pyro.task import ENTRY_POINTS, OutcomeError, UnknownTask, find_task
+from ddco_pyro.spec.types import TASKS
+from ddco_pyro.task import OutcomeError, UnknownTask, find_task
 
 not_a_task = "text"
 
@@ -27,7 +28,7 @@ def test_a_registered_task_is_found_by_its_name(monkeypatch):
             return toy_task.task
 
     def entry_points(group):
-        assert group == ENTRY_POINTS
+        assert group == TASKS
         return [Point]
 
     monkeypatch.setattr("ddco_pyro.task.entry_points", entry_points)

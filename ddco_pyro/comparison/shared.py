@@ -12,9 +12,6 @@ from ddco_pyro.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.run import Fit
 
-TOLERANCE = 1e-4
-"""Relative; a log-likelihood computed again on another machine differs in the last digits of float32."""
-
 
 class NotShared(BadInput):
     """Runs that were not held out on the same data; one line with the two runs and what is different."""
@@ -35,11 +32,12 @@ def held_out(fits: Sequence[Fit]) -> list[Held]:
     """Every run on the held-out demonstrations that all of them share.
 
     :raises NotShared: a run held nothing out, its demonstrations are no longer those it was fitted to, or the others
-        held out others.
+        held out others, or score other dimensions of the control.
     """
     own = [_own(fit) for fit in fits]
     for fit, demos in zip(fits[1:], own[1:], strict=True):
         _check_same(fits[0], own[0], fit, demos)
+        _check_dimensions(fits[0], fit)
     return [_held(fit, demos.select(own[0].names)) for fit, demos in zip(fits, own, strict=True)]
 
 
@@ -67,6 +65,19 @@ def _check_same(first: Fit, ours: Demonstrations, second: Fit, theirs: Demonstra
             raise NotShared(f"{lead}: {mine.name} has other {different}; fit both to the same demonstrations")
 
 
+def _check_dimensions(first: Fit, second: Fit) -> None:
+    """Both likelihoods are densities of the same control dimensions: constant ones are no part of a model."""
+    ours, theirs = (set(one.hierarchy.scaling.varying.tolist()) for one in (first, second))
+    if ours != theirs:
+        dimension = min(ours ^ theirs)
+        scored, left = (first, second) if dimension in ours else (second, first)
+        raise NotShared(
+            f"{first.folder} and {second.folder} score different things: control dimension {dimension} is in the "
+            f"likelihood of {scored.folder} and not in that of {left.folder}; fit both to the same demonstrations, "
+            "with the same version"
+        )
+
+
 def _different(mine: Demonstration, yours: Demonstration) -> str:
     """What two demonstrations differ in, among what both have; nothing where they are the same."""
     both = [key for key in mine.observations if key in yours.observations]
@@ -77,8 +88,7 @@ def _different(mine: Demonstration, yours: Demonstration) -> str:
 
 def _held(fit: Fit, demos: Demonstrations) -> Held:
     values = fit.log_likelihood(demos)
-    recorded = {one["name"]: one["log_likelihood"] for one in fit.metrics["valid"]}
     for name, value in zip(demos.names, values, strict=True):
-        if not np.isclose(recorded.get(name, np.nan), value, rtol=TOLERANCE, atol=TOLERANCE):
+        if not fit.was_held_out(name, float(value)):
             raise NotShared(f"{fit.folder}: {name} has changed since this run was fitted to it; fit it again")
     return Held(str(fit.folder), fit, demos.names, demos.lengths, values)

@@ -117,7 +117,8 @@ def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
     """What the runner has to know beside the weights."""
     encoder = hierarchy.encoder
     vectors = {one.key: one for one in encoder.specs}
-    scale, shift = hierarchy.scaling.scale.numpy(), hierarchy.scaling.shift.numpy()
+    scaling = hierarchy.scaling
+    scale, shift = scaling.scale.numpy(), scaling.shift.numpy()
     return {
         "observations": [
             {
@@ -129,6 +130,7 @@ def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
             for key, shape in [*((key, encoder.shapes[key]) for key in vectors), *encoder.images.items()]
         ],
         "levels": [level.count for level in hierarchy.option_levels()],
+        "varying": scaling.varying.tolist(),
         "scale": scale.tolist(),
         "shift": shift.tolist(),
         "control": control.control,

@@ -39,7 +39,7 @@ class StepProgram(nn.Module):
             if one.selection is not None:
                 found[f"selection_{level}"] = one.selection[0, 0]
             if one.mean is not None:
-                found[f"control_{level}"] = one.mean[0, 0].double() * scaling.scale + scaling.shift
+                found[f"control_{level}"] = scaling.emitted(one.mean[0, 0])
         for level, log in enumerate(said.termination):
             found[f"termination_{level}"] = log[0, 0, :, 1].double().exp()
         return found

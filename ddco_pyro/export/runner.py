@@ -115,9 +115,10 @@ class Runner:
     def _control(self, outputs: Outputs, generator: np.random.Generator) -> np.ndarray:
         """The mean of the lowest level whose choice is an option, else of the meta-policy, or a sample around it."""
         level, actor = next(((d, h - 1) for d, h in enumerate(self.choices) if h > 0), (len(self.choices), 0))
-        found: np.ndarray = outputs[f"control_{level}"][actor]
-        if self.about["control"] == "sample":
-            found = found + np.array(self.about["std"][level]) * generator.standard_normal(len(found))
+        found: np.ndarray = outputs[f"control_{level}"][actor].copy()
+        if self.about["control"] == "sample":  # dimensions that never varied in the demonstrations stay as they are
+            std, varying = np.array(self.about["std"][level]), self.about["varying"]
+            found[varying] += std * generator.standard_normal(len(varying))
         return found
 
 
@@ -156,7 +157,9 @@ class NumpyNetworks:
             if one["choices"]:
                 found[f"selection_{level}"] = _selection(logits, one)
             if mean.shape[1]:
-                found[f"control_{level}"] = mean.astype(np.float64) * weights["scale"] + weights["shift"]
+                varying = mean.astype(np.float64) * weights["scale"] + weights["shift"]
+                constant = np.tile(weights["constant"], (len(varying), 1))
+                found[f"control_{level}"] = np.concatenate([varying, constant], axis=1)[:, weights["order"]]
             if level < depth:
                 raw = self._network(self._about["terminations"][level], f"end_{level}", vector, step, images)[:, 0]
                 bound = np.float32(self._about["termination_bound"])
@@ -166,13 +169,11 @@ class NumpyNetworks:
     def _network(
         self, kind: Mapping[str, Any], name: str, vector: np.ndarray, step: int, images: Mapping[str, np.ndarray]
     ) -> np.ndarray:
-        """[K, outputs] of K networks."""
+        """[K, outputs] of K perceptrons, those of this step, over the vector and the convolutions of the images."""
         copies = kind["copies"]
-        values = np.broadcast_to(vector, (copies, 1, len(vector)))
-        if kind["network"] == "conv":
-            maps = [self._convolved(kind, f"{name}.{key}", images[key]) for key in kind["images"]]
-            values = np.concatenate([values, *(one[:, None] for one in maps)], axis=2)
-        first = min(step, kind["steps"] - 1) * copies if kind["network"] == "per_timestep" else 0
+        maps = [self._convolved(kind, f"{name}.image.{key}", images[key])[:, None] for key in kind["images"]]
+        values = np.concatenate([np.broadcast_to(vector, (copies, 1, len(vector))), *maps], axis=2)
+        first = min(step, kind["steps"] - 1) * copies
         for layer in range(kind["layers"]):
             weight, bias = self._weights[f"{name}.{layer}.weight"], self._weights[f"{name}.{layer}.bias"]
             values = values @ weight[first : first + copies] + bias[first : first + copies]
@@ -279,11 +280,13 @@ def replay(controller: Runner, episodes: Mapping[str, np.ndarray]) -> tuple[floa
 
 
 def _difference(about: Mapping[str, Any], name: str, value: np.ndarray, original: np.ndarray) -> float:
-    unit = np.ones(1)
     if name.startswith("selection"):
         value, original = np.exp(value), np.exp(original)
+    unit = np.ones(original.shape)
     if name.startswith("control"):
-        unit = np.maximum(np.maximum(1.0, about["scale"]), np.abs(original - np.array(about["shift"])))
+        varying = about["varying"]
+        distance = np.abs(original[..., varying] - np.array(about["shift"]))
+        unit[..., varying] = np.maximum(np.maximum(1.0, about["scale"]), distance)
     found = float((np.abs(value - original) / unit).max())
     return found if np.isfinite(found) else np.inf
 

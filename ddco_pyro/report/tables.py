@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ddco_pyro.colours import option_colour
+from ddco_pyro.convergence import effort
 from ddco_pyro.report.plot_likelihood import Likelihood
 from ddco_pyro.report.strips import choice_name
 from ddco_pyro.report.words import interval, measure, method, number, p_value, percent, rate, signed
@@ -64,9 +65,12 @@ def option_use(levels: Sequence[str], options: Sequence[Sequence[Mapping[str, An
 
 
 def likelihood(found: Sequence[Likelihood]) -> Table:
-    """Log-likelihood per step of each method and the differences with their standard errors."""
+    """Log-likelihood per step of each method, the differences with their standard errors, and what they took."""
     rows = []
     for one in found:
         difference = "" if one.difference is None else f"{signed(one.difference[0])} ± {number(one.difference[1])}"
-        rows.append([method(one.name), number(one.valid), number(one.train), difference])
-    return Table(["Method", "Held out", "Training", f"{method(found[0].name)} minus it, held out"], rows)
+        size = "–" if one.parameters is None else str(one.parameters)
+        likelihoods = [number(one.valid), number(one.train), difference]
+        rows.append([method(one.name), *likelihoods, size, effort(one.training)])
+    ours = f"{method(found[0].name)} minus it, held out"
+    return Table(["Method", "Held out", "Training", ours, "Parameters", "Gradient steps"], rows)

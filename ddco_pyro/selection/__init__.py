@@ -70,7 +70,7 @@ def check(spec: Spec, workers: Workers = HERE) -> list[Candidate]:
     found = grid.candidates(spec, dimensions(grid.wide(spec)))
     own = spec.demonstrations
     if own.path is None or not Path(own.path).exists():  # they will be collected
-        dividing.assign(own.count, spec.selection.folds, spec.seed)
+        dividing.assign(own.count - len(set(own.exclude)), spec.selection.folds, spec.seed)
     else:
         dividing.divide(demonstrations(grid.wide(spec)), spec.selection.folds, spec.seed)
     workers.check()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from ddco_pyro.data import Dimensions
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.files import write_text
+from ddco_pyro.records import Record, read_record
 
 
 class FoldError(BadInput):
@@ -23,21 +24,21 @@ class FoldError(BadInput):
 
 @dataclass(frozen=True)
 class Folds:
-    """Demonstrations ``demos`` and, for each fold, the names of those that are ``held_out``."""
+    """Demonstrations ``demos`` and, for each fold, the names of those that are ``held_out``.
+
+    :param dimensions: the dimensions of all the demonstrations, so that networks and what they score are the same in
+        every fold, and in the fit that follows.
+    """
 
     demos: Demonstrations
     held_out: tuple[tuple[str, ...], ...]
+    dimensions: Dimensions
 
     def split(self, fold: int) -> tuple[Demonstrations, Demonstrations]:
         """The demonstrations to train with in a fold, and those to score on."""
         out = set(self.held_out[fold])
         train = [name for name in self.demos.names if name not in out]
         return self.demos.select(train), self.demos.select(self.held_out[fold])
-
-    @property
-    def dimensions(self) -> Dimensions:
-        """The dimensions of all the demonstrations, so that networks are the same in every fold."""
-        return Dimensions.of(self.demos)
 
 
 def divide(demos: Demonstrations, folds: int, seed: int) -> Folds:
@@ -47,7 +48,8 @@ def divide(demos: Demonstrations, folds: int, seed: int) -> Folds:
     :raises FoldError: there are fewer demonstrations than folds, or too few to train and tune with.
     """
     used = demos.split(0.5, seed)[0] if demos.masks.keys() & {"train", "valid"} else demos
-    return Folds(used, tuple(tuple(used.names[row] for row in rows) for rows in assign(len(used), folds, seed)))
+    held_out = tuple(tuple(used.names[row] for row in rows) for rows in assign(len(used), folds, seed))
+    return Folds(used, held_out, replace(Dimensions.of(demos), steps=max(used.lengths)))
 
 
 def assign(count: int, folds: int, seed: int) -> list[list[int]]:
@@ -66,13 +68,20 @@ def assign(count: int, folds: int, seed: int) -> list[list[int]]:
 def keep(folds: Folds, path: Path) -> None:
     """Write the folds, or see that those already there are the same.
 
+    :raises Damaged: they cannot be read.
     :raises FoldError: they are of other demonstrations.
     """
     text = json.dumps({"demonstrations": digest(folds.demos), "folds": folds.held_out}, indent=1) + "\n"
-    if path.exists() and path.read_text() != text:
+    if path.exists() and path.read_bytes() != text.encode():
+        read_record(path, _Kept, "remove it and do the same again")
         raise FoldError(f"{path}: the demonstrations have changed since; choose another --out")
     if not path.exists():
         write_text(path, text)
+
+
+class _Kept(Record):
+    demonstrations: str
+    folds: list[list[str]]
 
 
 def digest(demos: Demonstrations, observations: Sequence[str] | None = None) -> str:

@@ -1,0 +1,53 @@
+"""The section on control dimensions: what each does in the demonstrations, and what it adds to the log-likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ddco_pyro.control_dimensions import ControlDimension
+from ddco_pyro.report.tables import Table
+from ddco_pyro.report.words import method, number
+
+
+@dataclass(frozen=True)
+class Dimensions:
+    """What each control dimension and choosing options add to the log-likelihood per step of each method.
+
+    :param part: of which demonstrations: ``held-out`` or ``training``.
+    """
+
+    table: Table
+    part: str
+
+
+def section(metrics: Mapping[str, Any], baselines: Mapping[str, Mapping[str, Any]]) -> Dimensions | None:
+    """The section of a run, from its ``metrics.json`` and its baselines'; None for runs of before."""
+    by_method = {metrics["model"]: metrics, **baselines}
+    known = {name: one["log_likelihood_by_dimension"] for name, one in by_method.items() if _KEY in one}
+    if metrics["model"] not in known:
+        return None
+    part = "valid" if known[metrics["model"]]["valid"] else "train"
+    values = {name: one[part] for name, one in known.items()}
+    control = [ControlDimension(**one) for one in metrics["control_dimensions"]]
+    return Dimensions(_table(control, values), "held-out" if part == "valid" else "training")
+
+
+_KEY = "log_likelihood_by_dimension"
+
+
+def _table(control: Sequence[ControlDimension], values: Mapping[str, Mapping[str, Any]]) -> Table:
+    rows = [
+        [str(one.number), *(number(value["by_dimension"][one.number]) for value in values.values()), one.note]
+        for one in control
+    ]
+    totals = [sum(filter(None, value["by_dimension"])) + value["options"] for value in values.values()]
+    return Table(
+        ["Control dimension", *map(method, values), "In the demonstrations"],
+        [
+            *rows,
+            ["options", *(number(value["options"]) for value in values.values()), ""],
+            ["sum", *map(number, totals), ""],
+        ],
+    )

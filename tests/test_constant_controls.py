@@ -1,0 +1,274 @@
+"""Control dimensions that never change: no part of the model, emitted exactly, and said everywhere.
+
+The truth is a second file without those columns: fitted to it, the same numbers have to come out.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+from test_cli import call
+
+import ddco_pyro
+from ddco_pyro.comparison import compare
+from ddco_pyro.comparison.shared import NotShared
+from ddco_pyro.controller import Controller
+from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.export import TOLERANCE, export, runner
+from ddco_pyro.lockstep import Actors
+from ddco_pyro.run import Fit, fit
+from ddco_pyro.selection import folds as dividing
+from ddco_pyro.selection.scoring import Unwatched
+from ddco_pyro.spec import RolloutSpec, Spec, parse_spec, with_overrides
+
+STILL = {1: 0.1, 3: -7.0}
+"""Dimension to value; 0.1 is no float32."""
+
+FREE = [0, 2]
+
+
+def controls(random: np.random.Generator, steps: int) -> np.ndarray:
+    """[T, 4]: a free dimension, a constant one, a switch, another constant one."""
+    found = random.normal(3.0, 2.0, (steps, 4))
+    found[:, 2] = np.where(random.random(steps) < 0.4, 1.0, -1.0)
+    for dimension, value in STILL.items():
+        found[:, dimension] = value
+    return found
+
+
+def make_demonstrations(number: int = 8) -> Demonstrations:
+    random = np.random.default_rng(0)
+    records = [
+        Demonstration(f"demo_{n}", {"pose": random.normal(size=(9, 3))}, controls(random, 9)) for n in range(number)
+    ]
+    return Demonstrations(tuple(records), {"valid": (f"demo_{number - 1}", f"demo_{number - 2}")})
+
+
+def with_controls(demos: Demonstrations, change: dict[str, np.ndarray] | None = None, columns=slice(None)):
+    """The same demonstrations with other controls, or with some columns of them."""
+    records = [Demonstration(d.name, d.observations, (change or {}).get(d.name, d.actions)[:, columns]) for d in demos]
+    return Demonstrations(tuple(records), demos.masks)
+
+
+def spec_for(path: Path, **changes: object) -> Spec:
+    return parse_spec(
+        {
+            "demonstrations": {"path": str(path)},
+            "observations": ["pose"],
+            "control": {"std": {"learn": True}},
+            "hierarchy": {
+                "levels": [{"name": "option", "count": 2, "policy": {"hidden": [4]}}],
+                "meta_policy": {"hidden": [4], "emits": ["options", "control"]},
+            },
+            "training": {"initialize": "vq_controls", "epochs": 3, "batch_size": 2},
+            "compare_with": ["flat"],
+            **changes,
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("constant")
+
+
+@pytest.fixture(scope="module")
+def whole(folder: Path) -> Fit:
+    """Fitted to all four dimensions."""
+    make_demonstrations().write(folder / "whole.hdf5")
+    return fit(spec_for(folder / "whole.hdf5"), folder / "whole", Unwatched())
+
+
+@pytest.fixture(scope="module")
+def reduced(folder: Path) -> Fit:
+    """Fitted to those that vary."""
+    with_controls(make_demonstrations(), columns=FREE).write(folder / "reduced.hdf5")
+    return fit(spec_for(folder / "reduced.hdf5"), folder / "reduced", Unwatched())
+
+
+# --- the likelihood ---------------------------------------------------------------------------------------------------
+
+
+def test_they_are_no_part_of_the_likelihood(whole: Fit, reduced: Fit) -> None:
+    for ours, theirs in ((whole, reduced), (whole.baselines["flat"], reduced.baselines["flat"])):
+        for part in ("log_likelihood_per_step", "valid", "parameters"):
+            assert ours.metrics[part] == theirs.metrics[part]
+    assert whole.metrics["divergences"] == reduced.metrics["divergences"]
+    assert whole.metrics["comparison"]["flat"]["difference"] == reduced.metrics["comparison"]["flat"]["difference"]
+    assert whole.hierarchy.scaling.varying.tolist() == FREE
+
+
+def test_each_dimension_has_its_part_of_it(whole: Fit, reduced: Fit) -> None:
+    for ours, theirs in ((whole, reduced), (whole.baselines["flat"], reduced.baselines["flat"])):
+        for part in ("train", "valid"):
+            found = ours.metrics["log_likelihood_by_dimension"][part]
+            assert [found["by_dimension"][d] for d in STILL] == [None, None]
+            own = [found["by_dimension"][d] for d in FREE]
+            assert own == theirs.metrics["log_likelihood_by_dimension"][part]["by_dimension"]
+            total = sum(own) + found["options"]
+            assert total == pytest.approx(ours.metrics["log_likelihood_per_step"][part], rel=1e-6)
+    assert whole.metrics["log_likelihood_by_dimension"]["train"]["options"] < 0
+    assert whole.baselines["flat"].metrics["log_likelihood_by_dimension"]["train"]["options"] == 0
+
+
+def test_what_they_are_comes_back_from_the_run(whole: Fit) -> None:
+    again = ddco_pyro.load(whole.folder)
+    demos = make_demonstrations()
+    np.testing.assert_array_equal(again.log_likelihood(demos), whole.log_likelihood(demos))
+    assert dict(zip((1, 3), again.hierarchy.scaling.constant.tolist(), strict=True)) == STILL
+
+
+def test_runs_of_before_have_every_dimension_in_them(reduced: Fit, tmp_path: Path) -> None:
+    """Their weights do not say which dimensions vary."""
+    run = shutil.copytree(reduced.folder, tmp_path / "run")
+    with safe_open(run / "model.safetensors", "pt") as file:
+        names = set(file.keys()) - {"scaling.varying", "scaling.constant"}
+        assert len(names) == len(file.keys()) - 2
+        tensors, metadata = {name: file.get_tensor(name) for name in names}, file.metadata()
+    save_file(tensors, run / "model.safetensors", metadata)
+    again, demos = ddco_pyro.load(run), with_controls(make_demonstrations(), columns=FREE)
+    np.testing.assert_array_equal(again.log_likelihood(demos), reduced.log_likelihood(demos))
+    metrics = json.loads((run / "metrics.json").read_text())
+    del metrics["log_likelihood_by_dimension"], metrics["control_dimensions"]
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    assert call("report", run).status == 0
+    assert "by control dimension" not in (run / "report.html").read_text()
+
+
+# --- what acts --------------------------------------------------------------------------------------------------------
+
+
+def observations(number: int = 6) -> list[dict[str, np.ndarray]]:
+    random = np.random.default_rng(5)
+    return [{"pose": random.normal(size=3)} for _ in range(number)]
+
+
+def check_control(found: np.ndarray, expected: np.ndarray) -> None:
+    """The constants exactly, the rest as the model of the rest has it."""
+    assert found.shape == (4,)
+    assert {d: found[d] for d in STILL} == STILL
+    np.testing.assert_array_equal(found[FREE], expected)
+
+
+@pytest.mark.parametrize("control", ["mean", "sample"])
+def test_the_controller_emits_them(whole: Fit, reduced: Fit, control: str) -> None:
+    acting, expected = (Controller(one.hierarchy, control, seed=3) for one in (whole, reduced))
+    for observation in observations():
+        check_control(acting.act(observation), expected.act(observation))
+
+
+@pytest.mark.parametrize("control", ["mean", "sample"])
+def test_many_at_once_emit_them(whole: Fit, reduced: Fit, control: str) -> None:
+    controls = []
+    for one in (whole, reduced):
+        torch.manual_seed(0)
+        actors = Actors(one.hierarchy, RolloutSpec(control=control), 6)
+        with torch.no_grad():
+            controls.append(actors.act(observations()))
+    for found, expected in zip(*controls, strict=True):
+        check_control(found, expected)
+
+
+@pytest.mark.parametrize("control", ["mean", "sample"])
+def test_exported_controllers_emit_them(whole: Fit, tmp_path: Path, control: str) -> None:
+    changed = Fit(whole.folder, with_overrides(whole.spec, {"rollout.control": control}), whole.hierarchy)
+    differences = export(changed, tmp_path, onnx=True)
+    assert set(differences) == {"numpy", "onnx"}
+    assert all(difference < TOLERANCE for difference, _ in differences.values())
+    for form in differences:
+        exported, original = runner.Runner(tmp_path, form), changed.controller()
+        for observation in observations():
+            found, expected = exported.act(observation), original.act(observation)
+            assert {d: found[d] for d in STILL} == STILL
+            np.testing.assert_allclose(found, expected, atol=1e-5)
+    program = torch.export.load(tmp_path / "controller.pt2").module()
+    outputs = program(torch.zeros(3, dtype=torch.float64), torch.zeros(1, dtype=torch.int64))
+    (means,) = [one for one in outputs if one.shape == (2, 4)]
+    assert {d: means[:, d].tolist() for d in STILL} == {d: [value] * 2 for d, value in STILL.items()}
+
+
+def test_the_monitor_takes_whole_controls(whole: Fit, reduced: Fit) -> None:
+    monitors, control = (whole.monitor(), reduced.monitor()), None
+    for observation in observations():
+        beliefs = [
+            monitor.step(observation, None if control is None else control[columns])
+            for monitor, columns in zip(monitors, (slice(None), FREE), strict=True)
+        ]
+        torch.testing.assert_close(*(one.levels for one in beliefs), rtol=0, atol=0)
+        control = controls(np.random.default_rng(1), 1)[0]
+    assert monitors[0].log_likelihood == monitors[1].log_likelihood != 0
+
+
+# --- which are constant -----------------------------------------------------------------------------------------------
+
+
+def test_what_changes_in_held_out_demonstrations_alone_stays_in(folder: Path, tmp_path: Path) -> None:
+    demos = make_demonstrations()
+    changed = demos.select(["demo_7"])[0].actions.copy()
+    changed[4, 3] = 0.0
+    path = tmp_path / "demos.hdf5"
+    with_controls(demos, {"demo_7": changed}).write(path)
+    found = fit(spec_for(path, compare_with=[]), tmp_path / "run", Unwatched())
+    assert found.hierarchy.scaling.varying.tolist() == [0, 2, 3]
+    held_out = found.metrics["log_likelihood_by_dimension"]["valid"]["by_dimension"]
+    assert np.isfinite(held_out[3])
+    assert call("segment", tmp_path / "run", path, "--csv", tmp_path / "a.csv").status == 0
+
+
+def test_folds_decide_it_once_for_all(tmp_path: Path) -> None:
+    """By all demonstrations, be they in one fold alone or set apart by the file."""
+    demos = make_demonstrations()
+    assert dividing.divide(demos, 3, 0).dimensions.constant == STILL
+    for name in ("demo_0", "demo_7"):
+        changed = demos.select([name])[0].actions.copy()
+        changed[4, 3] = 0.0
+        assert dividing.divide(with_controls(demos, {name: changed}), 3, 0).dimensions.constant == {1: 0.1}
+
+
+def test_runs_that_score_other_dimensions_are_not_compared(whole: Fit, tmp_path: Path) -> None:
+    demos = make_demonstrations()
+    changed = demos[2].actions.copy()
+    changed[:, 3] += np.arange(9)
+    path = tmp_path / "demos.hdf5"
+    with_controls(demos, {"demo_2": changed}).write(path)
+    runs = [
+        fit(spec_for(path, compare_with=[], demonstrations=own | {"path": str(path)}), tmp_path / name, Unwatched())
+        for name, own in (("all", {}), ("without", {"exclude": ["demo_2"]}))
+    ]
+    message = (
+        rf"{runs[0].folder} and {runs[1].folder} score different things: control dimension 3 is in the likelihood of "
+        rf"{runs[0].folder} and not in that of {runs[1].folder}; fit both to the same demonstrations, with the same ver"
+    )
+    with pytest.raises(NotShared, match=message):
+        compare([one.folder for one in runs])
+    assert len(compare([whole.folder, whole.folder / "baselines" / "flat"]).rows) == 2
+
+
+# --- what is said -----------------------------------------------------------------------------------------------------
+
+
+def test_every_command_says_the_same(whole: Fit, folder: Path, tmp_path: Path) -> None:
+    demos, spec = folder / "whole.hdf5", tmp_path / "spec.yaml"
+    notes = {
+        1: "constant (0.1): no part of the model, emitted as it is",
+        2: "takes two values, -1 and 1",
+        3: "constant (-7): no part of the model, emitted as it is",
+    }
+    lines = [f"control dimension {number}: {note}" for number, note in notes.items()]
+    assert call("init", demos, "--out", spec).status == 0
+    written = [line.strip("# ") for line in spec.read_text().splitlines() if "control dimension" in line]
+    assert written == lines
+    for command in (["inspect", demos], ["check", spec]):
+        said = [line for line in call(*command).out.splitlines() if line.startswith("control dimension")]
+        assert said == lines
+    assert call("report", whole.folder).status == 0
+    page = (whole.folder / "report.html").read_text()
+    assert all(note in page for note in notes.values())
+    assert "by control dimension" in page

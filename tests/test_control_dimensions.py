@@ -1,0 +1,54 @@
+"""What is said of each control dimension, against counts by hand, whatever the blocks it is read in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ddco_pyro.control_dimensions import control_dimensions, notes
+
+STEPS = 200
+
+
+def controls() -> np.ndarray:
+    """Free; constant; a switch; at its maximum in 3 of 200 steps; in 2, which is 1 %; at both ends, in halves."""
+    random = np.random.default_rng(0)
+    found = random.uniform(-0.9, 0.9, (STEPS, 6))
+    found[:, 1] = 0.3
+    found[:, 2] = np.where(np.arange(STEPS) < 50, -0.0, 1.0)
+    found[[3, 100, 199], 3] = 1.0
+    found[[3, 199], 4] = 1.0
+    found[:60, 5], found[150:, 5] = -2.0, 7.25
+    return found
+
+
+@pytest.mark.parametrize("cuts", [[], [1, 2, 3], [60, 150], list(range(1, STEPS))])
+def test_each_dimension_is_described(cuts: list[int]) -> None:
+    free, still, switch, seldom, twice, both = control_dimensions(np.split(controls(), cuts))
+    assert (free.constant, free.values, free.extremes, free.note) == (False, (), (), "")
+    assert (still.constant, still.values) == (True, (0.3,))
+    assert (switch.constant, switch.values, switch.extremes) == (False, (0.0, 1.0), ())
+    assert (switch.at_minimum, switch.at_maximum, switch.steps) == (50, 150, STEPS)
+    assert seldom.extremes == (("maximum", 1.0, 0.015),)
+    assert twice.extremes == ()
+    assert both.extremes == (("minimum", -2.0, 0.3), ("maximum", 7.25, 0.25))
+    assert notes([free, still, switch, seldom, twice, both]) == [
+        "control dimension 1: constant (0.3): no part of the model, emitted as it is",
+        "control dimension 2: takes two values, 0 and 1",
+        "control dimension 3: exactly at its maximum 1 in 1.5 % of the steps",
+        "control dimension 5: exactly at its minimum -2 in 30.0 % of the steps, at its maximum 7.25 in 25.0 % of the "
+        "steps",
+    ]
+
+
+def test_a_short_file_does_not_sit_on_its_extremes() -> None:
+    """In 20 steps a value that is taken once is taken in 5 % of them."""
+    assert notes(control_dimensions([np.arange(20.0)[:, None]])) == []
+
+
+def test_values_that_are_not_finite_do_not_count() -> None:
+    column = np.array([np.nan, 2.0, np.inf, 2.0, -np.inf])
+    for blocks in ([column[:, None]], np.split(column[:, None], 5)):
+        (found,) = control_dimensions(blocks)
+        assert (found.values, found.steps) == ((2.0,), 2)
+    assert control_dimensions([np.full((3, 1), np.nan)]) == ()

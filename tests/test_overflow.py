@@ -1,0 +1,151 @@
+"""Numbers that overflow: refused in a line that names demonstration, key and step, never a likelihood that is none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from test_cli import call
+
+from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.metrics import NotFinite, evaluate
+from ddco_pyro.networks import Inputs, InputShape
+from ddco_pyro.run import Fit, TrainingError, fit
+from ddco_pyro.selection.scoring import Unwatched
+from ddco_pyro.spec import parse_spec
+
+SPEC = """
+demonstrations: {{path: {path}}}
+observations: [{{key: pose, differences: true, standardize: {standardize}}}]
+control: {{std: {{learn: true}}, scale: {scale}}}
+hierarchy:
+  levels: [{{name: option, count: 2, policy: {{network: linear}}, termination: {{network: linear}}}}]
+  meta_policy: {{network: linear}}
+training: {{initialize: vq_controls, epochs: 1}}
+compare_with: [{{kind: flat, policy: {{network: linear}}}}]
+"""
+
+
+def spec_with(folder: Path, place: str, value: float, scaled: bool = True) -> Path:
+    """The spec for demonstrations with one number replaced: ``data/demo_N/KEY`` at step 5, second dimension."""
+    random, path = np.random.default_rng(0), folder / "demos.hdf5"
+    with h5py.File(path, "w") as file:
+        for number in range(8):
+            file[f"data/demo_{number}/obs/pose"] = random.normal(size=(12, 3))
+            file[f"data/demo_{number}/actions"] = random.normal(size=(12, 2))
+        file["mask/valid"] = [b"demo_6", b"demo_7"]
+        file[place][5, 1] = value
+    spec = folder / "spec.yaml"
+    choices = {"standardize": "true", "scale": "standardize"} if scaled else {"standardize": "false", "scale": "none"}
+    spec.write_text(SPEC.format(path=path, **choices))
+    return spec
+
+
+@pytest.mark.parametrize("key", ["actions", "obs/pose"])
+@pytest.mark.parametrize("name", ["demo_1", "demo_6"])
+@pytest.mark.parametrize("value", [1e300, -1e160, 2e30])
+def test_numbers_that_nothing_can_hold(tmp_path: Path, name: str, key: str, value: float) -> None:
+    """Trained with or held out; their variance is infinite, or float32 cannot hold them."""
+    spec = spec_with(tmp_path, f"data/{name}/{key}", value)
+    for command in (["check", spec], ["fit", spec, "--out", tmp_path / "run"]):
+        ended = call(*command)
+        assert (ended.status, ended.out) == (2, "")
+        assert ended.err == (
+            f"ddco-pyro: {tmp_path / 'demos.hdf5'}: {name}: {key} is {value:g} at step 5, index [1], and at most 1e+30 "
+            f"can be used; repair it, or leave {name} out (demonstrations.exclude)\n"
+        )
+    assert not (tmp_path / "run").exists()
+    assert "beyond ±1e+30, the first in" in call("inspect", tmp_path / "demos.hdf5").out
+
+
+@pytest.mark.parametrize("key", ["actions", "obs/pose"])
+@pytest.mark.parametrize(("name", "scaled"), [("demo_1", False), ("demo_6", True), ("demo_6", False)])
+@pytest.mark.parametrize("value", [1e25, -1e15])
+def test_numbers_whose_squares_networks_cannot_hold(
+    tmp_path: Path, name: str, key: str, scaled: bool, value: float
+) -> None:
+    """What is standardised with them is small in training: there it is held out that they are too large."""
+    ended = call("fit", spec_with(tmp_path, f"data/{name}/{key}", value, scaled), "--out", tmp_path / "run")
+    assert ended.status == 2
+    assert ended.err.startswith(f"ddco-pyro: {name}: {key} at step 5 is 1")
+    assert ended.err.endswith(
+        f"once it is scaled, and networks take at most 1e+12; repair it, or leave {name} out (demonstrations.exclude)\n"
+    )
+    assert not list(tmp_path.glob("run/*.safetensors"))
+    assert "training" not in ended.err  # it was said before
+
+
+@pytest.mark.parametrize("key", ["actions", "obs/pose"])
+def test_what_can_be_held_has_a_likelihood(tmp_path: Path, key: str) -> None:
+    """Held out, just within the limit; every number of the result is one."""
+    ended = call("fit", spec_with(tmp_path, f"data/demo_6/{key}", 9e11, scaled=False), "--out", tmp_path / "run")
+    assert ended.status == 0, ended.err
+    rows = [line.split("│") for line in ended.out.splitlines() if "│" in line]
+    assert all(np.isfinite(float(cell)) for row in rows for cell in row[1:3])
+    assert "nan" not in ended.out
+
+
+def test_a_fold_says_it_too(tmp_path: Path) -> None:
+    spec = spec_with(tmp_path, "data/demo_1/actions", 1e15)
+    grid = "selection={folds: 2, grid: {hierarchy.levels.0.count: [1, 2]}}"
+    ended = call("select", spec, "--out", tmp_path / "select", "--jobs", "1", "--set", grid)
+    assert ended.status == 1
+    assert "unexpected" not in ended.err
+    assert "demo_1: actions at step 5 is 1" in ended.err.splitlines()[-1]
+
+
+# --- what no bound on numbers can know --------------------------------------------------------------------------------
+
+
+class Undefined(torch.nn.Module):
+    """A network that gives NaN."""
+
+    def __init__(self, shape: InputShape, outputs: int, copies: int) -> None:
+        super().__init__()
+        self.size = (copies, outputs)
+        self.weight = torch.nn.Parameter(torch.zeros(1))
+
+    def forward(self, inputs: Inputs) -> torch.Tensor:
+        return torch.full((*inputs.batch, *self.size), torch.nan) * self.weight
+
+
+def demonstrations_for(path: Path) -> Demonstrations:
+    random = np.random.default_rng(0)
+    records = [
+        Demonstration(f"demo_{n}", {"pose": random.normal(size=(5, 2))}, random.normal(size=(5, 2))) for n in range(5)
+    ]
+    found = Demonstrations(tuple(records))
+    found.write(path)
+    return found
+
+
+def spec_of(path: Path, network: str):
+    policy = {"network": network}
+    return parse_spec(
+        {
+            "demonstrations": {"path": str(path), "valid_fraction": 0.4},
+            "observations": ["pose"],
+            "hierarchy": {"levels": [{"count": 2, "policy": policy}], "meta_policy": {"network": "linear"}},
+            "training": {"epochs": 1},
+        }
+    )
+
+
+def test_networks_that_give_no_numbers_are_named_before_training(tmp_path: Path) -> None:
+    demonstrations_for(tmp_path / "demos.hdf5")
+    with pytest.raises(TrainingError, match="before any training a network gives values that are NaN or infinite; loo"):
+        fit(spec_of(tmp_path / "demos.hdf5", "test_overflow:Undefined"), tmp_path / "run", Unwatched())
+
+
+def test_a_likelihood_that_is_none_is_not_reported(tmp_path: Path) -> None:
+    demos = demonstrations_for(tmp_path / "demos.hdf5")
+    found: Fit = fit(spec_of(tmp_path / "demos.hdf5", "linear"), tmp_path / "run", Unwatched())
+    with torch.no_grad():
+        next(found.hierarchy.levels[0].policy.parameters())[:] = torch.inf
+    with pytest.raises(
+        NotFinite, match=r"run: the log-likelihood of demo_0 under the fitted model is (nan|-inf); look"
+    ):
+        evaluate(found, {"train": demos}, demos)
