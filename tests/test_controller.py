@@ -173,26 +173,6 @@ def test_the_lowest_option_acts(top, middle, choices, control):
     assert controller.choices == choices
 
 
-@pytest.mark.parametrize("network", ["mlp", "per_timestep"])
-@pytest.mark.parametrize("differences", [False, True])
-def test_the_control_is_the_active_options_mean_in_the_controls_own_units(network, differences):
-    """Step by step against the whole demonstration at once; differences are those to the observation before."""
-    hierarchy = make(network=network, observation={"key": "state", "differences": differences})
-    random = np.random.default_rng(0)
-    demos = demonstrations(random.normal(5, 2, (2, 4, 3)), random.normal(40, 9, (2, 4, 2)))
-    hierarchy.encoder.fit(demos)
-    hierarchy.scaling.fit(demos)
-    with torch.no_grad():
-        outputs = hierarchy(encode(demos, hierarchy.encoder, hierarchy.scaling).inputs)
-    means = hierarchy.scaling.unscaled(outputs.decisions[0].mean)
-    controller = Controller(hierarchy)
-    for n, demo in enumerate(demos):
-        controller.reset(n)
-        for t in range(len(demo)):
-            control = controller.act({"state": demo.observations["state"][t]})
-            np.testing.assert_allclose(control, means[n, t, controller.choices[0] - 1], rtol=1e-5)
-
-
 def test_a_sample_has_the_models_deviation():
     hierarchy = by_hand([[1.0, -1.0]], [SELDOM], [0])
     hierarchy.scaling.scale.copy_(torch.tensor([10.0, 0.1]))
