@@ -43,7 +43,7 @@ def whole(arguments: Sequence[object], folder: Path, cache: Path) -> float:
 
 STRIKES_ITSELF = """
 import os, signal
-from ddco_pyro.cli import app as cli, console
+from ddco_pyro.cli.app import app as cli, console
 
 left, go_on = {after}, console.{watcher}
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from ddco_pyro.controller import Controller
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.encoding import encode
-from ddco_pyro.hierarchy import Hierarchy
-from ddco_pyro.observing import Window
+from ddco_pyro.acting.controller import Controller
+from ddco_pyro.acting.window import Window
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import parse_spec
 
 LONGEST = 6  # steps that networks for each step of time are made for

@@ -11,8 +11,8 @@ import torch
 from scipy import stats
 from test_run import Silent
 
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.run import fit
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.fitting.run import fit
 from ddco_pyro.spec import parse_spec
 
 STD = 0.4  # of the control, in units of its spread

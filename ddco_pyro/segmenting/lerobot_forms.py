@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 import pyarrow
 
-from ddco_pyro.sources.lerobot import SUBTASK
+from ddco_pyro.data.sources.lerobot import SUBTASK
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
 
