@@ -76,20 +76,24 @@ def run(spec, tmp_path_factory):
 
 
 def test_check_shows_defaults_shapes_and_parameters(spec):
-    ended = call("check", spec, "--set", "hierarchy.levels.0.count=3")
+    changes = ["hierarchy.levels.0.count=3", "compare_with=[flat]"]
+    ended = call("check", spec, *with_set(*changes))
     assert (ended.status, ended.err) == (0, "")
-    resolved = load_spec(spec, ["hierarchy.levels.0.count=3"])
+    resolved = load_spec(spec, changes)
     assert ended.out.startswith(dump_spec(resolved))
     assert "patience: 20" in ended.out
     table = [[cell.strip() for cell in line.split("│")] for line in ended.out.splitlines() if "│" in line]
+    sizes = (3 * (5 * 8 + 8 + 8 * 2 + 2), 3 * (5 + 1), 5 * 8 + 8 + 8 * 3 + 3)
     assert table == [
         ["observation offsets", "[4]"],
         ["observation visited", "[1]"],
         ["features", "5"],
         ["control", "[2]"],
-        ["hierarchy.levels.0.policy", str(3 * (5 * 8 + 8 + 8 * 2 + 2))],
-        ["hierarchy.levels.0.termination", str(3 * (5 + 1))],
-        ["hierarchy.meta_policy", str(5 * 8 + 8 + 8 * 3 + 3)],
+        ["hierarchy.levels.0.policy", str(sizes[0])],
+        ["hierarchy.levels.0.termination", str(sizes[1])],
+        ["hierarchy.meta_policy", str(sizes[2])],
+        ["all networks", str(sum(sizes))],
+        ["compare_with.0: flat, hidden: [64]", str(5 * 64 + 64 + 64 * 2 + 2)],
     ]
 
 

@@ -351,7 +351,10 @@ def specs(draw: st.DrawFn) -> dict[str, Any]:
         {"kind": st.just("flat"), "policy": networks}
     )
     equal = st.just("flat_equal") | st.fixed_dictionaries(
-        {"kind": st.just("flat_equal"), "policy": st.fixed_dictionaries({"hidden": st.lists(counts, min_size=1)})}
+        {
+            "kind": st.just("flat_equal"),
+            "policy": st.fixed_dictionaries({"hidden": st.lists(counts, min_size=1, max_size=3)}),
+        }
     )
     observation = texts | st.fixed_dictionaries({"key": texts}, optional={"differences": st.booleans()})
     names = st.lists(observation, min_size=1, max_size=3, unique_by=lambda o: o if isinstance(o, str) else o["key"])
