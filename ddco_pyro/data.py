@@ -12,9 +12,10 @@ import torch
 from ddco_pyro.collect import OnDemonstration, collect
 from ddco_pyro.control_dimensions import ControlDimension, all_constant, control_dimensions
 from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError, extent
-from ddco_pyro.encoding import Shapes
+from ddco_pyro.encoding import STEPS_AT_ONCE, Shapes
 from ddco_pyro.hierarchy import Hierarchy
-from ddco_pyro.memory import refuse_too_much
+from ddco_pyro.initialize import POOLED
+from ddco_pyro.memory import Extent, Work, refuse_too_much
 from ddco_pyro.networks import ShapeError
 from ddco_pyro.spec import BaselineSpec, Spec, SpecError, own_networks
 from ddco_pyro.task import find_task
@@ -166,7 +167,35 @@ def demonstrations(spec: Spec, on_demonstration: OnDemonstration | None = None) 
 
 
 def _refuse_what_is_larger_than_memory(spec: Spec, path: Path) -> None:
+    remedy = (
+        "leave observations out, make its demonstrations fewer, shorter or equally long, scale pictures down, or lower "
+        "filters or hidden"
+    )
+    what = f"{path}: a fit to {', '.join(one.key for one in spec.observations)}"
+    refuse_too_much(memory_needed(spec, path), what, remedy)
+
+
+def memory_needed(spec: Spec, path: Path) -> float:
+    """Bytes that a fit of the spec and its baselines to a file of demonstrations takes, about, by the file's headers.
+
+    :raises DemonstrationsError: the file cannot be read or does not hold what the spec names.
+    """
     found = extent(path, [one.key for one in spec.observations], spec.demonstrations.exclude)
-    needed = found.fit({f"obs/{one.key}" for one in spec.observations if one.differences})
-    remedy = "leave observations out, make its demonstrations fewer or equally long, or scale pictures down"
-    refuse_too_much(needed, f"{path}: a fit to {', '.join(one.key for one in spec.observations)}", remedy)
+    models = [spec, *(baseline_spec(spec, baseline) for baseline in spec.compare_with)]
+    works = [_work(model, found) for model in models]
+    return found.fit(works, {f"obs/{one.key}" for one in spec.observations if one.differences})
+
+
+def _work(spec: Spec, extent: Extent) -> Work:
+    """What training the spec's model takes; what networks take is left out where they cannot be made."""
+    shapes = {place.removeprefix("obs/"): shape for place, shape in extent.shapes.items() if place != "actions"}
+    control = math.prod(extent.shapes["actions"])
+    try:
+        with torch.random.fork_rng(devices=[]):
+            hierarchy = build_hierarchy(spec, Dimensions(shapes, control, max(extent.lengths)))
+    except SpecError:  # it is said better where networks are checked
+        return Work(spec.training.batch_size, STEPS_AT_ONCE, 0, 0)
+    features = len(hierarchy.encoder.mean) + sum(shape[-1] * POOLED**2 for shape in hierarchy.encoder.images.values())
+    kind = spec.training.initialize if hierarchy.depth else "random"
+    clustered = {"random": 0, "vq": features, "vq_controls": features + control}[kind]
+    return Work(spec.training.batch_size, hierarchy.steps_at_once, hierarchy.step_bytes, clustered)

@@ -9,13 +9,10 @@ import numpy as np
 import torch
 
 from ddco_pyro.demonstrations import Demonstrations
-from ddco_pyro.encoding import STEPS_AT_ONCE, encode
+from ddco_pyro.encoding import encode
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference import posterior, segment
 from ddco_pyro.run import Fit
-
-CHUNK = STEPS_AT_ONCE
-"""Steps that are looked at together."""
 
 MOST_BINS = 60
 
@@ -52,7 +49,7 @@ def activity(fit: Fit, demos: Demonstrations) -> Activity:
     """Posteriors, most likely paths and terminations of a fit with at least one level."""
     assert fit.spec.hierarchy is not None  # a baseline has no levels
     specs, steps = fit.spec.hierarchy.levels, max(demos.lengths)
-    size = max(1, CHUNK // steps)
+    size = max(1, fit.hierarchy.steps_at_once // steps)
     parts = [_chunk(fit.hierarchy, part, steps) for part in _chunks(demos, size)]
     levels = []
     for number, level in enumerate(specs):
