@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from provenance import Record, record, sentence, text
 
 from ddco_pyro.analysis import paired
-from ddco_pyro.data import baseline_spec, demonstrations
+from ddco_pyro.data import Dimensions, baseline_spec, demonstrations
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.files import write_text
 from ddco_pyro.report.pictures import blank, keep, style
@@ -33,17 +34,23 @@ OUT = Path("docs/results")
 RUNS = Path("runs/learning_curve")
 RATE = 0.5  # of dropout, as in SM 2.5
 DROPOUT = {f"hierarchy.{place}.dropout": RATE for place in ("levels.0.policy", "levels.0.termination", "meta_policy")}
-COLOURS = {"ddco": "#1f3f70", "ddco, dropout": "#e76300", "flat": "#8a8a8a", "per_timestep": "#3d8f5f"}
+COLOURS = {
+    "ddco": "#1f3f70",
+    "ddco, dropout": "#e76300",
+    "flat": "#8a8a8a",
+    "flat_equal": "#c0a030",
+    "per_timestep": "#3d8f5f",
+}
 
 
-def models(spec: Spec) -> dict[str, Spec]:
+def models(spec: Spec, dimensions: Dimensions) -> dict[str, Spec]:
     """The spec, the same with dropout, and its baselines."""
     alone = with_overrides(spec, {"compare_with": []})
-    baselines = {one.kind: baseline_spec(spec, one) for one in spec.compare_with}
+    baselines = {one.kind: baseline_spec(spec, one, dimensions) for one in spec.compare_with}
     return {"ddco": alone, "ddco, dropout": with_overrides(alone, DROPOUT)} | baselines
 
 
-def run(own: argparse.Namespace, fold: int, folds: Folds, count: int, name: str, spec: Spec) -> None:
+def run(own: argparse.Namespace, made_by: Record, fold: int, folds: Folds, count: int, name: str, spec: Spec) -> None:
     """One fit, unless it is done."""
     path = RUNS / own.spec / f"{fold:02d}-{count:03d}-{name.replace(', ', '-')}.json"
     if path.exists():
@@ -60,6 +67,7 @@ def run(own: argparse.Namespace, fold: int, folds: Folds, count: int, name: str,
         "count": count,
         "model": name,
         "changes": own.set,
+        "made_by": made_by,
         "steps": held_out.lengths,
         "log_likelihood": log_likelihoods(hierarchy, held_out).tolist(),
         "cpu_seconds": time.process_time() - start,
@@ -90,11 +98,11 @@ def _totals(found: list[dict[str, Any]], name: str, count: int) -> tuple[np.ndar
     return np.array([sum(one["log_likelihood"]) for one in own]), np.array([float(sum(one["steps"])) for one in own])
 
 
-def markdown(summary: dict[str, Any], folds: int, command: str) -> str:
+def markdown(summary: dict[str, Any], folds: int, made_by: str) -> str:
     """The curves as a table."""
     counts = list(summary["ddco"])
     lines = [
-        f"Command: `{command}`",
+        made_by,
         "",
         f"Held-out log-likelihood in nats per step, {folds} folds, the same for all models; ± is one standard error "
         "over folds. In brackets: minus ddco, paired by fold.",
@@ -145,29 +153,37 @@ def main() -> None:
     parser.add_argument("--counts", type=int, nargs="+", default=[10, 20, 40, 80])
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     own = parser.parse_args()
+    command = command_of(own)
+    made_by = record(command)
     spec = load_spec(f"specs/{own.spec}.yaml", own.set)
-    folds, wanted = divide(demonstrations(spec), own.folds, spec.seed), models(spec)
+    folds = divide(demonstrations(spec), own.folds, spec.seed)
+    wanted = models(spec, folds.dimensions)
     for fold in range(own.folds):
         for count in own.counts:
             for name, model in wanted.items():
-                run(own, fold, folds, count, name, model)
-    report(own, list(wanted))
+                run(own, made_by, fold, folds, count, name, model)
+    report(own, list(wanted), command)
 
 
-def report(own: argparse.Namespace, names: list[str]) -> None:
+def command_of(own: argparse.Namespace) -> str:
+    """The command that runs what was asked for."""
+    settings = "".join(f" --set '{one}'" for one in own.set)
+    counts = " ".join(map(str, own.counts))
+    return f"python benchmarks/learning_curve.py --spec {own.spec} --folds {own.folds} --counts {counts}{settings}"
+
+
+def report(own: argparse.Namespace, names: list[str], command: str) -> None:
     """Write the results of the folds that are complete."""
     found = [json.loads(path.read_text()) for path in sorted((RUNS / own.spec).glob("*.json"))]
     fits = len(names) * len(own.counts)
     whole = [fold for fold in range(own.folds) if sum(one["fold"] == fold for one in found) == fits]
-    settings = "".join(f" --set '{one}'" for one in own.set)
-    counts = " ".join(map(str, own.counts))
-    command = f"python benchmarks/learning_curve.py --spec {own.spec} --folds {own.folds} --counts {counts}"
-    summary = summarize([one for one in found if one["fold"] in whole], names)
-    text = markdown(summary, len(whole), command + settings)
-    write_text(OUT / "learning_curve.json", json.dumps(summary, indent=1) + "\n")
-    write_text(OUT / "learning_curve.md", text)
+    used = [one for one in found if one["fold"] in whole]
+    summary, made_by = summarize(used, names), [one.get("made_by") for one in used]
+    page = markdown(summary, len(whole), sentence(command, made_by))
+    write_text(OUT / "learning_curve.json", text(summary, made_by))
+    write_text(OUT / "learning_curve.md", page)
     draw(summary, OUT / "learning_curve.png")
-    print(text)
+    print(page)
 
 
 if __name__ == "__main__":

@@ -8,17 +8,17 @@ Fits ``specs/metaworld_pick_place.yaml`` with each way to initialise; writes ``d
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
-from needle_success import Silent
+from provenance import record, sentence, text
 
 from ddco_pyro.files import write_text
 from ddco_pyro.run import fit
+from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import load_spec
 
 INITIALIZATIONS = ("random", "vq", "vq_controls")
@@ -30,7 +30,7 @@ def run(initialize: str, seed: int, overrides: list[str]) -> dict[str, Any]:
     changes = [*overrides, f"training.initialize={initialize}", f"seed={seed}", "compare_with=[]"]
     spec = load_spec("specs/metaworld_pick_place.yaml", changes)
     with tempfile.TemporaryDirectory() as folder:
-        metrics = fit(spec, Path(folder) / "run", Silent()).metrics
+        metrics = fit(spec, Path(folder) / "run", Unwatched()).metrics
     return {
         "initialize": initialize,
         "seed": seed,
@@ -40,10 +40,10 @@ def run(initialize: str, seed: int, overrides: list[str]) -> dict[str, Any]:
     }
 
 
-def table(rows: list[dict[str, Any]], command: str) -> str:
+def table(rows: list[dict[str, Any]], made_by: str) -> str:
     """Mean, spread and range for each way to initialise, as Markdown."""
     lines = [
-        f"Command: `{command}`",
+        made_by,
         "",
         "| initialise | held-out nats/step, mean ± sd (range) | NMI with the phases, held out, mean ± sd (range) |",
         "|---|---|---|",
@@ -63,13 +63,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     arguments = parser.parse_args()
+    settings = "".join(f" --set '{one}'" for one in arguments.set)
+    made_by = record(f"python benchmarks/metaworld_segments.py --seeds {arguments.seeds}{settings}")
     calls = (delayed(run)(name, s, arguments.set) for name in INITIALIZATIONS for s in range(arguments.seeds))
     rows = Parallel(n_jobs=-1)(calls)
-    settings = "".join(f" --set '{one}'" for one in arguments.set)
-    text = table(rows, f"python benchmarks/metaworld_segments.py --seeds {arguments.seeds}{settings}")
-    write_text(OUT / "metaworld.json", json.dumps(rows, indent=1) + "\n")
-    write_text(OUT / "metaworld.md", text)
-    print(text)
+    page = table(rows, sentence(made_by["command"], [made_by]))
+    write_text(OUT / "metaworld.json", text(rows, [made_by]))
+    write_text(OUT / "metaworld.md", page)
+    print(page)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ one right after the other; the networks, the data and the tables are the same in
 
 from __future__ import annotations
 
-import json
 import statistics
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import peers
 import torch
+from provenance import record, sentence, text
 
 from ddco_pyro.ahmm import Tables, complete
 from ddco_pyro.encoding import Batch
@@ -243,7 +243,7 @@ def peak_in_process(what: str, network: str) -> float:
 
 def main() -> None:
     """Measure everything, and write it down."""
-    most = torch.get_num_threads()
+    most, made_by = torch.get_num_threads(), record("python benchmarks/performance.py")
     found: dict[str, dict[str, float]] = {}
     for threads in sorted({1, most}):
         torch.set_num_threads(threads)
@@ -257,12 +257,10 @@ def main() -> None:
         both[f"memory_step_over_networks {network}"] = peak_in_process("step", network) / peak_in_process(
             "networks", network
         )
-    (HERE / "latest.json").write_text(
-        json.dumps({"threads": most, "ratios": found}, indent=1, ensure_ascii=False) + "\n"
-    )
+    (HERE / "latest.json").write_text(text({"threads": most, "ratios": found}, [made_by]))
     page = HERE.parent / "docs" / "performance.md"
     above, mark, _ = page.read_text().partition("<!-- written by make bench -->\n")
-    page.write_text(above + mark + table(found))
+    page.write_text(f"{above}{mark}{sentence(made_by['command'], [made_by])}\n\n{table(found)}")
     print(table(found))
 
 

@@ -9,7 +9,6 @@ goes on from the same to train all of them together. Writes ``planted_levels.jso
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from joblib import Parallel, delayed
+from provenance import record, sentence, text
 from scipy import stats
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
@@ -51,10 +51,10 @@ def interval(values: list[float]) -> str:
     return f"{np.mean(values):.3f} ± {half:.3f}"
 
 
-def table(rows: list[dict[str, Any]], command: str) -> str:
+def table(rows: list[dict[str, Any]], made_by: str) -> str:
     """The numbers as Markdown."""
     lines = [
-        f"Command: `{command}`", "",
+        made_by, "",
         f"{COUNTS} options, lowest level first; {DEMONSTRATIONS} demonstrations of {STEPS} steps, {HELD_OUT} held out; "
         f"{len(rows)} seeds, mean and 95 % t interval.", "",
         "| model | held-out log-likelihood per step, nats | NMI with the true options, level 1 | level 2 | level 3 |",
@@ -80,11 +80,12 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("docs/results"))
     arguments = parser.parse_args()
+    made_by = record(f"python benchmarks/planted_levels.py --seeds {arguments.seeds}")
     rows = Parallel(n_jobs=arguments.jobs)(delayed(one_seed)(seed) for seed in range(arguments.seeds))
-    command = f"python benchmarks/planted_levels.py --seeds {arguments.seeds}"
-    write_text(arguments.out / "planted_levels.json", json.dumps(rows, indent=1) + "\n")
-    write_text(arguments.out / "planted_levels.md", table(rows, command))
-    print(table(rows, command))
+    page = table(rows, sentence(made_by["command"], [made_by]))
+    write_text(arguments.out / "planted_levels.json", text(rows, [made_by]))
+    write_text(arguments.out / "planted_levels.md", page)
+    print(page)
 
 
 if __name__ == "__main__":

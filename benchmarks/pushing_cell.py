@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 import torch
 from ddco_tasks import pushing
+from provenance import Record
 
-from ddco_pyro.data import Dimensions, build_hierarchy
+from ddco_pyro.data import Dimensions, baseline_spec, build_hierarchy, dimensions
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.encoding import encode
 from ddco_pyro.files import read_tensors, write_tensors, write_text
@@ -24,9 +25,9 @@ from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.lockstep import Played, play
 from ddco_pyro.rollout import run_episode
 from ddco_pyro.run import log_likelihoods
-from ddco_pyro.spec import Spec, load_spec, with_overrides
+from ddco_pyro.spec import BaselineSpec, NetworkSpec, Spec, load_spec, with_overrides
 from ddco_pyro.task import Task
-from ddco_pyro.training import Trainer, plan
+from ddco_pyro.training import Trainer
 
 SETTINGS = Path(__file__).parent / "pushing_settings.json"  # written by the sweep
 POOL = 80  # demonstrations of a seed; a cell takes the first ones
@@ -39,15 +40,17 @@ UPDATES = 3000  # gradient steps of a fit, whatever the method and the number of
 TRAINING, DEVELOPMENT, HELD_OUT_SEED = 100_000, 800_000, 900_000
 EVALUATION, DEVELOPMENT_EPISODES = 2_000_000, 500_000
 
+EQUAL = "flat MLP, equal parameters"
+
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "flat linear": ("pushing_flat_linear", {}),
     "flat MLP": ("pushing_flat_mlp", {}),
-    "flat MLP, equal parameters": ("pushing_flat_mlp", {"baseline.policy.hidden": [131]}),
+    EQUAL: ("pushing_mlp", {}),
     "DDCO linear": ("pushing_linear", {}),
     "DDCO MLP": ("pushing_mlp", {}),
     "hybrid MLP": ("pushing_mlp", {"hierarchy.meta_policy.emits": ["options", "control"]}),
 }
-"""Name of a method to its spec and what it changes there."""
+"""Name of a method to its spec and what it changes there; the one of equal parameters is the flat policy beside it."""
 
 VARIANTS: dict[str, tuple[dict[str, Any], int]] = {
     "base": ({}, UPDATES),
@@ -98,10 +101,16 @@ def spec_of(cell: Cell, settings: Mapping[str, Any] | None = None) -> Spec:
     if cell.options is not None:
         changed["hierarchy.levels.0.count"] = cell.options
     spec = with_overrides(load_spec(Path(__file__).parents[1] / "specs" / f"{file}.yaml"), changed)
-    stages = len(plan(spec, 1 if spec.hierarchy else 0))
     trained = cell.demonstrations - round_tune(cell.demonstrations, spec.training.tune_fraction)
-    epochs = int(np.ceil(updates / stages / np.ceil(trained / spec.training.batch_size)))
-    return with_overrides(spec, {"training.epochs": epochs})
+    epochs = int(np.ceil(updates / np.ceil(trained / spec.training.batch_size)))
+    spec = with_overrides(spec, {"training.epochs": epochs})
+    return _flat_equal(spec) if cell.method == EQUAL else spec
+
+
+def _flat_equal(spec: Spec) -> Spec:
+    """A flat perceptron with as many parameters as the spec's hierarchy."""
+    baseline = BaselineSpec(kind="flat_equal", policy=NetworkSpec(hidden=(64,)))
+    return baseline_spec(spec, baseline, dimensions(spec))
 
 
 def round_tune(count: int, fraction: float) -> int:
@@ -152,7 +161,7 @@ def per_step(hierarchy: Hierarchy, demos: Demonstrations) -> float:
     return float(log_likelihoods(hierarchy, demos).sum() / sum(demos.lengths))
 
 
-def fitted(cell: Cell, folder: Path) -> Hierarchy:
+def fitted(cell: Cell, folder: Path, made_by: Record) -> Hierarchy:
     """The hierarchy of a cell, fitted unless it has been already."""
     spec = spec_of(cell)
     path = folder / "models" / f"{cell.fit}.safetensors"
@@ -168,6 +177,7 @@ def fitted(cell: Cell, folder: Path) -> Hierarchy:
         "parameters": sum(one.numel() for one in hierarchy.parameters()),
         "std": spec.control.std,
         "seconds": seconds,
+        "made_by": made_by,
         "log_likelihood_per_step": likelihood,
     }
     write_text(folder / "fits" / f"{cell.fit}.json", json.dumps(found, indent=1) + "\n")
@@ -175,21 +185,28 @@ def fitted(cell: Cell, folder: Path) -> Hierarchy:
     return hierarchy
 
 
-def run(cell: Cell, folder: Path, limited: bool = False) -> None:
+def fit_made_by(cell: Cell, folder: Path) -> Record | None:
+    """What fitted a cell; None for a fit from before that was recorded."""
+    found: Record | None = json.loads((folder / "fits" / f"{cell.fit}.json").read_text()).get("made_by")
+    return found
+
+
+def run(cell: Cell, folder: Path, made_by: Record, limited: bool = False) -> None:
     """Fit and roll out a cell, and keep what came of it; nothing where it has been kept already.
 
+    :param made_by: the record of the study that does so.
     :param limited: at most 250 steps for each goal.
     """
     torch.set_num_threads(1)
     path = folder / ("limited" if limited else "rollouts") / f"{cell.name}.json"
     if path.exists():
         return
-    hierarchy = fitted(cell, folder)
+    hierarchy = fitted(cell, folder, made_by)
     first = EVALUATION + 1000 * cell.seed
     task: Task = pushing.limited if limited else pushing.task
     start = time.perf_counter()
     episodes = play(task, hierarchy, spec_of(cell).rollout, range(first, first + EPISODES))
-    found = {**summary(episodes), "seconds": time.perf_counter() - start}
+    found = {**summary(episodes), "seconds": time.perf_counter() - start, "made_by": made_by}
     write_text(path, json.dumps(found, indent=1) + "\n")
 
 

@@ -20,7 +20,8 @@ import torch
 from ddco_tasks import pushing
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from pushing_cell import EVALUATION, LABELS, Cell, fitted, held_out, pool, spec_of
+from provenance import record, text
+from pushing_cell import EVALUATION, LABELS, Cell, fit_made_by, fitted, held_out, pool, spec_of
 from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.colours import option_colour
@@ -59,7 +60,7 @@ def segments(options: int, seed: int, arguments: argparse.Namespace) -> tuple[De
     cell = Cell("DDCO MLP", options, arguments.demonstrations, seed)
     spec = spec_of(cell)
     demos = held_out(arguments.runs, spec)
-    (found,) = Fit(arguments.runs, spec, fitted(cell, arguments.runs)).segment(demos)
+    (found,) = Fit(arguments.runs, spec, fitted(cell, arguments.runs, arguments.made_by)).segment(demos)
     return demos, found[found >= 0]
 
 
@@ -100,9 +101,14 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs/pushing-studies"))
     parser.add_argument("--out", type=Path, default=Path("docs/results/pushing"))
     arguments = parser.parse_args()
+    arguments.made_by = record(
+        "python benchmarks/pushing_joint_angles.py"
+        f" --demonstrations {arguments.demonstrations} --seed {arguments.seed} --seeds {arguments.seeds}"
+        f" --options {' '.join(map(str, arguments.options))}"
+    )
     torch.set_num_threads(1)
     cell = Cell("DDCO MLP", 2, arguments.demonstrations, arguments.seed)
-    hierarchy, first = fitted(cell, arguments.runs), EVALUATION + 1000 * arguments.seed
+    hierarchy, first = fitted(cell, arguments.runs, arguments.made_by), EVALUATION + 1000 * arguments.seed
     keep = ("joint_angles", "goal_from_box")
     episodes = play(pushing.task, hierarchy, spec_of(cell).rollout, range(first, first + EPISODES), keep)
     ours = [(one.observations["joint_angles"], one.choices[:, 0]) for one in episodes]
@@ -121,9 +127,6 @@ def main() -> None:
     with whole_file(arguments.out / "joint_angles.png") as temporary:
         figure.savefig(temporary, dpi=110, format="png")
     found = {
-        "command": "python benchmarks/pushing_joint_angles.py"
-        f" --demonstrations {arguments.demonstrations} --seed {arguments.seed} --seeds {arguments.seeds}"
-        f" --options {' '.join(map(str, arguments.options))}",
         "segments_nmi": {
             str(k): [agreement(k, seed, arguments) for seed in range(arguments.seeds)] for k in arguments.options
         },
@@ -132,7 +135,13 @@ def main() -> None:
         "nmi_option_side": float(normalized_mutual_info_score(sides, options)),
         "goal_on_the_right_given_option": {int(o): float(sides[options == o].mean()) for o in np.unique(options)},
     }
-    write_text(arguments.out / "joint_angles.json", json.dumps(found, indent=1) + "\n")
+    used = [
+        Cell("DDCO MLP", k, arguments.demonstrations, seed)
+        for k in arguments.options
+        for seed in range(arguments.seeds)
+    ]
+    records = [arguments.made_by, *(fit_made_by(one, arguments.runs) for one in used)]
+    write_text(arguments.out / "joint_angles.json", text(found, records))
     print(json.dumps(found, indent=1))
 
 

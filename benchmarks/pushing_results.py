@@ -14,7 +14,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from pushing_cell import EPISODES, Cell
+from provenance import Record, sentence, text
+from pushing_cell import EPISODES, Cell, fit_made_by
 from scipy import stats
 
 from ddco_pyro.files import whole_file, write_text
@@ -38,12 +39,23 @@ def rows_of(cells: Sequence[Cell], folder: Path) -> list[Row]:
         if not rollout.exists():
             continue
         row: Row = asdict(cell) | json.loads(fit.read_text())
+        row.pop("made_by", None)
         row |= {f"log_likelihood_{part}": value for part, value in row.pop("log_likelihood_per_step").items()}
         row |= _means(json.loads(rollout.read_text()), "")
         limited = folder / "limited" / f"{cell.name}.json"
         row |= _means(json.loads(limited.read_text()) if limited.exists() else {}, "limited_")
         found.append(row)
     return found
+
+
+def made_by(cells: Sequence[Cell], folder: Path) -> list[Record | None]:
+    """What fitted and rolled out the cells that are done; None for what was before that was recorded."""
+    rolled = [cell for cell in cells if (folder / "rollouts" / f"{cell.name}.json").exists()]
+    paths = [folder / what / f"{cell.name}.json" for cell in rolled for what in ("rollouts", "limited")]
+    return [
+        *(fit_made_by(cell, folder) for cell in rolled),
+        *(json.loads(path.read_text()).get("made_by") for path in paths if path.exists()),
+    ]
 
 
 def _means(found: dict[str, Any], prefix: str) -> Row:
@@ -73,19 +85,21 @@ def grouped(rows: Sequence[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]
 
 
 def write(study: str, cells: Sequence[Cell], folder: Path, out: Path, command: str) -> None:
-    """NAME.csv, NAME.md and NAME.png of the cells that are done."""
+    """NAME.csv, NAME.md and NAME.png of the cells that are done, and NAME.json, which says what made them."""
     rows = rows_of(cells, folder)
     if not rows:
         raise SystemExit(f"{study}: nothing has been measured yet")
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    rows_text = io.StringIO()
+    writer = csv.DictWriter(rows_text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    write_text(out / f"{study}.csv", text.getvalue())
+    write_text(out / f"{study}.csv", rows_text.getvalue())
     describe, draw = STUDIES[study]
     supervisor = _supervisor(out)
     whole = "What commands with other parts of the grid have measured is in the table, too."
-    head = [f"Command: `{command}`. {whole}", "", _protocol(supervisor), ""]
+    records = made_by(cells, folder)
+    head = [f"{sentence(command, records)} {whole}", "", _protocol(supervisor), ""]
+    write_text(out / f"{study}.json", text(None, records))
     write_text(out / f"{study}.md", "\n".join([*head, *describe(rows)]) + "\n")
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
@@ -97,7 +111,11 @@ def write(study: str, cells: Sequence[Cell], folder: Path, out: Path, command: s
 def _supervisor(out: Path) -> float | None:
     """The level of the supervisor that was recorded, with an exact hand."""
     path = out / "supervisors.json"
-    return float(json.loads(path.read_text())["supervisors"]["scripted"]["goals"]["mean"]) if path.exists() else None
+    return (
+        float(json.loads(path.read_text())["results"]["supervisors"]["scripted"]["goals"]["mean"])
+        if path.exists()
+        else None
+    )
 
 
 def _protocol(supervisor: float | None) -> str:

@@ -32,6 +32,7 @@ import numpy as np
 import torch
 from ddco_tasks import pushing
 from joblib import Parallel, delayed
+from provenance import Record, record
 from pushing_cell import (
     DEVELOPMENT_EPISODES,
     METHODS,
@@ -177,12 +178,14 @@ def main() -> None:
     if arguments.study == "sweep":
         sweep(arguments.runs, arguments.jobs)
         return
+    command = command_of(arguments)
+    made_by = record(command)
     cells = [cell for seed in range(arguments.seeds) for cell in STUDIES[arguments.study](seed)]
     if not arguments.summarize:
         asked = cells_of(arguments, cells)
         prepare(asked, arguments.runs)
-        work(asked, arguments)
-    write(arguments.study, cells, arguments.runs, arguments.out, command_of(arguments))
+        work(asked, arguments, made_by)
+    write(arguments.study, cells, arguments.runs, arguments.out, command)
 
 
 def command_of(arguments: argparse.Namespace) -> str:
@@ -207,11 +210,13 @@ def cells_of(arguments: argparse.Namespace, cells: Sequence[Cell]) -> list[Cell]
     ]
 
 
-def work(cells: Sequence[Cell], arguments: argparse.Namespace) -> None:
+def work(cells: Sequence[Cell], arguments: argparse.Namespace, made_by: Record) -> None:
     """Fit and roll out the cells, in parallel."""
     todo = [(cell, limited) for limited in (False, *[True] * arguments.limited) for cell in cells]
     workers = Parallel(n_jobs=arguments.jobs, return_as="generator_unordered", pre_dispatch="n_jobs")
-    for done, _ in enumerate(workers(delayed(run)(cell, arguments.runs, limited) for cell, limited in todo), 1):
+    for done, _ in enumerate(
+        workers(delayed(run)(cell, arguments.runs, made_by, limited) for cell, limited in todo), 1
+    ):
         print(f"{arguments.study}: {done} of {len(todo)}", flush=True)
 
 

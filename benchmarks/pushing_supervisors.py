@@ -25,6 +25,7 @@ from ddco_tasks import pushing
 from ddco_tasks.pushing_planner import Planner
 from ddco_tasks.pushing_supervisor import SHAKIER, WayPoints, policy
 from joblib import Parallel, delayed
+from provenance import record, sentence, text
 from scipy import stats
 from sklearn.model_selection import GroupKFold
 from sklearn.neighbors import KNeighborsRegressor
@@ -124,7 +125,7 @@ def table(results: dict[str, Any]) -> str:
     """The numbers as Markdown."""
     lines = []
     if "supervisors" in results:
-        lines += [f"Command: `{results['supervisors_command']}`", ""]
+        lines += [made_by(results, "supervisors"), ""]
         lines += ["Mean and 95 % t interval over seeds of an episode of 2000 steps.", ""]
         lines += [
             "| supervisor | goals | topples | lost | control steps per second | seeds |",
@@ -136,7 +137,7 @@ def table(results: dict[str, Any]) -> str:
             lines.append(f"| {' | '.join([name, *cells, speed, str(one['goals']['trials'])])} |")
         lines.append("")
     if "predictability" in results:
-        lines += [f"Command: `{results['predictability_command']}`", ""]
+        lines += [made_by(results, "predictability"), ""]
         lines += [f"Held-out R² of the controls, mean and 95 % t interval over {FOLDS} folds by demonstration.", ""]
         lines += ["| supervisor | nearest neighbours | network | success | demonstrations |", "|---|---|---|---|---|"]
         for name, one in results["predictability"].items():
@@ -144,6 +145,12 @@ def table(results: dict[str, Any]) -> str:
             success = one["success"]
             lines.append(f"| {' | '.join([name, *cells, format(success['mean'], '.2f'), str(success['trials'])])} |")
     return "\n".join(lines) + "\n"
+
+
+def made_by(results: dict[str, Any], part: str) -> str:
+    """The line that says what made a part."""
+    one = results[f"{part}_made_by"]
+    return sentence(one["command"], [one])
 
 
 def spread(one: dict[str, Any], form: str) -> str:
@@ -165,11 +172,11 @@ def main() -> None:
     arguments = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     path = arguments.out / "supervisors.json"
-    results: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    results: dict[str, Any] = json.loads(path.read_text())["results"] if path.exists() else {}
     for part in arguments.parts:
+        results[f"{part}_made_by"] = record(shlex.join(["python", *sys.argv]))
         results[part] = PARTS[part](arguments)
-        results[f"{part}_command"] = shlex.join(["python", *sys.argv])
-    write_text(path, json.dumps(results, indent=1) + "\n")
+    write_text(path, text(results, (results[f"{part}_made_by"] for part in PARTS if part in results)))
     write_text(path.with_suffix(".md"), table(results))
     print(table(results))
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from provenance import Record, record, sentence, text
 
 from ddco_pyro.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.files import write_text
@@ -101,7 +102,7 @@ def planted_spec(path: Path, folds: int, most: int, seed: int) -> Spec:
     return parse_spec(data)
 
 
-def draw(options: int, seed: int, folds: int, most: int, jobs: int) -> dict[str, Any]:
+def draw(options: int, seed: int, folds: int, most: int, jobs: int, made_by: Record) -> dict[str, Any]:
     """One selection: what was planted, chosen and best, and the differences to the best."""
     start = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
@@ -115,6 +116,7 @@ def draw(options: int, seed: int, folds: int, most: int, jobs: int) -> dict[str,
     return {
         "options": options,
         "seed": seed,
+        "made_by": made_by,
         "chosen": found.chosen.candidate.number + 1,
         "best": found.best.candidate.number + 1,
         "means": [row.mean for row in found.rows],
@@ -125,10 +127,10 @@ def draw(options: int, seed: int, folds: int, most: int, jobs: int) -> dict[str,
     }
 
 
-def table(rows: list[dict[str, Any]], command: str) -> str:
+def table(rows: list[dict[str, Any]], made_by: str) -> str:
     """How often what was planted was chosen, as Markdown."""
     lines = [
-        f"Command: `{command}`",
+        made_by,
         "",
         "| planted | chosen | right | best instead | right |",
         "|--:|---|--:|---|--:|",
@@ -154,21 +156,26 @@ def main() -> None:
         f"python benchmarks/selection_planted.py --options {' '.join(map(str, own.options))} --draws {own.draws} "
         f"--folds {own.folds} --most {own.most}"
     )
+    made_by = record(command)
     settings = {"folds": own.folds, "most": own.most}
     path = OUT / "selection_planted.json"
-    kept = json.loads(path.read_text()) if path.exists() else {"draws": []} | settings
+    stored = json.loads(path.read_text()) if path.exists() else {"results": {"draws": []} | settings}
+    kept = stored["results"]
     if any(kept[key] != value for key, value in settings.items()):
         raise SystemExit(f"{path}: was made with other --folds or --most; remove it first")
+    for row in kept["draws"]:
+        row.setdefault("made_by", stored["provenance"][0])  # draws that were adopted as a whole
     done = {(row["seed"], row["options"]): row for row in kept["draws"]}
     wanted = list(product(range(FIRST_SEED, FIRST_SEED + own.draws), own.options))
     for seed, options in wanted:
         if (seed, options) not in done:
-            done[seed, options] = draw(options, seed, own.folds, own.most, own.jobs)
+            done[seed, options] = draw(options, seed, own.folds, own.most, own.jobs, made_by)
             print(done[seed, options], flush=True)
         rows = [done[key] for key in sorted(done, key=lambda key: (key[1], key[0]))]
-        write_text(path, json.dumps(settings | {"draws": rows}, indent=1) + "\n")
-        write_text(OUT / "selection_planted.md", table(rows, command))
-    print(table(rows, command))
+        page = table(rows, sentence(command, (row.get("made_by") for row in rows)))
+        write_text(path, text(settings | {"draws": rows}, (row.get("made_by") for row in rows)))
+        write_text(OUT / "selection_planted.md", page)
+    print(page)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from provenance import record, text
+
 from ddco_pyro.data import demonstrations
 from ddco_pyro.files import write_text
 from ddco_pyro.run import claim
@@ -80,10 +82,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["folds", "speed-up"])
     what = parser.parse_args().what
-    found = {"command": f"python benchmarks/selection_time.py {what}"}
-    found |= one_fold() if what == "folds" else speed_up()
+    made_by = record(f"python benchmarks/selection_time.py {what}")
+    found = one_fold() if what == "folds" else speed_up()
     print(json.dumps(found, indent=1))
-    write_text(OUT / f"selection_time_{what.replace('-', '_')}.json", json.dumps(found, indent=1) + "\n")
+    write_text(OUT / f"selection_time_{what.replace('-', '_')}.json", text(found, [made_by]))
 
 
 if __name__ == "__main__":

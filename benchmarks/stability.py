@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from joblib import Parallel, delayed
 from matplotlib.axes import Axes
+from provenance import Record, record, sentence, text
 from scipy import stats
 
 from ddco_pyro.analysis import agreement, divergences, option_use
@@ -69,7 +70,7 @@ def divide(spec: Spec) -> tuple[Demonstrations, dict[str, Demonstrations]]:
     return demos, found
 
 
-def run(name: str, initialize: str, layerwise: bool, seed: int, changes: list[str]) -> Path:
+def run(name: str, initialize: str, layerwise: bool, seed: int, changes: list[str], made_by: Record) -> Path:
     """One fit, unless it is done; where its numbers are."""
     layers = "layerwise" if layerwise else "joint"
     path = RUNS / name / f"{seed:02d}-{initialize}-{layers}.json"
@@ -83,6 +84,7 @@ def run(name: str, initialize: str, layerwise: bool, seed: int, changes: list[st
     hierarchy = train(spec, Dimensions.of(demos), divided["train"], Unwatched()).hierarchy
     found = measure(Fit(path.parent, spec, hierarchy), demos, divided)
     found |= {"spec": name, "setting": name_of(initialize, layerwise), "seed": seed, "changes": changes}
+    found |= {"made_by": made_by}
     write_text(path, json.dumps(found | {"cpu_seconds": time.process_time() - start}) + "\n")
     return path
 
@@ -146,10 +148,10 @@ def _against(one: dict[str, Any], first: dict[str, Any], key: str) -> dict[str, 
     return {"variance_ratio": one["variance"][key] / first["variance"][key], "p_value": float(test.pvalue)}
 
 
-def markdown(summaries: dict[str, Any], command: str) -> str:
+def markdown(summaries: dict[str, Any], made_by: str) -> str:
     """The study as Markdown."""
     lines = [
-        f"Command: `{command}`",
+        made_by,
         "",
         "Mean over seeds; variance over seeds, with its ratio to that of random and joint and the p-value of "
         "Brown and Forsythe's test that the two are equal (not corrected for the number of tests). NMI: mean over all "
@@ -218,29 +220,33 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     own = parser.parse_args()
+    settings = "".join(f" --set '{one}'" for one in own.set)
+    command = f"python benchmarks/stability.py --seeds {own.seeds} --specs {' '.join(own.specs)}{settings}"
+    made_by = record(command)
     pool = Parallel(n_jobs=own.jobs, return_as="generator_unordered", batch_size=1)
     for path in pool(
-        delayed(run)(name, *setting, seed, own.set)
+        delayed(run)(name, *setting, seed, own.set, made_by)
         for seed in range(own.seeds)
         for name in own.specs
         for setting in SETTINGS
     ):
         print(path, flush=True)
-    report(own.specs, own.seeds, own.set)
+    report(own.specs, own.seeds, command)
 
 
-def report(names: list[str], seeds: int, changes: list[str]) -> None:
+def report(names: list[str], seeds: int, command: str) -> None:
     """Write the results of what is there."""
-    summaries = {}
+    summaries, made_by = {}, []
     for name in names:
         found = complete([json.loads(path.read_text()) for path in sorted((RUNS / name).glob("*.json"))])
-        summaries[name] = summarize([one for one in found if one["seed"] < seeds])
-    settings = "".join(f" --set '{one}'" for one in changes)
-    text = markdown(summaries, f"python benchmarks/stability.py --seeds {seeds} --specs {' '.join(names)}{settings}")
-    write_text(OUT / "stability.json", json.dumps(summaries, indent=1) + "\n")
-    write_text(OUT / "stability.md", text)
+        used = [one for one in found if one["seed"] < seeds]
+        summaries[name] = summarize(used)
+        made_by += [one.get("made_by") for one in used]
+    page = markdown(summaries, sentence(command, made_by))
+    write_text(OUT / "stability.json", text(summaries, made_by))
+    write_text(OUT / "stability.md", page)
     draw(summaries, OUT / "stability.png")
-    print(text)
+    print(page)
 
 
 if __name__ == "__main__":

@@ -8,16 +8,16 @@ Fits both on Meta-World's pick-place demonstrations; writes ``docs/results/start
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from pathlib import Path
 
 import numpy as np
-from needle_success import Silent
+from provenance import record, sentence, text
 
 from ddco_pyro.files import write_text
 from ddco_pyro.inspection import inspect
 from ddco_pyro.run import fit
+from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import load_spec
 from ddco_pyro.starting import starting_spec
 
@@ -28,7 +28,7 @@ OUT = Path("docs/results")
 def valid(spec: Path, seed: int) -> float:
     """Held-out nats per step of one fit."""
     with tempfile.TemporaryDirectory() as folder:
-        metrics = fit(load_spec(spec, [f"seed={seed}", "compare_with=[]"]), Path(folder) / "run", Silent()).metrics
+        metrics = fit(load_spec(spec, [f"seed={seed}", "compare_with=[]"]), Path(folder) / "run", Unwatched()).metrics
     return float(metrics["log_likelihood_per_step"]["valid"])
 
 
@@ -37,6 +37,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5)
     arguments = parser.parse_args()
+    made_by = record(f"python benchmarks/starting_spec.py --seeds {arguments.seeds}")
     demonstrations = load_spec(TUNED).demonstrations.path
     assert demonstrations is not None
     with tempfile.TemporaryDirectory() as folder:
@@ -47,7 +48,7 @@ def main() -> None:
     difference = np.mean(rows["ddco-pyro init"]) - np.mean(rows["tuned by hand"])
     ratio = float(np.mean(rows["ddco-pyro init"]) / np.mean(rows["tuned by hand"]))
     lines = [
-        f"Command: `python benchmarks/starting_spec.py --seeds {arguments.seeds}`",
+        sentence(made_by["command"], [made_by]),
         "",
         "| spec | held-out nats/step, mean ± sd (range) |",
         "|---|---|",
@@ -59,7 +60,7 @@ def main() -> None:
         f"The first is {ratio:.1%} of the second (a ratio of log-densities depends on the control's unit; the",
         f"difference of {difference:+.2f} nats per step does not).",
     ]
-    write_text(OUT / "starting_spec.json", json.dumps({"valid": rows, "ratio": ratio}, indent=1) + "\n")
+    write_text(OUT / "starting_spec.json", text({"valid": rows, "ratio": ratio}, [made_by]))
     write_text(OUT / "starting_spec.md", "\n".join(lines) + "\n")
     print("\n".join(lines))
 

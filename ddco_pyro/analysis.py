@@ -24,12 +24,14 @@ class OptionUse:
 
     :param share: mean of u_t, the part of the time it is active.
     :param selected: Σ v_t, how often it is selected.
+    :param demonstrations: in how many demonstrations it is selected: the sum over them of min(1, Σ v_t).
     :param duration: expected steps from a selection to the next, Σ u_t / Σ v_t; None where it is never selected.
     """
 
     choice: int
     share: float
     selected: float
+    demonstrations: float
     duration: float | None
 
 
@@ -37,15 +39,17 @@ def option_use(posterior: Posterior) -> list[list[OptionUse]]:
     """For each level, lowest first, the use of every choice."""
     found = []
     for u, v in zip(posterior.u, posterior.v, strict=True):
-        active, selected = u.sum((0, 1)).numpy(), v.sum((0, 1)).numpy()
-        shares = active / active.sum()
-        found.append([_use(choice, shares, active, selected) for choice in range(len(active))])
+        active, selected = u.sum((0, 1)).numpy(), v.sum(1).numpy()
+        total = float(active.sum())
+        found.append([_use(choice, float(active[choice]), selected[:, choice], total) for choice in range(len(active))])
     return found
 
 
-def _use(choice: int, shares: np.ndarray, active: np.ndarray, selected: np.ndarray) -> OptionUse:
-    duration = float(active[choice] / selected[choice]) if selected[choice] > 1e-6 else None
-    return OptionUse(choice, float(shares[choice]), float(selected[choice]), duration)
+def _use(choice: int, active: float, selected: np.ndarray, total: float) -> OptionUse:
+    """One choice that is ``active`` in so many of ``total`` steps, and ``selected`` so often in each demonstration."""
+    often = float(selected.sum())
+    duration = active / often if often > 1e-6 else None
+    return OptionUse(choice, active / total, often, float(selected.clip(max=1.0).sum()), duration)
 
 
 def as_rows(use: Sequence[Sequence[OptionUse]]) -> list[list[dict[str, float | int | None]]]:

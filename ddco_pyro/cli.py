@@ -22,7 +22,7 @@ from ddco_pyro import console
 from ddco_pyro.commands import incoming, outgoing
 from ddco_pyro.commands.options import AllowCode, RunPath
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.spec import SpecError, dump_spec, load_spec, refuse_own_networks, spec_schema
+from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
 
 app = typer.Typer(
     add_completion=False,
@@ -60,14 +60,13 @@ def check(
         return
     if spec is None:
         raise SpecError("name a spec, such as: ddco-pyro check specs/needle.yaml")
-    found = load_spec(spec, overrides)
-    refuse_own_networks(found, spec, allow_code)
-    from ddco_pyro.data import check_networks, dimensions
+    found = load_spec(spec, overrides, allow_code)
+    from ddco_pyro.data import baselines, check_networks, dimensions
 
     size = dimensions(found)
     hierarchy = check_networks(found, size)
     print(dump_spec(found), end="")
-    console.dimensions(found, size, hierarchy)
+    console.dimensions(found, size, hierarchy, baselines(found, size))
     console.control(size)
 
 
@@ -76,9 +75,10 @@ def collect(
     spec: SpecPath,
     out: Annotated[Path | None, typer.Option(help="The HDF5 file; by default in the cache, by content.")] = None,
     overrides: Overrides = [],  # noqa: B006
+    allow_code: AllowCode = False,
 ) -> None:
     """Record demonstrations of the task's supervisor, unless they are there already."""
-    found = load_spec(spec, overrides)
+    found = load_spec(spec, overrides, allow_code)
     if found.demonstrated_task is None:
         raise SpecError(f"{spec}: names no task, so there is no supervisor to record")
     from ddco_pyro.collect import collect as record
@@ -103,11 +103,10 @@ def fit(
 
     An unfinished run of this very spec in --out is continued.
     """
-    found = load_spec(spec, overrides)
-    refuse_own_networks(found, spec, allow_code)
+    found = load_spec(spec, overrides, allow_code)
     from ddco_pyro import run
     from ddco_pyro.data import check_networks, demonstrations, dimensions
-    from ddco_pyro.report import degeneracies, write_report
+    from ddco_pyro.report import degeneracies, unconverged, write_report
 
     check_networks(found, dimensions(found))  # before anything is collected, trained or written
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -117,14 +116,20 @@ def fit(
             fitted = run.fit(found, folder, watcher)
     except KeyboardInterrupt:
         resolved = folder / "spec.yaml"
-        print(f"interrupted; continue with: ddco-pyro fit {resolved} --out {folder} --resume", file=sys.stderr)
+        again = f"ddco-pyro fit {resolved} --out {folder} --resume{_allowed(found)}"
+        print(f"interrupted; continue with: {again}", file=sys.stderr)
         raise typer.Exit(1) from None
     console.log_likelihoods(fitted.metrics)
-    console.warnings(degeneracies(fitted.spec, fitted.metrics))
+    console.warnings([*unconverged(fitted.metrics), *degeneracies(fitted.spec, fitted.metrics)])
     print(f"report: {write_report(fitted, demonstrations(found))}")
     if found.hierarchy and found.demonstrations.path:
         file = shlex.quote(found.demonstrations.path)
-        print(f"next: ddco-pyro segment {shlex.quote(str(folder))} {file} --html segments.html")
+        print(f"next: ddco-pyro segment {shlex.quote(str(folder))} {file} --html segments.html{_allowed(found)}")
+
+
+def _allowed(spec: Spec) -> str:
+    """What has to be said again so that the user code of this spec is imported again."""
+    return " --allow-code" if user_code(spec) else ""
 
 
 @app.command(epilog="Example: ddco-pyro select specs/mine.yaml --set selection.grid.hierarchy.levels.0.count=[1,2,4,8]")
@@ -146,13 +151,12 @@ def select(
     so far puts it below the best so far (one-sided, p < 0.001), or where a fold of it has failed.
     """
     number = [] if folds is None else [f"selection.folds={folds}"]
-    found = load_spec(spec, [*overrides, *number])
-    refuse_own_networks(found, spec, allow_code)
+    found = load_spec(spec, [*overrides, *number], allow_code)
     if (backend is Backend.DASK) != (scheduler is not None):
         raise SpecError("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
     from ddco_pyro import run, selection
     from ddco_pyro.data import demonstrations
-    from ddco_pyro.report import degeneracies, write_report
+    from ddco_pyro.report import degeneracies, unconverged, write_report
     from ddco_pyro.selection.table import HEAD, cells
 
     workers = selection.Workers(jobs, scheduler)
@@ -167,11 +171,12 @@ def select(
             final = selection.final_spec(found, made.choice.chosen.candidate)
             fitted = run.fit(final, folder / "fit", watcher)
     except KeyboardInterrupt:
-        again = f"ddco-pyro select {folder / 'spec.yaml'} --out {folder} --resume{' --stop-early' * stop_early}"
+        early = " --stop-early" * stop_early
+        again = f"ddco-pyro select {folder / 'spec.yaml'} --out {folder} --resume{early}{_allowed(found)}"
         print(f"interrupted; continue with: {again}", file=sys.stderr)
         raise typer.Exit(1) from None
     console.selection(made.choice, HEAD, [cells(row, made.choice) for row in made.choice.rows])
-    console.warnings(degeneracies(fitted.spec, fitted.metrics))
+    console.warnings([*unconverged(fitted.metrics), *degeneracies(fitted.spec, fitted.metrics)])
     print(f"selection: {folder / 'selection.json'}")
     print(f"report: {write_report(fitted, demonstrations(fitted.spec))}")
 
@@ -192,6 +197,7 @@ def compare(
     console.comparison(page.HEAD, [page.cells(row) for row in found.rows])
     if found.rollouts:
         console.comparison(page.ROLLOUT_HEAD, page.rollout_cells(found))
+    print(page.verdict(found))
     print(f"comparison: {comparison.write(found, out or Path('runs') / time.strftime('compare-%Y%m%d-%H%M%S'))}")
 
 
@@ -201,9 +207,15 @@ def rollout(
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each method; by default the spec's.")] = None,
     video: Annotated[bool, typer.Option("--video", help="Film the first episodes of each method.")] = False,
     jobs: Jobs = -1,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Where RUN holds these very rollouts, show them again.")
+    ] = False,
     allow_code: AllowCode = False,
 ) -> None:
-    """Roll the model, its baselines and the spec's scripted policies out from the same initial states."""
+    """Roll the model, its baselines and the spec's scripted policies out from the same initial states.
+
+    An unfinished rollout of as many episodes is continued.
+    """
     from ddco_pyro.data import demonstrations
     from ddco_pyro.evaluate import policies, roll_out
     from ddco_pyro.report import write_report
@@ -212,7 +224,7 @@ def rollout(
     fitted = load(run, allow_code)
     number = episodes or fitted.spec.rollout.episodes
     with console.Rolling(number * len(policies(fitted))) as progress:
-        results = roll_out(fitted, number, FILMED if video else 0, progress.episode, jobs)
+        results = roll_out(fitted, number, FILMED if video else 0, progress.episode, jobs, resume)
     console.successes(results)
     print(f"report: {write_report(fitted, demonstrations(fitted.spec))}")
 
@@ -242,7 +254,8 @@ app.command(epilog="Example: ddco-pyro export runs/mine --out controller --onnx"
 def main() -> None:
     """Run the command line; ends the process with 0, 1 or 2."""
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
-    sys.path.append(os.getcwd())  # where a user's own module:name lies
+    if "--allow-code" in arguments:
+        sys.path.append(os.getcwd())  # where a user's module:name lies
     try:
         status = app(arguments or ["--help"], prog_name="ddco-pyro", standalone_mode=False)
     except Exception as error:

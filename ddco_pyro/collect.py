@@ -65,14 +65,15 @@ def collect(
             parts.add(recording_of(episode.record))
             if on_demonstration:
                 on_demonstration(len(parts.done), spec.count)
-        attributes = {"task": task.name, "policy": spec.supervisor, "supervisor": json.dumps(_summary(parts))}
+        attributes = {"task": task.name, "policy": spec.supervisor, "supervisor": json.dumps(_summary(task, parts))}
         parts.finish(attributes, {}, {})
     return path
 
 
-def _summary(parts: Parts) -> dict[str, Any]:
+def _summary(task: Task, parts: Parts) -> dict[str, Any]:
     """How often the supervisor succeeded itself."""
     facts = parts.attributes()
     return summarize(
-        [{name: float(value) for name, value in one.items() if name not in ("seed", "num_samples")} for one in facts]
+        task,
+        [{name: float(value) for name, value in one.items() if name not in ("seed", "num_samples")} for one in facts],
     )

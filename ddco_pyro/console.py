@@ -9,11 +9,12 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
 from ddco_pyro.control_dimensions import notes
+from ddco_pyro.convergence import effort
 
 if TYPE_CHECKING:
     from ddco_pyro.data import Dimensions
@@ -30,12 +31,13 @@ class _Bar:
 
     def __init__(self) -> None:
         self.console = Console(stderr=True)
-        columns = [TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}")]
+        columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
         self._progress = Progress(
             *columns, TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=self.console
         )
         self._task: TaskID | None = None
-        self._label, self._total, self._done = "", 0, 0
+        self._label, self._done = "", 0
+        self._total: int | None = 0
         self._start = self._said = 0.0
 
     def __enter__(self) -> Self:
@@ -49,8 +51,8 @@ class _Bar:
         if self.console.is_terminal:
             self._progress.stop()
 
-    def begin(self, label: str, total: int) -> None:
-        """Begin to count up to ``total``."""
+    def begin(self, label: str, total: int | None) -> None:
+        """Begin to count up to ``total``; None where nobody knows how far it goes."""
         self.end()
         self._label, self._total, self._done = label, total, 0
         self._start = self._said = time.monotonic()
@@ -64,14 +66,20 @@ class _Bar:
         now = time.monotonic()
         if not self.console.is_terminal and (now - self._said > PLAIN_SECONDS or done == self._total):
             self._said = now
-            left = (now - self._start) / max(done, 1) * (self._total - done)
-            self._say(f"{done}/{self._total}, at most {left:.0f} s left  {note}".rstrip())
+            self._say(f"{self._place(now)}  {note}".rstrip())
+
+    def _place(self, now: float) -> str:
+        """How far it has come, and the time left."""
+        if self._total is None:
+            return str(self._done)
+        left = (now - self._start) / max(self._done, 1) * (self._total - self._done)
+        return f"{self._done}/{self._total}, at most {left:.0f} s left"
 
     def end(self) -> None:
         """Whatever was counted is over, however far it came."""
         if self._task is not None:
             self._progress.update(self._task, total=max(self._done, 1), completed=max(self._done, 1))
-            if not self.console.is_terminal and self._done < self._total:
+            if not self.console.is_terminal and self._done != self._total:
                 self._say(f"done after {self._done}, {time.monotonic() - self._start:.0f} s")
         self._task = None
 
@@ -96,13 +104,13 @@ class Collecting(_Bar):
 class Fitting(Collecting):
     """Shows how a fit goes on (a :class:`ddco_pyro.run.Watcher`)."""
 
-    def training(self, name: str, epochs: int) -> None:
-        """A model begins to be trained, for at most so many epochs in all."""
+    def training(self, name: str, epochs: int | None) -> None:
+        """A model begins to be trained, for at most so many epochs in all; None for no limit."""
         self.begin(f"training {name}", epochs)
 
     def epoch(self, row: Mapping[str, Any]) -> None:
         """An epoch has ended; its row of the history."""
-        note = f"{row['stage']}: loss {-row['train']:.3f}, held out {row['tune']:.3f} nats/step"
+        note = f"{row['stage']}: training {row['train']:.3f}, tuning {row['tune']:.3f} nats/step"
         self.advance(self._done + 1, note)
 
     def trained(self, name: str) -> None:
@@ -144,16 +152,28 @@ class Rolling(_Bar):
         self.advance(self._done + 1, name)
 
 
-def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy) -> None:
-    """Shapes of observations and control, and the parameters of each network."""
+def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Sequence[tuple[Spec, Hierarchy]]) -> None:
+    """Shapes of observations and control, and the parameters of each network and of each baseline."""
+    from ddco_pyro.data import parameters
+
     table = Table("", "shape or parameters", show_edge=False)
     for one in spec.observations:
         table.add_row(f"observation {one.key}", str(list(size.shapes[one.key])))
     table.add_row("features", str(len(hierarchy.encoder.mean)))
     table.add_row("control", str([size.control_size]))
     for name, network in hierarchy.named_networks():
-        table.add_row(name, str(sum(parameter.numel() for parameter in network.parameters())))
+        table.add_row(name, str(parameters(network)))
+    table.add_row("all networks", str(parameters(hierarchy)))
+    for number, (other, policy) in enumerate(baselines):
+        table.add_row(f"compare_with.{number}: {_baseline(other)}", str(parameters(policy)))
     _show(table)
+
+
+def _baseline(spec: Spec) -> str:
+    """A baseline's kind and the sizes of its hidden layers."""
+    assert spec.baseline is not None
+    hidden = list(spec.baseline.policy.hidden)
+    return f"{spec.baseline.kind}, {f'hidden: {hidden}' if hidden else spec.baseline.policy.network}"
 
 
 def control(size: Dimensions) -> None:
@@ -163,13 +183,15 @@ def control(size: Dimensions) -> None:
 
 
 def log_likelihoods(metrics: Mapping[str, Any]) -> None:
-    """Held-out log-likelihood of the model and of what it is compared with."""
-    table = Table("model", "train", "held out", "ours - this", title="log-likelihood, nats per step", show_edge=False)
+    """Log-likelihood of the model and of what it is compared with, in training and on what was held out."""
+    head = ("model", "training", "validation (held out)", "ours - this, validation", "gradient steps")
+    table = Table(*head, title="log-likelihood, nats per step", show_edge=False)
     rows = {metrics["model"]: metrics, **metrics["comparison"]}
     for name, row in rows.items():
         values, difference = row["log_likelihood_per_step"], row.get("difference")
         shown = _difference(difference) if difference else ""
-        table.add_row(name, *(_number(values[part]) for part in ("train", "valid")), shown)
+        numbers = [_number(values[part]) for part in ("train", "valid")]
+        table.add_row(name, *numbers, shown, effort(row.get("training")))
     _show(table)
 
 
@@ -225,12 +247,12 @@ def successes(results: Mapping[str, Any]) -> None:
     measures = list(dict.fromkeys(name for one in methods.values() for name in one["measures"]))
     table = Table("method", *measures, title=f"{results['episodes']} episodes each", show_edge=False)
     for name, one in methods.items():
-        table.add_row(name, *(_measure(one["measures"][measure]) for measure in measures))
+        table.add_row(name, *(_measure(one["measures"].get(measure)) for measure in measures))
     _show(table)
 
 
-def _measure(one: Mapping[str, Any]) -> str:
-    if one["trials"] == 0:
+def _measure(one: Mapping[str, Any] | None) -> str:
+    if one is None or one["trials"] == 0:
         return "-"
     if "successes" in one:
         low, high = one["interval"]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from torch import nn
 
 from ddco_pyro.collect import OnDemonstration, collect
 from ddco_pyro.control_dimensions import ControlDimension, all_constant, control_dimensions
@@ -15,10 +16,11 @@ from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError, extent
 from ddco_pyro.encoding import STEPS_AT_ONCE, Shapes
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.initialize import POOLED
-from ddco_pyro.memory import Extent, Work, refuse_too_much
+from ddco_pyro.memory import Work, refuse_too_much
 from ddco_pyro.networks import ShapeError
-from ddco_pyro.spec import BaselineSpec, Spec, SpecError, own_networks
+from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code
 from ddco_pyro.task import find_task
+from ddco_pyro.widths import nearest_widths
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,12 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
     if missing:
         known = ", ".join(sorted(dimensions.shapes))
         raise SpecError(f"observations: there is no {', '.join(missing)} (there are: {known})")
+    drawn = spec.report.trajectory
+    shape = dimensions.shapes[drawn] if drawn else (3,)
+    if len(shape) != 1 or shape[0] < 3:
+        raise SpecError(
+            f"report.trajectory: {drawn!r} has shape {list(shape)} at each step; name a vector of three numbers or more"
+        )
     scale = spec.control.scale
     if isinstance(scale, tuple) and len(scale) != dimensions.control_size:
         raise SpecError(
@@ -89,21 +97,31 @@ def _refuse_giants(spec: Spec, dimensions: Dimensions) -> None:
             f"hierarchy.levels: the levels have {choices} joint choices, at most {MOST_CHOICES} can be summed over; "
             "lower count"
         )
-    if own_networks(spec):
+    if any(place.endswith(".network") for place in user_code(spec)):
         return  # its sizes are its own affair
     try:
-        with torch.device("meta"):
-            hierarchy = Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps)
+        number = _counted(spec, dimensions)
     except ShapeError:
         return  # it is said better where the networks are made
     except (RuntimeError, MemoryError, TypeError):  # sizes that no tensor can have
-        parameters = "more parameters than a machine can count"
+        said = "more parameters than a machine can count"
     else:
-        number = sum(parameter.numel() for parameter in hierarchy.parameters())
         if number <= MOST_PARAMETERS:
             return
-        parameters = f"{number} parameters, more than {MOST_PARAMETERS}"
-    raise SpecError(f"the networks have {parameters}; lower count, hidden, filters or kernel, or scale the images down")
+        said = f"{number} parameters, more than {MOST_PARAMETERS}"
+    raise SpecError(f"the networks have {said}; lower count, hidden, filters or kernel, or scale the images down")
+
+
+def _counted(spec: Spec, dimensions: Dimensions) -> int:
+    """The number of parameters of the spec's networks, which are made without their numbers."""
+    with torch.device("meta"):
+        size = dimensions.shapes, dimensions.control_size, dimensions.steps, dimensions.constant
+        return parameters(Hierarchy(spec, *size))
+
+
+def parameters(network: nn.Module) -> int:
+    """The number of trained parameters."""
+    return sum(parameter.numel() for parameter in network.parameters())
 
 
 def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
@@ -112,17 +130,42 @@ def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
     :raises SpecError: something in the spec does not fit the observations or the control.
     """
     hierarchy = build_hierarchy(spec, dimensions)
-    for number, baseline in enumerate(spec.compare_with):
-        try:
-            build_hierarchy(baseline_spec(spec, baseline), dimensions)
-        except SpecError as error:  # what it shares with the spec is in order: it is about its own network
-            raise SpecError(f"compare_with.{number}.{str(error).removeprefix('baseline.')}") from error
+    baselines(spec, dimensions)
     return hierarchy
 
 
-def baseline_spec(spec: Spec, baseline: BaselineSpec) -> Spec:
-    """The spec of a baseline trained beside: the same but for the model."""
-    return spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": ()})
+def baselines(spec: Spec, dimensions: Dimensions) -> list[tuple[Spec, Hierarchy]]:
+    """The spec and the networks of each baseline that is trained beside.
+
+    :raises SpecError: a baseline's network does not fit the observations.
+    """
+    found = []
+    for number, baseline in enumerate(spec.compare_with):
+        try:
+            beside = baseline_spec(spec, baseline, dimensions)
+            found.append((beside, build_hierarchy(beside, dimensions)))
+        except SpecError as error:  # what it shares with the spec is in order: it is about its own network
+            problems = (problem.removeprefix("baseline.") for problem in error.problems)
+            raise SpecError(*(f"compare_with.{number}.{problem}" for problem in problems)) from error
+    return found
+
+
+def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) -> Spec:
+    """The spec of a baseline trained beside: the same but for the model.
+
+    :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
+    """
+    alone = spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": ()})
+    if baseline.kind != "flat_equal":
+        return alone
+
+    def resized(hidden: tuple[int, ...]) -> Spec:
+        policy = baseline.policy.model_copy(update={"hidden": hidden})
+        return alone.model_copy(update={"baseline": baseline.model_copy(update={"policy": policy})})
+
+    build_hierarchy(alone, dimensions)  # what is wrong with it is said here
+    target = parameters(build_hierarchy(spec, dimensions))
+    return resized(nearest_widths(baseline.policy.hidden, target, lambda hidden: _counted(resized(hidden), dimensions)))
 
 
 def dimensions(spec: Spec) -> Dimensions:
@@ -161,9 +204,21 @@ def demonstrations(spec: Spec, on_demonstration: OnDemonstration | None = None) 
     if spec.demonstrated_task is not None and (path is None or not path.exists()):
         path = collect(spec.demonstrated_task, own, path, on_demonstration)
     assert path is not None  # a spec has a task or a file
+    if not path.exists():
+        raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
     _refuse_what_is_larger_than_memory(spec, path)
     labels = (own.labels,) if own.labels else ()
     return Demonstrations.read(path, [one.key for one in spec.observations], labels, own.exclude)
+
+
+def _needed(spec: Spec) -> str:
+    """What to do about a file that is not there."""
+    labels = [spec.demonstrations.labels] if spec.demonstrations.labels else []
+    read = ["actions", *(f"obs/{one.key}" for one in spec.observations), *(f"labels/{name}" for name in labels)]
+    return (
+        "put it there, or fit to another with --set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, "
+        f"with {', '.join(read)} in each data/<demonstration>"
+    )
 
 
 def _refuse_what_is_larger_than_memory(spec: Spec, path: Path) -> None:
@@ -181,21 +236,19 @@ def memory_needed(spec: Spec, path: Path) -> float:
     :raises DemonstrationsError: the file cannot be read or does not hold what the spec names.
     """
     found = extent(path, [one.key for one in spec.observations], spec.demonstrations.exclude)
-    models = [spec, *(baseline_spec(spec, baseline) for baseline in spec.compare_with)]
-    works = [_work(model, found) for model in models]
+    shapes = {place.removeprefix("obs/"): shape for place, shape in found.shapes.items() if place != "actions"}
+    size = Dimensions(shapes, math.prod(found.shapes["actions"]), max(1, *found.lengths))
+    try:
+        with torch.random.fork_rng(devices=[]):
+            works = [_work(*model, size) for model in ((spec, build_hierarchy(spec, size)), *baselines(spec, size))]
+    except SpecError:  # it is said where networks are checked
+        works = [Work(spec.training.batch_size, STEPS_AT_ONCE, 0, 0)]
     return found.fit(works, {f"obs/{one.key}" for one in spec.observations if one.differences})
 
 
-def _work(spec: Spec, extent: Extent) -> Work:
-    """What training the spec's model takes; what networks take is left out where they cannot be made."""
-    shapes = {place.removeprefix("obs/"): shape for place, shape in extent.shapes.items() if place != "actions"}
-    control = math.prod(extent.shapes["actions"])
-    try:
-        with torch.random.fork_rng(devices=[]):
-            hierarchy = build_hierarchy(spec, Dimensions(shapes, control, max(extent.lengths)))
-    except SpecError:  # it is said better where networks are checked
-        return Work(spec.training.batch_size, STEPS_AT_ONCE, 0, 0)
+def _work(spec: Spec, hierarchy: Hierarchy, dimensions: Dimensions) -> Work:
+    """What training a model takes."""
     features = len(hierarchy.encoder.mean) + sum(shape[-1] * POOLED**2 for shape in hierarchy.encoder.images.values())
     kind = spec.training.initialize if hierarchy.depth else "random"
-    clustered = {"random": 0, "vq": features, "vq_controls": features + control}[kind]
+    clustered = {"random": 0, "vq": features, "vq_controls": features + dimensions.control_size}[kind]
     return Work(spec.training.batch_size, hierarchy.steps_at_once, hierarchy.step_bytes, clustered)

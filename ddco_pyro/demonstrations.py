@@ -14,6 +14,7 @@ from typing import Any, overload
 import h5py
 import numpy as np
 
+from ddco_pyro.errors import nearest
 from ddco_pyro.files import whole_file
 from ddco_pyro.hdf5 import (
     Attribute,
@@ -25,7 +26,6 @@ from ddco_pyro.hdf5 import (
     member,
     names_in_mask,
     natural,
-    nearest,
     opened,
     written,
 )

@@ -9,12 +9,15 @@ from typing import Any, Literal
 UNUSED_SHARE = 0.01
 DOMINATING_SHARE = 0.9
 SHORTEST_DURATION = 1.5
+AGAIN_AND_AGAIN = 3.0
+"""Selections in each demonstration that has the option; an option may end after one step by design, such as a grasp."""
+
 HIGH_FITTING_SHARE = 0.5
 SMALLEST_DIVERGENCE = 0.1
 """Nats per step; two Gaussian policies whose means are 0.45 σ apart."""
 
 Use = Sequence[Mapping[str, Any]]
-"""How each choice of one level is used, control (0) first: ``choice``, ``share``, ``duration`` of ``metrics.json``."""
+"""How each choice of one level is used, control (0) first: its rows in ``metrics["options"]``."""
 
 Alike = Sequence[Mapping[str, Any]]
 """How differently each two ``options`` of one level act: ``divergence`` in nats per step."""
@@ -41,7 +44,7 @@ ADVICE: Mapping[Kind, str] = {
 class Finding:
     """One sign of a degenerate solution: its ``kind``, the ``level`` (1 is the lowest) and ``choice`` it concerns, and
     the ``value`` that gave it away: a share of the time, a duration in steps, or nats per step. A redundant option acts
-    like the ``other``.
+    like the ``other``; one that never persists has so many ``selections`` in each demonstration that has it.
     """
 
     kind: Kind
@@ -49,6 +52,7 @@ class Finding:
     choice: int
     value: float
     other: int = 0
+    selections: float = 0.0
 
     @property
     def advice(self) -> str:
@@ -59,10 +63,11 @@ class Finding:
 def diagnose(options: Sequence[Use], divergences: Sequence[Alike] = ()) -> list[Finding]:
     """The signs found in ``metrics["options"]`` and ``metrics["divergences"]``, levels lowest first.
 
-    An option is unused below 1 % of the time, dominating above 90 % where it is not the only one, and never persisting
-    where it is used but is expected to last less than 1.5 steps. Two options that are both used are redundant where
-    they differ by less than 0.1 nats per step over the time that one of them is active. A caller is high-fitting where
-    it emits the control itself in more than half of the time that it acts.
+    An option is unused below 1 % of the time, and dominating above 90 % where it is not the only one. It never persists
+    where it is expected to last less than 1.5 steps and is selected again and again, three times or more in each
+    demonstration that has it: it ends at once, and its caller does all the work. Two options that are both used are
+    redundant where they differ by less than 0.1 nats per step over the time that one of them is active. A caller is
+    high-fitting where it emits the control itself in more than half of the time that it acts.
     """
     found: list[Finding] = []
     for level, use in enumerate(options, start=1):
@@ -81,8 +86,10 @@ def _of_option(level: int, use: Mapping[str, Any], alone: bool) -> list[Finding]
     found = []
     if share > DOMINATING_SHARE and not alone:
         found.append(Finding("dominating", level, choice, share))
-    if duration is not None and duration < SHORTEST_DURATION:
-        found.append(Finding("never_persisting", level, choice, float(duration)))
+    within = float(use.get("demonstrations", 0.0))  # runs of before do not have it
+    selections = float(use["selected"]) / within if within else 0.0
+    if duration is not None and duration < SHORTEST_DURATION and selections >= AGAIN_AND_AGAIN:
+        found.append(Finding("never_persisting", level, choice, float(duration), selections=selections))
     return found
 
 
@@ -92,7 +99,7 @@ def _of_pairs(level: int, use: Use, alike: Alike) -> list[Finding]:
         Finding("redundant", level, second, float(one["divergence"]), first)
         for one in alike
         for first, second in [one["options"]]
-        if {first, second} <= used and one["divergence"] < SMALLEST_DIVERGENCE
+        if {first, second} <= used and one["divergence"] is not None and one["divergence"] < SMALLEST_DIVERGENCE
     ]
 
 

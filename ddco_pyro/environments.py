@@ -19,7 +19,8 @@ import numpy as np
 from dm_env import specs
 from gymnasium import spaces
 
-from ddco_pyro.task import ENTRY_POINTS, find_task
+from ddco_pyro.spec.types import TASKS
+from ddco_pyro.task import find_task
 
 NAMESPACE = "ddco"
 
@@ -59,7 +60,7 @@ class TaskEnvironment(gymnasium.Env[Observation, np.ndarray]):
         """One control step; the environment's end is a truncation where it says that more could follow."""
         step = self._environment.step(np.asarray(action))
         ended = step.last() and step.discount == 0
-        info = self.task.outcome(self._environment) if step.last() else {}
+        info = self.task.measured(self._environment) if step.last() else {}
         return _observation(step), float(step.reward or 0.0), bool(ended), bool(step.last() and not ended), info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
@@ -89,7 +90,7 @@ def _box(spec: specs.Array) -> spaces.Box:
 
 def register() -> None:
     """Register every task that is not registered yet as ``ddco/<task>-v0``."""
-    for point in entry_points(group=ENTRY_POINTS):
+    for point in entry_points(group=TASKS):
         name = f"{NAMESPACE}/{point.name}-v0"
         if name not in gymnasium.registry:
             gymnasium.register(name, "ddco_pyro.environments:TaskEnvironment", kwargs={"task": point.name})

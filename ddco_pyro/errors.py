@@ -1,5 +1,11 @@
 """The bases of errors that tell a user what to change."""
 
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from typing import Any
+
 
 class BadInput(ValueError):
     """What was given cannot be used: one line that says what is wrong, where, and what to do (exit status 2)."""
@@ -7,3 +13,9 @@ class BadInput(ValueError):
 
 class Failed(RuntimeError):
     """What was asked for cannot be done, though the input is in order: one line as above (exit status 1)."""
+
+
+def nearest(given: Any, names: Iterable[str]) -> str:
+    """A question whether the closest of the names was meant; nothing where none is close."""
+    close = difflib.get_close_matches(str(given), list(names), n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""

@@ -5,22 +5,25 @@ from __future__ import annotations
 import errno
 import fcntl
 import glob
+import hashlib
 import json
 import os
 import platform
+import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from safetensors import safe_open
+import torch
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from ddco_pyro.errors import BadInput, Failed
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-_FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR}
+_FORBIDDEN = {errno.EACCES, errno.EBUSY, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR}
 
 
 class NoSpace(Failed):
@@ -29,6 +32,13 @@ class NoSpace(Failed):
 
 class NotWritable(BadInput):
     """A place where nothing may be written."""
+
+
+class Damaged(BadInput):
+    """A file does not hold what was written into it."""
+
+    def __init__(self, path: Path, what: str, remedy: str) -> None:
+        super().__init__(f"{path}: is damaged: {what}; {remedy}")
 
 
 class Busy(BadInput):
@@ -51,8 +61,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary = Path(name)
         try:
             yield temporary
-            with temporary.open("rb") as written:
-                os.fsync(written.fileno())
+            _flush(temporary)
             temporary.chmod(0o644)
             temporary.replace(path)
         finally:
@@ -62,13 +71,46 @@ def whole_file(path: Path) -> Iterator[Path]:
 _TEMPORARY = ".tmp"
 
 
+def _flush(path: Path) -> None:
+    """See that what was written is on the disk."""
+    if path.is_file():
+        with path.open("rb") as written:
+            os.fsync(written.fileno())
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder beside ``path``, which takes the place of ``path`` once the block has ended without an error.
+
+    :raises NoSpace: the disk is full.
+    :raises NotWritable: nothing may be written there.
+    """
+    with _explained(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_stale(path)
+        prefix = f".{path.name}-{platform.node()}-{os.getpid()}-"
+        temporary = Path(tempfile.mkdtemp(prefix=prefix, suffix=_TEMPORARY, dir=path.parent))
+        try:
+            yield temporary
+            for file in temporary.rglob("*"):
+                _flush(file)
+            temporary.chmod(0o755)
+            before = temporary.with_name(f"{prefix}before{_TEMPORARY}")
+            if path.exists():
+                path.rename(before)
+            temporary.rename(path)
+            shutil.rmtree(before, ignore_errors=True)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
 def _remove_stale(path: Path) -> None:
-    """Remove what a process of this machine, killed while it wrote this very file, has left."""
+    """Remove what a process of this machine, killed while it wrote this very file or folder, has left."""
     prefix = f".{path.name}-{platform.node()}-"
     for old in path.parent.glob(f"{glob.escape(prefix)}*{_TEMPORARY}"):
         process = old.name.removeprefix(prefix).partition("-")[0]
         if process.isdecimal() and not Path(f"/proc/{process}").exists():
-            old.unlink(missing_ok=True)
+            shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
 
 
 def leftovers(folder: Path) -> list[Path]:
@@ -129,8 +171,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write named tensors and text metadata as safetensors, whole or not at all; equal contents give equal bytes."""
-    content = save({name: value.contiguous() for name, value in tensors.items()}, dict(metadata))
+    """Write named tensors and text metadata as safetensors, whole or not at all; equal contents give equal bytes.
+
+    A checksum of both is written with them.
+    """
+    checked = {**metadata, CHECKSUM: _digest(tensors, metadata)}
+    content = save({name: value.contiguous() for name, value in tensors.items()}, checked)
     with whole_file(path) as temporary:
         temporary.write_bytes(_metadata_in_order(content))
 
@@ -145,7 +191,32 @@ def _metadata_in_order(content: bytes) -> bytes:
     return len(text).to_bytes(8, "little") + text + content[end:]
 
 
-def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Named tensors and metadata of a safetensors file."""
-    with safe_open(path, framework="pt") as file:
-        return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+CHECKSUM = "sha256"
+
+
+def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+    """SHA-256 of names, types, shapes, bytes and metadata."""
+    found = hashlib.sha256(json.dumps(sorted(metadata.items())).encode())
+    for name in sorted(tensors):
+        value = tensors[name].detach().cpu().contiguous()
+        found.update(json.dumps([name, str(value.dtype), list(value.shape)]).encode())
+        found.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())
+    return found.hexdigest()
+
+
+def read_tensors(path: Path, remedy: str = "write it again") -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Named tensors and metadata of a safetensors file; what was written without a checksum is believed.
+
+    :param remedy: what to do where it is damaged.
+    :raises Damaged: it cannot be read, or does not hold what was written.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            metadata = dict(file.metadata() or {})
+    except (SafetensorError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        raise Damaged(path, " ".join(str(error).split()), remedy) from error
+    known = metadata.pop(CHECKSUM, None)
+    if known is not None and known != _digest(tensors, metadata):
+        raise Damaged(path, "its contents are not what was written", remedy)
+    return tensors, metadata

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import io
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +13,7 @@ from typing import Any, Literal
 import h5py
 import numpy as np
 
-from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.errors import BadInput, Failed, nearest
 
 Attribute = float | int | str | bool
 
@@ -233,9 +232,3 @@ def attributes_of(owner: h5py.HLObject) -> dict[str, Attribute]:
 
 def _is_number_or_text(dtype: np.dtype) -> bool:
     return dtype.kind in "iufb" or h5py.check_string_dtype(dtype) is not None
-
-
-def nearest(name: str, names: Iterable[str]) -> str:
-    """A question whether the closest of the names was meant; nothing where none is close."""
-    close = difflib.get_close_matches(name, list(names), n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""

@@ -21,7 +21,7 @@ from ddco_pyro.encoding import STEPS_AT_ONCE, Batch, ControlScaling, Observation
 from ddco_pyro.networks import Inputs, InputShape, ShapeError, build
 from ddco_pyro.networks.activations import training_bytes
 from ddco_pyro.outputs import Decision, Outputs
-from ddco_pyro.spec import ControlSpec, LearnedStd, LevelSpec, NetworkSpec, Spec
+from ddco_pyro.spec import ControlSpec, LearnedStd, LevelSpec, NetworkSpec, Spec, SpecError
 
 INITIAL_STD = 0.5
 """A learned standard deviation starts here, in scaled units."""
@@ -105,9 +105,8 @@ class Level(nn.Module):
         self.count = spec.count
         with _named(f"{place}.policy"):
             self.policy = Caller(
-                spec.policy, spec.policy.emits or _default(options_below), options_below, shape, control, control_size,
-                spec.count,
-            )  # fmt: skip
+                spec.policy, spec.policy.emits, options_below, shape, control, control_size, spec.count
+            )
         with _named(f"{place}.termination"):
             self.termination = build(spec.termination, shape, 1, spec.count)
 
@@ -117,12 +116,10 @@ def _named(place: str) -> Iterator[None]:
     """Errors about a network say where in the spec it stands."""
     try:
         yield
+    except SpecError as error:
+        raise SpecError(*(f"{place}.{problem}" for problem in error.problems)) from error
     except ShapeError as error:
         raise ShapeError(f"{place}: {error}") from error
-
-
-def _default(options_below: int) -> tuple[Emits, ...]:
-    return ("options",) if options_below else ("control",)
 
 
 class Hierarchy(nn.Module):
@@ -133,6 +130,7 @@ class Hierarchy(nn.Module):
     :param steps: the longest demonstration, for per-timestep networks.
     :param constant: the control dimensions that are no part of the model, and the values that are emitted for them.
     :raises ShapeError: where a network cannot read these observations.
+    :raises SpecError: where a user's network does not take its options.
     """
 
     def __init__(
@@ -144,6 +142,7 @@ class Hierarchy(nn.Module):
         constant: Mapping[int, float] = MappingProxyType({}),
     ) -> None:
         super().__init__()
+        self.steps = steps
         self.encoder = ObservationEncoder(spec.observations, shapes)
         self.scaling = ControlScaling(spec.control, control_size, constant)
         self.input_shape = shape = self.encoder.shape(steps)

@@ -11,8 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ddco_pyro.errors import BadInput
-from ddco_pyro.hdf5 import Attribute, DemonstrationsError, nearest, opened
+from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.hdf5 import Attribute, DemonstrationsError, opened
 from ddco_pyro.parts import Parts, discard, parts_of
 from ddco_pyro.sources import Column, Format, Recording, Source, open_source
 from ddco_pyro.values import LARGEST, usable

@@ -70,7 +70,7 @@ def _play(
     return [
         Played(
             seed,
-            {name: float(value) for name, value in task.outcome(environment).items()},
+            task.measured(environment),
             np.stack(own),
             {key: np.stack(values) for key, values in kept.items()},
         )

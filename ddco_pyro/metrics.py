@@ -35,12 +35,15 @@ def _log_likelihood(found: Fit, demos: Demonstrations) -> np.ndarray:
 
 
 def evaluate(found: Fit, parts: dict[str, Demonstrations], demos: Demonstrations) -> dict[str, Any]:
-    """What ``metrics.json`` says of a model: log-likelihood in nats per step of each part of the data, its paired
-    difference to every baseline, and with options their use, divergences and agreement with labels.
+    """What ``metrics.json`` says of a model: log-likelihood in nats per step of each part of the data and of each
+    demonstration, its paired difference to every baseline, and with options their use, divergences and agreement with
+    labels.
 
     :raises NotFinite: a log-likelihood is NaN or infinite.
     """
-    values = {name: _log_likelihood(found, part) for name, part in parts.items()}
+    methods = {found.name: found, **found.baselines}
+    by_method = {name: {part: _log_likelihood(fit, parts[part]) for part in parts} for name, fit in methods.items()}
+    values = by_method[found.name]
     per_step = {name: float(v.sum() / sum(parts[name].lengths)) for name, v in values.items()}
     metrics: dict[str, Any] = {
         "model": found.name,
@@ -49,10 +52,13 @@ def evaluate(found: Fit, parts: dict[str, Demonstrations], demos: Demonstrations
             name: _by_dimension(found, parts[name]) if name in parts else None for name in ("train", "valid")
         },
         "valid": _each(parts["valid"], values["valid"]) if "valid" in parts else [],
+        "demonstrations_by_likelihood": _worst_first(found.name, parts, by_method),
         "comparison": {
             name: {
                 "log_likelihood_per_step": one.metrics["log_likelihood_per_step"],
-                "difference": _difference(values["valid"], one, parts["valid"]),
+                "difference": _difference(values["valid"], by_method[name]["valid"], parts["valid"]),
+                "parameters": one.metrics["parameters"],
+                "training": one.metrics["training"],
             }
             for name, one in found.baselines.items()
         },
@@ -73,6 +79,27 @@ def _each(demos: Demonstrations, values: np.ndarray) -> list[dict[str, Any]]:
     ]
 
 
+def _worst_first(
+    ours: str, parts: dict[str, Demonstrations], by_method: dict[str, dict[str, np.ndarray]]
+) -> list[dict[str, Any]]:
+    """Every demonstration with its part of the data and its log-likelihood per step under each method, by method; the
+    least likely under the method ``ours`` first.
+    """
+    rows = [
+        {
+            "name": demo.name,
+            "part": part,
+            "steps": len(demo),
+            "log_likelihood_per_step": {
+                name: float(values[part][row]) / len(demo) for name, values in by_method.items()
+            },
+        }
+        for part, demos in parts.items()
+        for row, demo in enumerate(demos)
+    ]
+    return sorted(rows, key=lambda row: row["log_likelihood_per_step"][ours])
+
+
 def _by_dimension(found: Fit, demos: Demonstrations) -> dict[str, Any]:
     """What each control dimension (None for constant ones, which are no part of the model) and choosing options add to
     the log-likelihood per step.
@@ -85,8 +112,8 @@ def _by_dimension(found: Fit, demos: Demonstrations) -> dict[str, Any]:
     return {"by_dimension": values, "options": float(each.options.sum()) / steps}
 
 
-def _difference(ours: np.ndarray, baseline: Fit, valid: Demonstrations) -> dict[str, float]:
-    return analysis.paired(ours, baseline.log_likelihood(valid), np.array(valid.lengths, dtype=float))
+def _difference(ours: np.ndarray, theirs: np.ndarray, valid: Demonstrations) -> dict[str, float]:
+    return analysis.paired(ours, theirs, np.array(valid.lengths, dtype=float))
 
 
 def _agreement(found: Fit, parts: dict[str, Demonstrations]) -> dict[str, Any]:

@@ -47,7 +47,7 @@ def run_episode(task: Task, policy: Policy | str, seed: int, film: bool = False)
             labels.append(dict(getattr(actor, "annotations", {})))
             step = environment.step(control)
         frames += [task.frame(environment)] if film else []
-        outcome = {name: float(value) for name, value in task.outcome(environment).items()}
+        outcome = task.measured(environment)
     finally:
         environment.close()
     record = Demonstration(
@@ -76,23 +76,28 @@ def _run_named(task: str, policy: Policy | str, seed: int, film: bool) -> Episod
     return run_episode(find_task(task), policy, seed, film)
 
 
-def summarize(outcomes: Sequence[Mapping[str, float]]) -> dict[str, dict[str, Any]]:
-    """Each measure over episodes: a rate with its Wilson 95 % interval, or a mean with its 95 % interval.
+def summarize(task: Task, outcomes: Sequence[Mapping[str, float]]) -> dict[str, dict[str, Any]]:
+    """Each measure over episodes: a rate with its Wilson 95 % interval, or a mean with Student's, as the task declares.
 
-    A measure whose values are all 0 or 1 is a rate. NaN (does not apply to this episode) is left out of ``trials``.
+    NaN (does not apply to this episode) is left out of ``trials``.
     """
-    names = list(dict.fromkeys(name for outcome in outcomes for name in outcome))
-    return {name: _summary(np.array([outcome.get(name, np.nan) for outcome in outcomes])) for name in names}
+    found = {}
+    for name in dict.fromkeys(name for outcome in outcomes for name in outcome):
+        values = np.array([outcome.get(name, np.nan) for outcome in outcomes])
+        values = values[~np.isnan(values)]
+        found[name] = rate(int(values.sum()), len(values)) if task.kind(name) == "rate" else mean(values)
+    return found
 
 
-def _summary(values: np.ndarray) -> dict[str, Any]:
-    values = values[~np.isnan(values)]
-    if np.isin(values, (0.0, 1.0)).all():
-        return rate(int(values.sum()), len(values))
-    mean, spread = float(values.mean()), float(values.std(ddof=1)) if len(values) > 1 else float("nan")
-    half = spread / np.sqrt(len(values)) * stats.t.ppf((1 + CONFIDENCE) / 2, max(len(values) - 1, 1))
-    interval = [mean - half, mean + half] if len(values) > 1 else None
-    return {"mean": mean, "std": spread if len(values) > 1 else None, "trials": len(values), "interval": interval}
+def mean(values: np.ndarray) -> dict[str, Any]:
+    """A mean with its standard deviation and Student's 95 % interval, both of which take two values at least."""
+    trials = len(values)
+    centre = float(values.mean()) if trials else None
+    if centre is None or trials < 2:
+        return {"mean": centre, "std": None, "trials": trials, "interval": None}
+    spread = float(values.std(ddof=1))
+    half = float(spread / np.sqrt(trials) * stats.t.ppf((1 + CONFIDENCE) / 2, trials - 1))
+    return {"mean": centre, "std": spread, "trials": trials, "interval": [centre - half, centre + half]}
 
 
 def rate(successes: int, trials: int) -> dict[str, Any]:

@@ -16,13 +16,12 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
 from torch import Tensor
 
 from ddco_pyro import analysis
 from ddco_pyro.ahmm import Tables
 from ddco_pyro.controller import Controller
-from ddco_pyro.data import Dimensions, baseline_spec, build_hierarchy, demonstrations, parts
+from ddco_pyro.data import Dimensions, baseline_spec, build_hierarchy, demonstrations, parameters, parts
 from ddco_pyro.decomposition import Decomposition, decompose
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.encoding import Batch, encode, refuse_overflow
@@ -34,8 +33,12 @@ from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_
 from ddco_pyro.metrics import evaluate, supervisor
 from ddco_pyro.monitor import Monitor
 from ddco_pyro.outputs import Outputs
-from ddco_pyro.spec import Spec, dump_spec, load_spec, own_networks, refuse_own_networks
-from ddco_pyro.training import Trainer, TrainingError, plan
+from ddco_pyro.records import read_metrics, refit
+from ddco_pyro.spec import Spec, dump_spec, load_spec, user_code
+from ddco_pyro.training import Trainer, TrainingError
+
+TOLERANCE = 1e-4
+"""Relative; a log-likelihood computed again on another machine differs in the last digits of float32."""
 
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
 
@@ -50,8 +53,8 @@ class Watcher(Protocol):
     def collected(self, done: int, total: int) -> None:
         """So many of the demonstrations have been collected."""
 
-    def training(self, name: str, epochs: int) -> None:
-        """A model begins to be trained, for at most so many epochs in all."""
+    def training(self, name: str, epochs: int | None) -> None:
+        """A model begins to be trained, for at most so many epochs in all; None for no limit."""
 
     def epoch(self, row: dict[str, Any]) -> None:
         """An epoch has ended; its row of the history."""
@@ -70,9 +73,12 @@ class Fit:
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """The contents of ``metrics.json``."""
-        found: dict[str, Any] = json.loads((self.folder / "metrics.json").read_text())
-        return found
+        """The contents of ``metrics.json``.
+
+        :raises Damaged: it lacks something that a reader needs.
+        """
+        hierarchy = self.spec.hierarchy
+        return read_metrics(self.folder, [level.count for level in hierarchy.levels] if hierarchy else [])
 
     @property
     def name(self) -> str:
@@ -83,8 +89,17 @@ class Fit:
     def baselines(self) -> dict[str, Fit]:
         """The baselines that were trained beside it, by name."""
         folders = [self.folder / "baselines" / baseline.kind for baseline in self.spec.compare_with]
-        own = bool(own_networks(self.spec))  # theirs are named in this spec too
-        return {folder.name: load(folder, own) for folder in folders if _finished(folder)}
+        allow_code = bool(user_code(self.spec))  # theirs is named in this spec too
+        return {folder.name: load(folder, allow_code) for folder in folders if _finished(folder)}
+
+    @cached_property
+    def held_out(self) -> dict[str, float]:
+        """log p(ξ) of each demonstration that was held out, by name, as it was then."""
+        return {one["name"]: one["log_likelihood"] for one in self.metrics["valid"]}
+
+    def was_held_out(self, name: str, log_likelihood: float) -> bool:
+        """Whether a demonstration is one of those that were held out: the same name, and as likely as it was then."""
+        return bool(np.isclose(self.held_out.get(name, np.nan), log_likelihood, rtol=TOLERANCE, atol=TOLERANCE))
 
     def log_likelihood(self, demos: Demonstrations) -> np.ndarray:
         """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units."""
@@ -168,10 +183,11 @@ def model_name(spec: Spec) -> str:
 def load(folder: str | Path, allow_code: bool = False) -> Fit:
     """The fit in a run folder.
 
-    :param allow_code: import the networks of one's own (``module:Class``) that its spec names; nothing else in a run
-        is ever executed.
-    :raises RunError: the folder has no finished fit, or a damaged one.
-    :raises SpecError: its spec names a network of one's own, and that is not allowed.
+    :param allow_code: import the user code (``module:name``) that its spec names; nothing else in a run is ever
+        executed.
+    :raises RunError: the folder has no finished fit, or its model is of another spec.
+    :raises Damaged: the model or ``metrics.json`` is damaged.
+    :raises SpecError: its spec names user code, and that is not allowed.
     """
     folder = Path(folder)
     missing = [name for name in ("spec.yaml", "model.safetensors", "metrics.json") if not (folder / name).exists()]
@@ -180,18 +196,19 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
         if (folder / "folds.json").exists():
             what = f"a selection; the fit of what it chose is in {folder / 'fit'} once it is done"
         raise RunError(f"{folder}: {what} (it has no {missing[0]})")
-    spec = load_spec(folder / "spec.yaml")
-    refuse_own_networks(spec, folder / "spec.yaml", allow_code)
+    spec = load_spec(folder / "spec.yaml", allow_code=allow_code)
     try:
-        return Fit(folder, spec, _read_model(spec, folder / "model.safetensors").eval())
+        found = Fit(folder, spec, _read_model(spec, folder / "model.safetensors").eval())
     except BadInput:
         raise
-    except (SafetensorError, KeyError, ValueError, RuntimeError) as error:
-        raise RunError(f"{folder}: model.safetensors is damaged, or of another spec than spec.yaml") from error
+    except (KeyError, ValueError, RuntimeError) as error:
+        raise RunError(f"{folder / 'model.safetensors'}: is of another spec than spec.yaml; {refit(folder)}") from error
+    _ = found.metrics  # whoever loads a run is told that they are damaged, before any work
+    return found
 
 
 def _read_model(spec: Spec, path: Path) -> Hierarchy:
-    tensors, metadata = read_tensors(path)
+    tensors, metadata = read_tensors(path, refit(path.parent))
     shapes = {key: tuple(shape) for key, shape in json.loads(metadata["shapes"]).items()}
     size = int(metadata["control_size"])
     whole = {"scaling.varying": torch.arange(size), "scaling.constant": torch.empty(0, dtype=torch.float64)}
@@ -225,28 +242,30 @@ def fit(spec: Spec, folder: Path, watcher: Watcher) -> Fit:
 
 
 def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, clock: _Clock) -> Fit:
-    split, size = parts(spec, demos), Dimensions.of(demos)
+    split = parts(spec, demos)
+    dimensions = Dimensions.of(demos)
     with clock("training"):
         checkpoint = folder / "checkpoints" / "latest.safetensors"
-        trained = train(spec, size, split["train"], watcher, checkpoint, split.get("valid"))
+        trained = train(spec, dimensions, split["train"], watcher, checkpoint, split.get("valid"))
     hierarchy = trained.hierarchy
     _write_history(folder, trained.history)
-    _write_model(folder, hierarchy, size)
+    _write_model(folder, hierarchy, dimensions)
     found = Fit(folder, spec, hierarchy)
     with clock("baselines"):
         for baseline in spec.compare_with:
-            own = folder / "baselines" / baseline.kind
-            claim(own, baseline_spec(spec, baseline))
+            own, beside = folder / "baselines" / baseline.kind, baseline_spec(spec, baseline, dimensions)
+            claim(own, beside)
             if not _finished(own):
-                _fit(baseline_spec(spec, baseline), own, demos, watcher, _Clock())
+                _fit(beside, own, demos, watcher, _Clock())
     with clock("evaluation"):
         metrics = evaluate(found, split, demos)
     held_out = {"valid": len(split.get("valid", ()))}
     metrics |= {
         "engine_check": trained.check._asdict(),
         "demonstrations": trained.demonstrations | held_out | supervisor(demos),
-        "control_dimensions": [one.as_data() for one in size.control],
-        "parameters": sum(parameter.numel() for parameter in hierarchy.parameters()),
+        "control_dimensions": [dimension.as_data() for dimension in dimensions.control],
+        "parameters": parameters(hierarchy),
+        "training": trained.training,
         "seconds": clock.seconds,
         "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
     }
@@ -255,8 +274,8 @@ def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, cloc
 
 
 def _finished(folder: Path) -> bool:
-    """Whether the run is complete: its metrics are written last."""
-    return (folder / "metrics.json").exists()
+    """Whether the run is complete: its metrics are written last. What was damaged and removed is made again."""
+    return all((folder / name).exists() for name in ("model.safetensors", "metrics.json"))
 
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
@@ -276,7 +295,7 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     if folder.exists() and not folder.is_dir():
         raise RunError(f"{folder}: is a file; choose another --out")
     if path.exists():
-        if path.read_text() != text:
+        if path.read_bytes() != text.encode():
             raise RunError(f"{folder}: holds a run of another spec; choose another --out or remove it")
         if not resume and _finished(folder) and (folder / "report.html").exists():  # what `fit` writes last
             raise RunError(
@@ -290,14 +309,16 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
 
 @dataclass(frozen=True)
 class Trained:
-    """What training gave: the ``hierarchy``, the ``check`` of the engines before it, the ``history`` of its epochs, and
-    the numbers of ``demonstrations`` that it was trained and tuned on.
+    """What training gave: the ``hierarchy``, the ``check`` of the engines before it, the ``history`` of its epochs, the
+    numbers of ``demonstrations`` that it was trained and tuned on, and what it spent of its budget, ``training``
+    (:func:`ddco_pyro.convergence.summary`).
     """
 
     hierarchy: Hierarchy
     check: EngineCheck
     history: list[dict[str, Any]]
     demonstrations: dict[str, int]
+    training: dict[str, Any]
 
 
 def train(
@@ -336,30 +357,33 @@ def _train(
         hierarchy.scaling.fit(kept)
         return hierarchy
 
-    first = make()
-    if held_out is not None:
-        refuse_overflow(held_out, first.encoder, first.scaling)
-    batches = [encode(part, first.encoder, first.scaling) for part in parts]
-    few = batches[0].select(torch.arange(min(len(batches[0]), TRAJECTORIES)), STEPS)
-    with torch.no_grad():
-        outputs = first(few.inputs)
-    if not all(bool(torch.isfinite(leaf).all()) for leaf in outputs.leaves() if leaf is not None):
-        raise TrainingError(
-            "before any training a network gives values that are NaN or infinite; look at its code, or at the ranges "
-            "of the observations (ddco-pyro inspect)"
-        )
-    check = compare_engines(outputs, few.actions, first.scaling.log_volume, few.lengths)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(spec.seed)
+        first = make()
+        if held_out is not None:
+            refuse_overflow(held_out, first.encoder, first.scaling)
+        batches = [encode(part, first.encoder, first.scaling) for part in parts]
+        few = batches[0].select(torch.arange(min(len(batches[0]), TRAJECTORIES)), STEPS)
+        with torch.no_grad():
+            outputs = first(few.inputs)
+        if not all(bool(torch.isfinite(leaf).all()) for leaf in outputs.leaves() if leaf is not None):
+            raise TrainingError(
+                "before any training a network gives values that are NaN or infinite; look at its code, or at the "
+                "ranges of the observations (ddco-pyro inspect)"
+            )
+        check = compare_engines(outputs, few.actions, first.scaling.log_volume, few.lengths)
     if not check.agrees:
         raise TrainingError(
             f"the engines disagree (value {check.value:.1e}, gradient {check.gradient:.1e}): "
             "this is a defect; use inference.engine=enumerate and report it"
         )
-    stages = len(plan(spec, first.depth))
-    watcher.training(model_name(spec), stages * spec.training.epochs * spec.training.restarts)
+    training = spec.training
+    watcher.training(model_name(spec), None if training.epochs is None else training.epochs * training.restarts)
     trainer = Trainer(spec, make, batches[0], batches[1], checkpoint, list(kept.names), watcher.epoch)
     hierarchy = trainer.run()
     watcher.trained(model_name(spec))
-    return Trained(hierarchy, check, trainer.progress.history, {"train": len(kept), "tune": len(tune)})
+    counts = {"train": len(kept), "tune": len(tune)}
+    return Trained(hierarchy, check, trainer.progress.history, counts, trainer.summary)
 
 
 def _write_model(folder: Path, hierarchy: Hierarchy, dimensions: Dimensions) -> None:

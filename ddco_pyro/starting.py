@@ -27,11 +27,15 @@ STEPS_PER_BATCH = 1000
 LINEAR_BELOW = 2000
 """With fewer steps than this in all, options have linear policies: hidden layers fit what will not come again."""
 
-GRADIENT_STEPS = 600
-"""A stage may take about so many gradient steps, and at least :data:`EPOCHS` epochs."""
+GRADIENT_STEPS = 4800
+"""A model may take about so many gradient steps in all: about a minute of one core, and enough for a hierarchy and for
+the policies beside it to stop by :data:`PATIENCE` on the files of docs/decisions.md."""
 
-EPOCHS = (50, 400)
-"""Fewest and most epochs of a stage."""
+EPOCHS = (200, 1600)
+"""Fewest and most epochs of a model."""
+
+PATIENCE = 50
+"""Epochs without improvement before a stage stops; with 20 flat policies stopped too early (docs/decisions.md)."""
 
 
 def starting_spec(found: Inspection, path: str | Path) -> str:
@@ -105,10 +109,13 @@ def _lines(found: Inspection, path: str) -> Iterator[str]:
     yield "  initialize: vq_controls           # clusters of observations and controls; vq: of observations alone"
     yield "  optimizer: {name: adam, lr: 3.0e-3}"
     batch = _batch(lengths)
-    yield f"  epochs: {_epochs(lengths, batch)}                       # of each stage, at most: it stops early"
+    yield f"  epochs: {_epochs(lengths, batch)}                      # of all stages together, at most"
+    yield f"  patience: {PATIENCE}                      # a stage stops after so many epochs without improvement"
     yield f"  batch_size: {batch}                    # demonstrations in a gradient step"
-    yield "# Is the hierarchy worth it? One policy without options, trained beside it."
-    yield f"compare_with: [{{kind: flat, policy: {_network(found)}}}]"
+    yield "# Is the hierarchy worth it? Policies without options, trained beside it with the same budget."
+    yield "compare_with:"
+    yield f"  - {{kind: flat, policy: {_network(found)}}}"
+    yield f"  - {{kind: flat_equal, policy: {_network(found)}}}   # as wide as gives it the hierarchy's parameters"
 
 
 def _text(value: str) -> str:

@@ -7,18 +7,23 @@ or by ``module:name``, and sees it only through :class:`Task`.
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol, get_args
 
 import dm_env
 import numpy as np
 
 from ddco_pyro.errors import BadInput
+from ddco_pyro.spec.types import TASKS
 
-ENTRY_POINTS = "ddco_pyro.tasks"
+SUCCESS = "success"
+"""The measure by which methods are compared."""
+
+Kind = Literal["rate", "mean"]
 
 Observation = Mapping[str, np.ndarray]
 
@@ -48,6 +53,9 @@ class Task:
     :param frame: a picture of the scene as it is now, uint8 [H, W, 3].
     :param sources: the files whose contents decide what a demonstration looks like, for caching.
     :param steps: the most control steps that an episode can have, where that is known; 1 otherwise.
+    :param measures: the kind of each measure in ``outcome``: a ``"rate"`` is 0 or 1 in every episode, a ``"mean"`` any
+        number. Without it every measure is a mean but ``success``, which is always a rate.
+    :raises OutcomeError: ``measures`` has another kind, or calls ``success`` a mean.
     """
 
     name: str
@@ -57,6 +65,41 @@ class Task:
     frame: Callable[[dm_env.Environment], np.ndarray]
     sources: tuple[Path, ...] = field(default=())
     steps: int = 1
+    measures: Mapping[str, Kind] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse a wrong declaration."""
+        for name, kind in self.measures.items():
+            if kind not in get_args(Kind):
+                raise self._wrong(f"{name} is declared a {kind!r}; it has to be a 'rate' or a 'mean'")
+        if self.kind(SUCCESS) != "rate":
+            raise self._wrong(f"{SUCCESS} is a rate, by which methods are compared; call the mean otherwise")
+
+    def kind(self, measure: str) -> Kind:
+        """Whether a measure is a rate or a mean."""
+        return self.measures.get(measure, "rate" if measure == SUCCESS else "mean")
+
+    def measured(self, environment: dm_env.Environment) -> dict[str, float]:
+        """The ``outcome`` of the episode that just ended.
+
+        :raises OutcomeError: it has other measures than were declared, or a rate that is not 0, 1 or NaN.
+        """
+        found = {name: float(value) for name, value in self.outcome(environment).items()}
+        if self.measures and found.keys() != self.measures.keys():
+            names = f"{', '.join(found)}, and its measures are {', '.join(self.measures)}"
+            raise self._wrong(f"its outcome has {names}; declare all of them")
+        for name, value in found.items():
+            if self.kind(name) == "rate" and not (value in (0.0, 1.0) or math.isnan(value)):
+                why = "a rate is 0 or 1 in every episode"
+                raise self._wrong(f"{name} is {value:g}, and {why}; make it a mean, which {SUCCESS} cannot be")
+        return found
+
+    def _wrong(self, what: str) -> OutcomeError:
+        return OutcomeError(f"task {self.name!r}: {what}")
+
+
+class OutcomeError(BadInput):
+    """What a task measures is not what it declares."""
 
 
 class UnknownTask(BadInput):
@@ -68,7 +111,7 @@ def find_task(name: str) -> Task:
 
     :raises UnknownTask: names what is registered.
     """
-    registered = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+    registered = {point.name: point for point in entry_points(group=TASKS)}
     if name in registered:
         found: Any = registered[name].load()
     elif ":" in name:

@@ -10,6 +10,7 @@ the end of any epoch gives the same result, bit for bit, as one that was not. Ch
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -20,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ddco_pyro.convergence import StageEnd, share, summary
 from ddco_pyro.encoding import Batch
 from ddco_pyro.errors import Failed
 from ddco_pyro.files import read_tensors, write_tensors
@@ -80,16 +82,20 @@ def plan(spec: Spec, depth: int) -> list[Stage]:
 class Progress:
     """Where training stands at the end of an epoch; with the tensors of a checkpoint it is all that is needed.
 
-    ``best`` is the tuning log-likelihood per step of the best epoch of this stage, ``winner`` that of the best
-    finished restart.
+    ``start`` is the tuning log-likelihood per step from before this stage, ``best`` that of its best epoch, ``winner``
+    that of the best finished restart. ``ended`` has a :class:`StageEnd` for each stage of this restart that has ended,
+    ``winner_ended`` those of the best finished restart.
     """
 
     restart: int = 0
     stage: int = 0
     epoch: int = 0
     stale: int = 0
+    start: float = -np.inf
     best: float = -np.inf
     winner: float = -np.inf
+    ended: list[dict[str, Any]] = field(default_factory=list)
+    winner_ended: list[dict[str, Any]] = field(default_factory=list)
     history: list[dict[str, Any]] = field(default_factory=list)
 
 
@@ -133,37 +139,47 @@ class Trainer:
             if self.progress.stage == 0 and self.progress.epoch == 0:
                 model = self._fresh()
             while self.progress.stage < len(stages):
-                self._run_stage(model, stages[self.progress.stage])
+                self._run_stage(model, stages[self.progress.stage], len(stages) - self.progress.stage)
                 self.progress.stage += 1
             self._finish_restart(model)
         model.load_state_dict(self._saved["winner"])
         return model.eval()
 
+    @property
+    def summary(self) -> dict[str, Any]:
+        """How the best restart was trained, for ``metrics.json``."""
+        ends = [StageEnd(**end) for end in self.progress.winner_ended]
+        return summary(self.spec.training, ends, math.ceil(len(self.train) / self.spec.training.batch_size))
+
     def _fresh(self) -> Hierarchy:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self._seed(self.progress.restart))
-            return self.make()
+            return self.make().eval()
 
     def _seed(self, *where: int) -> int:
         return int(np.random.SeedSequence([self.spec.seed, *where]).generate_state(1)[0])
 
-    def _run_stage(self, model: Hierarchy, stage: Stage) -> None:
-        now = self.progress
+    def _run_stage(self, model: Hierarchy, stage: Stage, stages_left: int) -> None:
+        now, training = self.progress, self.spec.training
+        cap = share(training.epochs, sum(end["epochs"] for end in now.ended), stages_left)
         objective = _Objective(self, stage)
         parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
-        optimizer = _optimizer(self.spec.training.optimizer, parameters)
+        optimizer = _optimizer(training.optimizer, parameters)
         if now.epoch > 0:
             model.load_state_dict(self._saved["model"])
             _restore_optimizer(optimizer, self._saved["optimizer"])
         else:
-            now.best, now.stale = objective.tune(model), 0
+            now.start, now.stale = objective.tune(model), 0
+            now.best = now.start
             self._saved["best"] = _copy(model)
-        while now.epoch < self.spec.training.epochs and now.stale < (self.spec.training.patience or np.inf):
+        while (cap is None or now.epoch < cap) and (training.patience is None or now.stale < training.patience):
             train = self._epoch(model, optimizer, parameters, objective)
             self._record(stage, train, objective.tune(model), model)
             if time.monotonic() - self._saved_at > SAVE_EVERY:
                 self._save(model, optimizer)
         model.load_state_dict(self._saved["best"])
+        tune = [now.start, *(row["tune"] for row in now.history[len(now.history) - now.epoch :])]
+        now.ended.append(asdict(StageEnd.of(stage.name, cap, tune, training.patience)))
         now.epoch = 0
 
     def _epoch(
@@ -199,9 +215,9 @@ class Trainer:
         now = self.progress
         value = _Objective(self, WHOLE).tune(model)
         if "winner" not in self._saved or value > now.winner:
-            now.winner = value
+            now.winner, now.winner_ended = value, now.ended
             self._saved["winner"] = _copy(model)
-        now.restart, now.stage, now.epoch = now.restart + 1, 0, 0
+        now.restart, now.stage, now.epoch, now.ended = now.restart + 1, 0, 0, []
         self._save(model, None)
 
     def _save(self, model: Hierarchy, optimizer: torch.optim.Optimizer | None) -> None:
@@ -216,7 +232,8 @@ class Trainer:
     def _load(self) -> None:
         if self.checkpoint is None or not self.checkpoint.exists():
             return
-        tensors, metadata = read_tensors(self.checkpoint)
+        remedy = "remove it and do the same again: training begins anew"
+        tensors, metadata = read_tensors(self.checkpoint, remedy)
         self.progress = Progress(**json.loads(metadata["progress"]))
         self._saved = {"optimizer": {}}
         for name, value in tensors.items():

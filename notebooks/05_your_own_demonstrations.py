@@ -14,8 +14,9 @@
 # # Your own demonstrations
 #
 # Anything in robomimic's HDF5 layout can be fitted. Here: 50 demonstrations of Meta-World's scripted expert, which were
-# recorded by somebody else, where they lie beside this repository; otherwise demonstrations of the needle task,
-# written to a file, take their place.
+# recorded by somebody else. Their file is not part of this repository; `specs/metaworld_pick_place.yaml` says what it
+# holds and how to record one, and `NOTEBOOK_METAWORLD=FILE` in the environment says where it is. Without it
+# demonstrations of the needle task, written to a file, take their place.
 
 # %%
 import os

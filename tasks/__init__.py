@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import os
-import sys
 
-
-def _has_display() -> bool:
-    """Whether a window system could give an OpenGL context."""
-    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
+from .opengl import has_display
 
 # MuJoCo reads the variable once, when it is first imported, so it has to be set before any task is.
-if not _has_display():
+if not has_display():
     os.environ.setdefault("MUJOCO_GL", "egl")
 
 # Before any task: dm-control looks for OpenGL when it is imported, and its own error does not say what to install.
-from . import rendering  # noqa: E402, F401
+from . import rendering  # noqa: F401

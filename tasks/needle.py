@@ -148,5 +148,6 @@ task = Task(
     outcome=outcome,
     frame=frame,
     steps=STEPS,
+    measures={"grasped": "rate", "inserted": "rate", "success": "rate", "accuracy_mm": "mean"},
     sources=(HERE / "needle.xml", *sorted(HERE.glob("needle*.py")), *(HERE / name for name in SHARED_SOURCES)),
 )

@@ -19,7 +19,7 @@ from dm_control.rl import control
 from dm_control.suite import base
 from dm_env import specs
 
-from ddco_pyro.task import Task
+from ddco_pyro.task import Kind, Task
 
 from . import pushing_geometry as geometry
 from . import pushing_supervisor
@@ -248,9 +248,12 @@ def _load(task: Pushing) -> Environment:
     return Environment(Physics.from_xml_path(str(HERE / "pushing.xml")), task, n_sub_steps=SUB_STEPS)
 
 
+MEASURES: dict[str, Kind] = {"success": "rate", "goals": "mean", "topples": "mean", "lost": "mean", "missed": "mean"}
+
+
 def _task(name: str, load: Callable[[int], Environment], steps: int) -> Task:
     sources = (HERE / "pushing.xml", *sorted(HERE.glob("pushing*.py")), *(HERE / name for name in SHARED_SOURCES))
-    return Task(name, load, pushing_supervisor.POLICIES, outcome, frame, sources, steps)
+    return Task(name, load, pushing_supervisor.POLICIES, outcome, frame, sources, steps, MEASURES)
 
 
 task = _task("pushing", load, STEPS)

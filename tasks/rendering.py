@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import ctypes
+
 import numpy as np
 
+from ddco_pyro.errors import Failed
+
+from . import opengl
+
 MAX_GEOMS = 200  # in a picture; making room for more for every picture takes as long as drawing it
-PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
 
 
-class NoOpenGL(RuntimeError):
+class NoOpenGL(Failed):
     """No OpenGL context can be made on this machine."""
 
-    def __init__(self, cause: BaseException) -> None:
-        super().__init__(
-            f"this task renders images, and no OpenGL is found here ({cause}). On Debian or Ubuntu: "
-            f"apt-get install {PACKAGES}; then set MUJOCO_GL=egl where there is no display"
-        )
 
+def _no_opengl(error: BaseException) -> NoOpenGL:
+    return NoOpenGL(opengl.advice(opengl.missing() or str(error)))
+
+
+_ERRORS = (ImportError, AttributeError, RuntimeError, OSError, ctypes.ArgumentError)
+"""PyOpenGL fails with any of these."""
 
 try:
     from dm_control import mujoco
-except (ImportError, AttributeError, RuntimeError, OSError) as error:  # PyOpenGL fails with any of these
-    raise NoOpenGL(error) from error
+except _ERRORS as error:
+    raise _no_opengl(error) from error
 
 
 def render(physics: mujoco.Physics, camera: str, height: int, width: int) -> np.ndarray:
@@ -34,5 +40,5 @@ def render(physics: mujoco.Physics, camera: str, height: int, width: int) -> np.
         picture: np.ndarray = seen.render()
         seen.scene.free()
         return picture
-    except (ImportError, AttributeError, RuntimeError, OSError) as error:
-        raise NoOpenGL(error) from error
+    except _ERRORS as error:
+        raise _no_opengl(error) from error

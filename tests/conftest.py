@@ -1,19 +1,33 @@
-"""Fixtures that several test files share: one thread, a cache of their own, and a fitted run of the toy task."""
+"""Fixtures that several test files share: one thread, a cache of their own, and a fitted run of the toy task.
+
+No test depends on how busy the machine is, and every run draws the same examples.
+"""
 
 from __future__ import annotations
 
 import os
+import sys
+from pathlib import Path
 
 import pytest
 import torch
 import toy_task
 import yaml
+from hypothesis import settings
 
 from ddco_pyro.run import fit
 from ddco_pyro.spec import parse_spec
 
+HERE = Path(__file__).parent
+INSTALLED = HERE / "fixtures" / "installed"
+"""Like a folder that packages are installed in: it registers the toy task under the name ``toy``."""
+
+sys.path.append(str(INSTALLED))
+os.environ["PYTHONPATH"] = f"{HERE}:{INSTALLED}"  # of the processes that tests start
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that run episodes
 torch.set_num_threads(1)
+settings.register_profile("deterministic", deadline=None, derandomize=True)
+settings.load_profile("deterministic")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -15,10 +15,11 @@ from typing import Any
 import h5py
 import numpy as np
 import yaml
+from killing import HANGS
 from random_demonstrations import demonstrations
 
 SECONDS = 60
-"""A file that keeps the process busy for longer hangs."""
+"""A spec that keeps the process busy for longer hangs."""
 
 VALUES: tuple[Any, ...] = (
     None, True, -1, 0, 1, 3, 10**6, 10**12, 10**40, -0.0, 1e-320, 1e308, float("nan"), float("inf"), "", " ", "x",
@@ -251,7 +252,7 @@ class Worker:
     def _line(self) -> str:
         assert self.process is not None
         assert self.process.stdout is not None
-        ready, _, _ = select.select([self.process.stdout], [], [], SECONDS)
+        ready, _, _ = select.select([self.process.stdout], [], [], HANGS)
         return self.process.stdout.readline() if ready else ""
 
     def close(self) -> None:

@@ -17,6 +17,9 @@ from pathlib import Path
 
 COMMAND = Path(sys.executable).with_name("ddco-pyro")
 
+HANGS = 600
+"""A process that takes more seconds hangs, on however busy a machine."""
+
 
 def environment(cache: Path) -> dict[str, str]:
     """With a cache of its own, one thread, and without what the tests' runner adds."""
@@ -33,9 +36,56 @@ def whole(arguments: Sequence[object], folder: Path, cache: Path) -> float:
         env=environment(cache),
         check=True,
         capture_output=True,
-        timeout=600,
+        timeout=HANGS,
     )
     return time.monotonic() - start
+
+
+STRIKES_ITSELF = """
+import os, signal
+from ddco_pyro import cli, console
+
+left, go_on = {after}, console.{watcher}
+
+def strike(*arguments):
+    global left
+    left -= 1
+    if left == 0:
+        {strike}
+    go_on(*arguments)
+
+console.{watcher} = strike
+cli.main()
+"""
+
+
+def struck(arguments: Sequence[object], folder: Path, watcher: str, after: int, strike: str) -> tuple[int, str]:
+    """Run a command that is struck by a signal at a moment of its own, whatever else the machine does.
+
+    :param watcher: the method of :mod:`ddco_pyro.console` whose call is the moment, such as ``Fitting.epoch``.
+    :param after: which of its calls.
+    :param strike: Python that sends the signal.
+    :returns: its exit status, and what it printed to stderr.
+    """
+    program = STRIKES_ITSELF.format(watcher=watcher, after=after, strike=strike)
+    with tempfile.TemporaryFile("w+") as err:  # not a pipe: orphans would keep it open
+        process = subprocess.Popen(
+            [sys.executable, "-c", program, *map(str, arguments)],
+            cwd=folder,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            stdout=subprocess.DEVNULL,
+            stderr=err,
+            start_new_session=True,
+            preexec_fn=_heed,
+        )
+        status = process.wait(timeout=HANGS)
+        err.seek(0)
+        return status, err.read()
+
+
+def _heed() -> None:
+    """A shell's background jobs, and all they start, ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @dataclass(frozen=True)
@@ -84,7 +134,7 @@ def until_done(
                     start_new_session=True,
                 )
                 groups.append(process.pid)
-                limit = choose.uniform(0, seconds) if killed.total() < kills else 600
+                limit = choose.uniform(0, seconds) if killed.total() < kills else HANGS
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(timeout=limit)
                 running = process.poll() is None

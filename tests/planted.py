@@ -15,7 +15,7 @@ from ddco_pyro.spec import parse_spec
 from ddco_pyro.training import Trainer
 
 CONTROL = {"std": 0.05, "scale": "none"}
-TRAINING = {"epochs": 150, "restarts": 3, "patience": 25, "initialize": "vq_controls"}
+TRAINING = {"epochs": 900, "restarts": 3, "patience": 25, "initialize": "vq_controls"}
 
 
 def make_spec(counts=(2,), seed=0, control=None, **training):
@@ -29,7 +29,7 @@ def make_spec(counts=(2,), seed=0, control=None, **training):
             "observations": ["state"],
             "control": control or {"std": 0.1, "scale": "none"},
             "hierarchy": {"levels": levels, "meta_policy": {"network": "linear"}},
-            "training": {"optimizer": {"lr": 0.03}, "epochs": 5, **training},
+            "training": {"optimizer": {"lr": 0.03}, "epochs": 20, **training},
             "seed": seed,
         }
     )

@@ -64,11 +64,11 @@ def spec_at(folder, demos=None, **selection):
     return parse_spec({**data, "selection": {**data["selection"], **selection}})
 
 
-def score(candidate, fold, per_step, lengths=(10,), failed=""):
+def score(candidate, fold, per_step, lengths=(10,), failed="", steps=0, converged=True):
     """A score that says ``per_step`` nats in each of these demonstrations."""
     names = tuple(f"demo_{fold}_{number}" for number in range(len(lengths)))
     values = () if failed else tuple(per_step * steps for steps in lengths)
-    return Score(candidate, fold, names, tuple(lengths), values, failed)
+    return Score(candidate, fold, names, tuple(lengths), values, failed, steps, converged)
 
 
 def kept(folder):

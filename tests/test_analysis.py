@@ -26,6 +26,7 @@ def test_use_of_options_by_sums_over_every_path():
         assert one.choice == choice
         assert one.share == pytest.approx(u[choice] / 7)
         assert one.selected == pytest.approx(v[choice])
+        assert one.demonstrations == pytest.approx(sum(min(1.0, truth.v[0].sum(0)[choice]) for truth in truths))
         assert one.duration == pytest.approx(u[choice] / v[choice])
     assert found[0].duration == pytest.approx(1)  # control lasts one step
 
@@ -37,10 +38,10 @@ def test_an_option_that_is_never_selected_has_no_duration():
     chosen[0, [1, 3, 4]] = 0
     (found,) = as_rows(option_use(Posterior((active,), (chosen,), (active,))))
     assert found == [
-        {"choice": 0, "share": 0.0, "selected": 0.0, "duration": None},
-        {"choice": 1, "share": 0.4, "selected": 1.0, "duration": 2.0},
-        {"choice": 2, "share": 0.6, "selected": 1.0, "duration": 3.0},
-        {"choice": 3, "share": 0.0, "selected": 0.0, "duration": None},
+        {"choice": 0, "share": 0.0, "selected": 0.0, "demonstrations": 0.0, "duration": None},
+        {"choice": 1, "share": 0.4, "selected": 1.0, "demonstrations": 1.0, "duration": 2.0},
+        {"choice": 2, "share": 0.6, "selected": 1.0, "demonstrations": 1.0, "duration": 3.0},
+        {"choice": 3, "share": 0.0, "selected": 0.0, "demonstrations": 0.0, "duration": None},
     ]
 
 

@@ -7,17 +7,20 @@ import json
 import re
 import shutil
 from html.parser import HTMLParser
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
 from scipy import stats
+from test_cli import call
 
 from ddco_pyro import load
-from ddco_pyro.comparison import CompareError, compare, page, write
+from ddco_pyro.comparison import CompareError, Comparison, Row, compare, page, write
 from ddco_pyro.comparison.shared import NotShared
 from ddco_pyro.data import demonstrations, parts
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.evaluate import roll_out
+from ddco_pyro.report import words, write_report
 from ddco_pyro.run import fit
 from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import with_overrides
@@ -72,8 +75,66 @@ def test_rows_are_what_az_compare_would_say(found, folders, held_out):
         assert row.dse == pytest.approx(np.sqrt(n) * difference.std(ddof=1), abs=1e-9)
         assert row.per_step == pytest.approx(own.sum() / sum(held_out.lengths))
     assert (found.rows[0].difference, found.rows[0].dse) == (0.0, 0.0)
-    assert found.steps == sum(held_out.lengths)
+    assert found.steps == held_out.lengths
     assert found.trajectories == held_out.names
+
+
+def test_the_verdict_is_that_of_the_report_in_its_words(toy_run, found, folders):
+    """The best run against each other one, with the difference and the error that the report gives."""
+    pair = compare([toy_run.folder, toy_run.folder / "baselines" / "flat"])
+    difference = toy_run.metrics["comparison"]["flat"]["difference"]
+    ours, theirs = (str(folder) for folder in folders[:2])
+    if difference["nats_per_step"] < 0:  # the best run is the subject
+        ours, theirs = theirs, ours
+    said = words.verdict(toy_run.metrics | {"comparison": {"flat": {"difference": difference | {
+        "nats_per_step": abs(difference["nats_per_step"])}}}})  # fmt: skip
+    assert page.verdict(pair) == said.replace("DDCO explains", f"{ours} explains").replace("flat", theirs, 1)
+    assert page.verdict(found).startswith(f"{found.rows[0].name} explains held-out demonstrations ")
+    assert all(row.name in page.verdict(found) for row in found.rows)
+
+
+@pytest.mark.parametrize(
+    ("each", "said"),
+    [
+        ([1.0, 1.2, 0.8, 1.0], "1.00 ± 0.08 nats per step better than b"),
+        ([4.0, -2.0, 3.0, -1.0], "with no clear difference from b (+1.00 ± 1.47 nats per step)"),
+    ],
+)
+def test_the_verdict_says_whether_a_difference_is_outside_its_error(each, said):
+    """By hand, trajectories of one step: ± is the standard deviation of the four differences by the root of four."""
+    rows = [row("a", 0, each), row("b", 1, [0.0] * 4)]
+    found = Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], "a")
+    assert page.verdict(found) == (
+        f"a explains held-out demonstrations {said} (4 held-out demonstrations; ± is one standard error)."
+    )
+
+
+def row(name, rank, each, model="ddco"):
+    return Row(rank, name, model, 3, sum(each), 0.1, 0.0, 0.0, sum(each) / len(each), tuple(each))
+
+
+def test_demonstrations_are_listed_worst_first_by_the_best_hierarchy(toy_run, found, folders, held_out):
+    values = {str(one): load(one).log_likelihood(held_out) / held_out.lengths for one in folders}
+    hierarchies = [row.name for row in found.rows if row.model == "ddco"]
+    order = np.argsort(values[hierarchies[0]])
+    assert [one["name"] for one in found.worst_first] == [held_out.names[n] for n in order]
+    for one, n in zip(found.worst_first, order, strict=True):
+        assert one["steps"] == held_out.lengths[n]
+        assert one["log_likelihood_per_step"] == pytest.approx({name: each[n] for name, each in values.items()})
+
+
+def test_the_list_leads_to_the_segments_in_the_report(toy_run, toy_spec, tmp_path):
+    run = load(shutil.copytree(toy_run.folder, tmp_path / "a run"))
+    found = compare([run.folder, run.folder / "baselines" / "flat"])
+    assert 'href="' not in write(found, tmp_path / "without").read_text()
+    report = write_report(run, demonstrations(toy_spec))
+    path = write(found, tmp_path / "compare" / "here")
+    links = re.findall(r'<td><a href="([^"]*)">(\w+)</a></td>', path.read_text())
+    assert [name for _, name in links] == [one["name"] for one in found.worst_first]
+    for link, name in links:
+        address, _, place = link.partition("#")
+        assert (path.parent / unquote(address)).resolve() == report.resolve()
+        assert f'<div class="demonstration" id="{place}"><div class="who">{name}\n' in report.read_text()
 
 
 def test_models_and_parameters_are_named(found, folders):
@@ -228,12 +289,25 @@ def test_the_files_say_the_same(found, tmp_path):
     text = (folder / "compare.md").read_text()
     table = [re.split(r" *\| *", line.strip("| ")) for line in text.splitlines() if line.startswith("|")]
     assert table[0] == list(page.HEAD)
-    assert table[2:] == [page.cells(row) for row in found.rows]
+    assert table[2 : 2 + len(found.rows)] == [page.cells(row) for row in found.rows]
     read = Cells()
     read.feed(path.read_text())
     assert read.loaded == []
-    assert read.cells == [*page.HEAD, *(cell for row in found.rows for cell in page.cells(row))]
+    listed = [cell for row in [page.list_head(found), *page.list_cells(found)] for cell in row]
+    assert read.cells == [*page.HEAD, *(cell for row in found.rows for cell in page.cells(row)), *listed]
+    assert data["demonstrations"] == found.worst_first
+    assert text.startswith(page.verdict(found))
+    assert table[2 + len(found.rows)] == page.list_head(found)
+    assert table[4 + len(found.rows) :] == page.list_cells(found)
+    assert f'<p class="verdict">{page.verdict(found)}</p>' in path.read_text()
     assert (folder / "compare.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_command_ends_with_the_verdict(folders, found, tmp_path):
+    ended = call("compare", *folders, "--out", tmp_path / "x")
+    *_, verdict, place = ended.out.splitlines()
+    assert verdict == page.verdict(found)
+    assert place == f"comparison: {tmp_path / 'x' / 'compare.html'}"
 
 
 def test_a_single_trajectory_has_no_error(other, tmp_path):

@@ -35,7 +35,7 @@ def test_a_fit_that_stops_early_says_so(clock, capsys):
             progress.epoch(row)
         progress.trained("ddco")
     assert capsys.readouterr().err.splitlines() == [
-        "training ddco: 3/100, at most 388 s left  level-1: loss -1.250, held out -0.500 nats/step",
+        "training ddco: 3/100, at most 388 s left  level-1: training 1.250, tuning -0.500 nats/step",
         "training ddco: done after 3, 16 s",
     ]
 
@@ -50,7 +50,8 @@ def test_log_likelihoods(capsys):
     values = {"train": 1.0, "valid": 0.5}
     other = {"log_likelihood_per_step": values, "difference": {"nats_per_step": -0.25, "standard_error": 0.125}}
     console.log_likelihoods({"model": "ddco", "log_likelihood_per_step": values, "comparison": {"flat": other}})
-    *_, ours, theirs = capsys.readouterr().out.splitlines()
+    _, head, _, ours, theirs = capsys.readouterr().out.splitlines()
+    assert [cell.strip() for cell in head.split("┃")[1:3]] == ["training", "validation (held out)"]
     assert ours.split("│")[0].split() + ours.split("│")[1].split() == ["ddco", "1.000"]
     assert "-0.250 ± 0.125" in theirs
 

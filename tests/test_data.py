@@ -11,7 +11,7 @@ from ddco_pyro.demonstrations import Demonstration, Demonstrations, Demonstratio
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 
 TASK = "toy_task:task"
-SIZE = Dimensions({"offsets": (4,), "camera": (8, 8, 3)}, control_size=2, steps=12)
+SIZE = Dimensions({"offsets": (4,), "camera": (8, 8, 3), "visited": (1,)}, control_size=2, steps=12)
 
 
 def spec(**changes):
@@ -118,8 +118,13 @@ def test_demonstrations_may_come_from_another_task(tmp_path):
 def test_a_file_that_is_not_there_and_cannot_be_collected_is_an_error(tmp_path):
     missing = {"path": str(tmp_path / "none.hdf5")}
     for read in (demonstrations, dimensions):
-        with pytest.raises(DemonstrationsError, match=r"none\.hdf5: there is no such file; check the path$"):
-            read(spec(task=None, demonstrations=missing))
+        with pytest.raises(DemonstrationsError) as refused:
+            read(spec(task=None, demonstrations=missing | {"labels": "phase"}, observations=["offsets", "visited"]))
+        assert str(refused.value) == (
+            f"demonstrations.path: {missing['path']}: there is no such file; put it there, or fit to another with "
+            "--set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, with actions, obs/offsets, "
+            "obs/visited, labels/phase in each data/<demonstration>"
+        )
 
 
 def test_labels_that_are_not_there_are_an_error(path):
@@ -137,6 +142,14 @@ WRONG = {"network": "test_networks:Wrong", "options": {"how": "swapped"}}
     [
         ({"observations": ["offsets", "pose", "jaw"]}, r"^observations: there is no pose, jaw \(there are: camera, of"),
         ({"control": {"scale": [1.0]}}, r"^control\.scale: has 1 numbers, but the control has 2 dimensions$"),
+        (
+            {"observations": ["visited"], "report": {"trajectory": "visited"}},
+            r"^report\.trajectory: 'visited' has shape \[1\] at each step; name a vector of three numbers or more$",
+        ),
+        (
+            {"observations": ["camera"], "report": {"trajectory": "camera"}},
+            r"^report\.trajectory: 'camera' has shape \[8, 8, 3\] at each step; name a vector",
+        ),
         ({"observations": ["camera"]}, r"^baseline\.policy: reads vectors, but camera are images"),
         (
             {"baseline": None, "hierarchy": {"levels": [LEVEL | {"policy": CONV}]}},
@@ -152,8 +165,8 @@ WRONG = {"network": "test_networks:Wrong", "options": {"how": "swapped"}}
         ),
         (
             {"baseline": None, "hierarchy": {"levels": [LEVEL | {"termination": WRONG}]}},
-            r"^hierarchy\.levels\.0\.termination: network 'test_networks:Wrong' gives shape \[1, 2, 1, 2\]; .*, "
-            r"here \[1, 2, 2, 1\]$",
+            r"^hierarchy\.levels\.0\.termination: network 'test_networks:Wrong' gives shape \[2, 3, 1, 2\]; .*, "
+            r"here \[2, 3, 2, 1\]$",
         ),
     ],
 )

@@ -1,14 +1,32 @@
 import pytest
+import torch
 
+from ddco_pyro.analysis import as_rows, option_use
 from ddco_pyro.diagnostics import Finding, diagnose
+from ddco_pyro.inference import Posterior
 
 
 def level(*shares, durations=None):
+    """Options that are selected ten times in each of two demonstrations."""
     durations = durations or [5.0] * len(shares)
     return [
-        {"choice": choice, "share": share, "selected": 1.0, "duration": duration}
+        {"choice": choice, "share": share, "selected": 20.0, "demonstrations": 2.0, "duration": duration}
         for choice, (share, duration) in enumerate(zip(shares, durations, strict=True))
     ]
+
+
+def use(*demonstrations):
+    """The use of options under a posterior that is certain: of each demonstration, segments ``(option, steps)``."""
+    size = 1 + max(option for segments in demonstrations for option, _ in segments)
+    steps = max(sum(length for _, length in segments) for segments in demonstrations)
+    active, selected = (torch.zeros(len(demonstrations), steps, size, dtype=torch.float64) for _ in range(2))
+    for row, segments in enumerate(demonstrations):
+        start = 0
+        for option, length in segments:
+            active[row, start : start + length, option] = 1
+            selected[row, start, option] = 1
+            start += length
+    return as_rows(option_use(Posterior((active,), (selected,), (active,))))
 
 
 def test_a_balanced_solution_has_no_signs():
@@ -35,7 +53,35 @@ def test_a_single_option_cannot_dominate():
 @pytest.mark.parametrize(("duration", "short"), [(1.49, True), (1.5, False), (None, False)])
 def test_never_persisting_below_one_and_a_half_steps(duration, short):
     found = diagnose([level(0.0, 0.5, 0.5, durations=[None, duration, 5.0])])
-    assert found == ([Finding("never_persisting", 1, 1, duration)] if short else [])
+    assert found == ([Finding("never_persisting", 1, 1, duration, selections=10.0)] if short else [])
+
+
+def test_an_option_that_ends_at_once_and_is_selected_again_and_again_never_persists():
+    """The meta-policy does all the work of option 1; option 2 lasts."""
+    found = diagnose(use(*[[(1, 1)] * 6 + [(2, 6)]] * 4))
+    assert found == [Finding("never_persisting", 1, 1, 1.0, selections=6.0)]
+
+
+def test_options_that_take_turns_at_every_step_never_persist():
+    found = diagnose(use(*[[(1, 1), (2, 1)] * 4] * 3))
+    assert [(one.kind, one.choice) for one in found] == [("never_persisting", 1), ("never_persisting", 2)]
+
+
+def test_an_option_that_lasts_one_step_once_is_no_sign():
+    """The first reach of every demonstration, and a grasp: each is selected once and ends by design."""
+    assert diagnose(use(*[[(1, 1), (2, 6), (3, 1), (2, 7)]] * 4)) == []
+
+
+def test_selections_are_counted_where_an_option_is_used():
+    """One demonstration in ten flickers; that it is not in the others is no excuse."""
+    found = diagnose(use([(1, 1)] * 10, *[[(2, 5), (3, 5)]] * 9))
+    assert found == [Finding("never_persisting", 1, 1, 1.0, selections=10.0)]
+
+
+def test_runs_of_before_do_not_say_how_often_an_option_is_selected_in_a_demonstration():
+    before = [{key: value for key, value in one.items() if key != "demonstrations"} for one in level(0.0, 0.5, 0.5)]
+    before[1]["duration"] = 1.0
+    assert diagnose([before]) == []
 
 
 def test_an_unused_option_is_not_also_said_to_be_short():

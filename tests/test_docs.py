@@ -45,3 +45,23 @@ def test_the_site_is_generated_from_the_code() -> None:
     for name, command in typer.main.get_command(app).commands.items():
         assert f"\n## {name}\n" in commands
         assert all(one.opts[0] in commands for one in command.params if one.param_type_name == "option")
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/install.md"])
+def test_what_the_demo_installs_is_said_as_make_says_it(page: str) -> None:
+    sizes = re.findall(r"^SIZE := (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert len(sizes) == 1
+    assert sizes[0] in (ROOT / page).read_text()
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/install.md"])
+def test_every_package_of_opengl_is_named(page: str) -> None:
+    from ddco_tasks.opengl import PACKAGES
+
+    assert f"sudo apt-get install {PACKAGES}" in (ROOT / page).read_text()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_every_make_target_that_is_named_exists(page: Path) -> None:
+    targets = set(re.findall(r"^([.a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert set(re.findall(r"(?:^|`)make ([.a-z]+)", page.read_text(), re.MULTILINE)) <= targets

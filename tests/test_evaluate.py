@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 from collections import Counter
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ import toy_task
 
 import ddco_pyro
 from ddco_pyro.evaluate import policies, roll_out
-from ddco_pyro.rollout import run_episode
+from ddco_pyro.files import read_tensors, write_tensors
+from ddco_pyro.rollout import run_episode, run_episodes
 from ddco_pyro.run import Fit, RunError
 from ddco_pyro.spec import with_overrides
 
@@ -104,7 +106,7 @@ def changed(run, **changes):
 
 
 def test_an_unknown_scripted_policy_is_refused(toy_run):
-    message = r"^rollout\.policies: task 'toy_task:task' has no expert \(it has: supervisor, open_loop\)$"
+    message = r"^rollout\.policies: task 'toy' has no expert \(it has: supervisor, open_loop\)$"
     with pytest.raises(RunError, match=message):
         policies(changed(toy_run, **{"rollout.policies": ["open_loop", "expert"]}))
 
@@ -112,3 +114,106 @@ def test_an_unknown_scripted_policy_is_refused(toy_run):
 def test_a_run_without_a_task_cannot_be_rolled_out(toy_run):
     with pytest.raises(RunError, match=r"toy: its spec has no task, so there is nothing to roll out in$"):
         policies(changed(toy_run, task=None, **{"demonstrations.path": "demos.hdf5"}))
+
+
+# --- the same rollouts again ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def copied(rolled, tmp_path):
+    """A copy of the run with its rollouts."""
+    run, *_ = rolled
+    return ddco_pyro.load(shutil.copytree(run.folder, tmp_path / "copied"))
+
+
+def refuse(*arguments):
+    raise AssertionError(f"rolled out: {arguments[1]}")
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_rollouts_that_the_run_holds_are_not_done_again_if_asked(copied, rolled, monkeypatch):
+    _, results, *_ = rolled
+    before = contents(copied.folder)
+    monkeypatch.setattr("ddco_pyro.evaluate.run_episodes", refuse)
+    assert roll_out(copied, EPISODES, 2, refuse, jobs=1, resume=True) == results
+    assert contents(copied.folder) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "episodes", "film", "resume"),
+    [
+        ("nothing", EPISODES, 2, False),
+        ("nothing", EPISODES - 1, 2, True),
+        ("nothing", EPISODES, 3, True),
+        ("seed", EPISODES, 2, True),
+        ("method", EPISODES, 2, True),
+    ],
+)
+def test_others_are(copied, change, episodes, film, resume):
+    told = []
+    if change == "seed":
+        copied = changed(copied, **{"rollout.seed": FIRST + 1})
+    if change == "method":
+        copied = changed(copied, **{"rollout.policies": ["supervisor"]})
+    results = roll_out(copied, episodes, film, told.append, jobs=1, resume=resume)
+    methods = METHODS[1:] if change == "method" else METHODS
+    assert Counter(told) == dict.fromkeys(methods, episodes)
+    assert (list(results["methods"]), results["episodes"]) == (methods, episodes)
+
+
+def interrupted(run, after, **options):
+    """Roll out as above, and be interrupted in the middle of a method."""
+    told = []
+
+    def on_episode(name):
+        told.append(name)
+        if len(told) == after:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        roll_out(run, EPISODES, 2, on_episode, jobs=1, **options)
+
+
+@pytest.fixture
+def fresh(toy_run, tmp_path):
+    return ddco_pyro.load(shutil.copytree(toy_run.folder, tmp_path / "fresh"))
+
+
+def test_what_was_interrupted_goes_on_with_the_next_method(rolled, fresh, monkeypatch):
+    run, results, *_ = rolled
+    interrupted(fresh, after=2 * EPISODES + 3)
+    assert "rollouts" not in fresh.metrics
+    begun, told = [], []
+
+    def counted(task, policy, *rest):
+        begun.append(policy)
+        return run_episodes(task, policy, *rest)
+
+    monkeypatch.setattr("ddco_pyro.evaluate.run_episodes", counted)
+    assert roll_out(fresh, EPISODES, 2, told.append, jobs=1) == results
+    assert len(begun) == len(METHODS) - 2
+    assert Counter(told) == dict.fromkeys(METHODS, EPISODES)
+    assert (fresh.folder / "rollouts.csv").read_bytes() == (run.folder / "rollouts.csv").read_bytes()
+    assert {path.name for path in fresh.folder.iterdir()} == {path.name for path in run.folder.iterdir()}
+
+
+@pytest.mark.parametrize("change", ["model", "baseline", "seeds", "films"])
+def test_what_was_interrupted_is_not_mixed_with_anything_else(fresh, change):
+    interrupted(fresh, after=2 * EPISODES + 3)
+    if change in ("model", "baseline"):
+        path = fresh.folder / {"model": ".", "baseline": "baselines/flat"}[change] / "model.safetensors"
+        tensors, metadata = read_tensors(path)
+        write_tensors(path, {key: value + 0.5 for key, value in tensors.items()}, metadata)
+    episodes, film = EPISODES - (change == "seeds"), 3 if change == "films" else 0
+    begun = []
+
+    def stop(task, policy, *rest):
+        begun.append(policy)
+        raise KeyboardInterrupt
+
+    with mock.patch("ddco_pyro.evaluate.run_episodes", stop), pytest.raises(KeyboardInterrupt):
+        roll_out(ddco_pyro.load(fresh.folder), episodes, film, lambda name: None, jobs=1)
+    assert begun == [METHODS[0]]

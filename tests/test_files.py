@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 
-from ddco_pyro.files import read_tensors, whole_file, write_tensors, write_text
+from ddco_pyro.files import NotWritable, read_tensors, whole_file, whole_folder, write_tensors, write_text
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
@@ -33,6 +38,60 @@ def test_nobody_sees_a_file_before_it_is_whole(tmp_path):
     assert path.read_text() == "whole"
     assert list(path.parent.iterdir()) == [path]
     assert path.stat().st_mode & 0o777 == 0o644
+
+
+def contents(folder):
+    return {str(path.relative_to(folder)): path.is_file() and path.read_text() for path in folder.rglob("*")}
+
+
+def write_folder(path, text, error=None):
+    with whole_folder(path) as temporary:
+        (temporary / "deeper").mkdir()
+        (temporary / "deeper" / "file").write_text(text)
+        assert not path.exists() or contents(path) == {"deeper": False, "deeper/file": "old"}
+        if error:
+            raise error
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_a_folder_that_is_cut_off_leaves_what_was_there(tmp_path, error):
+    with pytest.raises(error):
+        write_folder(tmp_path / "a" / "folder", "half", error)
+    assert contents(tmp_path) == {"a": False}
+    write_folder(tmp_path / "folder", "old")
+    with pytest.raises(error):
+        write_folder(tmp_path / "folder", "half", error)
+    assert contents(tmp_path / "folder") == {"deeper": False, "deeper/file": "old"}
+    write_folder(tmp_path / "folder", "new")
+    assert contents(tmp_path / "folder") == {"deeper": False, "deeper/file": "new"}
+    assert {path.name for path in tmp_path.iterdir()} == {"a", "folder"}
+    assert (tmp_path / "folder").stat().st_mode & 0o777 == 0o755
+
+
+KILLED = """
+import os, signal
+from pathlib import Path
+from ddco_pyro.files import whole_folder
+with whole_folder(Path("folder")) as temporary:
+    (temporary / "file").write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_process_left_of_a_folder_is_removed(tmp_path):
+    ended = subprocess.run([sys.executable, "-c", KILLED], cwd=tmp_path, check=False)
+    assert ended.returncode == -signal.SIGKILL
+    assert [path.name.startswith(".folder-") for path in tmp_path.iterdir()] == [True]
+    write_folder(tmp_path / "folder", "whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+
+
+def test_a_folder_that_cannot_be_replaced_is_said(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    message = r"^\.: cannot be written: .*; choose another place or change this one$"
+    with pytest.raises(NotWritable, match=message), whole_folder(Path(".")) as temporary:
+        (temporary / "file").touch()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_text_is_utf_8(tmp_path):

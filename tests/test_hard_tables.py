@@ -27,14 +27,14 @@ hard = given(
 )
 
 
-@settings(deadline=None, max_examples=300, derandomize=True)
+@settings(max_examples=300)
 @hard
 def test_value_and_gradient_are_those_of_log_space(**case):
     compare(**case)
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=5000)
+@settings(max_examples=5000)
 @hard
 def test_value_and_gradient_are_those_of_log_space_in_thousands_of_cases(**case):
     compare(**case)

@@ -191,7 +191,7 @@ def test_a_fit_takes_what_was_estimated(
 
 def test_a_demonstration_that_cannot_be_segmented_is_refused(toy_run, tmp_path: Path) -> None:
     path = toy_like(tmp_path / "long.hdf5", 2, 1_000_000)
-    ended = call("segment", toy_run.folder, path)
+    ended = call("segment", toy_run.folder, path, "--in-place")
     assert (ended.status, ended.err.count("\n")) == (2, 1)
     assert ended.err.startswith(f"ddco-pyro: {path}: demo_0: segmenting its 1000000 steps takes about")
     assert "divide it" in ended.err
@@ -315,7 +315,7 @@ def test_a_file_that_really_has_more_than_memory(tmp_path: Path, toy_run, toy_sp
     assert "26 demonstrations of 500 to 500 steps" in run("inspect", path)
     run("init", path, "--out", tmp_path / "spec.yaml")
     run("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--set", "training.epochs=2")
-    run("segment", toy_run.folder, path, "--html", tmp_path / "a.html")
+    run("segment", toy_run.folder, path, "--in-place", "--html", tmp_path / "a.html")
     run("import", path, "--out", tmp_path / "imported.hdf5")
     print({name: f"{peak / 1e6:.0f} MB" for name, peak in peaks.items()})
     assert max(peaks.values()) < LIMIT

@@ -21,11 +21,15 @@ SHAPES = {"offsets": (4,), "visited": (1,)}
 OBSERVATIONS = [{"key": "offsets", "differences": True}, "visited"]
 
 
-def make(model):
-    """A randomly initialised model of the toy task whose networks see differences."""
+def make(model, weights=0, gain=1.0):
+    """A model of the toy task whose networks see differences, its weights drawn from this seed and that much larger."""
     spec = parse_spec({"demonstrations": {"path": "unused.hdf5"}, "observations": OBSERVATIONS, **model})
-    torch.manual_seed(0)
-    return Hierarchy(spec, SHAPES, 2, steps=toy_task.STEPS)
+    torch.manual_seed(weights)
+    hierarchy = Hierarchy(spec, SHAPES, 2, steps=toy_task.STEPS)
+    with torch.no_grad():
+        for parameter in hierarchy.parameters():
+            parameter.mul_(gain)
+    return hierarchy
 
 
 def two_levels(emits):
@@ -46,21 +50,25 @@ def ragged(task):
     return replace(task, load=lambda seed: toy_task.Point(seed, steps=seed))
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_together_as_alone(name):
-    task, hierarchy = ragged(toy_task.task), make(MODELS[name])
-    for found in play(task, hierarchy, MEAN, SEEDS, keep=("offsets",)):
-        alone = run_episode(task, Controller.from_spec(hierarchy, MEAN), found.seed)
-        assert found.outcome == alone.outcome
-        np.testing.assert_array_equal(found.choices, alone.choices)
-        np.testing.assert_allclose(found.observations["offsets"], alone.record.observations["offsets"], atol=1e-5)
-
-
-def test_the_hybrid_meta_policy_acts_in_some_step():
-    """Otherwise the test above would not see its control."""
-    found = play(toy_task.task, make(MODELS["hybrid"]), MEAN, range(30))
-    choices = np.concatenate([one.choices for one in found])
-    assert (choices[:, 1] == 0).any() or (choices[:, 0] == 0).any()
+@pytest.mark.parametrize(
+    ("name", "weights", "actors"), [("flat", (0,), {0}), ("options", (4, 6, 8), {0}), ("hybrid", (0, 2, 10), {0, 1, 2})]
+)
+def test_together_as_alone(name, weights, actors):
+    """With models in which options change within an episode and, in the hybrid, an option of each level and the
+    meta-policy act.
+    """
+    task, acted, changes = ragged(toy_task.task), set(), 0
+    for seed in weights:
+        hierarchy = make(MODELS[name], seed, gain=3.0)
+        for found in play(task, hierarchy, MEAN, SEEDS, keep=("offsets",)):
+            alone = run_episode(task, Controller.from_spec(hierarchy, MEAN), found.seed)
+            assert found.outcome == pytest.approx(alone.outcome, abs=1e-5, nan_ok=True)
+            np.testing.assert_array_equal(found.choices, alone.choices)
+            np.testing.assert_allclose(found.observations["offsets"], alone.record.observations["offsets"], atol=1e-5)
+            acted |= {next((d for d, choice in enumerate(row) if choice), len(row)) for row in found.choices.tolist()}
+            changes += (np.diff(found.choices, axis=0) != 0).any(1).sum()
+    assert acted == actors
+    assert changes > 1 or name == "flat"
 
 
 def test_equal_seeds_draw_equally():

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
-from ddco_pyro.networks import Inputs, InputShape, ShapeError, build
+from ddco_pyro.networks import CLASSES, Inputs, InputShape, ShapeError, build
 from ddco_pyro.networks.conv import POOLED
 from ddco_pyro.networks.stacked import StackedLinear
 from ddco_pyro.spec import NetworkSpec
@@ -128,6 +131,18 @@ def test_networks_of_different_steps_differ():
     assert all(not torch.allclose(found[:, t], found[:, 0]) for t in range(1, LONGEST))
 
 
+@pytest.mark.parametrize(
+    ("trajectories", "steps", "start"), [(2, 60, 0), (2, 59, 0), (2, 7, 40), (1, 1, 7), (1, 1, 99)]
+)
+def test_each_step_costs_one_network_however_many_there_are(trajectories, steps, start):
+    width, longest = 16, 60
+    network = make(InputShape(FEATURES, {}, longest), network="per_timestep", hidden=[width])
+    with FlopCounterMode(display=False) as counter:
+        network(make_inputs(trajectories, steps, start))
+    multiplications = COPIES * (FEATURES * width + width * OUTPUTS)
+    assert counter.get_total_flops() == 2 * trajectories * steps * multiplications
+
+
 # --- images -----------------------------------------------------------------------------------------------------------
 
 
@@ -158,6 +173,13 @@ def test_conv_reads_images_without_any_vector():
     alone = Inputs(inputs.vector[..., :0], inputs.images, inputs.time)
     assert network(alone).shape == (2, LONGEST, COPIES, OUTPUTS)
     assert not torch.allclose(network(alone)[0, 0], network(alone)[0, 1])
+
+
+def test_an_image_may_be_called_as_a_layer_is():
+    network = make(InputShape(FEATURES, {"0": PIXELS}), network="conv", filters=2, hidden=[3])
+    _, arrays = network.numpy_form()
+    shapes = sorted(parameter.shape for parameter in network.parameters())
+    assert sorted(array.shape for array in arrays.values()) == shapes
 
 
 # --- a user's own -----------------------------------------------------------------------------------------------------
@@ -223,8 +245,15 @@ def test_a_network_of_ones_own():
 
 
 def test_trying_a_network_of_ones_own_leaves_no_trace():
-    spec = NetworkSpec(network="test_networks:Stateful")
-    network = build(spec, InputShape(FEATURES, {"camera": PIXELS}, steps=1), OUTPUTS, COPIES)
+    spec, shape = NetworkSpec(network="test_networks:Stateful"), InputShape(FEATURES, {"camera": PIXELS}, steps=1)
+    torch.manual_seed(0)
+    network = build(spec, shape, OUTPUTS, COPIES)
+    drawn = torch.rand(3)
+    torch.manual_seed(0)
+    untried = Stateful(shape, OUTPUTS, COPIES)
+    assert torch.equal(torch.rand(3), drawn)
+    states = zip(network.state_dict().items(), untried.state_dict().items(), strict=True)
+    assert all(name == other and torch.equal(value, expected) for (name, value), (other, expected) in states)
     assert network.training
     assert int(network.norm.num_batches_tracked) == 0
     assert all(parameter.grad is None for parameter in network.parameters())
@@ -233,13 +262,13 @@ def test_trying_a_network_of_ones_own_leaves_no_trace():
 @pytest.mark.parametrize(
     ("how", "message"),
     [
-        ("joined", "gives shape [1, 2, 8]; it has to be a tensor [N, T, copies, outputs], here [1, 2, 4, 2]"),
-        ("swapped", "gives shape [1, 2, 2, 4]; it has to be a tensor [N, T, copies, outputs], here [1, 2, 4, 2]"),
-        ("one", "gives shape [1, 2, 1, 2]; it has to be a tensor [N, T, copies, outputs], here [1, 2, 4, 2]"),
-        ("squeezed", "gives shape [2, 4, 2]; it has to be a tensor [N, T, copies, outputs], here [1, 2, 4, 2]"),
-        ("time first", "gives shape [2, 1, 4, 2]; it has to be a tensor [N, T, copies, outputs], here [1, 2, 4, 2]"),
-        ("list", "gives a list; it has to be a tensor [N, T, copies, outputs], here [1, 2, 4, 2]"),
-        ("fails", "fails for observations that are 0, N = 1, T = 2: "),
+        ("joined", "gives shape [2, 3, 8]; it has to be a tensor [N, T, copies, outputs], here [2, 3, 4, 2]"),
+        ("swapped", "gives shape [2, 3, 2, 4]; it has to be a tensor [N, T, copies, outputs], here [2, 3, 4, 2]"),
+        ("one", "gives shape [2, 3, 1, 2]; it has to be a tensor [N, T, copies, outputs], here [2, 3, 4, 2]"),
+        ("squeezed", "gives shape [1, 4, 2]; it has to be a tensor [N, T, copies, outputs], here [1, 1, 4, 2]"),
+        ("time first", "gives shape [3, 2, 4, 2]; it has to be a tensor [N, T, copies, outputs], here [2, 3, 4, 2]"),
+        ("list", "gives a list; it has to be a tensor [N, T, copies, outputs], here [2, 3, 4, 2]"),
+        ("fails", "fails for random observations, N = 2, T = 3: "),
     ],
 )
 def test_an_output_of_another_shape_is_refused_when_the_network_is_made(how, message):
@@ -258,10 +287,99 @@ def test_an_output_of_another_shape_is_refused_when_the_network_is_made(how, mes
         (SHAPE, {"network": "no_such_module:Net"}, "'no_such_module:Net' cannot be imported: No module named"),
         (SHAPE, {"network": "test_networks:Missing"}, "'test_networks:Missing' cannot be imported: .*no attribute"),
         (SHAPE, {"network": "test_networks:NotANetwork"}, "is not a torch.nn.Module class"),
-        (SHAPE, {"network": "test_networks:Own", "options": {"gian": 1}}, "'test_networks:Own' .* argument 'gian'"),
         (SHAPE, {"network": "test_networks:Own", "options": {"gain": -1}}, "the gain has to be positive"),
     ],
 )
 def test_a_network_that_cannot_be_built_says_why(shape, settings, message):
     with pytest.raises(ShapeError, match=message):
         make(shape, **settings)
+
+
+# --- a step alone and in its trajectory -------------------------------------------------------------------------------
+
+
+def random_inputs(shape, trajectories, steps, start):
+    generator = torch.Generator().manual_seed(2)
+    images = {
+        key: torch.randint(256, (trajectories, steps, *size), generator=generator, dtype=torch.uint8)
+        for key, size in shape.images.items()
+    }
+    vector = torch.randn(trajectories, steps, shape.vector, generator=generator)
+    return Inputs(vector, images, torch.arange(start, start + steps))
+
+
+def step_by_step(network, inputs):
+    """The outputs of a call for every step of every trajectory."""
+    trajectories, steps = inputs.batch
+    rows = []
+    for n in range(trajectories):
+        for t in range(steps):
+            images = {key: image[n, t][None, None] for key, image in inputs.images.items()}
+            rows.append(network(Inputs(inputs.vector[n, t][None, None], images, inputs.time[t : t + 1])))
+    return torch.stack([torch.stack(rows[n * steps : (n + 1) * steps]) for n in range(trajectories)])[:, :, 0, 0]
+
+
+vectors, sizes = st.integers(1, 6), st.lists(st.integers(1, 5), max_size=2)
+pictures = st.dictionaries(
+    st.sampled_from(["camera", "wrist"]), st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(1, 4)),
+    min_size=1,
+)  # fmt: skip
+perceptrons = st.fixed_dictionaries({"network": st.sampled_from(["mlp", "per_timestep"]), "hidden": sizes})
+convolutions = st.fixed_dictionaries(
+    {"network": st.just("conv"), "hidden": sizes, "filters": st.integers(1, 3), "kernel": st.integers(1, 5)}
+)
+users = st.just({"network": "test_networks:Own", "options": {"gain": 0.7}})
+assert set(CLASSES) == {"linear", "mlp", "per_timestep", "conv"}, "a new network belongs in every_kind"
+every_kind = st.one_of(
+    st.tuples(st.just({"network": "linear"}) | perceptrons | users, vectors, st.just({})),
+    st.tuples(convolutions, st.integers(0, 4), pictures),
+)
+
+
+@settings(deadline=None)
+@given(every_kind, st.integers(1, 9), st.integers(1, 3), st.integers(1, 8), st.integers(0, 12))
+def test_a_call_for_many_steps_is_a_call_for_each(kind, longest, trajectories, steps, start):
+    spec, vector, images = kind
+    network = make(InputShape(vector, images, longest), **spec)
+    inputs = random_inputs(InputShape(vector, images), trajectories, steps, start)
+    assert_close(network(inputs), step_by_step(network, inputs))
+
+
+class WithMemory(nn.Module):
+    """A network of one's own whose output at a step is not that of the step alone."""
+
+    def __init__(self, shape, outputs, copies, how, zero=False):
+        super().__init__()
+        self.how, self.size = how, (copies, outputs)
+        self.lstm = nn.LSTM(shape.vector, 16, batch_first=how != "over trajectories")
+        self.head = nn.Linear(16 if how in ("over time", "over trajectories") else shape.vector, copies * outputs)
+        if zero:
+            nn.init.zeros_(self.head.weight)
+            nn.init.zeros_(self.head.bias)
+
+    def forward(self, inputs):
+        features = {
+            "over time": lambda x: self.lstm(x)[0],
+            "over trajectories": lambda x: self.lstm(x)[0],
+            "differences": lambda x: torch.cat([x[:, :1], x[:, 1:] - x[:, :-1]], 1),
+            "later steps": lambda x: x.flip(1).cumsum(1).flip(1),
+            "whole trajectory": lambda x: x - x.mean(1, keepdim=True),
+            "whole batch": lambda x: x / (1 + x.square().sum()),
+            "chance": lambda x: nn.functional.dropout(x, 0.5, training=True),
+        }[self.how](inputs.vector)
+        return self.head(features).unflatten(-1, self.size)
+
+
+MEMORIES = ["over time", "over trajectories", "differences", "later steps", "whole trajectory", "whole batch", "chance"]
+
+
+@pytest.mark.parametrize("zero", [False, True])
+@pytest.mark.parametrize("how", MEMORIES)
+def test_a_network_with_a_memory_is_refused_when_it_is_made(how, zero):
+    with pytest.raises(ShapeError) as caught:
+        make(network="test_networks:WithMemory", options={"how": how, "zero": zero})
+    assert str(caught.value).startswith(
+        "network 'test_networks:WithMemory' gives a step alone other outputs than within its trajectory: it depends on "
+        "earlier steps"
+    )
+    assert "\n" not in str(caught.value)

@@ -12,6 +12,7 @@ from pathlib import Path
 import jupytext
 import nbformat
 import pytest
+from killing import HANGS
 
 ROOT = Path(__file__).parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -47,7 +48,8 @@ def test_all_run_on_small_data_from_a_fresh_clone(tmp_path, cache):
     """No data of anybody else's lies beside the repository; fits are made anew."""
     own = {"NOTEBOOK_RUNS": str(tmp_path / "runs"), "NOTEBOOK_METAWORLD": str(tmp_path / "none"), "MUJOCO_GL": "egl"}
     environment = os.environ | own | {"NOTEBOOK_SMALLER": SMALL, "DDCO_PYRO_CACHE": str(cache)}
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--nbmake", *map(str, NOTEBOOKS)]
+    options = ["-q", "-p", "no:cacheprovider", "--nbmake", f"--nbmake-timeout={HANGS}"]
+    command = [sys.executable, "-m", "pytest", *options, *map(str, NOTEBOOKS)]
     ended = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
     assert ended.returncode == 0, ended.stdout[-5000:]
     assert f"{len(NOTEBOOKS)} passed" in ended.stdout

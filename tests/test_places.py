@@ -16,6 +16,7 @@ import pytest
 import selecting
 import toy_task
 import yaml
+from killing import HANGS
 from random_demonstrations import demonstrations
 from test_cli import call
 
@@ -66,7 +67,7 @@ def test_a_full_disk_while_segmenting(toy_run, toy_spec, tmp_path: Path, size: i
     before = path.read_bytes()
     for more in ([], ["--csv", tmp_path / "a.csv"], ["--html", tmp_path / "a.html"]):
         with room(size):
-            ended = call("segment", toy_run.folder, path, *more)
+            ended = call("segment", toy_run.folder, path, "--in-place", *more)
         assert ended.status == 1
         assert "there is no room to write it" in ended.err.splitlines()[-1]
     assert path.read_bytes() == before
@@ -151,7 +152,7 @@ def test_who_waits_goes_on_when_the_other_has_ended(tmp_path: Path) -> None:
         other.join(0.2)
         order.append("first")
         shutil.rmtree(folder)
-    other.join(10)
+    other.join(HANGS)
     assert order == ["first", "second"]
 
 

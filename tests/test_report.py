@@ -1,19 +1,22 @@
 import html
 import re
+import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import h5py
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+import toy_task
 
-from ddco_pyro.data import demonstrations
+from ddco_pyro.data import demonstrations, parts
 from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.report import film, words, write_report
-from ddco_pyro.report.activity import LevelActivity, activity, bins
+from ddco_pyro.report import film, tables, words, write_report
+from ddco_pyro.report.activity import Activity, LevelActivity, activity, bins
 from ddco_pyro.report.plot_rows import order
 from ddco_pyro.report.plot_timing import shares, terminations
-from ddco_pyro.report.plot_trajectories import position_key, view
+from ddco_pyro.report.plot_trajectories import movement, position_key, view
 from ddco_pyro.rollout import paired_difference, summarize
 from ddco_pyro.run import fit, write_metrics
 from ddco_pyro.spec import parse_spec
@@ -97,7 +100,9 @@ OURS, THEIRS = [1.0, 1.0, 0.0, 1.0], [0.0, 1.0, 0.0, 0.0]
 
 def rollouts():
     def outcomes(successes):
-        return summarize([{"success": s, "accuracy_mm": 2.0 + n if s else np.nan} for n, s in enumerate(successes)])
+        return summarize(
+            toy_task.task, [{"success": s, "accuracy_mm": 2.0 + n if s else np.nan} for n, s in enumerate(successes)]
+        )
 
     methods = {
         "flat": {"measures": outcomes(THEIRS), "against": paired_difference(OURS, THEIRS)},
@@ -154,9 +159,10 @@ def test_figures_are_also_files(labelled, deep):
 
 
 def test_sections_are_there_where_they_apply(labelled, deep):
-    assert ids(labelled[1]) == ["likelihood", "learning", "options", "warnings", "particulars"]
-    everything = ["likelihood", "rollouts", "learning", "options", "warnings", "films", "particulars"]
-    assert ids(deep[1]) == everything
+    some = ["likelihood", "demonstrations", "learning", "options", "warnings", "particulars", "segments"]
+    assert ids(labelled[1]) == some
+    more = ["likelihood", "demonstrations", "rollouts", "learning", "options", "warnings", "films", "particulars"]
+    assert ids(deep[1]) == [*more, "segments"]
     assert "trajectories" not in {path.stem for path in (deep[0].folder / "figures").iterdir()}
     assert "mutual information" in labelled[1]
     assert "mutual information" not in deep[1]
@@ -167,7 +173,8 @@ def test_a_baseline_has_no_options(labelled):
     before = found.baselines["flat"].metrics
     page = write_report(found.baselines["flat"], demos).read_text()
     assert found.baselines["flat"].metrics == before
-    assert ids(page) == ["likelihood", "learning", "particulars"]
+    assert ids(page) == ["likelihood", "demonstrations", "learning", "particulars"]
+    assert 'href="#segments' not in page
     assert "no other model was trained to compare with" in page
 
 
@@ -189,12 +196,125 @@ def test_numbers_are_those_of_the_metrics(labelled):
     assert metrics["versions"]["torch"] in shown
 
 
+def rows_of(page):
+    """The list of demonstrations: (name, where its link leads, whether it is marked as held out, numbers) of each."""
+    (section,) = re.findall(r'<section id="demonstrations">(.*?)</section>', page, re.DOTALL)
+    found = []
+    for row in re.findall(r"<tr><td>(.*?)</tr>", section, re.DOTALL):
+        link = re.match(r'<a href="#([^"]*)">', row)
+        name, mark, *numbers = re.findall(r"([^<>]*)(?:</a>|</span>)?</td>", row)
+        found.append((html.unescape(name), link[1] if link else None, mark == "held out", numbers))
+    return found
+
+
+def test_demonstrations_are_listed_worst_first_with_links_to_their_segments(labelled):
+    found, page, demos = labelled
+    per_step = {}
+    for name, fitted in (("ddco", found), ("flat", found.baselines["flat"])):
+        values = fitted.log_likelihood(demos) / demos.lengths
+        per_step[name] = dict(zip(demos.names, values, strict=True))
+    valid = parts(found.spec, demos)["valid"].names
+    listed = rows_of(page)
+    assert [name for name, *_ in listed] == sorted(demos.names, key=per_step["ddco"].__getitem__)
+    for name, link, held_out, numbers in listed:
+        assert held_out == (name in valid)
+        steps = str(len(demos[demos.names.index(name)]))
+        assert numbers == [steps, *(words.number(per_step[method][name]) for method in ("ddco", "flat"))]
+        assert page.count(f'id="{link}"') == 1
+        (timeline,) = re.findall(rf'<div class="demonstration" id="{link}">(.*?)</div>', page, re.DOTALL)
+        assert timeline.startswith(f'<div class="who">{name}\n')
+        assert ("held out" in timeline) == held_out
+
+
+def test_the_segments_are_those_of_the_most_likely_path(labelled):
+    found, page, demos = labelled
+    (path,) = found.segment(demos)
+    for name, link, *_ in rows_of(page):
+        after = page.partition(f'id="{link}"')[2].partition('class="demonstration"')[0]
+        drawn = [
+            (int(option), int(start), int(end))
+            for option, start, end in re.findall(r'title="option (\d), steps (\d+) to (\d+), probability', after)
+        ]
+        steps = np.concatenate([np.full(end + 1 - start, option) for option, start, end in drawn])
+        row = demos.names.index(name)
+        np.testing.assert_array_equal(steps, path[row, : len(demos[row])])
+        labels = [(int(label), int(start)) for label, start in re.findall(r'title="phase (\d), steps (\d+) to', after)]
+        assert labels == [(0, 0), (1, len(steps) // 2)]
+
+
+def test_a_long_list_is_folded_and_long_timelines_are_cut(labelled, monkeypatch):
+    found, _, demos = labelled
+    monkeypatch.setattr("ddco_pyro.report.demonstration_list.SHOWN", 3)
+    monkeypatch.setattr("ddco_pyro.report.demonstration_list.MOST_BOXES", 1)
+    page = write_report(found, demos).read_text()
+    seen, _, folded = page.partition("<details><summary>The other 5 demonstrations</summary>")
+    listed = rows_of(page)
+    assert [name for name, *_ in listed[:3]] == [name for name, *_ in rows_of(seen + "</section>")]
+    assert [link is not None for _, link, *_ in listed] == [True] + 7 * [False]
+    assert folded.count('class="demonstration"') == 1
+    assert "ddco-pyro segment RUN FILE --html PAGE" in folded
+
+
+def test_runs_of_before_have_no_list(labelled, tmp_path):
+    found, _, demos = labelled
+    before = {key: value for key, value in found.metrics.items() if key != "demonstrations_by_likelihood"}
+    copy = replace(found, folder=shutil.copytree(found.folder, tmp_path / "before"))
+    write_metrics(copy.folder, before)
+    page = write_report(copy, demos).read_text()
+    assert ids(page) == ["likelihood", "learning", "options", "warnings", "particulars"]
+    assert 'href="#segments' not in page
+
+
+def test_words_of_the_method_are_explained_where_they_stand(labelled, deep):
+    shown = " ".join(text(labelled[1]).split())
+    for explained in (
+        "DDCO: the hierarchy of options; flat: one policy without options.",
+        "“From clusters” trains",
+        "“Alone” trains",
+        "vq-1, level-1, meta-policy, joint, policy",
+        "how likely an active option is to end at a step (its termination condition, ψ in the paper)",
+        "given the whole demonstration (u in the paper)",
+        "A nat is the unit of log-likelihood",
+    ):
+        assert explained in shown
+    assert "per-timestep: a policy for each time step." in " ".join(text(deep[1]).split())
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("vq-1", "level 1 from clusters"),
+        ("level-2", "level 2 alone"),
+        ("meta-policy", "meta-policy alone"),
+        ("joint", "all together"),
+        ("policy", "policy"),
+    ],
+)
+def test_stages_in_words(name, said):
+    assert words.stage(name) == said
+
+
 def test_success_is_shown_with_trials_intervals_and_the_paired_comparison(deep):
     shown = " ".join(text(deep[1]).split())
     assert "DDCO 3 of 4 (30 to 95 %) 3.33 ± 1.53 [−0.46 to 7.13], n = 3" in shown
     assert "flat 1 of 4 (5 to 70 %) 3.00, n = 1" in shown
     assert "flat 2 0 4 0.5" in shown
     assert "DDCO succeeds in 3 of 4 episodes (30 to 95 %); flat in 1 of 4 (5 to 70 %)." in shown
+
+
+def test_a_column_is_of_one_kind_whatever_was_seen():
+    """A method that toppled 0 or 1 boxes in each episode beside one that toppled more, and one that grasped nothing."""
+    task = replace(toy_task.task, measures={"topples": "mean", "inserted": "rate", "accuracy_mm": "mean"})
+    seen = {
+        "flat": [{"topples": 0.0, "inserted": np.nan, "accuracy_mm": np.nan}] * 2,
+        "ddco": [{"topples": 3.0, "inserted": 1.0, "accuracy_mm": 1.0}] * 2,
+    }
+    found = tables.measures({name: {"measures": summarize(task, outcomes)} for name, outcomes in seen.items()})
+    assert found.head == ["Method", "Topples", "Inserted", "Accuracy (mm)"]
+    assert found.rows == [
+        ["flat", "0.00 ± 0.00 [0.00 to 0.00], n = 2", "0 of 0", "– (n = 0)"],
+        ["DDCO", "3.00 ± 0.00 [3.00 to 3.00], n = 2", "2 of 2 (34 to 100 %)", "1.00 ± 0.00 [1.00 to 1.00], n = 2"],
+    ]
 
 
 def test_warnings_are_in_words_with_their_numbers(labelled, deep):
@@ -241,7 +361,7 @@ def test_names_are_escaped(tmp_path):
     assert "<i>" not in page
     assert "<img>" not in page
     assert "&lt;b&gt;&amp;run" in page
-    assert "stages named vq" not in page.lower()
+    assert "from clusters" not in page
 
 
 def comparison(mean, error, held_out=10):
@@ -302,7 +422,7 @@ def test_bins_are_normalised_time_otherwise():
 def test_shares_and_terminations_are_weighted_means():
     active = np.array([[[0, 1, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 0], [0, 0.5, 0.5], [0, 0, 1]]], dtype=float)
     termination = np.array([[[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]], [[0.1, 0.2], [0.7, 0.8], [0.9, 1.0]]])
-    level = LevelActivity("option", active, np.zeros((2, 3), int), termination)
+    level = LevelActivity("option", active, np.zeros((2, 3), int), np.zeros((2, 3), int), termination)
     gathered = bins(np.array([3, 3]))
     np.testing.assert_allclose(shares(level, gathered), [[0, 1, 0], [0, 0.75, 0.25], [0, 0, 1]])
     nan = np.nan  # nobody can end before the first step, and option 2 is not there before the last
@@ -310,9 +430,15 @@ def test_shares_and_terminations_are_weighted_means():
     np.testing.assert_allclose(terminations(level, gathered), expected)
 
 
-def test_rows_are_sorted_by_length_then_by_the_first_change(labelled):
-    found, _, demos = labelled
-    np.testing.assert_array_equal(order(activity(found, demos)), np.arange(len(demos)))
+def test_rows_are_sorted_by_length_then_by_the_first_change():
+    """Two levels, of which the lowest counts; a demonstration without a change comes after those of its length."""
+    paths = ["11222", "1222-", "12111", "1111-", "11111", "1121-", "1----"]
+    low = np.array([[-1 if step == "-" else int(step) for step in path] for path in paths])
+    high = np.array([[1, 2, 1, 1, 1]] * len(paths))
+    nothing = np.zeros((len(paths), 5, 3))
+    levels = tuple(LevelActivity(name, nothing, path, nothing) for name, path in (("low", low), ("high", high)))
+    found = order(Activity(levels, (low >= 0).sum(1)))
+    assert [paths[row] for row in found] == ["1----", "1222-", "1121-", "1111-", "12111", "11222", "11111"]
 
 
 def test_positions_are_seen_from_where_they_spread():
@@ -324,5 +450,70 @@ def test_positions_are_seen_from_where_they_spread():
 
 
 @pytest.mark.parametrize(("size", "key"), [(2, None), (3, "place"), (7, "place")])
-def test_position_is_the_first_vector_of_three_numbers(size, key):
+def test_a_position_has_three_numbers_or_more(size, key):
     assert position_key(made(2, size)) == key
+
+
+def recorded(**keys):
+    """Demonstrations of these observations, key to an array [T, ...] for each demonstration."""
+    rows = [dict(zip(keys, values, strict=True)) for values in zip(*keys.values(), strict=True)]
+    return Demonstrations(
+        tuple(Demonstration(f"demo_{n}", row, np.zeros((len(row[next(iter(keys))]), 1))) for n, row in enumerate(rows))
+    )
+
+
+def reaches(number=6, steps=40):
+    """Smooth reaches from scattered starts by scattered ways: positions [T, 3] of each."""
+    rng, time = np.random.default_rng(0), np.linspace(0, 1, steps)[:, None]
+    eased = 10 * time**3 - 15 * time**4 + 6 * time**5
+    return [rng.normal(size=3) + eased * 2 * rng.normal(size=3) for _ in range(number)]
+
+
+def test_what_moves_is_drawn_whatever_comes_first():
+    """Before it in the alphabet: what is constant within each demonstration, in all of them, or only measured badly."""
+    rng, hands = np.random.default_rng(1), reaches()
+    steps = [np.ones((len(hand), 1)) for hand in hands]
+    demos = recorded(
+        base=[step * np.array([0.1, 0.2, 0.3]) for step in steps],
+        goal=[step * rng.normal(size=3) for step in steps],
+        guess=[step * rng.normal(size=3) + 1e-3 * rng.normal(size=(len(step), 3)) for step in steps],
+        hand=hands,
+    )
+    assert position_key(demos) == "hand"
+
+
+def test_what_goes_somewhere_is_drawn_rather_than_its_velocity_or_a_force():
+    rng, hands = np.random.default_rng(1), reaches()
+    demos = recorded(
+        force=[rng.normal(size=hand.shape) for hand in hands],
+        speed=[np.gradient(hand, axis=0) for hand in hands],
+        state=[np.hstack([hand, hand]) for hand in hands],  # the same, but three of its six numbers are not drawn
+        hand=hands,
+    )
+    assert position_key(demos) == "hand"
+
+
+def test_nothing_is_drawn_where_nothing_moves():
+    assert position_key(recorded(goal=[np.full((5, 3), 0.1), np.full((1, 3), 0.7)])) is None
+
+
+def test_movement_by_hand():
+    """Even steps along a straight line: 1; there and back: half as far for the way it goes."""
+    line = np.arange(5.0)[:, None] * np.array([1.0, 2.0, 2.0])
+    assert movement([line, line]) == pytest.approx(1)
+    assert movement([line[[0, 1, 2, 1, 0]]] * 2) == pytest.approx(0.5)
+    assert movement([np.hstack([line, line])] * 2) == pytest.approx(0.5)
+    within, between = 9 * 2.0, 3 * 4.0  # the variance of 0 to 4 is 2; that of a mean of -2 and one of 2 is 4
+    assert movement([line - 2, line + 2]) == pytest.approx(np.sqrt(within / (within + between)))
+    assert movement([np.array([[1.0, 2.0, 3.0]])]) == 0
+
+
+def test_the_spec_may_say_what_is_drawn(tmp_path, labelled):
+    demos = recorded(arm=reaches(steps=12), hand=reaches(steps=12))
+    found, demos = run(tmp_path, demos, labelled=False, observations=["arm", "hand"], report={"trajectory": "hand"},
+                       training={"epochs": 1, "initialize": "random"}, compare_with=[])  # fmt: skip
+    shown = " ".join(text(write_report(found, demos).read_text()).split())
+    assert "first three numbers of observation “hand”, in its own units" in shown
+    automatic = " ".join(text(labelled[1]).split())
+    assert "observation “place”, in its own units. Of those with three numbers or more it moves the most" in automatic
+    assert "report.trajectory in the spec names another" in automatic

@@ -163,19 +163,30 @@ def test_mcnemars_exact_p_value(only_ours, only_theirs, both):
 
 def test_a_measure_leaves_out_the_episodes_it_does_not_apply_to():
     outcomes = [{"success": 1.0, "error": 0.5}, {"success": 0.0, "error": math.nan}, {"success": 1.0, "error": 1.5}]
-    found = summarize([*outcomes, {"success": 1.0}])
+    found = summarize(task, [*outcomes, {"success": 1.0}])
     assert (found["success"]["successes"], found["success"]["trials"]) == (3, 4)
     assert (found["error"]["mean"], found["error"]["trials"]) == (1.0, 2)
 
 
 def test_a_mean_has_students_interval():
     values = [0.5, 1.5, 2.5, 4.0]
-    found = summarize([{"error": value} for value in values])["error"]
+    found = summarize(task, [{"error": value} for value in values])["error"]
     low, high = stats.t.interval(0.95, 3, np.mean(values), stats.sem(values))
     np.testing.assert_allclose(found["interval"], [low, high])
     assert found["std"] == pytest.approx(np.std(values, ddof=1))
-    assert summarize([{"error": 0.5}])["error"] == {"mean": 0.5, "std": None, "trials": 1, "interval": None}
+    assert summarize(task, [{"error": 0.5}])["error"] == {"mean": 0.5, "std": None, "trials": 1, "interval": None}
 
 
-def test_a_measure_that_never_applies_has_no_trials():
-    assert summarize([{"error": math.nan}] * 3)["error"]["trials"] == 0
+def test_a_mean_is_a_mean_whatever_its_values_happen_to_be():
+    """Topples that were 0 or 1 in every episode are still counted, not a rate of successes."""
+    found = summarize(task, [{"error": value} for value in (0.0, 1.0, 1.0, 0.0)])["error"]
+    low, high = stats.t.interval(0.95, 3, 0.5, stats.sem([0.0, 1.0, 1.0, 0.0]))
+    assert found == {"mean": 0.5, "std": pytest.approx(3**-0.5), "trials": 4, "interval": pytest.approx([low, high])}
+    assert summarize(task, [{"error": 1.0}] * 2)["error"]["interval"] == [1.0, 1.0]
+
+
+def test_a_measure_that_never_applies_is_unknown_and_of_its_own_kind():
+    declared = replace(task, measures={"inserted": "rate", "error": "mean"})
+    found = summarize(declared, [{"inserted": math.nan, "error": math.nan}] * 3)
+    assert found["inserted"] == {"successes": 0, "trials": 0, "rate": None, "interval": None}
+    assert found["error"] == {"mean": None, "std": None, "trials": 0, "interval": None}

@@ -8,16 +8,17 @@ import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
-from ddco_pyro.data import demonstrations
+from ddco_pyro.data import Dimensions, demonstrations
 from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.run import RunError, claim, fit
+from ddco_pyro.files import Damaged
+from ddco_pyro.run import RunError, claim, fit, train
 from ddco_pyro.spec import dump_spec, load_spec, with_overrides
 
 
@@ -89,7 +90,7 @@ def test_the_history_has_every_epoch(toy_run, watched):
 
 
 def test_the_watcher_is_told_what_goes_on(toy_run, watched):
-    assert watched.models == [("ddco", 24), "ddco", ("flat", 6), "flat", ("per_timestep", 6), "per_timestep"]
+    assert watched.models == [("ddco", 24), "ddco", ("flat", 24), "flat", ("per_timestep", 24), "per_timestep"]
     assert watched.demonstrations in ([(n, 12) for n in range(1, 13)], [])  # nothing where they are in the cache
 
 
@@ -105,7 +106,7 @@ print(torch.get_num_threads())
 
 def test_the_compiled_engine_leaves_the_number_of_threads_alone():
     """Its first call in a process sets OpenMP's; torch then used every core, tenfold slower on a busy machine."""
-    environment = os.environ | {"NUMBA_NUM_THREADS": "2", "PYTHONPATH": str(Path(__file__).parent)}
+    environment = os.environ | {"NUMBA_NUM_THREADS": "2"}
     ended = subprocess.run([sys.executable, "-c", FIRST_ELIMINATION], env=environment, capture_output=True, text=True)
     assert ended.stdout == "1\n"
 
@@ -138,6 +139,23 @@ def test_log_likelihoods_can_be_computed_again(toy_run, parts):
         {"name": demo.name, "steps": len(demo), "log_likelihood": pytest.approx(value)}
         for demo, value in zip(parts["valid"], loaded.log_likelihood(parts["valid"]), strict=True)
     ]
+
+
+def test_every_demonstration_is_listed_worst_first(toy_run, demos, parts):
+    listed = toy_run.metrics["demonstrations_by_likelihood"]
+    methods = {"ddco": toy_run, **toy_run.baselines}
+    steps = dict(zip(demos.names, demos.lengths, strict=True))
+    values = {
+        name: dict(zip(demos.names, fitted.log_likelihood(demos) / demos.lengths, strict=True))
+        for name, fitted in methods.items()
+    }
+    assert [one["name"] for one in listed] == sorted(demos.names, key=values["ddco"].__getitem__)
+    for one in listed:
+        assert one["part"] == ("valid" if one["name"] in parts["valid"].names else "train")
+        assert one["steps"] == steps[one["name"]]
+        assert one["log_likelihood_per_step"] == pytest.approx({m: values[m][one["name"]] for m in methods})
+    flat = toy_run.baselines["flat"].metrics["demonstrations_by_likelihood"]
+    assert [one["name"] for one in flat] == sorted(demos.names, key=values["flat"].__getitem__)
 
 
 def test_comparisons_can_be_computed_again(toy_run, parts):
@@ -214,7 +232,7 @@ def test_planted_skills_are_found(planted, tmp_path, toy_spec):
         "demonstrations": {"path": str(planted), "labels": "skill"},
         "observations": ["side", "place"],
     }
-    spec = with_overrides(toy_spec, given | {"compare_with": [], "training.epochs": 60} | LINEAR)
+    spec = with_overrides(toy_spec, given | {"compare_with": [], "training.epochs": 240} | LINEAR)
     found = fit(spec, tmp_path / "run", Silent())
     assert found.metrics["agreement"]["valid"] == [pytest.approx(1)]
     assert "supervisor" not in found.metrics["demonstrations"]
@@ -234,14 +252,30 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(toy_run, toy_spec, tmp_pat
     fit(toy_spec, folder, Silent())
     for name in ("model.safetensors", "history.csv", "baselines/flat/model.safetensors", "spec.yaml"):
         assert (folder / name).read_bytes() == (toy_run.folder / name).read_bytes()
+    for name in ("metrics.json", "baselines/flat/metrics.json"):
+        ours, theirs = (json.loads((one / name).read_text()) | {"seconds": ...} for one in (folder, toy_run.folder))
+        assert ours == theirs
     assert not list(folder.rglob("*.tmp"))
+
+
+def test_the_engines_are_compared_on_a_model_that_the_seed_decides(toy_spec, demos):
+    """With dropout, and whatever was drawn before; nothing is drawn from the global generator."""
+    spec = with_overrides(toy_spec, {"training.epochs": 1, "hierarchy.levels.0.policy.dropout": 0.5})
+    checks = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        before = torch.get_rng_state()
+        checks.append(train(spec, Dimensions.of(demos), demos, Silent()).check)
+        assert torch.equal(torch.get_rng_state(), before)
+    assert checks[0] == checks[1]
+    assert checks[0] != train(with_overrides(spec, {"seed": 1}), Dimensions.of(demos), demos, Silent()).check
 
 
 def test_a_finished_run_is_left_as_it_is(copied, toy_spec):
     metrics = copied / "metrics.json"
-    metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"rollouts": "kept"}))
+    metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"note": "kept"}))
     before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in copied.rglob("*") if path.is_file()}
-    assert fit(toy_spec, copied, Interrupting(1)).metrics["rollouts"] == "kept"
+    assert fit(toy_spec, copied, Interrupting(1)).metrics["note"] == "kept"
     assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in before} == before
 
 
@@ -258,6 +292,7 @@ def test_claiming_a_folder(tmp_path, toy_spec):
     assert (folder / "spec.yaml").read_text() == dump_spec(toy_spec)
     (folder / ".spec.yaml-killed.tmp").touch()  # what a killed process left
     claim(folder, toy_spec, resume=False)
+    (folder / "model.safetensors").touch()
     (folder / "metrics.json").touch()
     claim(folder, toy_spec, resume=False)  # killed before its report
     (folder / "report.html").touch()
@@ -290,11 +325,15 @@ def test_a_damaged_model_is_not_loaded(copied):
     content = model.read_bytes()
     for damaged in (b"", content[:40], content[:-8], b"\xff" * 100):
         model.write_bytes(damaged)
-        with pytest.raises(RunError, match=r"run: model\.safetensors is damaged, or of another spec than spec\.yaml$"):
+        with pytest.raises(
+            Damaged, match=r"run/model\.safetensors: is damaged: .*; remove it and fit again: ddco-pyro fit"
+        ):
             ddco_pyro.load(copied)
 
 
 def test_a_model_of_another_spec_is_not_loaded(copied, toy_spec):
     (copied / "spec.yaml").write_text(dump_spec(with_overrides(toy_spec, {"hierarchy.levels.0.count": 3})))
-    with pytest.raises(RunError, match=r"of another spec than spec\.yaml$"):
+    with pytest.raises(
+        RunError, match=r"run/model\.safetensors: is of another spec than spec\.yaml; remove it and fit"
+    ):
         ddco_pyro.load(copied)

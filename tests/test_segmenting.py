@@ -13,11 +13,12 @@ import numpy as np
 import pyarrow.parquet as parquet
 import pytest
 import yaml
+from sklearn.metrics import normalized_mutual_info_score
 from test_cli import call
 from test_run import Silent
 
 import ddco_pyro
-from ddco_pyro.data import demonstrations
+from ddco_pyro.data import demonstrations, parts
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.importing import import_demonstrations
 from ddco_pyro.run import fit
@@ -70,9 +71,43 @@ def test_they_are_the_fits_own(toy_run, toy_spec, file, at_once, monkeypatch):
         np.testing.assert_array_equal(one.labels["phase"], demo.labels["phase"])
 
 
+@pytest.mark.parametrize("option", ["--html", "--csv", "--parquet"])
+def test_a_page_or_a_table_leaves_the_file_alone(toy_run, file, tmp_path, option):
+    before, time = file.read_bytes(), file.stat().st_mtime_ns
+    out = tmp_path / "segments"
+    assert call("segment", toy_run.folder, file, option, out)[:2] == (0, f"{out}\n")
+    assert (file.read_bytes(), file.stat().st_mtime_ns) == (before, time)
+    assert {path.name for path in tmp_path.iterdir()} == {"demos.hdf5", "segments"}
+
+
+NOTHING = (
+    "ddco-pyro: name what to write: --html PAGE, --csv FILE or --parquet FILE; labels for each step go to --out FILE "
+    "(a copy) or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], NOTHING),
+        (["--level", "option"], NOTHING),
+        (["--in-place", "--out", "copy.hdf5"], "ddco-pyro: --out and --in-place exclude each other; keep one\n"),
+        (["--out", "FILE"], "ddco-pyro: --out FILE: is the file itself; to write labels into it, say --in-place\n"),
+        (["--lerobot", "folder"], "ddco-pyro: FILE: is no LeRobot dataset; --lerobot annotates a copy of one\n"),
+    ],
+)
+def test_what_to_write_has_to_be_said(toy_run, file, monkeypatch, options, message):
+    monkeypatch.chdir(file.parent)
+    before = file.read_bytes()
+    named = [option.replace("FILE", str(file)) for option in options]
+    assert call("segment", toy_run.folder, file, *named) == (2, "", message.replace(" FILE: ", f" {file}: "))
+    assert [path.name for path in file.parent.iterdir()] == ["demos.hdf5"]
+    assert file.read_bytes() == before
+
+
 def test_labels_go_into_the_file_and_are_read_from_there(toy_run, file):
     before = Demonstrations.read(file, labels=["phase"])
-    ended = call("segment", toy_run.folder, file)
+    ended = call("segment", toy_run.folder, file, "--in-place")
     assert (ended.status, ended.out) == (0, f"{file}: labels/option\n")
     after = Demonstrations.read(file, labels=["phase", "option", "option_boundary"])
     for one, demo, was in zip(look(toy_run.folder, file).segments, after, before, strict=True):
@@ -81,7 +116,7 @@ def test_labels_go_into_the_file_and_are_read_from_there(toy_run, file):
         np.testing.assert_array_equal(demo.labels["phase"], was.labels["phase"])
         np.testing.assert_array_equal(demo.actions, was.actions)
     time = file.stat().st_mtime_ns
-    assert call("segment", toy_run.folder, file).status == 0
+    assert call("segment", toy_run.folder, file, "--in-place").status == 0
     assert file.stat().st_mtime_ns == time  # it has these labels already
 
 
@@ -97,7 +132,7 @@ def test_labels_from_elsewhere_are_never_replaced(toy_run, file):
     with h5py.File(file, "r+") as opened:
         opened["data/demo_3/labels/option"] = np.zeros(len(opened["data/demo_3/actions"]), int)
     before = file.read_bytes()
-    ended = call("segment", toy_run.folder, file)
+    ended = call("segment", toy_run.folder, file, "--in-place")
     assert ended.status == 2
     assert "demo_3: labels/option is there already and was not written by ddco-pyro segment" in ended.err
     assert file.read_bytes() == before
@@ -138,6 +173,52 @@ def test_the_page_shows_every_segment(toy_run, file, tmp_path):
     assert [(int(o), int(a), int(b) + 1) for o, a, b in titles] == runs
     assert "http" not in text
     assert "<script" not in text
+
+
+def marked(page):
+    """Names on the page that are marked as held out."""
+    shown = re.findall(r'<div class="who">(\S+)\s*(<span class="held-out">held out</span>)?', page)
+    return {name for name, mark in shown if mark}
+
+
+def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy_spec, file, tmp_path):
+    page = tmp_path / "segments.html"
+    assert call("segment", toy_run.folder, file, "--html", page).status == 0
+    text = page.read_text()
+    split = parts(toy_spec, demonstrations(toy_spec))
+    assert marked(text) == set(split["valid"].names)
+    scores = {}
+    for name, part in split.items():
+        (path,) = toy_run.segment(part)
+        found = np.concatenate([row[: len(demo)] for row, demo in zip(path, part, strict=True)])
+        scores[name] = normalized_mutual_info_score(np.concatenate([demo.labels["phase"] for demo in part]), found)
+    assert (
+        f"label “phase”, as normalised mutual information: {scores['valid']:.2f} on 3 held-out demonstrations and "
+        f"{scores['train']:.2f} on 9 other demonstrations. 0 is no agreement"
+    ) in " ".join(text.split())
+    assert "3 of 12 demonstrations were held out when it was fitted" in text
+
+
+def test_other_demonstrations_of_the_same_names_are_not_marked(toy_run, toy_spec, file, tmp_path):
+    with h5py.File(file, "r+") as opened:
+        for group in opened["data"].values():
+            group["actions"][:] += 0.1
+    page = tmp_path / "segments.html"
+    assert call("segment", toy_run.folder, file, "--html", page).status == 0
+    text = page.read_text()
+    assert marked(text) == set()
+    assert re.search(r"mutual information: \d\.\d\d on 12 demonstrations\. 0 is", text)
+    assert "were held out" not in text
+
+
+def test_without_labels_the_page_says_nothing_of_agreement(toy_run, file, tmp_path):
+    with h5py.File(file, "r+") as opened:
+        for group in opened["data"].values():
+            del group["labels/phase"]
+    page = tmp_path / "segments.html"
+    assert call("segment", toy_run.folder, file, "--html", page).status == 0
+    assert "mutual information" not in page.read_text()
+    assert marked(page.read_text())
 
 
 def test_the_page_escapes_what_it_shows(toy_run, tmp_path, toy_spec):
@@ -208,7 +289,8 @@ def test_lerobot_subtasks(lerobot_run, tmp_path):
             [LEROBOT, "--lerobot", tmp_path / "x", "--level", "skil"],
             "there is no level 'skil' (there is: skill",
         ),
-        ([LEROBOT], "labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot"),
+        ([LEROBOT, "--in-place"], "labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot"),
+        ([LEROBOT, "--html", tmp_path / "y", "--out", tmp_path / "z"], "labels go into HDF5 files only"),
     ):
         ended = call("segment", lerobot_run.folder, *wrong)
         assert (ended.status, ended.err.count("\n")) == (2, 1)
@@ -246,13 +328,13 @@ def test_other_demonstrations_are_refused(toy_run, file, change, message):
     with h5py.File(file, "r+") as opened:
         for group in opened["data"].values():
             change(group)
-    ended = call("segment", toy_run.folder, file)
+    ended = call("segment", toy_run.folder, file, "--in-place")
     assert (ended.status, ended.err.count("\n")) == (2, 1)
     assert message in ended.err
 
 
 def test_a_policy_without_options_is_refused(toy_run, file):
-    ended = call("segment", toy_run.folder / "baselines" / "flat", file)
+    ended = call("segment", toy_run.folder / "baselines" / "flat", file, "--in-place")
     assert ended.status == 2
     assert "is a flat policy without options; name a run with a hierarchy" in ended.err
 

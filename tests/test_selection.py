@@ -7,12 +7,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from killing import struck
 from selecting import Told, data_at, kept, score, spec_at, two_skills
 
 import ddco_pyro
@@ -220,23 +220,21 @@ def written(folder):
     return folder / "spec.yaml"
 
 
+KILL = "os.killpg(0, signal.SIGKILL)"
+
+
 def test_a_killed_selection_goes_on_and_gives_the_same(tmp_path):
     """kill -9 of the whole process group when some folds are done; what was done is not done again."""
     spec = written(tmp_path)
-    arguments = [COMMAND, "select", spec, "--out"]
+    arguments = ["select", spec, "--out"]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     cut = tmp_path / "cut"
-    process = subprocess.Popen([*arguments, cut, "--jobs", "2"], env=environment, start_new_session=True, **pipes)
-    while len(list((cut / "folds").glob("*.json"))) < 2 and process.poll() is None:
-        time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL
+    status, _ = struck([*arguments, cut, "--jobs", "2"], tmp_path, "Selecting.scored", 2, KILL)
+    assert status == -signal.SIGKILL
     done = {path: path.read_bytes() for path in (cut / "folds").glob("*.json")}
-    assert 2 <= len(done) < 8
+    assert len(done) == 2
     resumed = subprocess.run(
-        [*arguments, cut, "--jobs", "1", "--resume"], env=environment, capture_output=True, text=True
+        [COMMAND, *arguments, cut, "--jobs", "1", "--resume"], env=environment, capture_output=True, text=True
     )
     assert resumed.returncode == 0, resumed.stderr
     assert f"({len(done)} of 8 kept from before)" in resumed.stderr

@@ -8,10 +8,10 @@ import signal
 import socket
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import yaml
+from killing import HANGS
 from selecting import Told, data_at, kept, spec_at
 from test_cli import call
 
@@ -19,8 +19,6 @@ from ddco_pyro.selection import Workers, select
 from ddco_pyro.selection.parallel import BackendError
 
 distributed = pytest.importorskip("distributed")
-
-SECONDS = 60
 
 
 class Killing(Told):
@@ -44,7 +42,7 @@ def cluster(tmp_path_factory):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent)}
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
     commands = [
         ["scheduler", "--host", address, "--no-dashboard", "--no-show"],
         *[["worker", address, "--no-nanny", "--nthreads", "1", "--no-dashboard", "--local-directory", folder]] * 2,
@@ -54,8 +52,8 @@ def cluster(tmp_path_factory):
         subprocess.Popen([sys.executable, "-m", "dask", *command], env=environment, cwd=folder, **streams)
         for command in commands
     ]
-    with distributed.Client(address, timeout=SECONDS) as client:
-        client.wait_for_workers(2, timeout=SECONDS)
+    with distributed.Client(address, timeout=HANGS) as client:
+        client.wait_for_workers(2, timeout=HANGS)
     yield address, processes[1:]
     for process in processes:
         process.send_signal(signal.SIGKILL)

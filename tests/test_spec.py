@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
+import resource
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -16,6 +20,7 @@ from ddco_pyro.spec import (
     HierarchySpec,
     LearnedStd,
     LevelSpec,
+    NetworkSpec,
     Spec,
     SpecError,
     dump_spec,
@@ -24,6 +29,8 @@ from ddco_pyro.spec import (
     spec_schema,
     with_overrides,
 )
+from ddco_pyro.spec.keypaths import edited
+from ddco_pyro.spec.reading import read_yaml
 
 EXAMPLE = """\
 task: needle
@@ -76,7 +83,7 @@ def test_defaults() -> None:
     spec = parse_spec(SMALL)
     assert (spec.control.std, spec.control.scale) == (0.1, "standardize")
     assert (spec.demonstrations.count, spec.demonstrations.supervisor) == (100, "supervisor")
-    assert (spec.training.epochs, spec.training.patience, spec.training.clip_gradient) == (200, 20, None)
+    assert (spec.training.epochs, spec.training.patience, spec.training.clip_gradient) == (800, 20, None)
     assert (spec.inference.engine, spec.rollout.seed, spec.baseline, spec.compare_with) == ("fused", 1000, None, ())
     assert spec.hierarchy is not None
     assert spec.hierarchy.levels[0].termination.network == "linear"
@@ -166,6 +173,63 @@ def test_files_that_hold_no_spec(tmp_path: Path, text: str | bytes, message: str
     assert str(caught.value).startswith(f"{path}: ")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def levels_of(line: str, number: int = 12) -> str:
+    """Anchors of which each refers to the one before nine times."""
+    first = "x0: &x0 {a: 1}\n"
+    return first + "".join(
+        line.format(name=f"x{level}", nine=", ".join([f"*x{level - 1}"] * 9)) for level in range(1, number + 1)
+    )
+
+
+LISTS = levels_of("{name}: &{name} [{nine}]\n")
+MERGES = levels_of("{name}: &{name} {{<<: [{nine}]}}\n")
+CHAIN = "x0: &x0 [1]\n" + "".join(f"x{level}: &x{level} [*x{level - 1}]\n" for level in range(1, 300))
+
+
+def limited() -> None:
+    """No more than a minute's work and 4 GB."""
+    resource.setrlimit(resource.RLIMIT_CPU, (60, 60))
+    resource.setrlimit(resource.RLIMIT_AS, (4 * 10**9, 4 * 10**9))
+
+
+@pytest.mark.parametrize(("text", "column"), [(LISTS, 5), (MERGES, 14)], ids=["lists", "merge keys"])
+def test_aliases_that_expand_to_billions_are_refused_at_once(tmp_path: Path, text: str, column: int) -> None:
+    path = write(tmp_path, text)
+    command = [Path(sys.executable).with_name("ddco-pyro"), "check", path]
+    ended = subprocess.run(command, capture_output=True, text=True, preexec_fn=limited)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr == (
+        f"ddco-pyro: {path}: line 5, column {column}: not valid YAML: holds more than 10000 values where its "
+        "aliases are written out; refer to it less often\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"seed: [{'1, ' * 10_000}]", "line 1, column 7: not valid YAML: holds more than 10000 values"),
+        (CHAIN, "not valid YAML: nested too deeply"),
+        (CHAIN.replace("[1]", "{a: 1}").replace("[*", "{<<: *").replace("]", "}"), "not valid YAML: nested too deeply"),
+        ("a: &a [1, *a]", "not valid YAML: nested too deeply"),
+    ],
+    ids=["written out", "a chain", "a chain of merge keys", "itself"],
+)
+def test_too_much_and_too_deep(text: str, message: str) -> None:
+    with pytest.raises(SpecError, match=re.escape(message)):
+        read_yaml(text)
+
+
+def test_ordinary_aliases_and_merge_keys_are_read(tmp_path: Path) -> None:
+    anchored = EXAMPLE.replace("policy: {network: mlp", "policy: &mlp {network: mlp", 1).replace(
+        "meta_policy: {network: mlp, hidden: [64], emits: [options]}",
+        "meta_policy: {<<: *mlp, emits: [options]}\ncompare_with: [{kind: flat, policy: *mlp}]",
+    )
+    spec = load_spec(write(tmp_path, anchored))
+    assert spec.hierarchy is not None
+    assert spec.compare_with[0].policy == NetworkSpec(network="mlp", hidden=(64,), dropout=0.0)
+    assert spec.hierarchy.meta_policy.hidden == (64,)
 
 
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
@@ -264,6 +328,10 @@ networks = st.one_of(
 )
 emissions = st.lists(st.sampled_from(["options", "control"]), min_size=1, unique=True)
 
+trainings = st.fixed_dictionaries({"patience": st.none() | counts, "clip_gradient": st.none() | positive}) | (
+    st.fixed_dictionaries({"epochs": st.none() | counts, "patience": counts})
+)
+
 
 @st.composite
 def hierarchies(draw: st.DrawFn) -> dict[str, Any]:
@@ -282,6 +350,9 @@ def specs(draw: st.DrawFn) -> dict[str, Any]:
     baselines = st.sampled_from(["flat", "per_timestep"]) | st.fixed_dictionaries(
         {"kind": st.just("flat"), "policy": networks}
     )
+    equal = st.just("flat_equal") | st.fixed_dictionaries(
+        {"kind": st.just("flat_equal"), "policy": st.fixed_dictionaries({"hidden": st.lists(counts, min_size=1)})}
+    )
     observation = texts | st.fixed_dictionaries({"key": texts}, optional={"differences": st.booleans()})
     names = st.lists(observation, min_size=1, max_size=3, unique_by=lambda o: o if isinstance(o, str) else o["key"])
     std = positive | st.fixed_dictionaries({"learn": st.just(True)}, optional={"floor": positive})
@@ -292,8 +363,12 @@ def specs(draw: st.DrawFn) -> dict[str, Any]:
         "observations": draw(names),
         "control": {"std": draw(std), "scale": draw(scale)},
         **model,
-        "compare_with": draw(st.lists(baselines, max_size=2)),
-        "training": {"patience": draw(st.none() | counts), "clip_gradient": draw(st.none() | positive)},
+        "compare_with": draw(st.lists(baselines | equal, max_size=2)),
+        "training": {
+            "epochs": draw(counts),
+            "patience": draw(st.none() | counts),
+            "clip_gradient": draw(st.none() | positive),
+        },
         "selection": {"grid": draw(st.sampled_from([{}, {"seed": [1, 2]}, {"control.std": [0.1, {"learn": True}]}]))},
         "rollout": {"policies": draw(st.lists(texts, max_size=2))},
         "seed": draw(st.integers(0, 2**32 - 1)),
@@ -313,6 +388,36 @@ def test_all_defaults_are_written() -> None:
     assert written["training"]["optimizer"] == {"name": "adam", "lr": 1e-3, "momentum": 0.9, "weight_decay": 0.0}
     assert written["hierarchy"]["levels"][0]["termination"] == {"network": "linear"}
     assert set(written) == set(Spec.model_fields)
+
+
+@settings(deadline=None)
+@given(specs())
+def test_the_schema_accepts_what_is_accepted(data: dict[str, Any]) -> None:
+    jsonschema.Draft202012Validator(spec_schema()).validate(data)
+
+
+@pytest.mark.parametrize(
+    "network", [{"network": "mpl"}, {"hidden": [0]}, {"hiden": [3]}, {"dropout": 1}, {"network": "conv", "kernel": 1.5}]
+)
+@pytest.mark.parametrize(
+    "place", ["hierarchy.levels.0.policy", "hierarchy.levels.0.termination", "hierarchy.meta_policy"]
+)
+def test_the_schema_refuses_networks_that_are_refused(place: str, network: dict[str, Any]) -> None:
+    validator = jsonschema.Draft202012Validator(spec_schema())
+    validator.validate(SMALL)
+    wrong = edited(SMALL, {place: network})
+    with pytest.raises(SpecError):
+        parse_spec(wrong)
+    assert not validator.is_valid(wrong)
+
+
+def test_the_schema_says_which_networks_have_a_setting() -> None:
+    for name in ("NetworkSpec", "PolicySpec", "MetaPolicySpec"):
+        properties = spec_schema()["$defs"][name]["properties"]
+        assert properties["network"]["anyOf"][0] == {"enum": ["linear", "mlp", "per_timestep", "conv"]}
+        assert properties["filters"]["description"].endswith(" For ``conv``.")
+        assert properties["hidden"]["description"].endswith(" For ``mlp``, ``per_timestep``, ``conv``.")
+        assert properties["hidden"]["default"] == [64]
 
 
 def described(schema: dict[str, Any]) -> list[str]:

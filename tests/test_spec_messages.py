@@ -55,7 +55,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"hierarchy.meta_policy.emits": ["option"]},
-        "hierarchy.meta_policy.emits.0: must be options or control, got 'option' (did you mean options?)",
+        "hierarchy.meta_policy.emits.0: must be options or control, got 'option' (did you mean 'options'?)",
     ),
     (
         {"hierarchy.meta_policy.emits": ["options", "options"]},
@@ -63,7 +63,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"hierarchy.meta_policy.network": "mpl"},
-        "hierarchy.meta_policy.network: no network is called 'mpl' (did you mean mlp?); "
+        "hierarchy.meta_policy.network: no network is called 'mpl' (did you mean 'mlp'?); "
         "use one of linear, mlp, per_timestep, conv, module:Class",
     ),
     (
@@ -81,15 +81,39 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"baseline": "flat"},
         "baseline: stands beside hierarchy; keep one of them (compare_with takes baselines to train beside)",
     ),
-    ({"compare_with": ["flt"]}, "compare_with.0.kind: must be flat or per_timestep, got 'flt' (did you mean flat?)"),
+    (
+        {"compare_with": ["flt"]},
+        "compare_with.0.kind: must be flat or flat_equal or per_timestep, got 'flt' (did you mean 'flat'?)",
+    ),
+    (
+        {"compare_with": ["flat", {"kind": "flat_equal", "policy": {"network": "linear"}}]},
+        "compare_with.1.policy: flat_equal widens hidden layers, and network 'linear' has none; give it some, such as "
+        "{network: mlp, hidden: [64]}",
+    ),
+    (
+        {"hierarchy": None, "baseline": "flat_equal"},
+        "baseline: flat_equal takes its size from a hierarchy; list it in compare_with there, or say flat",
+    ),
+    (
+        {"training.epochs": None, "training.patience": None},
+        "training.epochs: null trains until training.patience, which is null too; give one of them",
+    ),
     ({"compare_with": [3]}, "compare_with.0: must be a mapping (key: value), got 3"),
     ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),
     ({"task": ""}, "task: must not be empty, got ''"),
     ({"observations": []}, "observations: must have at least 1 item(s), got []"),
     ({"observations": "pose"}, "observations: must be a list, got 'pose'"),
     ({"observations": ["a", "a"]}, "observations.1.key: 'a' is given twice; keep one"),
+    (
+        {"observations": ["hand_pos", "goal"], "report.trajectory": "hand_po"},
+        "report.trajectory: there is no observation 'hand_po' (did you mean hand_pos?); there is: hand_pos, goal",
+    ),
+    ({"report.trajektory": "pose"}, "report.trajektory: unknown key; did you mean report.trajectory?"),
     ({"control.std": -0.1}, "control.std: must be a positive number or {learn: true}, got -0.1"),
     ({"control.std": "0.1"}, "control.std: must be a positive number or {learn: true}, got '0.1'"),
+    ({"control.std": [0.1]}, "control.std: must be a positive number or {learn: true}, got [0.1]"),
+    ({"control.std": {}}, "control.std.learn: missing; it has to be given"),
+    ({"control.std": {"learn": True, "floor": -1}}, "control.std.floor: must be greater than 0, got -1"),
     ({"control.std": {"learn": False}}, "control.std.learn: must be true, got false"),
     (
         {"control.std": {"learn": True, "flor": 1}},
@@ -98,12 +122,14 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     (
         {"control.scale": "standardise"},
         "control.scale: must be standardize, none, or a list of positive numbers, got 'standardise' "
-        "(did you mean standardize?)",
+        "(did you mean 'standardize'?)",
     ),
+    ({"control.scale": 3}, "control.scale: must be standardize, none, or a list of positive numbers, got 3"),
+    ({"control.scale": []}, "control.scale: must have at least 1 item(s), got []"),
     ({"control.scale": [1.0, 0.0]}, "control.scale.1: must be greater than 0, got 0.0"),
     (
         {"training.optimizer.name": "Adam"},
-        "training.optimizer.name: must be adam or momentum, got 'Adam' (did you mean adam?)",
+        "training.optimizer.name: must be adam or momentum, got 'Adam' (did you mean 'adam'?)",
     ),
     ({"training.optimizer.lr": float("inf")}, "training.optimizer.lr: must be a finite number, got inf"),
     ({"training.layerwise": "yes"}, "training.layerwise: must be true or false, got 'yes'"),

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 import torch
 from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plant, recovered
 
+from ddco_pyro.convergence import RISING, StageEnd
 from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.spec import parse_spec
 from ddco_pyro.training import TrainingError, plan
 
 
@@ -18,6 +22,23 @@ def random_demonstrations(number=10, steps=8, seed=0):
             Demonstration(f"demo_{n}", {"state": generator.normal(size=(steps, 3))}, generator.normal(size=(steps, 2)))
             for n in range(number)
         )
+    )
+
+
+QUICK = {"control": {"std": 1.0}, "optimizer": {"lr": 0.1}}
+"""Every stage soon stops."""
+
+
+def flat(kind="flat", network="linear", lr=0.03, **training):
+    """The spec of a policy without options."""
+    return parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": ["state"],
+            "control": {"std": 0.5, "scale": "none"},
+            "baseline": {"kind": kind, "policy": {"network": network}},
+            "training": {"optimizer": {"lr": lr}, **training},
+        }
     )
 
 
@@ -37,15 +58,90 @@ def test_stages_go_from_the_lowest_level_up(training, depth, names):
     assert [stage.name for stage in plan(make_spec(**training), depth)] == names
 
 
-@pytest.mark.parametrize("optimizer", ["adam", "momentum"])
-def test_resuming_gives_the_same_bits(tmp_path, optimizer):
-    spec = make_spec((2, 2), optimizer={"name": optimizer, "lr": 0.01}, restarts=2, epochs=3)
+def epochs_of(trainer, restart=0):
+    """The number of epochs of each stage that made some."""
+    return Counter(row["stage"] for row in trainer.progress.history if row["restart"] == restart)
+
+
+def out_of_patience(tune, patience):
+    """Whether the last epochs were no better than those before; where there are no others, than the start."""
+    return len(tune) == patience or max(tune[-patience:]) <= max(tune[:-patience])
+
+
+def test_stages_share_the_budget_and_what_one_leaves_goes_to_the_later_ones(tmp_path):
+    """What each may take is worked out here from what the ones before it have taken."""
+    spec = make_spec((2, 2), epochs=62, patience=3)
+    trainer = make_trainer(spec, random_demonstrations(), tmp_path)
+    trainer.run()
+    left, taken = 62, epochs_of(trainer)
+    for number, stage in enumerate(plan(spec, 2)):
+        cap = left // (6 - number)
+        tune = [row["tune"] for row in trainer.progress.history if row["stage"] == stage.name]
+        assert taken[stage.name] == cap or out_of_patience(tune, 3)
+        assert taken[stage.name] <= cap
+        assert trainer.summary["stages"][number]["cap"] == cap
+        left -= taken[stage.name]
+    assert min(taken.values()) < 10  # one has stopped early
+    assert max(taken.values()) > 11  # and another has taken more than an even share
+    assert trainer.summary["spent"]["epochs"] == 62 - left
+
+
+def test_a_budget_that_is_smaller_than_the_stages_is_the_last_ones(tmp_path):
+    trainer = make_trainer(make_spec((2,), epochs=2), random_demonstrations(), tmp_path)
+    trainer.run()
+    assert epochs_of(trainer) == {"meta-policy": 1, "joint": 1}
+    assert [stage["converged"] for stage in trainer.summary["stages"]][:2] == [False, False]
+
+
+@pytest.mark.parametrize("model", [(2,), (2, 2), "flat", "per_timestep"])
+def test_every_model_has_the_same_budget(tmp_path, model):
+    """Whatever the number of its stages: 1, 4 or 6 here. The steps are those of minibatches of 3 out of 8."""
+    training = {"epochs": 26, "patience": None, "batch_size": 3, "restarts": 2}
+    spec = flat(model, **training) if isinstance(model, str) else make_spec(model, **training)
+    trainer = make_trainer(spec, random_demonstrations(), tmp_path)
+    trainer.run()
+    assert sum(epochs_of(trainer, 0).values()) == sum(epochs_of(trainer, 1).values()) == 26
+    assert trainer.summary["budget"] == trainer.summary["spent"] == {"epochs": 26, "gradient_steps": 26 * 3}
+
+
+def test_the_training_that_is_told_is_that_of_the_best_restart(tmp_path):
+    joint = {"initialize": "random", "layerwise": False, "patience": 2, "restarts": 3}
+    trainer = make_trainer(make_spec((2,), 4, **joint, **QUICK), random_demonstrations(), tmp_path)
+    trainer.run()
+    best = max(trainer.progress.history, key=lambda row: row["tune"])["restart"]
+    counts = [epochs_of(trainer, restart)["joint"] for restart in range(3)]
+    assert best != 2  # not simply the last
+    assert counts.count(counts[best]) == 1
+    assert trainer.summary["spent"]["epochs"] == counts[best]
+
+
+def test_without_a_budget_every_stage_trains_until_its_patience(tmp_path):
+    trainer = make_trainer(make_spec((2,), epochs=None, patience=2, **QUICK), random_demonstrations(), tmp_path)
+    trainer.run()
+    for stage in trainer.summary["stages"]:
+        tune = [row["tune"] for row in trainer.progress.history if row["stage"] == stage["stage"]]
+        assert out_of_patience(tune, 2)
+        assert (stage["cap"], stage["rising"], stage["converged"]) == (None, 0.0, True)
+    assert trainer.summary["budget"] == {"epochs": None, "gradient_steps": None}
+
+
+@pytest.mark.parametrize(
+    ("optimizer", "training", "rows"),
+    [
+        ("adam", {"epochs": 18}, 2 * 6 * 3),
+        ("momentum", {"epochs": 18}, 2 * 6 * 3),
+        ("adam", {"epochs": 30, "patience": 1}, None),
+    ],
+    ids=["adam", "momentum", "stages that stop early"],
+)
+def test_resuming_gives_the_same_bits(tmp_path, optimizer, training, rows):
+    spec = make_spec((2, 2), optimizer={"name": optimizer, "lr": 0.01}, restarts=2, **training)
     demos = random_demonstrations()
     whole = make_trainer(spec, demos, tmp_path / "whole")
     expected = whole.run().state_dict()
+    assert rows in (None, len(whole.progress.history))
     rows = len(whole.progress.history)
-    assert rows == 2 * 6 * 3
-    for stop in range(1, rows, 4):
+    for stop in range(1, rows, max(4, rows // 9)):
         folder = tmp_path / f"stop-{stop}"
         seen = []
 
@@ -59,12 +155,13 @@ def test_resuming_gives_the_same_bits(tmp_path, optimizer):
         resumed = make_trainer(spec, demos, folder)
         found = resumed.run().state_dict()
         assert resumed.progress.history == whole.progress.history
+        assert resumed.summary == whole.summary
         assert all(torch.equal(found[name], value) for name, value in expected.items())
 
 
 def test_frozen_levels_stay_as_they_were_discovered(tmp_path):
     snapshots = {}
-    spec = make_spec((2,), lower_levels="frozen")
+    spec = make_spec((2,), lower_levels="frozen", epochs=15)
     trainer = make_trainer(spec, random_demonstrations(), tmp_path)
 
     def keep(row):
@@ -82,7 +179,7 @@ def test_both_engines_train_to_the_same_model(tmp_path):
     demos = random_demonstrations(6, 5)
     states = []
     for engine in ("fused", "enumerate"):
-        spec = make_spec((2,), epochs=2, control={"std": 1.0})
+        spec = make_spec((2,), epochs=8, control={"std": 1.0})
         spec = spec.model_copy(update={"inference": spec.inference.model_copy(update={"engine": engine})})
         states.append(make_trainer(spec, demos, tmp_path / engine).run().state_dict())
     for name, value in states[0].items():
@@ -96,6 +193,52 @@ def test_what_is_not_finite_names_the_demonstration(tmp_path):
     assert "demo_0" in train.names
     with pytest.raises(TrainingError, match=r"demo_0 is not finite"):
         make_trainer(make_spec(), Demonstrations(tuple(bad)), tmp_path).run()
+
+
+# --- convergence ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("tune", "patience", "rising", "over"),
+    [
+        ([0.0, 1.0, 2.0, 4.0], 2, 3.0, 2),  # 1 before the last two, 4 with them
+        ([0.0, 5.0, 2.0, 4.0], 2, 0.0, 2),  # patience is exhausted
+        ([0.0, 5.0, 2.0, 6.0], 2, 1.0, 2),
+        ([3.0, 1.0, 2.0], 5, 0.0, 2),  # it was best before it began
+        ([1.0, 1.5], 5, 0.5, 1),
+        ([7.0], 5, 0.0, 0),  # no epochs at all
+        ([0.0, *range(30)], None, 20.0, 20),
+    ],
+)
+def test_how_much_a_stage_still_rose(tune, patience, rising, over):
+    end = StageEnd.of("joint", 10, tune, patience)
+    assert (end.epochs, end.rising, end.over) == (len(tune) - 1, rising, over)
+    assert end.converged == (rising == 0.0 and len(tune) > 1)
+
+
+def test_what_is_called_converged_is_at_the_optimum(tmp_path):
+    """A linear policy with a fixed σ is least squares: its optimum is known without any training."""
+    random = np.random.default_rng(0)
+    weights = random.normal(size=(3, 2))
+    records = []
+    for number in range(10):
+        state = random.normal(size=(50, 3))
+        records.append(Demonstration(f"demo_{number}", {"state": state}, state @ weights + random.normal(size=(50, 2))))
+    demos = Demonstrations(tuple(records))
+    train, tune = demos.split(0.2, 0)
+    states = [
+        np.concatenate([np.column_stack([d.observations["state"], np.ones(50)]) for d in p]) for p in (train, tune)
+    ]
+    actions = [np.concatenate([d.actions for d in p]) for p in (train, tune)]
+    error = actions[1] - states[1] @ np.linalg.lstsq(states[0], actions[0], rcond=None)[0]
+    optimum = (-0.5 * (error / 0.5) ** 2 - np.log(0.5) - 0.5 * np.log(2 * np.pi)).sum(1).mean()
+    below = {}
+    for epochs in (15, 400):
+        trainer = make_trainer(flat(epochs=epochs, patience=None, batch_size=8), demos, tmp_path / str(epochs))
+        trainer.run()
+        below[trainer.summary["converged"]] = optimum - trainer.progress.winner
+    assert below[True] < RISING
+    assert below[False] > 10 * RISING
 
 
 # --- planted hierarchies ----------------------------------------------------------------------------------------------

@@ -101,11 +101,19 @@ def frame(environment: Point) -> np.ndarray:
     return picture
 
 
-task = Task("toy", Point, {"supervisor": Supervisor, "open_loop": OpenLoop}, outcome, frame, (Path(__file__),))
+task = Task(
+    name="toy",
+    load=Point,
+    policies={"supervisor": Supervisor, "open_loop": OpenLoop},
+    outcome=outcome,
+    frame=frame,
+    sources=(Path(__file__),),
+    measures={"success": "rate", "error": "mean"},
+)
 short = replace(task, name="short", load=lambda seed: Point(seed, 5), steps=5)
 
 SPEC = """
-task: toy_task:task
+task: toy
 demonstrations: {count: 12, labels: phase, valid_fraction: 0.25}
 observations: [offsets, visited]
 control: {std: 0.5}
@@ -114,6 +122,6 @@ hierarchy:
     - {count: 2, policy: {hidden: [8]}}
   meta_policy: {hidden: [8]}
 compare_with: [flat, per_timestep]
-training: {epochs: 6, batch_size: 3, optimizer: {lr: 0.01}}
+training: {epochs: 24, batch_size: 3, optimizer: {lr: 0.01}}
 rollout: {episodes: 4, policies: [open_loop, supervisor]}
 """

@@ -10,5 +10,5 @@ import typer
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a finished fit.", show_default=False)]
 AllowCode = Annotated[
     bool,
-    typer.Option("--allow-code", help="Import the networks of one's own (module:Class) that the spec names."),
+    typer.Option("--allow-code", help="Import the user code (module:name) that the spec names."),
 ]

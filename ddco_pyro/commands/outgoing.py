@@ -24,8 +24,9 @@ def segment(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="Write labels into this copy of the file, not into the file.", show_default=False),
+        typer.Option(help="A copy of the HDF5 file with labels for each step.", show_default=False),
     ] = None,
+    in_place: Annotated[bool, typer.Option("--in-place", help="Write the labels into the HDF5 file itself.")] = False,
     csv: Annotated[Path | None, typer.Option(help="A table with a row for each step.", show_default=False)] = None,
     parquet: Annotated[Path | None, typer.Option(help="The same table as Parquet.", show_default=False)] = None,
     html: Annotated[
@@ -40,7 +41,16 @@ def segment(
     ] = None,
     allow_code: AllowCode = False,
 ) -> None:
-    """Label every step of demonstrations with a run's options: into the file, as a table, as subtasks, as a page."""
+    """Label every step of demonstrations with a run's options: as a page, a table, labels in HDF5, or subtasks.
+
+    Only what is asked for is written; DEMOS is left as it is unless --in-place says otherwise.
+    """
+    if not (out or in_place or csv or parquet or html or lerobot):
+        raise BadInput(
+            "name what to write: --html PAGE, --csv FILE or --parquet FILE; labels for each step go to --out FILE (a "
+            "copy) or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset"
+        )
+    labelled = _labelled(demos, out, in_place)
     from ddco_pyro import console
     from ddco_pyro.run import load
     from ddco_pyro.segmenting import segments
@@ -51,8 +61,7 @@ def segment(
 
     fit = load(run, allow_code)
     with open_source(demos) as source, console.Collecting("segmenting") as progress:
-        form = source.format
-        if form != "robomimic" and not (csv or parquet or html or lerobot):
+        if labelled and source.format != "robomimic":
             raise BadInput(f"{demos}: labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot")
         if lerobot:
             found = _annotate(fit, source, lerobot, level, progress.collected)
@@ -67,9 +76,21 @@ def segment(
     if html:
         write_page(html, found, str(run), str(demos))
         print(html)
-    if form == "robomimic":
-        write_labels(demos, out or demos, found)
-        print(f"{out or demos}: labels/{', labels/'.join(found.counts)}")
+    if labelled:
+        write_labels(demos, labelled, found)
+        print(f"{labelled}: labels/{', labels/'.join(found.counts)}")
+
+
+def _labelled(demos: Path, out: Path | None, in_place: bool) -> Path | None:
+    """The HDF5 file that is to have the labels, if any.
+
+    :raises BadInput: it is said in two ways, or the copy is the file itself.
+    """
+    if out and in_place:
+        raise BadInput("--out and --in-place exclude each other; keep one")
+    if out and out.resolve() == demos.resolve():
+        raise BadInput(f"--out {out}: is the file itself; to write labels into it, say --in-place")
+    return demos if in_place else out
 
 
 def _annotate(
@@ -98,16 +119,23 @@ def _annotate(
 def export(
     run: RunPath,
     out: Annotated[Path, typer.Option(help="The folder to write.", show_default=False)],
-    onnx: Annotated[bool, typer.Option("--onnx", help="Write ONNX too (pip install 'ddco-pyro[export]').")] = False,
+    onnx: Annotated[bool, typer.Option("--onnx", help="Write ONNX too (pip install 'ddco-pyro\\[export]').")] = False,
     allow_code: AllowCode = False,
 ) -> None:
     """Write the controller as files that need nothing of this library: numpy with a runner, torch.export, ONNX.
 
-    Every form has to act as the original does, to 1e-6, on made-up observations, or nothing is usable.
+    Every form is loaded again and acts in three episodes of made-up
+    observations, by the loop of runner.py. It has to choose the options
+    that the run's controller chooses, with probabilities within 1e-6 and
+    controls within 1e-6 of the largest of 1, their spread, and their
+    distance from their mean; else nothing is written and what was there
+    stays.
     """
     from ddco_pyro.export import export as write
     from ddco_pyro.run import load
 
-    for form, (difference, seconds) in write(load(run, allow_code), out, onnx).items():
-        print(f"{form}: largest difference of a control {difference:.1e}, a step takes {1e3 * seconds:.3f} ms")
-    print(f"{out}: try it with: python {out / 'runner.py'} {out}")
+    exported = write(load(run, allow_code), out, onnx)
+    for form, (difference, seconds) in exported.items():
+        print(f"{form}: largest difference {difference:.1e}, a step takes {1e3 * seconds:.3f} ms")
+    form = next(iter(exported))
+    print(f"{out}: try it with: python {out / 'runner.py'} {out}{'' if form == 'numpy' else f' {form}'}")

@@ -7,7 +7,7 @@ the held-out log-likelihood of a trajectory where arviz has the elpd of an obser
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,22 +48,40 @@ class Row:
     dse: float
     per_step: float
     each: tuple[float, ...]
+    training: Mapping[str, Any] | None
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Rows, the best first; the ``trajectories`` they were compared on, and rollouts paired by initial state."""
+    """Rows, the best first; the ``trajectories`` they were compared on and their ``steps``; rollouts paired by initial
+    state; and the run whose likelihood sorts the trajectories: the best with options, or the best.
+    """
 
     rows: Sequence[Row]
     trajectories: Sequence[str]
-    steps: int
+    steps: Sequence[int]
     rollouts: Sequence[dict[str, Any]]
+    sorted_by: str
+
+    @property
+    def worst_first(self) -> list[dict[str, Any]]:
+        """Every trajectory with its log-likelihood per step under each run, the least likely first."""
+        listed = [
+            {
+                "name": name,
+                "steps": steps,
+                "log_likelihood_per_step": {row.name: row.each[place] / steps for row in self.rows},
+            }
+            for place, (name, steps) in enumerate(zip(self.trajectories, self.steps, strict=True))
+        ]
+        return sorted(listed, key=lambda one: one["log_likelihood_per_step"][self.sorted_by])
 
     def as_data(self) -> dict[str, Any]:
         """The same as plain data."""
         return {
             "trajectories": list(self.trajectories),
-            "steps": self.steps,
+            "steps": sum(self.steps),
+            "demonstrations": self.worst_first,
             "rows": [vars(row) | {"each": list(row.each)} for row in self.rows],
             "rollouts": list(self.rollouts),
         }
@@ -72,7 +90,7 @@ class Comparison:
 def compare(folders: Sequence[Path], allow_code: bool = False) -> Comparison:
     """The runs in these folders (a run's ``baselines/NAME`` is a run too), the best first.
 
-    :param allow_code: import the networks of one's own that their specs name.
+    :param allow_code: import the user code that their specs name.
     :raises CompareError: there are less than two, or one twice.
     :raises NotShared: they were not held out on the same data.
     :raises RunError: a folder is not a finished run.
@@ -87,11 +105,13 @@ def compare(folders: Sequence[Path], allow_code: bool = False) -> Comparison:
     best = int(values.sum(1).argmax())
     rows = [_row(0, one, values[best]) for one in held]
     ranked = sorted(rows, key=lambda row: row.difference)
+    with_options = {one.run for one in held if one.fit.spec.hierarchy}
     return Comparison(
         [Row(**vars(row) | {"rank": rank}) for rank, row in enumerate(ranked)],
         held[0].names,
-        sum(held[0].steps),
+        held[0].steps,
         paired_rollouts(fits, [row.name for row in ranked]),
+        next((row.name for row in ranked if row.name in with_options), ranked[0].name),
     )
 
 
@@ -100,7 +120,7 @@ def _row(rank: int, one: Held, best: np.ndarray) -> Row:
     return Row(
         rank, one.run, one.fit.name, int(one.fit.metrics["parameters"]), float(one.values.sum()), _error(one.values),
         float(difference.sum()), _error(difference), float(one.values.sum() / sum(one.steps)),
-        tuple(one.values.tolist()),
+        tuple(one.values.tolist()), one.fit.metrics.get("training"),
     )  # fmt: skip
 
 
@@ -115,7 +135,7 @@ def write(found: Comparison, folder: Path) -> Path:
     data = json.dumps(_finite(found.as_data()), indent=1) + "\n"
     write_text(folder / "compare.json", data)
     write_text(folder / "compare.md", page.markdown(found))
-    write_text(folder / "compare.html", page.html(found, picture))
+    write_text(folder / "compare.html", page.html(found, picture, folder))
     return folder / "compare.html"
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ddco_pyro.evaluate import SUCCESS
+from ddco_pyro.records import read_successes
 from ddco_pyro.rollout import paired_difference, rate
 from ddco_pyro.run import Fit
 
@@ -40,9 +39,5 @@ def _outcomes(fit: Fit) -> Outcomes:
     """What ``rollout`` wrote: for a baseline into the folder of the run that it belongs to."""
     above = fit.folder.resolve().parent
     places = [fit.folder, above.parent] if above.name == "baselines" else [fit.folder]
-    path = next((place / "rollouts.csv" for place in places if (place / "rollouts.csv").exists()), None)
-    if path is None:
-        return {}
-    with path.open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["method"] == fit.name and row.get(SUCCESS)]
-    return {int(row["seed"]): float(row[SUCCESS]) for row in rows}
+    known = next((found for place in places if (found := read_successes(place))), {})
+    return {seed: value for (method, seed), value in known.items() if method == fit.name}

@@ -7,6 +7,8 @@ import json
 import logging
 import shutil
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +17,12 @@ import torch
 
 from ddco_pyro.controller import Controller
 from ddco_pyro.encoding import ObservationEncoder
-from ddco_pyro.errors import Failed
+from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.export import runner
 from ddco_pyro.export.program import StepProgram, example, input_names
+from ddco_pyro.export.runner import TOLERANCE
 from ddco_pyro.export.weights import weights_and_networks
-from ddco_pyro.files import whole_file, write_text
+from ddco_pyro.files import whole_folder
 from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.outputs import TERMINATION_BOUND
 from ddco_pyro.run import Fit
@@ -27,12 +30,12 @@ from ddco_pyro.spec import RolloutSpec
 
 __all__ = ["TOLERANCE", "Exported", "export"]
 
-TOLERANCE = 1e-6
-"""Largest difference between a control of the original and one of an exported form, in the control's own units, or in
-its spread where that is above 1."""
-
 EPISODES, STEPS = 3, 20
-"""Made-up episodes on which every form has to act as the original does."""
+"""Made-up episodes on which every form has to act as the original does; without images the first one is a step longer
+than the longest demonstration, so that networks of every step of time are among what is compared."""
+
+FILES = {"controller.json", "weights.npz", "controller.pt2", "controller.onnx", "runner.py", "check.npz", "__pycache__"}
+"""What there can be in an exported folder."""
 
 
 class ExportError(Failed):
@@ -48,35 +51,66 @@ def export(fit: Fit, folder: Path, onnx: bool = False) -> Exported:
 
     ``controller.json`` and ``weights.npz`` are run by ``runner.py`` with numpy alone; ``controller.pt2`` is a
     ``torch.export`` program of one step of all networks; ``controller.onnx`` the same for onnxruntime; ``check.npz``
-    has episodes to replay. ``controller.json`` is written last.
+    has episodes to replay. Each of the three is loaded again from the disk and driven by ``runner.py`` through made-up
+    episodes: every option has to be the one that the original chose, and every control, and whatever else the networks
+    say, within :data:`TOLERANCE`.
 
-    :raises ExportError: a form differs by more than :data:`TOLERANCE`, or cannot be made.
+    ``folder`` is there, or replaces what was exported there before, once all of them agree; else nothing is changed.
+
+    :raises ExportError: a form acts otherwise, or cannot be made.
+    :raises BadInput: ``folder`` holds something else.
     """
-    hierarchy, control = fit.hierarchy.eval(), fit.spec.rollout
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "controller.json").unlink(missing_ok=True)
+    if folder.exists() and not folder.is_dir():
+        raise BadInput(f"{folder}: is a file; choose another --out")
+    others = sorted(path.name for path in folder.iterdir() if path.name not in FILES) if folder.exists() else []
+    if others:
+        raise BadInput(f"{folder}: holds what was not exported, such as {others[0]}; choose another --out")
+    with whole_folder(folder) as temporary:
+        forms = _write(fit, temporary, onnx)
+        return _compare(temporary, forms)
+
+
+def _write(fit: Fit, folder: Path, onnx: bool) -> list[str]:
+    """Write every file; the forms that can be run."""
+    hierarchy = fit.hierarchy.eval()
+    program = StepProgram(hierarchy).eval()
     weights, about = weights_and_networks(hierarchy)
-    about |= _about(hierarchy, control)
+    about |= _about(hierarchy, fit.spec.rollout) | {"outputs": program.names}
     if about["numpy"]:
-        _write_arrays(folder / "weights.npz", weights)
-    _write_programs(hierarchy, folder, onnx)
-    with whole_file(folder / "runner.py") as temporary:
-        shutil.copyfile(runner.__file__, temporary)
-    episodes = record(Controller.from_spec(hierarchy, control), hierarchy.encoder)
-    _write_arrays(folder / "check.npz", episodes)
-    write_text(folder / "controller.json", json.dumps(about, indent=1) + "\n")
-    return _compare(folder, episodes, [*(["numpy"] if about["numpy"] else []), *(["onnx"] if onnx else [])])
+        np.savez(folder / "weights.npz", **weights)  # type: ignore[arg-type]
+    for name, content in _programs(program, hierarchy.encoder, onnx).items():
+        (folder / name).write_bytes(content)
+    shutil.copyfile(runner.__file__, folder / "runner.py")
+    np.savez(folder / "check.npz", **record(fit.controller(), hierarchy))  # type: ignore[arg-type]
+    (folder / "controller.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    return [*(["numpy"] if about["numpy"] else []), "torch", *(["onnx"] if onnx else [])]
 
 
-def _compare(folder: Path, episodes: dict[str, np.ndarray], forms: list[str]) -> Exported:
+def _compare(folder: Path, forms: list[str]) -> Exported:
+    """How each form in the folder, loaded from there, acts in the episodes that were recorded."""
+    with np.load(folder / "check.npz") as file:
+        episodes = {name: file[name] for name in file.files}
     found = {}
     for form in forms:
-        found[form] = runner.replay(runner.Runner(folder, form), episodes)
-        if not found[form][0] < TOLERANCE:
-            (folder / "controller.json").unlink()
-            difference = found[form][0]
-            raise ExportError(f"{folder}: as {form} a control differs by {difference:.1e}: this is a defect; report it")
+        with _reported(f"as {form} it cannot be run"):
+            found[form] = runner.replay(runner.Runner(folder, form), episodes)
+        difference = found[form][0]
+        if not difference < TOLERANCE:
+            what = f"as {form} it differs from the run by {difference:.1e}"
+            raise ExportError(f"nothing was written: {what}; with networks of this library that is a defect: report it")
     return found
+
+
+@contextmanager
+def _reported(what: str) -> Iterator[None]:
+    """What torch or onnxruntime makes of a model, a user's network in it or not, in one line."""
+    try:
+        yield
+    except ImportError as error:
+        raise ExportError(f"--onnx needs {error.name}; install it with: pip install 'ddco-pyro[export]'") from error
+    except Exception as error:
+        text = " ".join(str(error).split())[:300]
+        raise ExportError(f"nothing was written: {what}: {type(error).__name__}: {text}") from error
 
 
 def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
@@ -84,7 +118,7 @@ def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
     encoder = hierarchy.encoder
     vectors = {one.key: one for one in encoder.specs}
     scaling = hierarchy.scaling
-    scale = scaling.scale.numpy()
+    scale, shift = scaling.scale.numpy(), scaling.shift.numpy()
     return {
         "observations": [
             {
@@ -98,6 +132,7 @@ def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
         "levels": [level.count for level in hierarchy.option_levels()],
         "varying": scaling.varying.tolist(),
         "scale": scale.tolist(),
+        "shift": shift.tolist(),
         "control": control.control,
         "options": control.options,
         "std": [(one.std().detach().numpy().astype(float) * scale).tolist() for one in hierarchy.callers()],
@@ -105,79 +140,88 @@ def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
     }
 
 
-def _write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    content = io.BytesIO()
-    np.savez(content, **arrays)  # type: ignore[arg-type]
-    with whole_file(path) as temporary:
-        temporary.write_bytes(content.getvalue())
+def _programs(program: StepProgram, encoder: ObservationEncoder, onnx: bool) -> dict[str, bytes]:
+    """The contents of ``controller.pt2`` and, if asked for, of ``controller.onnx``, by name."""
+    inputs, content = example(encoder), io.BytesIO()
+    with _reported("the networks cannot be exported"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # of torch about itself
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, which nothing here needs
+        exported = torch.export.export(program, inputs)
+        torch.export.save(exported, content)
+        found = {"controller.pt2": content.getvalue()}
+        if onnx:
+            found["controller.onnx"] = _onnx(exported, inputs, input_names(encoder), program.names)
+    return found
 
 
-def _write_programs(hierarchy: Hierarchy, folder: Path, onnx: bool) -> None:
-    program, inputs = StepProgram(hierarchy).eval(), example(hierarchy.encoder)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # of torch about itself
-            logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, which nothing here needs
-            _write_both(program, inputs, hierarchy.encoder, folder, onnx)
-    except ImportError as error:
-        raise ExportError(f"--onnx needs {error.name}; install it with: pip install 'ddco-pyro[export]'") from error
-    except Exception as error:  # whatever torch makes of a network of one's own
-        text = " ".join(str(error).split())[:300]
-        raise ExportError(f"{folder}: the networks cannot be exported: {type(error).__name__}: {text}") from error
+def _onnx(
+    program: torch.export.ExportedProgram, inputs: tuple[torch.Tensor, ...], given: list[str], names: list[str]
+) -> bytes:
+    made = torch.onnx.export(program, inputs, input_names=given, output_names=names, dynamo=True, verbose=False)
+    assert made is not None
+    found: bytes = made.model_proto.SerializeToString()
+    return found
 
 
-def _write_both(
-    program: StepProgram, inputs: tuple[torch.Tensor, ...], encoder: ObservationEncoder, folder: Path, onnx: bool
-) -> None:
-    exported = torch.export.export(program, inputs)
-    content = io.BytesIO()
-    torch.export.save(exported, content)
-    with whole_file(folder / "controller.pt2") as temporary:
-        temporary.write_bytes(content.getvalue())
-    if onnx:
-        found = torch.onnx.export(
-            exported, inputs, input_names=input_names(encoder), output_names=program.names, dynamo=True, verbose=False
-        )
-        assert found is not None
-        with whole_file(folder / "controller.onnx") as temporary:
-            temporary.write_bytes(found.model_proto.SerializeToString())
+def record(controller: Controller, hierarchy: Hierarchy) -> dict[str, np.ndarray]:
+    """Made-up episodes: observations about as large as those that were fitted to, what was done, by whom, and what the
+    networks say of the whole episode at once.
 
-
-def record(controller: Controller, encoder: ObservationEncoder) -> dict[str, np.ndarray]:
-    """Made-up episodes: observations about as large as those that were fitted to, what was done, and by whom.
-
-    ``observation_<episode>_<key>`` [T, ...], ``controls_<episode>`` [T, A], ``choices_<episode>`` [T, D], ``seeds``.
+    ``seeds``, and for each episode ``observation_<episode>_<key>`` [T, ...], ``controls_<episode>`` [T, A],
+    ``choices_<episode>`` [T, D], and the runner's outputs as ``<output>_<episode>`` [T, ...].
     """
     random = np.random.default_rng(0)
     found: dict[str, np.ndarray] = {"seeds": np.arange(EPISODES)}
     for episode in range(EPISODES):
-        seen = _episode(encoder, random)
+        steps = STEPS if episode or hierarchy.encoder.images else max(STEPS, hierarchy.steps + 1)
+        seen = _episode(hierarchy.encoder, steps, random)
         controller.reset(episode)
         acted = [
-            (controller.act({key: one[step] for key, one in seen.items()}), controller.choices) for step in range(STEPS)
+            (controller.act({key: one[step] for key, one in seen.items()}), controller.choices) for step in range(steps)
         ]
         found |= {f"observation_{episode}_{key}": one for key, one in seen.items()}
         found[f"controls_{episode}"] = np.stack([control for control, _ in acted])
-        found[f"choices_{episode}"] = np.array([choices for _, choices in acted], dtype=int).reshape(STEPS, -1)
+        found[f"choices_{episode}"] = np.array([choices for _, choices in acted], dtype=int).reshape(steps, -1)
+        found |= {f"{name}_{episode}": values for name, values in _said(hierarchy, seen).items()}
     return found
 
 
-def _episode(encoder: ObservationEncoder, random: np.random.Generator) -> dict[str, np.ndarray]:
-    """Observations with the mean and spread that were fitted to, and with steps as long where those matter."""
+def _said(hierarchy: Hierarchy, episode: dict[str, np.ndarray]) -> runner.Outputs:
+    """The runner's outputs at every step, [T, ...], from one pass over the episode, as in training."""
+    found: runner.Outputs = {}
+    with torch.no_grad():
+        said = hierarchy(hierarchy.encoder.inputs([episode]))
+    for level, decision in enumerate(said.decisions):
+        if decision.selection is not None:
+            found[f"selection_{level}"] = decision.selection[0].numpy()
+        if decision.mean is not None:
+            found[f"control_{level}"] = hierarchy.scaling.unscaled(decision.mean[0])
+    return found | {f"termination_{level}": log[0, :, :, 1].exp().numpy() for level, log in enumerate(said.termination)}
+
+
+def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generator) -> dict[str, np.ndarray]:
+    """Observations with the mean and spread that were fitted to, and with differences as large where those matter."""
     found: dict[str, np.ndarray] = {}
     at = 0
     for spec, size in zip(encoder.specs, encoder.sizes, strict=True):
         shape = encoder.shapes[spec.key]
         mean, std = (one[at : at + size].numpy() for one in (encoder.mean, encoder.std))
         length = int(np.prod(shape))
+        values = mean[:length] + std[:length] * random.normal(size=(steps, length))
         if spec.differences:
-            start = mean[:length] + std[:length] * random.normal(size=length)
-            steps = mean[length:] + std[length:] * random.normal(size=(STEPS, length))
-            values = start + np.cumsum(steps, axis=0)
-        else:
-            values = mean + std * random.normal(size=(STEPS, length))
-        found[spec.key] = values.reshape(STEPS, *shape)
+            differences = mean[length:] + std[length:] * random.normal(size=values.shape)
+            values = _walk(values[0], differences, mean[:length], std[:length])
+        found[spec.key] = values.reshape(steps, *shape)
         at += size
     return found | {
-        key: random.integers(0, 256, (STEPS, *shape), dtype=np.uint8) for key, shape in encoder.images.items()
+        key: random.integers(0, 256, (steps, *shape), dtype=np.uint8) for key, shape in encoder.images.items()
     }
+
+
+def _walk(start: np.ndarray, differences: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Values [T, F] that go by these differences [T, F], or back where they would leave the mean by two deviations."""
+    values = [start]
+    for difference in differences[1:]:
+        ahead, back = values[-1] + difference, values[-1] - np.copysign(difference, values[-1] - mean)
+        values.append(np.where(np.abs(ahead - mean) > 2 * std, back, ahead))
+    return np.stack(values)

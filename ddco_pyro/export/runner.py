@@ -7,8 +7,9 @@
     control = controller.act({"state": state})    # [A], in the control's own units
     controller.choices, controller.terminations   # active options, lowest level first, and their ψ
 
-``python runner.py [FOLDER]`` replays the episodes in ``check.npz`` and says by how much it differs from the original.
-Networks of one's own, which numpy cannot evaluate, run with ``Runner(".", networks="onnx")`` and onnxruntime.
+``python runner.py [FOLDER] [numpy|torch|onnx]`` replays the episodes in ``check.npz`` and says by how much it differs
+from the original. Networks that numpy cannot evaluate (a user's) run with ``Runner(".", networks="torch")``, which
+needs torch, or with ``Runner(".", networks="onnx")``, which needs onnxruntime.
 """
 
 from __future__ import annotations
@@ -22,6 +23,10 @@ from typing import Any
 
 import numpy as np
 
+TOLERANCE = 1e-6
+"""Largest difference from the original: of a probability, and of a control in units of the largest of 1, its spread,
+and its distance from where it is centred (networks are float32)."""
+
 Outputs = dict[str, np.ndarray]
 """``selection_d`` log-probabilities [K, 1 + k], ``termination_d`` ψ [k], ``control_d`` means [K, A]; d counts levels
 from 0, and the last d is the meta-policy."""
@@ -33,13 +38,15 @@ Networks = Callable[[np.ndarray, int, Mapping[str, np.ndarray]], Outputs]
 class Runner:
     """An exported controller: :meth:`reset`, then :meth:`act` with each observation.
 
-    :param networks: ``numpy``, or ``onnx`` to evaluate the networks with onnxruntime.
+    :param networks: what evaluates the networks: ``numpy``, ``torch`` (the ``torch.export`` program) or ``onnx``.
     """
 
     def __init__(self, folder: str | Path, networks: str = "numpy") -> None:
         folder = Path(folder)
         self.about: dict[str, Any] = json.loads((folder / "controller.json").read_text(encoding="utf-8"))
-        self._networks: Networks = NumpyNetworks(folder, self.about) if networks == "numpy" else OnnxNetworks(folder)
+        if networks not in FORMS:
+            raise ValueError(f"networks={networks!r}: it has to be one of {', '.join(FORMS)}")
+        self._networks = FORMS[networks](folder, self.about)
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
@@ -47,6 +54,7 @@ class Runner:
         self.seed, self.time = seed, 0
         self.choices: tuple[int, ...] = ()
         self.terminations: tuple[float, ...] = ()
+        self.outputs: Outputs = {}
         self._last: dict[str, np.ndarray] | None = None
 
     def act(self, observation: Mapping[str, Any]) -> np.ndarray:
@@ -57,7 +65,7 @@ class Runner:
         now = {one["key"]: _checked(observation, one) for one in self.about["observations"]}
         features = self._features(now, self._last or now)
         images = {one["key"]: now[one["key"]] for one in self.about["observations"] if one["image"]}
-        outputs = self._networks(features, self.time, images)
+        self.outputs = outputs = self._networks(features, self.time, images)
         generator = np.random.default_rng([self.seed, self.time])
         self.choices = self._choose(outputs, generator)
         self.terminations = tuple(
@@ -133,7 +141,7 @@ class NumpyNetworks:
 
     def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
         if not about["numpy"]:
-            raise ValueError('it has networks that numpy cannot evaluate: use Runner(..., networks="onnx")')
+            raise ValueError('it has networks that numpy cannot evaluate: use Runner(..., networks="torch") or "onnx"')
         with np.load(folder / "weights.npz", allow_pickle=False) as file:
             self._weights = {name: file[name] for name in file.files}
         self._about = about
@@ -161,13 +169,11 @@ class NumpyNetworks:
     def _network(
         self, kind: Mapping[str, Any], name: str, vector: np.ndarray, step: int, images: Mapping[str, np.ndarray]
     ) -> np.ndarray:
-        """[K, outputs] of K networks."""
+        """[K, outputs] of K perceptrons, those of this step, over the vector and the convolutions of the images."""
         copies = kind["copies"]
-        values = np.broadcast_to(vector, (copies, 1, len(vector)))
-        if kind["network"] == "conv":
-            maps = [self._convolved(kind, f"{name}.{key}", images[key]) for key in kind["images"]]
-            values = np.concatenate([values, *(one[:, None] for one in maps)], axis=2)
-        first = min(step, kind["steps"] - 1) * copies if kind["network"] == "per_timestep" else 0
+        maps = [self._convolved(kind, f"{name}.image.{key}", images[key])[:, None] for key in kind["images"]]
+        values = np.concatenate([np.broadcast_to(vector, (copies, 1, len(vector))), *maps], axis=2)
+        first = min(step, kind["steps"] - 1) * copies
         for layer in range(kind["layers"]):
             weight, bias = self._weights[f"{name}.{layer}.weight"], self._weights[f"{name}.{layer}.bias"]
             values = values @ weight[first : first + copies] + bias[first : first + copies]
@@ -200,10 +206,33 @@ def _selection(logits: np.ndarray, one: Mapping[str, Any]) -> np.ndarray:
     return found if one["hybrid"] else np.insert(found, 0, -np.inf, axis=1)
 
 
+class TorchNetworks:
+    """Every network of the hierarchy, from ``controller.pt2``."""
+
+    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
+        import torch
+
+        self._torch = torch
+        self._program = torch.export.load(folder / "controller.pt2").module()
+        self._outputs = about["outputs"]
+
+    def __call__(self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray]) -> Outputs:
+        """The outputs of every network for one observation."""
+        given = (features, np.array([step], np.int64), *images.values())
+        threads = self._torch.get_num_threads()
+        self._torch.set_num_threads(1)  # networks are small: more threads only wait for one another
+        try:
+            with self._torch.no_grad():
+                values = self._program(*(self._torch.tensor(one) for one in given))
+        finally:
+            self._torch.set_num_threads(threads)
+        return {name: one.numpy() for name, one in zip(self._outputs, values, strict=True)}
+
+
 class OnnxNetworks:
     """Every network of the hierarchy, from ``controller.onnx``."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
@@ -220,15 +249,21 @@ class OnnxNetworks:
         return dict(zip(self._outputs, values, strict=True))
 
 
-def replay(controller: Runner, episodes: Mapping[str, np.ndarray]) -> tuple[float, float]:
-    """Act on recorded observations again: the largest difference of a control (infinite where another option is
-    active), and the median seconds of a step.
+FORMS: dict[str, Callable[[Path, Mapping[str, Any]], Networks]] = {
+    "numpy": NumpyNetworks,
+    "torch": TorchNetworks,
+    "onnx": OnnxNetworks,
+}
 
-    Differences are in the control's own units, but in its spread where that is above 1: networks are float32.
+
+def replay(controller: Runner, episodes: Mapping[str, np.ndarray]) -> tuple[float, float]:
+    """Act on recorded observations again: the largest difference, and the median seconds of a step.
+
+    The control is compared with the original's; every caller's mean control and selection probabilities, and every
+    option's ψ, with what the original's networks say of the whole episode at once. The difference is infinite where
+    another option is active or a number is NaN.
     """
     largest, seconds = 0.0, []
-    unit = np.ones(episodes["controls_0"].shape[1])
-    unit[controller.about["varying"]] = np.maximum(1.0, controller.about["scale"])
     for number, seed in enumerate(episodes["seeds"]):
         controller.reset(int(seed))
         for step in range(len(episodes[f"controls_{number}"])):
@@ -237,10 +272,23 @@ def replay(controller: Runner, episodes: Mapping[str, np.ndarray]) -> tuple[floa
             start = time.perf_counter()
             control = controller.act(seen)
             seconds.append(time.perf_counter() - start)
-            same = list(controller.choices) == episodes[f"choices_{number}"][step].tolist()
-            difference = (np.abs(control - episodes[f"controls_{number}"][step]) / unit).max()
-            largest = max(largest, float(difference) if same else np.inf)
+            if list(controller.choices) != episodes[f"choices_{number}"][step].tolist():
+                largest = np.inf
+            for name, value in {**controller.outputs, "controls": control}.items():
+                largest = max(largest, _difference(controller.about, name, value, episodes[f"{name}_{number}"][step]))
     return largest, float(np.median(seconds))
+
+
+def _difference(about: Mapping[str, Any], name: str, value: np.ndarray, original: np.ndarray) -> float:
+    if name.startswith("selection"):
+        value, original = np.exp(value), np.exp(original)
+    unit = np.ones(original.shape)
+    if name.startswith("control"):
+        varying = about["varying"]
+        distance = np.abs(original[..., varying] - np.array(about["shift"]))
+        unit[..., varying] = np.maximum(np.maximum(1.0, about["scale"]), distance)
+    found = float((np.abs(value - original) / unit).max())
+    return found if np.isfinite(found) else np.inf
 
 
 def main() -> None:
@@ -249,8 +297,8 @@ def main() -> None:
     networks = sys.argv[2] if len(sys.argv) > 2 else "numpy"
     with np.load(folder / "check.npz", allow_pickle=False) as file:
         difference, seconds = replay(Runner(folder, networks), {name: file[name] for name in file.files})
-    print(f"largest difference of a control: {difference:.1e}; a step takes {1e3 * seconds:.3f} ms")
-    sys.exit(0 if difference < 1e-6 else 1)
+    print(f"largest difference: {difference:.1e}; a step takes {1e3 * seconds:.3f} ms")
+    sys.exit(0 if difference < TOLERANCE else 1)
 
 
 if __name__ == "__main__":

@@ -4,44 +4,44 @@ from __future__ import annotations
 
 import importlib
 
-import torch
 from torch import nn
 
 from ddco_pyro.networks.conv import Conv
 from ddco_pyro.networks.inputs import Inputs, InputShape, ShapeError
-from ddco_pyro.networks.mlp import Mlp
+from ddco_pyro.networks.mlp import Linear, Mlp
+from ddco_pyro.networks.options import checked_options
 from ddco_pyro.networks.per_timestep import PerTimestep
+from ddco_pyro.networks.trial import try_network
 from ddco_pyro.spec import NetworkSpec
 
-__all__ = ["InputShape", "Inputs", "ShapeError", "build"]
+__all__ = ["CLASSES", "InputShape", "Inputs", "ShapeError", "build"]
+
+CLASSES: dict[str, type[nn.Module]] = {"linear": Linear, "mlp": Mlp, "per_timestep": PerTimestep, "conv": Conv}
+"""The built-in networks by name. Their settings, as a spec has them, are those of :mod:`ddco_pyro.spec.networks`."""
 
 
 def build(spec: NetworkSpec, shape: InputShape, outputs: int, copies: int) -> nn.Module:
     """``copies`` independent networks that map :class:`Inputs` to [N, T, copies, outputs].
 
-    A user's ``module:Class`` is called as ``Class(shape, outputs, copies, **options)``, and tried once.
+    Each is made as ``Class(shape, outputs, copies, **settings)``, a user's too, which is also tried.
 
-    :raises ShapeError: where the network cannot read these observations, cannot be imported or made, or gives
-        another shape.
+    :raises ShapeError: where the network cannot read these observations, cannot be imported or made, or is refused by
+        :func:`ddco_pyro.networks.trial.try_network`.
+    :raises SpecError: where the options do not fit the signature of a user's class.
     """
-    if spec.network == "linear":
-        return Mlp(shape, outputs, copies, hidden=())
-    if spec.network == "mlp":
-        return Mlp(shape, outputs, copies, spec.hidden, spec.dropout)
-    if spec.network == "per_timestep":
-        return PerTimestep(shape, outputs, copies, spec.hidden, spec.dropout)
-    if spec.network == "conv":
-        return Conv(shape, outputs, copies, spec.hidden, spec.dropout, spec.filters, spec.kernel)
-    own = _own(spec.network)
+    if spec.network in CLASSES:
+        return CLASSES[spec.network](shape, outputs, copies, **spec.settings)
+    network_class = _imported(spec.network)
+    options = checked_options(network_class, spec.settings)
     try:
-        network = own(shape, outputs, copies, **spec.options)
+        network = network_class(shape, outputs, copies, **options)
     except Exception as error:  # whatever the user's code raises
         raise ShapeError(f"network {spec.network!r} cannot be made with options {spec.options}: {error}") from error
-    _try(spec.network, network, shape, (copies, outputs))
+    try_network(spec.network, network, shape, (copies, outputs))
     return network
 
 
-def _own(name: str) -> type[nn.Module]:
+def _imported(name: str) -> type[nn.Module]:
     module, _, attribute = name.partition(":")
     try:
         found = getattr(importlib.import_module(module), attribute)
@@ -50,29 +50,3 @@ def _own(name: str) -> type[nn.Module]:
     if not (isinstance(found, type) and issubclass(found, nn.Module)):
         raise ShapeError(f"network {name!r} is not a torch.nn.Module class")
     return found
-
-
-def _try(name: str, network: nn.Module, shape: InputShape, size: tuple[int, int]) -> None:
-    """Run a user's network once, on observations that are 0.
-
-    :raises ShapeError: it fails, or does not give [N, T, copies, outputs].
-    """
-    batch = (1, 2)
-    images = {key: torch.zeros(*batch, *image, dtype=torch.uint8) for key, image in shape.images.items()}
-    time = torch.arange(batch[1]).clamp(max=shape.steps - 1)  # it may have parameters for each step
-    training = network.training
-    network.eval()  # nothing it keeps track of is to change
-    try:
-        with torch.no_grad():
-            found = network(Inputs(torch.zeros(*batch, shape.vector), images, time))
-    except Exception as error:  # whatever the user's code raises
-        what = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise ShapeError(f"network {name!r} fails for observations that are 0, N = 1, T = 2: {what}") from error
-    finally:
-        network.train(training)
-    given = f"shape {list(found.shape)}" if isinstance(found, torch.Tensor) else f"a {type(found).__name__}"
-    needed = [*batch, *size]
-    if given != f"shape {needed}":
-        raise ShapeError(
-            f"network {name!r} gives {given}; it has to be a tensor [N, T, copies, outputs], here {needed}"
-        )

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.networks.inputs import Inputs, InputShape, ShapeError
+from ddco_pyro.networks.numpy_form import NumpyForm, arrays_of, perceptrons
 from ddco_pyro.networks.stacked import stacked_mlp
 
 POOLED = 8
@@ -20,10 +21,10 @@ class Conv(nn.Module):
         shape: InputShape,
         outputs: int,
         copies: int,
-        hidden: tuple[int, ...] = (64,),
-        dropout: float = 0.0,
-        filters: int = 64,
-        kernel: int = 5,
+        hidden: tuple[int, ...],
+        dropout: float,
+        filters: int,
+        kernel: int,
     ) -> None:
         super().__init__()
         if not shape.images:
@@ -44,6 +45,13 @@ class Conv(nn.Module):
         maps = [self._features(key, image.flatten(0, 1)) for key, image in inputs.images.items()]
         found = self.layers(torch.cat([vector, *maps], dim=-1))
         return found.transpose(0, 1).reshape(*inputs.batch, *found.shape[::2])
+
+    def numpy_form(self) -> NumpyForm:
+        """What the numpy runner has to know of it."""
+        about, arrays = perceptrons(self.layers)
+        for key, convolution in self.convolutions.items():
+            arrays |= arrays_of(convolution, f"image.{key}")
+        return about | {"images": list(self.convolutions), "pooled": POOLED}, arrays
 
     def _features(self, key: str, image: Tensor) -> Tensor:
         """uint8 [M, H, W, C] to [K, M, filters · POOLED²]."""

@@ -5,15 +5,14 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from ddco_pyro.networks.inputs import Inputs, InputShape, ShapeError
+from ddco_pyro.networks.numpy_form import NumpyForm, perceptrons
 from ddco_pyro.networks.stacked import stacked_mlp
 
 
 class Mlp(nn.Module):
-    """K perceptrons over the observation vector. Without hidden layers this is the ``linear`` network."""
+    """K perceptrons over the observation vector."""
 
-    def __init__(
-        self, shape: InputShape, outputs: int, copies: int, hidden: tuple[int, ...] = (64,), dropout: float = 0.0
-    ) -> None:
+    def __init__(self, shape: InputShape, outputs: int, copies: int, hidden: tuple[int, ...], dropout: float) -> None:
         super().__init__()
         refuse_images(shape)
         self.layers = stacked_mlp(copies, shape.vector, hidden, outputs, dropout)
@@ -22,6 +21,17 @@ class Mlp(nn.Module):
         """[N, T, K, outputs]."""
         found: Tensor = self.layers(inputs.vector.flatten(0, 1).unsqueeze(0))
         return found.transpose(0, 1).reshape(*inputs.batch, *found.shape[::2])
+
+    def numpy_form(self) -> NumpyForm:
+        """What the numpy runner has to know of it."""
+        return perceptrons(self.layers)
+
+
+class Linear(Mlp):
+    """K linear maps of the observation vector."""
+
+    def __init__(self, shape: InputShape, outputs: int, copies: int) -> None:
+        super().__init__(shape, outputs, copies, hidden=(), dropout=0.0)
 
 
 def refuse_images(shape: InputShape) -> None:

@@ -17,8 +17,13 @@ class StackedLinear(nn.Module):
         self.weight = nn.Parameter(torch.empty(copies, inputs, outputs).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.empty(copies, 1, outputs).uniform_(-bound, bound))
 
-    def forward(self, x: Tensor) -> Tensor:
-        """[K, M, inputs], or [1, M, inputs] shared by all K, to [K, M, outputs]."""
+    def forward(self, x: Tensor, maps: Tensor | None = None) -> Tensor:
+        """[K, M, inputs], or [1, M, inputs] shared by all K, to [K, M, outputs].
+
+        :param maps: indices of the maps to apply, which then are the K; None for all of them.
+        """
+        if maps is not None:
+            return torch.baddbmm(self.bias[maps], x, self.weight[maps])
         if x.shape[0] == 1:
             return self._shared(x[0])
         return torch.baddbmm(self.bias, x, self.weight)

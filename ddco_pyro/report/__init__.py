@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import jinja2
-
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.files import write_text
-from ddco_pyro.report import dimensions, sections
+from ddco_pyro.report import activity, demonstration_list, dimensions, sections
 from ddco_pyro.report.pictures import style
 from ddco_pyro.report.sections import degeneracies
+from ddco_pyro.report.words import unconverged
 from ddco_pyro.run import Fit
+from ddco_pyro.templates import render
 
-__all__ = ["degeneracies", "write_report"]
+__all__ = ["degeneracies", "unconverged", "write_report"]
 
 
 def write_report(fit: Fit, demos: Demonstrations) -> Path:
@@ -22,6 +22,8 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
     :param demos: the demonstrations the fit was made from.
     """
     metrics = fit.metrics
+    active = activity.activity(fit, demos) if fit.spec.hierarchy else None
+    timelines = demonstration_list.timelines(fit, demos, active, metrics) if active else []
     with style():
         page = {
             "header": sections.header(fit, metrics),
@@ -29,22 +31,13 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             "dimensions": dimensions.section(metrics, {name: one.metrics for name, one in fit.baselines.items()}),
             "rollouts": sections.rollouts(fit, metrics),
             "learning": sections.learning(fit),
-            "options": sections.options(fit, demos, metrics),
+            "options": sections.options(fit, demos, active, metrics) if active else None,
             "warnings": sections.warnings(fit, metrics),
             "films": sections.films(fit),
             "particulars": sections.particulars(fit, metrics),
+            "demonstrations": demonstration_list.listed(metrics, {one.anchor for one in timelines}),
+            "timelines": timelines,
         }
     path = fit.folder / "report.html"
-    write_text(path, _template().render(page))
+    write_text(path, render("report/report.html.j2", page))
     return path
-
-
-def _template() -> jinja2.Template:
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("ddco_pyro.report", "."),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("report.html.j2")

@@ -11,7 +11,7 @@ import torch
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.encoding import encode
 from ddco_pyro.hierarchy import Hierarchy
-from ddco_pyro.inference import posterior, segment
+from ddco_pyro.inference import most_likely_path, posterior
 from ddco_pyro.run import Fit
 
 MOST_BINS = 60
@@ -23,12 +23,15 @@ class LevelActivity:
 
     :param active: u_t, probability that a choice is active [N, T, C]; 0 past a demonstration's end.
     :param path: choices of the most likely path [N, T]; -1 past the end.
+    :param ended: whether that path terminates a choice before this step, to select one anew: 1, 0, or -1 past the end
+        [N, T].
     :param termination: ψ_h(s_t) of the k options [N, T, k].
     """
 
     name: str
     active: np.ndarray
     path: np.ndarray
+    ended: np.ndarray
     termination: np.ndarray
 
     @property
@@ -53,8 +56,8 @@ def activity(fit: Fit, demos: Demonstrations) -> Activity:
     parts = [_chunk(fit.hierarchy, part, steps) for part in _chunks(demos, size)]
     levels = []
     for number, level in enumerate(specs):
-        active, path, termination = (np.concatenate([part[what][number] for part in parts]) for what in range(3))
-        levels.append(LevelActivity(level.name, active, path, termination))
+        arrays = (np.concatenate([part[what][number] for part in parts]) for what in range(4))
+        levels.append(LevelActivity(level.name, *arrays))
     return Activity(tuple(levels), np.array(demos.lengths))
 
 
@@ -63,17 +66,16 @@ def _chunks(demos: Demonstrations, size: int) -> Iterator[Demonstrations]:
         yield demos.select(demos.names[start : start + size])
 
 
-def _chunk(
-    hierarchy: Hierarchy, demos: Demonstrations, steps: int
-) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+def _chunk(hierarchy: Hierarchy, demos: Demonstrations, steps: int) -> tuple[list[np.ndarray], ...]:
     with torch.no_grad():
         batch = encode(demos, hierarchy.encoder, hierarchy.scaling)
         outputs = hierarchy(batch.inputs)
         tables = outputs.tables(batch.actions, hierarchy.scaling.log_volume)
         active = [_padded(one.float().numpy(), steps, 0.0) for one in posterior(tables, batch.lengths).u]
-        paths = [_padded(one.numpy(), steps, -1) for one in segment(tables, batch.lengths)]
+        path = most_likely_path(tables, batch.lengths)
+        choices, ended = ([_padded(one.numpy(), steps, -1) for one in part] for part in path)
         termination = [_padded(one[..., 1].exp().numpy(), steps, 0.0) for one in outputs.termination]
-    return active, paths, termination
+    return active, choices, ended, termination
 
 
 def _padded(array: np.ndarray, steps: int, value: float) -> np.ndarray:

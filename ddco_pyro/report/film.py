@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import imageio.v3 as imageio
 import numpy as np
 from matplotlib.figure import Figure
 
+from ddco_pyro.records import read_successes
 from ddco_pyro.report import words
 from ddco_pyro.report.pictures import blank, data_uri, hide_frame
 
@@ -39,13 +39,14 @@ class Film:
 def films(folder: Path, first: str) -> list[Film]:
     """The films in a run folder, those of the method ``first`` before the others."""
     paths = sorted((folder / "videos").glob("*.mp4"), key=lambda path: _key(path, first))
-    outcomes, left, found = _outcomes(folder / "rollouts.csv"), MOST_BYTES, []
+    outcomes = {key: "success" if value == 1 else "failure" for key, value in read_successes(folder).items()}
+    left, found = MOST_BYTES, []
     for path in paths:
         method, seed = _name(path)
         size = path.stat().st_size
         uri = data_uri(path.read_bytes(), "video/mp4") if size <= left else None
         left -= size if uri else 0
-        found.append(Film(method, seed, f"videos/{path.name}", uri, outcomes.get((method, str(seed)), "")))
+        found.append(Film(method, seed, f"videos/{path.name}", uri, outcomes.get((method, seed), "")))
     return found
 
 
@@ -73,12 +74,3 @@ def _name(path: Path) -> tuple[str, int]:
 def _key(path: Path, first: str) -> tuple[bool, str, int]:
     method, seed = _name(path)
     return method != first, method, seed
-
-
-def _outcomes(path: Path) -> dict[tuple[str, str], str]:
-    """``success`` or ``failure`` by method and seed."""
-    if not path.exists():
-        return {}
-    with path.open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row.get("success")]
-    return {(row["method"], row["seed"]): "success" if float(row["success"]) == 1 else "failure" for row in rows}

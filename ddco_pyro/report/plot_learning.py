@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from ddco_pyro.records import read_table, refit
+from ddco_pyro.report import words
 from ddco_pyro.report.pictures import INK, blank
-from ddco_pyro.report.words import method
 
 COLUMNS = 4
 TUNE = "#c2410c"
@@ -24,26 +24,32 @@ TUNE = "#c2410c"
 class Stage:
     """One stage of one model: for each restart an array of (epoch, train, tune) [E, 3], nats per step."""
 
-    title: str
+    model: str
+    name: str
     restarts: Sequence[np.ndarray]
+
+    @property
+    def title(self) -> str:
+        """Model and stage in words."""
+        return f"{words.method(self.model)}: {words.stage(self.name)}"
 
 
 def stages(histories: Mapping[str, Path]) -> list[Stage]:
     """The stages in ``history.csv`` of each model, in the order in which they were trained."""
     found = []
     for model, path in histories.items():
-        with path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
-        for stage in dict.fromkeys(row["stage"] for row in rows):
-            own = [row for row in rows if row["stage"] == stage]
-            restarts = [
-                [row for row in own if row["restart"] == one] for one in dict.fromkeys(r["restart"] for r in own)
-            ]
-            curves = [
-                np.array([[float(row[key]) for key in ("epoch", "train", "tune")] for row in r]) for r in restarts
-            ]
-            found.append(Stage(f"{method(model)}: {stage}", curves))
+        rows = read_table(path, _epoch, refit(path.parent, "it and metrics.json"))
+        for stage in dict.fromkeys(stage for stage, _, _ in rows):
+            own = [(restart, values) for name, restart, values in rows if name == stage]
+            numbers = dict.fromkeys(restart for restart, _ in own)
+            curves = [np.array([values for restart, values in own if restart == number]) for number in numbers]
+            found.append(Stage(model, stage, curves))
     return found
+
+
+def _epoch(row: Mapping[str, str]) -> tuple[str, int, list[float]]:
+    """The stage, restart and numbers of an epoch."""
+    return row["stage"], int(row["restart"]), [float(row[key]) for key in ("epoch", "train", "tune")]
 
 
 def draw(found: Sequence[Stage]) -> Figure:

@@ -21,6 +21,7 @@ class Likelihood:
     :param valid: NaN where nothing was held out.
     :param difference: (mean, standard error); None for the model itself.
     :param each: the difference on each held-out demonstration.
+    :param training: what it spent of its budget; None for runs of before.
     """
 
     name: str
@@ -28,18 +29,25 @@ class Likelihood:
     valid: float
     difference: tuple[float, float] | None = None
     each: tuple[float, ...] = ()
+    parameters: int | None = None
+    training: Mapping[str, Any] | None = None
 
 
 def likelihoods(metrics: Mapping[str, Any], baselines: Mapping[str, Mapping[str, Any]]) -> list[Likelihood]:
     """The model and what it was compared with, from its ``metrics.json`` and those of its baselines."""
     own = metrics["log_likelihood_per_step"]
-    found = [Likelihood(metrics["model"], own["train"], np.nan if own["valid"] is None else own["valid"])]
+    valid = np.nan if own["valid"] is None else own["valid"]
+    found = [Likelihood(metrics["model"], own["train"], valid, **_effort(metrics))]
     for name, one in metrics["comparison"].items():
         values, difference = one["log_likelihood_per_step"], one["difference"]
         each = _each(metrics["valid"], baselines.get(name, {}).get("valid", ()))
         mean_and_error = (difference["nats_per_step"], difference["standard_error"])
-        found.append(Likelihood(name, values["train"], values["valid"], mean_and_error, each))
+        found.append(Likelihood(name, values["train"], values["valid"], mean_and_error, each, **_effort(one)))
     return found
+
+
+def _effort(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: row.get(key) for key in ("parameters", "training")}
 
 
 def _each(ours: Sequence[Mapping[str, Any]], theirs: Sequence[Mapping[str, Any]]) -> tuple[float, ...]:

@@ -47,7 +47,7 @@ def _example(figure: SubFigure, found: Activity, example: Example) -> None:
     for depth, level in enumerate(reversed(found.levels)):
         stack, strip = panels[2 * depth], panels[2 * depth + 1]
         _stack(stack, level, example.row, length)
-        stack.set_ylabel(f"{level.name}\nu(h)" if len(found.levels) > 1 else "u(h)")
+        stack.set_ylabel(f"{level.name}\nprobability" if len(found.levels) > 1 else "probability")
         draw_path(strip, level.path[example.row, :length])
         strip.set_ylabel("path", rotation=0, ha="right", va="center", fontsize=7.5)
     if example.labels is not None:

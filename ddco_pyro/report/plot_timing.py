@@ -24,7 +24,7 @@ def draw(found: Activity) -> Figure:
         _shares(left, level, gathered)
         _terminations(right, level, gathered)
         left.set_title(f"share of each choice, level “{level.name}”")
-        right.set_title(f"termination probability ψ, level “{level.name}”")
+        right.set_title(f"probability of ending, level “{level.name}”")
     for axes in panels[-1]:
         axes.set_xlabel(gathered.axis)
     choices = sorted({choice for level in found.levels for choice in level.choices})

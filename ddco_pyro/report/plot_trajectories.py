@@ -12,7 +12,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from ddco_pyro.colours import option_colour
 from ddco_pyro.demonstrations import Demonstrations
-from ddco_pyro.report.activity import Activity
+from ddco_pyro.report.activity import Activity, LevelActivity
 from ddco_pyro.report.pictures import FAINT, INK, blank
 from ddco_pyro.report.strips import legend
 
@@ -27,9 +27,36 @@ MOST_STRETCHED = 4.0
 
 
 def position_key(demos: Demonstrations) -> str | None:
-    """The first observation that is a vector of at least three numbers; None where there is none."""
-    shapes = demos.observation_shapes
-    return next((key for key, shape in shapes.items() if len(shape) == 1 and shape[0] >= 3), None)
+    """The vector of at least three numbers that moves the most (:func:`movement`); None where none of them does."""
+    keys = [key for key, shape in demos.observation_shapes.items() if len(shape) == 1 and shape[0] >= 3]
+    moves = {key: movement([demo.observations[key] for demo in demos]) for key in keys}
+    best = max(moves, key=moves.__getitem__, default=None)
+    return best if best is not None and moves[best] > 0 else None
+
+
+def movement(values: Sequence[np.ndarray]) -> float:
+    """How much like a position the first three of n numbers [T, n] move, from 0 to 1; the product of three parts.
+
+    - Their standard deviation within demonstrations over that of all of them: 0 for a goal that is set anew for each
+      demonstration.
+    - How far a demonstration gets, measured across the box around it, for T steps as long as its (root mean square)
+      step: 1 along a straight line at one speed, little for a velocity, for noise, and for what hardly ever moves.
+    - The part of the numbers that is drawn, 3 / n.
+    """
+    points = [array[:, :3].astype(float) for array in values]
+    reach = float(np.mean([_reach(one) for one in points]))
+    if reach == 0:
+        return 0.0
+    within = np.mean([one.var(0).sum() for one in points])
+    between = np.array([one.mean(0) for one in points]).var(0).sum()
+    return float(np.sqrt(within / (within + between))) * reach * 3 / values[0].shape[1]
+
+
+def _reach(points: np.ndarray) -> float:
+    """The diagonal of the box around positions [T, 3], over T - 1 times the root mean square of their steps."""
+    steps = np.diff(points, axis=0)
+    length = np.sqrt(np.square(steps).sum() * len(steps))
+    return float(np.linalg.norm(np.ptp(points, axis=0)) / length) if length > 0 else 0.0
 
 
 def draw(found: Activity, positions: Sequence[np.ndarray], key: str) -> Figure:
@@ -38,17 +65,21 @@ def draw(found: Activity, positions: Sequence[np.ndarray], key: str) -> Figure:
     figure.set_layout_engine("none")  # it does not know how much room labels in space take
     turns = (0.0, TURN) if len(found.levels) == 1 else (0.0,)
     panels = [(level, turn) for level in reversed(found.levels) for turn in turns]
-    chosen = np.unique(np.linspace(0, len(positions) - 1, min(len(positions), MOST_TRAJECTORIES)).round().astype(int))
-    points = np.concatenate([positions[row] for row in chosen])
     for place, (level, turn) in zip(_places(len(panels), figure.get_figheight()), panels, strict=True):
         axes = figure.add_axes(place, projection="3d", proj_type="ortho")
-        for row in chosen:
-            _trajectory(axes, positions[row], level.path[row])
-        _frame(axes, points, key, turn)
+        panel(axes, level, positions, key, turn)
         axes.set_title(f"level “{level.name}”" + (f", turned by {turn:.0f}°" if turn else ""))
     choices = sorted({choice for level in found.levels for choice in level.choices})
     figure.legend(handles=legend(choices), loc="lower center", ncols=min(len(choices), 11), handlelength=1)
     return figure
+
+
+def panel(axes: Axes3D, level: LevelActivity, positions: Sequence[np.ndarray], key: str, turn: float = 0.0) -> None:
+    """One level over the positions [T_n, 3], of at most :data:`MOST_TRAJECTORIES` demonstrations."""
+    chosen = np.unique(np.linspace(0, len(positions) - 1, min(len(positions), MOST_TRAJECTORIES)).round().astype(int))
+    for row in chosen:
+        _trajectory(axes, positions[row], level.path[row])
+    _frame(axes, np.concatenate([positions[row] for row in chosen]), key, turn)
 
 
 def _places(count: int, height: float) -> list[tuple[float, float, float, float]]:

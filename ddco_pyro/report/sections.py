@@ -20,7 +20,7 @@ from ddco_pyro.report import (
     tables,
     words,
 )
-from ddco_pyro.report.activity import Activity, activity
+from ddco_pyro.report.activity import Activity
 from ddco_pyro.report.pictures import Picture, keep
 from ddco_pyro.run import Fit
 from ddco_pyro.spec import Spec, dump_spec
@@ -62,9 +62,12 @@ class Rollouts:
 
 @dataclass(frozen=True)
 class Warnings:
-    """Signs of a degenerate solution: each in words, with what usually helps."""
+    """Signs of a degenerate solution, each in words with what usually helps; None for a policy without options. Stages
+    of training that had not converged, likewise.
+    """
 
-    found: list[tuple[str, str]]
+    found: list[tuple[str, str]] | None
+    unconverged: list[tuple[str, str]]
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,8 @@ def header(fit: Fit, metrics: Mapping[str, Any]) -> Header:
         "Demonstrations": f"{counts['train']} for training, {counts['tune']} for tuning, {counts['valid']} held out",
         "Parameters": str(metrics["parameters"]),
     }
+    if "training" in metrics:
+        facts["Training"] = words.spent(metrics["training"])
     own = counts.get("supervisor", {}).get("success")
     if own and "successes" in own:
         facts["Supervisor’s own success"] = f"{words.rate(own, 'demonstrations')}, 95 % interval"
@@ -108,7 +113,7 @@ def likelihood(fit: Fit, metrics: Mapping[str, Any]) -> Figures:
         "demonstrations; diamond: mean with one standard error, dots: single demonstrations."
     )
     picture = keep(plot_likelihood.draw(rows), fit.folder / "figures" / "likelihood.png", alt, caption)
-    return Figures([picture], tables.likelihood(rows))
+    return Figures([picture], tables.likelihood(rows), words.about(row.name for row in rows))
 
 
 def rollouts(fit: Fit, metrics: Mapping[str, Any]) -> Rollouts | None:
@@ -140,21 +145,25 @@ def learning(fit: Fit) -> Figures | None:
         "lines for each restart. A steep start may be cut off."
     )
     alt = "Learning curves of the stages " + ", ".join(stage.title for stage in stages)
-    text = ""
-    if any(": vq-" in stage.title for stage in stages):
-        text = (
-            "Stages named vq-d maximise another quantity: the log-likelihood with level d’s choices clamped to "
-            "clusters of the observations. It can be compared within its panel only. Stages named level-d train under "
-            "a uniform meta-policy."
-        )
+    names = list(dict.fromkeys(stage.name for stage in stages))
+    kinds = dict.fromkeys(name.partition("-")[0] for name in names)
+    text = " ".join([*(STAGES[kind] for kind in kinds if kind in STAGES), STAGE_NAMES.format(", ".join(names))])
     return Figures([keep(plot_learning.draw(stages), fit.folder / "figures" / "learning.png", alt, caption)], text=text)
 
 
-def options(fit: Fit, demos: Demonstrations, metrics: Mapping[str, Any]) -> Figures | None:
+STAGES = {
+    "vq": "“From clusters” trains each option of a level on a cluster of steps of its own, so that options differ from "
+    "the beginning; it maximises another quantity, to be compared within its panel only.",
+    "level": "“Alone” trains a level’s options before anything selects among them: each is as likely as any other.",
+    "meta": "“Meta-policy alone” then trains the policy that selects the options.",
+    "joint": "“All together” trains everything once more.",
+}
+STAGE_NAMES = "In history.csv and on the console the stages are {}."
+
+
+def options(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Figures:
     """Which option is active when."""
-    if fit.spec.hierarchy is None:
-        return None
-    found = activity(fit, demos)
+    assert fit.spec.hierarchy is not None  # or there is no activity
     makers = (_posteriors, _rows, _trajectories, _timing)
     pictures = [picture for make in makers if (picture := make(fit, demos, found, metrics)) is not None]
     names = [level.name for level in fit.spec.hierarchy.levels]
@@ -166,6 +175,10 @@ def options(fit: Fit, demos: Demonstrations, metrics: Mapping[str, Any]) -> Figu
 
 
 PARTS = ("train", "tune", "valid")
+CHOSEN = (
+    "Of those with three numbers or more it moves the most within demonstrations; report.trajectory in the spec names "
+    "another. "
+)
 
 
 def _posteriors(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture:
@@ -176,8 +189,9 @@ def _posteriors(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mappi
         for name in names
     ]
     caption = (
-        f"Probability u of each choice at each step of {len(names)} {'held-out ' if held_out else ''}demonstrations, "
-        "given the whole demonstration (stacked), and the most likely path under it."
+        f"Probability of each option at each step of {len(names)} {'held-out ' if held_out else ''}demonstrations, "
+        "given the whole demonstration (u in the paper), stacked; under it the path: the most likely sequence of "
+        "options."
     )
     if examples[0].labels is not None:
         caption += f" Boxes: ground-truth label “{fit.spec.demonstrations.labels}”."
@@ -202,14 +216,16 @@ def _rows(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str
 
 def _trajectories(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture | None:
     del metrics
-    key = plot_trajectories.position_key(demos)
+    named = fit.spec.report.trajectory
+    key = named or plot_trajectories.position_key(demos)
     if key is None:
         return None
     figure = plot_trajectories.draw(found, [demo.observations[key][:, :3] for demo in demos], key)
     shown = min(len(demos), plot_trajectories.MOST_TRAJECTORIES)
     caption = (
         f"{shown} demonstrations in space, coloured by the most likely option: first three numbers of observation "
-        f"“{key}”, in its own units. Circles: first steps. Seen from where the trajectories spread the most."
+        f"“{key}”, in its own units. {'' if named else CHOSEN}Circles: first steps. Seen from where the trajectories "
+        "spread the most."
     )
     alt = f"Trajectories of {key} in three dimensions, coloured by option"
     return keep(figure, fit.folder / "figures" / "trajectories.png", alt, caption)
@@ -218,8 +234,8 @@ def _trajectories(fit: Fit, demos: Demonstrations, found: Activity, metrics: Map
 def _timing(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture:
     del metrics
     caption = (
-        "Left: mean probability of each choice over all demonstrations. Right: mean termination probability of each "
-        "option, weighted by how likely it was active in the step before; left out where it hardly ever is."
+        "Left: mean probability of each option over all demonstrations. Right: how likely an active option is to end "
+        "at a step (its termination condition, ψ in the paper); left out where it is hardly ever active before."
     )
     if len(found.levels) > 1:
         caption += " Above the lowest level an option can end only where the one below it ends."
@@ -249,10 +265,11 @@ def _scores(found: Mapping[str, Any], level: int) -> str:
 
 
 def warnings(fit: Fit, metrics: Mapping[str, Any]) -> Warnings | None:
-    """Signs of a degenerate solution."""
+    """Signs of a degenerate solution, and of too short a training."""
+    unconverged = words.unconverged(metrics)
     if fit.spec.hierarchy is None:
-        return None
-    return Warnings(degeneracies(fit.spec, metrics))
+        return Warnings(None, unconverged) if unconverged else None
+    return Warnings(degeneracies(fit.spec, metrics), unconverged)
 
 
 def degeneracies(spec: Spec, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ddco_pyro.colours import option_colour
+from ddco_pyro.convergence import effort
 from ddco_pyro.report.plot_likelihood import Likelihood
 from ddco_pyro.report.strips import choice_name
 from ddco_pyro.report.words import interval, measure, method, number, p_value, percent, rate, signed
@@ -24,21 +25,19 @@ class Table:
 def measures(methods: Mapping[str, Mapping[str, Any]]) -> Table:
     """Every measure of every method, as in the paper's table."""
     names = list(dict.fromkeys(name for one in methods.values() for name in one["measures"]))
-    rows = [
-        [method(key), *(_cell(one["measures"].get(name), methods, name) for name in names)]
-        for key, one in methods.items()
-    ]
+    rows = [[method(key), *(_cell(one["measures"].get(name)) for name in names)] for key, one in methods.items()]
     return Table(["Method", *map(measure, names)], rows)
 
 
-def _cell(found: Mapping[str, Any] | None, methods: Mapping[str, Mapping[str, Any]], name: str) -> str:
+def _cell(found: Mapping[str, Any] | None) -> str:
     if found is None:
         return "–"
-    if "mean" in found:
-        spread = "" if found["std"] is None else f" ± {number(found['std'])} [{interval(found['interval'])}]"
-        return f"{number(found['mean'])}{spread}, n = {found['trials']}"
-    has_mean = any("mean" in one["measures"].get(name, {}) for one in methods.values())
-    return "– (n = 0)" if has_mean and not found["trials"] else rate(found)
+    if "mean" not in found:
+        return rate(found)
+    if not found["trials"]:
+        return "– (n = 0)"
+    spread = "" if found["std"] is None else f" ± {number(found['std'])} [{interval(found['interval'])}]"
+    return f"{number(found['mean'])}{spread}, n = {found['trials']}"
 
 
 def against(methods: Mapping[str, Mapping[str, Any]], ours: str) -> Table | None:
@@ -66,9 +65,12 @@ def option_use(levels: Sequence[str], options: Sequence[Sequence[Mapping[str, An
 
 
 def likelihood(found: Sequence[Likelihood]) -> Table:
-    """Log-likelihood per step of each method and the differences with their standard errors."""
+    """Log-likelihood per step of each method, the differences with their standard errors, and what they took."""
     rows = []
     for one in found:
         difference = "" if one.difference is None else f"{signed(one.difference[0])} ± {number(one.difference[1])}"
-        rows.append([method(one.name), number(one.valid), number(one.train), difference])
-    return Table(["Method", "Held out", "Training", f"{method(found[0].name)} minus it, held out"], rows)
+        size = "–" if one.parameters is None else str(one.parameters)
+        likelihoods = [number(one.valid), number(one.train), difference]
+        rows.append([method(one.name), *likelihoods, size, effort(one.training)])
+    ours = f"{method(found[0].name)} minus it, held out"
+    return Table(["Method", "Held out", "Training", ours, "Parameters", "Gradient steps"], rows)

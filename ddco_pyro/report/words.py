@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from scipy import stats
@@ -13,7 +13,31 @@ from ddco_pyro.diagnostics import Finding
 CONFIDENCE = 0.95
 """A difference is called one where this interval about it leaves out 0."""
 
-METHODS = {"ddco": "DDCO", "flat": "flat", "per_timestep": "per-timestep", "open_loop": "open loop"}
+METHODS = {
+    "ddco": "DDCO",
+    "flat": "flat",
+    "flat_equal": "flat of equal size",
+    "per_timestep": "per-timestep",
+    "open_loop": "open loop",
+}
+
+ABOUT = {
+    "ddco": "the hierarchy of options",
+    "flat": "one policy without options",
+    "per_timestep": "a policy for each time step",
+}
+
+
+def about(names: Iterable[str]) -> str:
+    """A sentence on what the methods are."""
+    return "; ".join(f"{method(name)}: {ABOUT[name]}" for name in names if name in ABOUT) + "."
+
+
+def stage(name: str) -> str:
+    """What a stage of training is called in the page: ``vq-1`` is ``level 1 from clusters``."""
+    kind, _, level = name.partition("-")
+    whole = {"meta-policy": "meta-policy alone", "joint": "all together"}
+    return {"vq": f"level {level} from clusters", "level": f"level {level} alone"}.get(kind) or whole.get(name, name)
 
 
 def method(name: str) -> str:
@@ -79,19 +103,71 @@ def verdict(metrics: Mapping[str, Any]) -> str:
         return (
             f"{name} gives held-out demonstrations {value} nats per step; no other model was trained to compare with."
         )
-    clauses = [_clause(other, one["difference"], held_out) for other, one in metrics["comparison"].items()]
+    differences = {method(other): one["difference"] for other, one in metrics["comparison"].items()}
+    rising = [method(key) for key, one in trainings(metrics).items() if not one["converged"]]
+    return explains(name, differences, held_out, rising)
+
+
+def explains(
+    name: str, differences: Mapping[str, Mapping[str, float]], held_out: int, unconverged: Sequence[str] = ()
+) -> str:
+    """One sentence on how much better than others a model explains held-out demonstrations.
+
+    :param differences: what the others are called to ``nats_per_step`` and ``standard_error`` of the paired difference.
+    :param unconverged: those, it or others, that still rose when their training ended.
+    """
+    clauses = [_clause(other, difference, held_out) for other, difference in differences.items()]
     text = f"{name} explains held-out demonstrations {_listed(clauses)}"
-    return f"{text} ({held_out} held-out demonstration{'s' * (held_out != 1)}; ± is one standard error)."
+    text = f"{text} ({held_out} held-out demonstration{'s' * (held_out != 1)}; ± is one standard error)."
+    if not unconverged:
+        return text
+    return f"{text} {_capital(_listed(list(unconverged)))} had not converged: more epochs can change this."
+
+
+def trainings(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """How the model and what it is compared with were trained, by name; runs of before do not say."""
+    rows = {metrics["model"]: metrics, **metrics["comparison"]}
+    return {name: row["training"] for name, row in rows.items() if "training" in row}
+
+
+def spent(training: Mapping[str, Any]) -> str:
+    """Epochs and gradient steps, and how many were allowed."""
+    took, allowed = training["spent"], training["budget"]
+    of = "" if allowed["epochs"] is None else f" of at most {allowed['epochs']} ({allowed['gradient_steps']})"
+    return f"{took['epochs']} epochs ({took['gradient_steps']} gradient steps){of}"
+
+
+RAISE = "Raise training.epochs: it is the budget of every model that is compared, whatever its number of stages."
+
+
+def unconverged(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Every stage that its budget ended too early, in words with its number, and what to do."""
+    return [
+        (_too_short(_capital(method(name)), stage, last=stage is training["stages"][-1]), RAISE)
+        for name, training in trainings(metrics).items()
+        for stage in training["stages"]
+        if not stage["converged"]
+    ]
+
+
+def _too_short(name: str, stage: Mapping[str, Any], last: bool) -> str:
+    verdict = f"{name} has not converged" if last else f"{name} had not converged before its later stages"
+    if not stage["epochs"]:
+        return f"{verdict}: the budget left no epoch for stage {stage['stage']}."
+    return (
+        f"{verdict}: its tuning log-likelihood rose by {number(stage['rising'])} nats per step over the last "
+        f"{stage['over']} epochs of stage {stage['stage']}, which the budget ended after {stage['epochs']}."
+    )
 
 
 def _clause(other: str, difference: Mapping[str, float], held_out: int) -> str:
     mean, error = difference["nats_per_step"], difference["standard_error"]
     direction = "better" if mean > 0 else "worse"
     if not math.isfinite(error):
-        return f"{number(abs(mean))} nats per step {direction} than {method(other)} (error unknown)"
+        return f"{number(abs(mean))} nats per step {direction} than {other} (error unknown)"
     if abs(mean) <= error * stats.t.ppf((1 + CONFIDENCE) / 2, held_out - 1):
-        return f"with no clear difference from {method(other)} ({signed(mean)} ± {number(error)} nats per step)"
-    return f"{number(abs(mean))} ± {number(error)} nats per step {direction} than {method(other)}"
+        return f"with no clear difference from {other} ({signed(mean)} ± {number(error)} nats per step)"
+    return f"{number(abs(mean))} ± {number(error)} nats per step {direction} than {other}"
 
 
 def _listed(items: list[str]) -> str:
@@ -120,7 +196,8 @@ def warning(finding: Finding, level: str) -> str:
         "dominating": f"{option} dominates: it is active in {share} of all steps.",
         "redundant": f"{option} does the same as option {finding.other}: over the time that one of them is active they "
         f"differ by {number(finding.value, 3)} nats per step.",
-        "never_persisting": f"{option} never persists: it lasts {number(finding.value)} steps on average.",
+        "never_persisting": f"{option} never persists: it lasts {number(finding.value)} steps on average and is "
+        f"selected {number(finding.selections, 1)} times in each demonstration that has it.",
         "high_fitting": f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its "
         "steps, past its options.",
     }[finding.kind]

@@ -10,9 +10,9 @@ import torch
 
 from ddco_pyro.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.encoding import STEPS_AT_ONCE, encode
-from ddco_pyro.errors import BadInput
-from ddco_pyro.hdf5 import DemonstrationsError, nearest
-from ddco_pyro.inference import most_likely_path, posterior
+from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.hdf5 import DemonstrationsError
+from ddco_pyro.inference import log_likelihood, most_likely_path, posterior
 from ddco_pyro.memory import INFERENCE, PROGRAM, Extent, refuse_too_much
 from ddco_pyro.run import Fit
 from ddco_pyro.sources import Recording, Source
@@ -33,6 +33,14 @@ class LevelLabels:
     boundaries: np.ndarray
     probability: np.ndarray
 
+    @classmethod
+    def of(cls, options: np.ndarray, terminations: np.ndarray, active: np.ndarray) -> LevelLabels:
+        """From the most likely path, choices and terminations [T], and the posterior u [T, 1 + k]."""
+        boundaries = terminations == 1
+        boundaries[0] = True
+        probability = np.minimum(active[np.arange(len(options)), options], 1.0)  # rounding can exceed it
+        return cls(options, boundaries, probability)
+
     def runs(self) -> list[tuple[int, int, int]]:
         """(option, first step, step after the last) of each segment."""
         starts = np.flatnonzero(self.boundaries).tolist()
@@ -41,10 +49,14 @@ class LevelLabels:
 
 @dataclass(frozen=True)
 class Segments:
-    """One demonstration: its levels by name, lowest first, and the labels it had, name to [T]."""
+    """One demonstration: its levels by name, lowest first, log p(ξ) per step, whether it was held out when the run was
+    fitted, and the labels it had, name to [T].
+    """
 
     name: str
     levels: dict[str, LevelLabels]
+    log_likelihood: float
+    held_out: bool
     labels: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -53,11 +65,14 @@ class Segments:
 
 @dataclass(frozen=True)
 class Segmented:
-    """All demonstrations of a source. ``counts`` has the number of options of each level by name."""
+    """All demonstrations of a source. ``counts`` has the number of options of each level by name; ``truth`` is the name
+    of the labels that the run's spec compares with.
+    """
 
     segments: tuple[Segments, ...]
     counts: dict[str, int]
     frequency: float | None
+    truth: str | None = None
 
     def __len__(self) -> int:
         return len(self.segments)
@@ -79,7 +94,7 @@ def segments(
     for group in _groups(source, fit):
         found += _segment(fit, group, tuple(counts))
         on_demonstration(len(found), len(source.names))
-    return Segmented(tuple(found), counts, source.frequency)
+    return Segmented(tuple(found), counts, source.frequency, fit.spec.demonstrations.labels)
 
 
 def _groups(source: Source, fit: Fit) -> Iterator[list[Demonstration]]:
@@ -158,12 +173,11 @@ def _segment(fit: Fit, group: list[Demonstration], names: tuple[str, ...]) -> It
         tables = hierarchy.tabulate(batch)
         path = most_likely_path(tables, batch.lengths)
         active = posterior(tables, batch.lengths).u
+        values = log_likelihood(tables, batch.lengths).tolist()
     for row, demo in enumerate(group):
-        steps = np.arange(len(demo))
-        levels = {}
-        for name, options, ended, u in zip(names, path.choices, path.terminations, active, strict=True):
-            chosen, anew = options[row, : len(demo)].numpy(), ended[row, : len(demo)].numpy() == 1
-            anew[0] = True
-            probability = np.minimum(u[row].numpy()[steps, chosen], 1.0)  # rounding can exceed it
-            levels[name] = LevelLabels(chosen, anew, probability)
-        yield Segments(demo.name, levels, dict(demo.labels))
+        levels = {
+            name: LevelLabels.of(*(one[row, : len(demo)].numpy() for one in level))
+            for name, *level in zip(names, path.choices, path.terminations, active, strict=True)
+        }
+        held_out = fit.was_held_out(demo.name, values[row])
+        yield Segments(demo.name, levels, values[row] / len(demo), held_out, dict(demo.labels))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import pyarrow
 from pyarrow import parquet
 
 from ddco_pyro.errors import BadInput
-from ddco_pyro.files import write_text
+from ddco_pyro.files import whole_folder, write_text
 from ddco_pyro.segmenting import Segmented
 from ddco_pyro.sources.lerobot import SUBTASK, LeRobot
 
@@ -33,11 +32,7 @@ def annotate(source: LeRobot, out: Path, found: Segmented, level: str) -> None:
         if not _has(source, out, found, level):
             raise _taken(out)
         return
-    out.parent.mkdir(parents=True, exist_ok=True)
-    for old in out.parent.glob(f".{out.name}-*.tmp"):
-        shutil.rmtree(old)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}-", suffix=".tmp", dir=out.parent))
-    try:
+    with whole_folder(out) as temporary:
         shutil.copytree(source.folder, temporary, dirs_exist_ok=True, copy_function=_link)
         for path in (Path("meta/info.json"), *_data(source)):
             (temporary / path).unlink()
@@ -45,10 +40,6 @@ def annotate(source: LeRobot, out: Path, found: Segmented, level: str) -> None:
             _write_data(source.folder / path, temporary / path, found, level)
         _write_names(temporary / "meta" / "subtasks.parquet", level, found.counts[level])
         write_text(temporary / "meta" / "info.json", _info(source))
-        temporary.chmod(0o755)
-        temporary.rename(out)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def check_target(source: LeRobot, out: Path, level: str, count: int) -> None:

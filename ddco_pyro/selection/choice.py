@@ -46,6 +46,8 @@ class Row:
     :param difference: this minus the best over the folds that both have, and its standard error.
     :param folds: log-likelihood per step of each fold that was scored, by number.
     :param failed: why, by number of the fold.
+    :param gradient_steps: of a fold's training, on average; None where none was scored.
+    :param unconverged: the folds whose training had not converged when its budget ended.
     """
 
     candidate: Candidate
@@ -55,6 +57,8 @@ class Row:
     difference: tuple[float, float] | None
     folds: Mapping[int, float]
     failed: Mapping[int, str]
+    gradient_steps: float | None = None
+    unconverged: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -127,9 +131,10 @@ class _Scored:
         values, steps = self.arrays(list(self.good))
         own = paired(values, np.zeros(len(values)), steps)
         per_fold = dict(zip(self.good, (values / steps).tolist(), strict=True))
-        return Row(
-            self.candidate, status, self.mean, _finite(own["standard_error"]), self.against(best), per_fold, self.failed
-        )
+        took = float(np.mean([one.gradient_steps for one in self.good.values()]))
+        rising = tuple(fold for fold, one in self.good.items() if not one.converged)
+        error, difference = _finite(own["standard_error"]), self.against(best)
+        return Row(self.candidate, status, self.mean, error, difference, per_fold, self.failed, took, rising)
 
     def against(self, best: _Scored | None) -> tuple[float, float] | None:
         """Difference to another candidate per step and its standard error, over the folds that both have."""
@@ -192,5 +197,7 @@ def _row(row: Row, best: Row | None) -> dict[str, Any]:
         "standard_error": row.error,
         "difference": {"nats_per_step": mean, "standard_error": error},
         "within_one_standard_error": within_one_error(row, best),
+        "gradient_steps": row.gradient_steps,
+        "not_converged": len(row.unconverged),
         "folds": [{"fold": fold, "log_likelihood_per_step": value} for fold, value in row.folds.items()],
     }

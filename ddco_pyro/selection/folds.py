@@ -15,6 +15,7 @@ from ddco_pyro.data import Dimensions
 from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.files import write_text
+from ddco_pyro.records import Record, read_record
 
 
 class FoldError(BadInput):
@@ -67,13 +68,20 @@ def assign(count: int, folds: int, seed: int) -> list[list[int]]:
 def keep(folds: Folds, path: Path) -> None:
     """Write the folds, or see that those already there are the same.
 
+    :raises Damaged: they cannot be read.
     :raises FoldError: they are of other demonstrations.
     """
     text = json.dumps({"demonstrations": digest(folds.demos), "folds": folds.held_out}, indent=1) + "\n"
-    if path.exists() and path.read_text() != text:
+    if path.exists() and path.read_bytes() != text.encode():
+        read_record(path, _Kept, "remove it and do the same again")
         raise FoldError(f"{path}: the demonstrations have changed since; choose another --out")
     if not path.exists():
         write_text(path, text)
+
+
+class _Kept(Record):
+    demonstrations: str
+    folds: list[list[str]]
 
 
 def digest(demos: Demonstrations, observations: Sequence[str] | None = None) -> str:

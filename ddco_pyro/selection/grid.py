@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from ddco_pyro.data import Dimensions, build_hierarchy
+from ddco_pyro.data import Dimensions, build_hierarchy, parameters
 from ddco_pyro.spec import Spec, SpecError, with_overrides
 from ddco_pyro.spec.messages import show
 
@@ -93,5 +93,4 @@ def _where(grid: Mapping[str, Any], values: tuple[Any, ...]) -> str:
 def _candidate(number: int, values: dict[str, Any], spec: Spec, dimensions: Dimensions) -> Candidate:
     alone: dict[str, Any] = {"selection.grid": {}, "compare_with": []}  # baselines are compared, not selected
     own = with_overrides(spec, alone | values)
-    parameters = sum(one.numel() for one in build_hierarchy(own, dimensions).parameters())
-    return Candidate(number, values, own, parameters)
+    return Candidate(number, values, own, parameters(build_hierarchy(own, dimensions)))

@@ -12,7 +12,8 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.files import write_text
+from ddco_pyro.files import Damaged, write_text
+from ddco_pyro.records import read_record
 from ddco_pyro.run import Watcher, log_likelihoods, one_thread, train
 from ddco_pyro.selection.folds import Folds
 from ddco_pyro.selection.grid import Candidate
@@ -23,6 +24,8 @@ class Score:
     """What came of one fold of one candidate: ``log_likelihood`` in nats and ``steps`` of each held-out demonstration
     in ``names``; or why there is none, ``failed``.
 
+    :param gradient_steps: that its training took.
+    :param converged: False where its last stage had not converged when its budget ended.
     :param final: False where another attempt could go otherwise (out of memory); such a score is not kept.
     """
 
@@ -32,6 +35,8 @@ class Score:
     steps: tuple[int, ...]
     log_likelihood: tuple[float, ...] = ()
     failed: str = ""
+    gradient_steps: int = 0
+    converged: bool = True
     final: bool = True
     seconds: float = 0.0
 
@@ -47,7 +52,7 @@ class Unwatched(Watcher):
     def collected(self, done: int, total: int) -> None:
         """Nothing."""
 
-    def training(self, name: str, epochs: int) -> None:
+    def training(self, name: str, epochs: int | None) -> None:
         """Nothing."""
 
     def epoch(self, row: dict[str, Any]) -> None:
@@ -79,7 +84,11 @@ def score(folds: Folds, candidate: Candidate, fold: int) -> Score:
     else:
         bad = [name for name, value in zip(held_out.names, values, strict=True) if not math.isfinite(value)]
         reason = f"the held-out log-likelihood of {', '.join(bad)} is not finite"
-        found = replace(empty, failed=reason) if bad else replace(empty, log_likelihood=values)
+        ended = {
+            "gradient_steps": trained.training["spent"]["gradient_steps"],
+            "converged": trained.training["converged"],
+        }
+        found = replace(empty, failed=reason) if bad else replace(empty, log_likelihood=values, **ended)
     return replace(found, seconds=time.perf_counter() - start)
 
 
@@ -95,10 +104,16 @@ def keep(folder: Path, found: Score) -> None:
 
 
 def kept(folder: Path, candidate: int, fold: int) -> Score | None:
-    """The score kept from before, if there is one."""
+    """The score kept from before, if there is one.
+
+    :raises Damaged: it cannot be read.
+    """
     path = path_of(folder, candidate, fold)
     if not path.exists():
         return None
-    data: dict[str, Any] = json.loads(path.read_text())
-    data |= {key: tuple(value) for key, value in data.items() if isinstance(value, list)}
-    return Score(**data)
+    remedy = "remove it and do the same again: this fold alone is trained anew"
+    found = read_record(path, Score, remedy)
+    lengths = (len(found.steps), len(found.names) if found.failed else len(found.log_likelihood))
+    if (found.candidate, found.fold) != (candidate, fold) or {*lengths} != {len(found.names)} or 0 in found.steps:
+        raise Damaged(path, "is not the score of this candidate and fold", remedy)
+    return found

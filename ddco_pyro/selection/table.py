@@ -8,17 +8,17 @@ from typing import Any
 from ddco_pyro.report.words import number, signed
 from ddco_pyro.selection.choice import Choice, Row
 
-HEAD = ("Candidate", "Parameters", "Held-out nats/step", "Minus the best", "Folds", "")
+HEAD = ("Candidate", "Parameters", "Held-out nats/step", "Minus the best", "Gradient steps", "Folds", "")
 
 
 def markdown(choice: Choice, data: Mapping[str, Any]) -> str:
     """Table, rule, failed folds and notes."""
     lines = [
         f"{data['folds']}-fold cross-validation over {data['demonstrations']} demonstrations, the same folds for every "
-        "candidate; ± is one standard error over the folds.",
+        "candidate; ± is one standard error over the folds; gradient steps are the mean of a fold.",
         "",
         f"| {' | '.join(HEAD)} |",
-        "|---|--:|--:|--:|--:|---|",
+        "|---|--:|--:|--:|--:|--:|---|",
         *(f"| {' | '.join(cells(row, choice))} |" for row in choice.rows),
         "",
         data["rule"] + ".",
@@ -40,4 +40,6 @@ def cells(row: Row, choice: Choice) -> list[str]:
         difference = f"{signed(row.difference[0], 3)} ± {number(row.difference[1], 3)}"
     marks = [name for name, one in (("best", choice.best), ("chosen", choice.chosen)) if one is row]
     marks += [] if row.status == "scored" else [row.status]
-    return [row.candidate.name, str(row.candidate.parameters), mean, difference, str(len(row.folds)), ", ".join(marks)]
+    marks += [f"not converged in {len(row.unconverged)}"] if row.unconverged else []
+    took = [number(row.gradient_steps, 0), str(len(row.folds))]
+    return [row.candidate.name, str(row.candidate.parameters), mean, difference, *took, ", ".join(marks)]

@@ -6,7 +6,6 @@ An unknown key, a wrong type or a value out of range is a :class:`SpecError` wit
 from ddco_pyro.spec.hierarchy import BaselineSpec, HierarchySpec, LevelSpec
 from ddco_pyro.spec.messages import SpecError
 from ddco_pyro.spec.networks import MetaPolicySpec, NetworkSpec, PolicySpec
-from ddco_pyro.spec.own_code import own_networks, refuse_own_networks
 from ddco_pyro.spec.reading import dump_spec, load_spec, spec_schema
 from ddco_pyro.spec.settings import (
     ControlSpec,
@@ -15,10 +14,12 @@ from ddco_pyro.spec.settings import (
     LearnedStd,
     ObservationSpec,
     OptimizerSpec,
+    ReportSpec,
     RolloutSpec,
     SelectionSpec,
     TrainingSpec,
 )
+from ddco_pyro.spec.user_code import user_code
 from ddco_pyro.spec.whole import Spec, parse_spec, with_overrides
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "ObservationSpec",
     "OptimizerSpec",
     "PolicySpec",
+    "ReportSpec",
     "RolloutSpec",
     "SelectionSpec",
     "Spec",
@@ -41,9 +43,8 @@ __all__ = [
     "TrainingSpec",
     "dump_spec",
     "load_spec",
-    "own_networks",
     "parse_spec",
-    "refuse_own_networks",
     "spec_schema",
+    "user_code",
     "with_overrides",
 ]

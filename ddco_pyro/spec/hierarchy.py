@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from ddco_pyro.spec.messages import invalid
 from ddco_pyro.spec.networks import MetaPolicySpec, NetworkSpec, PolicySpec
@@ -54,16 +54,24 @@ def _with_emission(level: LevelSpec, default: Emission) -> LevelSpec:
     return level.model_copy(update={"policy": level.policy.model_copy(update={"emits": emits})})
 
 
-Kind = Literal["flat", "per_timestep"]
+Kind = Literal["flat", "flat_equal", "per_timestep"]
 
 
 class BaselineSpec(Model):
     """A policy without options, trained by behaviour cloning."""
 
     kind: Kind
-    """``flat``: one policy for all times; ``per_timestep``: one policy for each time step."""
+    """``flat``: one policy for all times; ``flat_equal``: the same with its hidden layers widened or narrowed, all by
+    one factor, until it has as many parameters as the hierarchy; ``per_timestep``: one policy for each time step."""
     policy: NetworkSpec = NetworkSpec()
     """The policy's network, π."""
+
+    @model_validator(mode="after")
+    def _can_be_widened(self) -> BaselineSpec:
+        if self.kind == "flat_equal" and not self.policy.hidden:
+            text = f"flat_equal widens hidden layers, and network {self.policy.network!r} has none; give it some"
+            raise invalid(("policy", f"{text}, such as {{network: mlp, hidden: [64]}}"))
+        return self
 
 
 Baseline = Annotated[BaselineSpec, bare("kind", Kind | BaselineSpec)]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from ddco_pyro.errors import BadInput
+from ddco_pyro.errors import BadInput, nearest
 
 
 class SpecError(BadInput):
@@ -69,9 +69,7 @@ def _follows_from_another(error: ErrorDetails, errors: list[ErrorDetails]) -> bo
 
 
 def _lines_of(error: ErrorDetails, model: type[BaseModel]) -> Iterator[str]:
-    parts = [str(part) for part in error["loc"]]
-    allowed = "".join(part[1:-1] for part in parts if re.fullmatch("<.+>", part))
-    parts = [part for part in parts if part != "[key]" and not re.fullmatch("<.*>", part)]
+    parts = [str(part) for part in error["loc"] if part != "[key]"]
     path = ".".join(parts)
     if error["type"] == "spec":
         for below, text in error["ctx"]["problems"]:
@@ -79,18 +77,18 @@ def _lines_of(error: ErrorDetails, model: type[BaseModel]) -> Iterator[str]:
     elif error["type"] == "extra_forbidden":
         yield f"{path}: unknown key; {_suggestion(parts, model)}"
     else:
-        yield f"{path or 'spec'}: {_text(error, allowed)}"
+        yield f"{path or 'spec'}: {in_words(error)}"
 
 
-def _text(error: ErrorDetails, allowed: str) -> str:
-    """What is wrong in words; ``allowed`` is what the key takes where it takes more than one type."""
+def in_words(error: ErrorDetails) -> str:
+    """What is wrong with a value, without saying where it is."""
     kind = "invalid_key" if "[key]" in error["loc"] else error["type"]
     context = {
         key: f"{value:.15g}" if isinstance(value, float) else value for key, value in error.get("ctx", {}).items()
     }
     names = re.findall(r"'([^']*)'", context.get("expected", ""))
     context["names"] = " or ".join(names) or "true"
-    expected = f"must be {allowed}" if allowed else _MESSAGES.get(kind, error["msg"]).format(**context)
+    expected = _MESSAGES.get(kind, error["msg"]).format(**context)
     return expected if kind == "missing" else f"{expected}, got {show(error['input'])}{nearest(error['input'], names)}"
 
 
@@ -99,12 +97,6 @@ def show(value: Any) -> str:
     text = {None: "null", True: "true", False: "false"}.get(value) if value is None or isinstance(value, bool) else None
     text = text or repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def nearest(given: Any, names: Iterable[str]) -> str:
-    """A question whether one of the names was meant, or nothing where none is close."""
-    close = difflib.get_close_matches(str(given), list(names), n=1)
-    return f" (did you mean {close[0]}?)" if close else ""
 
 
 def _suggestion(parts: list[str], whole: type[BaseModel]) -> str:

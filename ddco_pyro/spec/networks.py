@@ -1,4 +1,8 @@
-"""The networks that a spec can name, and the policies made of them."""
+"""The networks that a spec can name, the settings of each, and the policies made of them.
+
+The settings of a network are the keyword arguments of its class in :mod:`ddco_pyro.networks`. Their types, defaults and
+bounds stand here and nowhere else: reading a spec, or its schema, is to do without importing torch.
+"""
 
 from __future__ import annotations
 
@@ -6,53 +10,106 @@ import re
 from collections import Counter
 from typing import Any
 
-from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer, model_validator
+from pydantic import (
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
-from ddco_pyro.spec.messages import invalid, nearest
-from ddco_pyro.spec.types import Count, Emission, Items, Model, Share
+from ddco_pyro.errors import nearest
+from ddco_pyro.spec.messages import invalid
+from ddco_pyro.spec.types import Count, Emission, Items, Model, NetworkName, Share
 
-CUSTOM = "module:Class"
-NETWORK_KEYS: dict[str, tuple[str, ...]] = {
-    "linear": (),
-    "mlp": ("hidden", "dropout"),
-    "per_timestep": ("hidden", "dropout"),
-    "conv": ("hidden", "dropout", "filters", "kernel"),
-    CUSTOM: ("options",),
+USER_DEFINED = "module:Class"
+_USER_DEFINED_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
+
+
+class Network(Model):
+    """A network without settings."""
+
+    network: NetworkName = "mlp"
+    """The kind of network; ``module:Class`` for a network of your own."""
+
+
+class Perceptron(Network):
+    """Settings of a multi-layer perceptron."""
+
+    hidden: Items[Count] = Field(default=(64,), validate_default=True)
+    """Sizes of the hidden layers, first one first."""
+    dropout: Share = 0.0
+    """Probability with which a unit is dropped while training."""
+
+
+class Convolution(Perceptron):
+    """Settings of a convolution followed by a perceptron."""
+
+    filters: Count = 64
+    """Number of filters of each convolution."""
+    kernel: Count = 5
+    """Height and width of each filter in pixels."""
+
+
+class UserDefined(Network):
+    """Settings of a user's class."""
+
+    options: dict[str, Any] = Field(default={})
+    """Keyword arguments of the class."""
+
+
+SETTINGS: dict[str, type[Network]] = {
+    "linear": Network,
+    "mlp": Perceptron,
+    "per_timestep": Perceptron,
+    "conv": Convolution,
 }
-_SETTINGS = ("hidden", "dropout", "filters", "kernel", "options")
+"""The built-in networks by name; every other name is a user's ``module:Class``."""
 
 
 def foreign_keys(network: Any) -> tuple[str, ...]:
     """The settings that do not apply to a network of this kind."""
-    known = NETWORK_KEYS.get(network, NETWORK_KEYS[CUSTOM]) if isinstance(network, str) else _SETTINGS
-    return tuple(key for key in _SETTINGS if key not in known)
+    kind = SETTINGS.get(network, UserDefined) if isinstance(network, str) else Network
+    return tuple(key for key in NetworkSpec.model_fields if key not in kind.model_fields)
 
 
-class NetworkSpec(Model):
+def _describe_kinds(schema: dict[str, Any]) -> None:
+    """Adds to a JSON Schema which networks there are, and which of them have each setting."""
+    properties = schema["properties"]
+    del properties["network"]["type"]
+    properties["network"]["anyOf"] = [{"enum": list(SETTINGS)}, {"type": "string", "pattern": _USER_DEFINED_PATTERN}]
+    kinds: dict[str, type[Network]] = {**SETTINGS, USER_DEFINED: UserDefined}
+    for key in NetworkSpec.model_fields.keys() - Network.model_fields.keys():
+        names = ", ".join(f"``{name}``" for name, kind in kinds.items() if key in kind.model_fields)
+        properties[key]["description"] += f" For {names}."
+
+
+class NetworkSpec(UserDefined, Convolution):
     """A network from observations to the parameters of a distribution. Settings of other networks are refused."""
 
-    network: str = "mlp"
-    """``linear``, ``mlp``, ``per_timestep``, ``conv``, or ``module:Class`` for a network of your own."""
-    hidden: Items[Count] = Field(
-        default_factory=lambda data: () if "hidden" in foreign_keys(data.get("network")) else (64,)
-    )
-    """Sizes of the hidden layers, first one first (``mlp``, ``per_timestep`` and ``conv``; default [64])."""
-    dropout: Share = 0.0
-    """Probability with which a unit is dropped while training."""
-    filters: Count = 64
-    """Number of filters of each convolution (``conv``)."""
-    kernel: Count = 5
-    """Height and width of each filter in pixels (``conv``)."""
-    options: dict[str, Any] = Field(default={})
-    """Keyword arguments of the class (``module:Class``)."""
+    model_config = ConfigDict(json_schema_extra=_describe_kinds)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Keyword arguments of the network's class."""
+        if self.network not in SETTINGS:
+            return self.options
+        return {key: getattr(self, key) for key in SETTINGS[self.network].model_fields if key != "network"}
 
     @field_validator("network")
     @classmethod
     def _known_network(cls, name: str) -> str:
-        if name == CUSTOM or (name not in NETWORK_KEYS and not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", name)):
-            names = ", ".join(NETWORK_KEYS)
-            raise invalid(("", f"no network is called {name!r}{nearest(name, NETWORK_KEYS)}; use one of {names}"))
+        if name not in SETTINGS and (name == USER_DEFINED or not re.fullmatch(_USER_DEFINED_PATTERN, name)):
+            names = [*SETTINGS, USER_DEFINED]
+            raise invalid(("", f"no network is called {name!r}{nearest(name, names)}; use one of {', '.join(names)}"))
         return name
+
+    @field_validator("hidden")
+    @classmethod
+    def _hidden_layers(cls, hidden: tuple[int, ...], info: ValidationInfo) -> tuple[int, ...]:
+        return () if "hidden" in foreign_keys(info.data.get("network")) else hidden
 
     @model_validator(mode="after")
     def _settings_apply(self) -> NetworkSpec:

@@ -11,6 +11,7 @@ import yaml
 
 from ddco_pyro.spec.keypaths import plain
 from ddco_pyro.spec.messages import SpecError, show
+from ddco_pyro.spec.user_code import refuse_user_code
 from ddco_pyro.spec.whole import Spec, parse_spec
 
 
@@ -38,10 +39,14 @@ for _yaml in (_Loader, _Dumper):
     _yaml.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.0123456789"))
 
 
-def load_spec(path: str | Path, overrides: Iterable[str] = ()) -> Spec:
+def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool = False) -> Spec:
     """The spec in a YAML file, after ``overrides`` such as ``"hierarchy.levels.0.count=3"`` (the value is YAML).
 
-    :raises SpecError: the file cannot be read, is not YAML, or is not a valid spec; one line for each problem.
+    Nothing that it names is imported here.
+
+    :param allow_code: whether it may name user code (``module:name``), which is imported where the spec is used.
+    :raises SpecError: the file cannot be read, is not YAML, is not a valid spec, or names code that is not allowed; one
+        line for each problem.
     """
     try:
         content = Path(path).read_bytes()
@@ -53,9 +58,12 @@ def load_spec(path: str | Path, overrides: Iterable[str] = ()) -> Spec:
             raise SpecError("the file is empty; it has to hold a spec")
         if not isinstance(data, dict):
             raise SpecError(f"the file holds {show(data)}, not a mapping (key: value)")
-        return parse_spec(data, dict(_parse_override(text) for text in overrides))
+        spec = parse_spec(data, dict(_parse_override(text) for text in overrides))
     except SpecError as error:
         raise SpecError(*(f"{path}: {problem}" for problem in error.problems)) from None
+    if not allow_code:
+        refuse_user_code(spec, path)
+    return spec
 
 
 def dump_spec(spec: Spec) -> str:
@@ -77,15 +85,58 @@ def read_yaml(content: bytes | str) -> Any:
     :raises SpecError: it is not YAML.
     """
     try:
-        return plain(yaml.load(content, Loader=_Loader))
+        return plain(_constructed(content))
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+        where = _place(mark) if mark else ""
         raise SpecError(f"{where}not valid YAML: {error.problem or error.context}") from None
     except RecursionError:
         raise SpecError("not valid YAML: nested too deeply") from None
     except (yaml.YAMLError, ValueError) as error:  # not text, or a date or number that Python cannot hold
         raise SpecError(f"not valid YAML: {' '.join(str(error).split())}") from None
+
+
+MOST_VALUES = 10_000
+"""Keys and values of a spec where its aliases are written out; an ordinary one has a few hundred."""
+
+DEEPEST = 100
+
+
+def _constructed(content: bytes | str) -> Any:
+    """What YAML text holds, once its aliases are known to stand for no more than that."""
+    loader = _Loader(content)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        _extent(node, {})
+        return loader.construct_document(node)
+    finally:
+        loader.dispose()
+
+
+def _extent(node: yaml.Node, known: dict[yaml.Node, tuple[int, int]]) -> tuple[int, int]:
+    """How many keys and values a node is where its aliases are written out, and how deeply they are nested.
+
+    :param known: of nodes that were met before: an alias is the node that it refers to, met again.
+    :raises RecursionError: they are nested too deeply, or a node holds itself.
+    """
+    if node not in known:
+        parts = [] if isinstance(node, yaml.ScalarNode) else node.value
+        nodes = [part for pair in parts for part in pair] if isinstance(node, yaml.MappingNode) else parts
+        extents = [_extent(part, known) for part in nodes]
+        size, depth = 1 + sum(size for size, _ in extents), 1 + max((depth for _, depth in extents), default=0)
+        if depth > DEEPEST:
+            raise RecursionError
+        if size > MOST_VALUES:
+            problem = f"holds more than {MOST_VALUES} values where its aliases are written out; refer to it less often"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
+        known[node] = size, depth
+    return known[node]
+
+
+def _place(mark: yaml.Mark) -> str:
+    return f"line {mark.line + 1}, column {mark.column + 1}: "
 
 
 def _parse_override(text: str) -> tuple[str, Any]:

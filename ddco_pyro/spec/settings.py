@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import Field, TypeAdapter, model_validator
 
-from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Seed, Share, Text, bare
+from ddco_pyro.spec.messages import invalid
+from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Seed, Share, TaskName, Text, bare, nested
 
 
 class DemonstrationsSpec(Model):
@@ -15,7 +16,7 @@ class DemonstrationsSpec(Model):
 
     path: Text | None = None
     """HDF5 file in robomimic's layout; without it they are collected in the task."""
-    task: Text | None = None
+    task: TaskName | None = None
     """Task in which they are collected, such as one whose episodes are single demonstrations; null: the spec's own."""
     count: int = Field(default=100, ge=2)
     """Number of demonstrations to collect."""
@@ -54,27 +55,29 @@ class LearnedStd(Model):
     """Lower bound, in scaled units."""
 
 
-_STD = "<a positive number or {learn: true}>"
-_STD_LEARNED = "<>"
-_SCALE_NAME = "<standardize, none, or a list of positive numbers>"
-_SCALE_SIZES = "<>"
+Std = Annotated[
+    Positive | LearnedStd, nested((Mapping,), LearnedStd.model_validate, "a positive number or {learn: true}")
+]
+
+ScaleName = Literal["standardize", "none"]
+Scales = Annotated[Items[Positive], Field(min_length=1)]
+Scale = Annotated[
+    ScaleName | Scales,
+    nested(
+        (list, tuple),
+        TypeAdapter(Scales, config=Model.model_config).validate_python,
+        "standardize, none, or a list of positive numbers",
+        get_args(ScaleName),
+    ),
+]
 
 
 class ControlSpec(Model):
     """The distribution of the control, a_t ~ N(π(s_t), σ²)."""
 
-    std: Annotated[
-        Annotated[Positive, Tag(_STD)] | Annotated[LearnedStd, Tag(_STD_LEARNED)],
-        Discriminator(lambda value: _STD_LEARNED if isinstance(value, Mapping | LearnedStd) else _STD),
-    ] = 0.1
+    std: Std = 0.1
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``."""
-    scale: Annotated[
-        Annotated[Literal["standardize", "none"], Tag(_SCALE_NAME)]
-        | Annotated[Items[Positive], Field(min_length=1), Tag(_SCALE_SIZES)],
-        Discriminator(
-            lambda value: _SCALE_SIZES if isinstance(value, Sequence) and not isinstance(value, str) else _SCALE_NAME
-        ),
-    ] = "standardize"
+    scale: Scale = "standardize"
     """``standardize`` (by the training demonstrations), ``none``, or one positive number for each control dimension,
     by which it is divided."""
 
@@ -104,18 +107,26 @@ class TrainingSpec(Model):
     """Layer-wise training: whether a last stage trains all levels together, or what was discovered stays as it is."""
     optimizer: OptimizerSpec = OptimizerSpec()
     """The optimiser."""
-    epochs: Count = 200
-    """Passes over the training demonstrations in each stage, at most."""
+    epochs: Count | None = 800
+    """Passes over the training demonstrations in all stages together, at most: the same budget of gradient steps for
+    every model, whatever its number of stages. A stage may take an even share of what is left; null for no limit but
+    patience."""
     batch_size: Count = 16
     """Trajectories in each gradient step."""
     restarts: Count = 1
     """Independent initialisations; the best on the tuning demonstrations is kept."""
     tune_fraction: Fraction = 0.1
-    """Part of the training demonstrations held out to stop early and to choose among restarts."""
+    """Part of the training demonstrations set aside for tuning: to stop early and to choose among restarts."""
     patience: Count | None = 20
     """Epochs without improvement before a stage stops; null for never."""
     clip_gradient: Positive | None = None
     """Largest norm of a gradient; null for no limit."""
+
+    @model_validator(mode="after")
+    def _ends(self) -> TrainingSpec:
+        if self.epochs is None and self.patience is None:
+            raise invalid(("epochs", "null trains until training.patience, which is null too; give one of them"))
+        return self
 
 
 class InferenceSpec(Model):
@@ -147,3 +158,10 @@ class RolloutSpec(Model):
     """Whether options and terminations are sampled or the most likely ones."""
     policies: Items[Text] = ()
     """Scripted policies of the task that are rolled out beside, such as ``open_loop``."""
+
+
+class ReportSpec(Model):
+    """What the report shows."""
+
+    trajectory: Text | None = None
+    """Observation whose first three numbers are drawn as trajectories in space; null: the one that moves the most."""

@@ -9,23 +9,24 @@ from pydantic import Field, ValidationError, model_validator
 
 from ddco_pyro.spec.hierarchy import Baseline, HierarchySpec
 from ddco_pyro.spec.keypaths import edited
-from ddco_pyro.spec.messages import SpecError, invalid, lines, show
+from ddco_pyro.spec.messages import SpecError, invalid, lines, nearest, show
 from ddco_pyro.spec.settings import (
     ControlSpec,
     DemonstrationsSpec,
     InferenceSpec,
     Observation,
+    ReportSpec,
     RolloutSpec,
     SelectionSpec,
     TrainingSpec,
 )
-from ddco_pyro.spec.types import Items, Model, Seed, Text
+from ddco_pyro.spec.types import Items, Model, Seed, TaskName
 
 
 class Spec(Model):
     """Everything that determines a run."""
 
-    task: Text | None = None
+    task: TaskName | None = None
     """Name of a registered task, or ``module:name``."""
     demonstrations: DemonstrationsSpec = DemonstrationsSpec()
     """Where the demonstrations come from."""
@@ -47,6 +48,8 @@ class Spec(Model):
     """Cross-validation over a grid."""
     rollout: RolloutSpec = RolloutSpec()
     """How the fitted policy is tried in the task."""
+    report: ReportSpec = ReportSpec()
+    """What the report shows."""
     seed: Seed = 0
     """Seed of everything random that has no seed of its own."""
 
@@ -57,7 +60,12 @@ class Spec(Model):
 
     @model_validator(mode="after")
     def _consistent(self) -> Spec:
-        problems = [*self._choices(), *self._repeated_observations(), *self._nothing_held_out()]
+        problems = [
+            *self._choices(),
+            *self._repeated_observations(),
+            *self._unknown_trajectory(),
+            *self._nothing_held_out(),
+        ]
         if problems:
             raise invalid(*problems)
         if self.selection.grid:
@@ -73,6 +81,9 @@ class Spec(Model):
             yield "hierarchy", "missing; declare a hierarchy, or a baseline in its place"
         if self.hierarchy is not None and self.baseline is not None:
             yield "baseline", "stands beside hierarchy; keep one of them (compare_with takes baselines to train beside)"
+        alone = self.baseline
+        if alone and alone.kind == "flat_equal" and "hidden" not in alone.policy.model_fields_set:
+            yield "baseline", "flat_equal takes its size from a hierarchy; list it in compare_with there, or say flat"
 
     def _nothing_held_out(self) -> Iterator[tuple[str, str]]:
         if self.compare_with and self.demonstrations.valid_fraction == 0:
@@ -83,6 +94,12 @@ class Spec(Model):
         for index, key in enumerate(keys):
             if key in keys[:index]:
                 yield f"observations.{index}.key", f"{key!r} is given twice; keep one"
+
+    def _unknown_trajectory(self) -> Iterator[tuple[str, str]]:
+        key, known = self.report.trajectory, [observation.key for observation in self.observations]
+        if key is not None and key not in known:
+            there = ", ".join(known)
+            yield "report.trajectory", f"there is no observation {key!r}{nearest(key, known)}; there is: {there}"
 
 
 def _grid_problems(spec: Spec) -> Iterator[tuple[str, str]]:

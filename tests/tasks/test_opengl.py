@@ -1,0 +1,90 @@
+"""A machine without what cameras are drawn with: one line that says what to install, before anything else is done."""
+
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from ddco_tasks.opengl import PACKAGES, advice
+from ddco_tasks.rendering import NoOpenGL
+
+from ddco_pyro.errors import Failed
+
+ROOT = Path(__file__).parents[2]
+COMMAND = Path(sys.executable).with_name("ddco-pyro")
+NO_DRIVER = {"__EGL_VENDOR_LIBRARY_DIRS": "/nowhere"}
+LIBRARIES = {
+    "libEGL.so.1 cannot be loaded": ("libEGL",),
+    "libOpenGL.so.0 cannot be loaded": ("libOpenGL", "libGL.so", "libGLES"),
+}
+"""What is said where these are not installed."""
+
+WITHOUT = """
+import ctypes, sys
+original = ctypes.CDLL.__init__
+def refuse(self, name, *arguments, **options):
+    if str(name).startswith({missing!r}):
+        raise OSError(f"{{name}}: cannot open shared object file: No such file or directory")
+    original(self, name, *arguments, **options)
+ctypes.CDLL.__init__ = refuse
+"""
+
+
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def ended(*command: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    own = os.environ | environment
+    return subprocess.run(command, env=own, cwd=ROOT, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("cause", LIBRARIES)
+def test_without_opengl_libraries_one_line_names_the_packages(cause: str) -> None:
+    before = WITHOUT.format(missing=LIBRARIES[cause])
+    command = "sys.argv = ['ddco-pyro', 'check', 'specs/needle.yaml']; from ddco_pyro.cli import main; main()"
+    looking = "import runpy; runpy.run_path('tasks/opengl.py', run_name='__main__')"
+    for script, head in ((command, "ddco-pyro: "), (looking, "")):
+        found = ended(sys.executable, "-c", before + script)
+        assert (found.returncode, found.stdout) == (1, "")
+        assert found.stderr.splitlines() == [f"{head}{advice(cause)}"]
+    assert f"apt-get install {PACKAGES}" in advice(cause)
+
+
+def test_without_a_driver_one_line_names_the_packages() -> None:
+    for command in ((sys.executable, "tasks/opengl.py"), (COMMAND, "check", "specs/needle.yaml")):
+        found = ended(*command, **NO_DRIVER)
+        assert found.returncode == 1
+        assert found.stderr.splitlines()[-1].endswith(advice("EGL has no device that starts"))
+
+
+def test_where_the_tasks_can_draw_nothing_is_said() -> None:
+    found = ended(sys.executable, "tasks/opengl.py")
+    assert (found.returncode, found.stdout, found.stderr) == (0, "", "")
+
+
+def test_another_renderer_or_a_display_is_taken_to_work() -> None:
+    for own in ({"MUJOCO_GL": "osmesa"}, {"DISPLAY": ":0"}):
+        found = ended(sys.executable, "tasks/opengl.py", **NO_DRIVER, **own)
+        assert (found.returncode, found.stderr) == (0, "")
+
+
+def test_the_demo_looks_for_opengl_before_it_installs_anything(tmp_path: Path) -> None:
+    for name in ("Makefile", "pyproject.toml", "setup.py", "constraints.txt", "tasks/opengl.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes((ROOT / name).read_bytes())
+    found = ended("make", "-C", tmp_path, "demo", **NO_DRIVER, PIP_NO_INDEX="1")
+    assert found.returncode == 2
+    assert advice("EGL has no device that starts") in found.stderr.splitlines()
+    assert not (tmp_path / ".venv").exists()
+
+
+def test_the_error_survives_another_process() -> None:
+    """Episodes run in processes, whose errors are pickled."""
+    error = pickle.loads(pickle.dumps(NoOpenGL(advice("gone"))))
+    assert str(error) == advice("gone")
+    assert isinstance(error, Failed)

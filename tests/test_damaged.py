@@ -1,0 +1,351 @@
+"""A damaged file of a run or a selection: one line with the file and what to do, from every command that reads it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import shutil
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from safetensors.torch import save_file
+from selecting import data_at
+from test_cli import call
+
+import ddco_pyro
+from ddco_pyro import console
+from ddco_pyro.data import demonstrations
+from ddco_pyro.evaluate import roll_out
+from ddco_pyro.files import Damaged, read_tensors, write_tensors
+from ddco_pyro.records import read_metrics, read_successes
+from ddco_pyro.report import plot_likelihood, sections, tables, words
+from ddco_pyro.run import Fit
+
+LINE = r"ddco-pyro: {path}: is damaged: "
+
+
+@pytest.fixture(scope="module")
+def rolled(toy_run: Fit, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that was rolled out, and its demonstrations; nobody changes it."""
+    folder = tmp_path_factory.mktemp("rolled")
+    shutil.copytree(toy_run.folder, folder / "run")
+    demonstrations(toy_run.spec).write(folder / "demos.hdf5")
+    roll_out(ddco_pyro.load(folder / "run"), 2, 0, lambda name: None, jobs=1)
+    return folder
+
+
+@pytest.fixture
+def run(rolled: Path, tmp_path: Path) -> Path:
+    shutil.copytree(rolled, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "run"
+
+
+COMMANDS = {
+    "compare": ("compare", "RUN/baselines/flat", "RUN", "--out", "compared"),
+    "report": ("report", "RUN"),
+    "rollout": ("rollout", "RUN", "--episodes", "1", "--jobs", "1"),
+    "segment": ("segment", "RUN", "DEMOS", "--csv", "a.csv"),
+    "export": ("export", "RUN", "--out", "controller"),
+}
+
+
+def refused(run: Path, command: tuple[str, ...], path: Path, what: str) -> None:
+    """The command says in one line that this file is damaged, and changes nothing."""
+    before = {one: one.read_bytes() for one in run.parent.rglob("*") if one.is_file()}
+    named = [one.replace("RUN", str(run)).replace("DEMOS", str(run.parent / "demos.hdf5")) for one in command]
+    ended = call(*named)
+    assert (ended.status, ended.err.count("\n")) == (2, 1), ended.err
+    assert ended.err.startswith(f"ddco-pyro: {path}: is damaged: {what}")
+    assert "; remove it and " in ended.err
+    assert {one: one.read_bytes() for one in run.parent.rglob("*") if one.is_file()} == before
+
+
+# --- metrics.json -----------------------------------------------------------------------------------------------------
+
+DAMAGE: dict[str, tuple[Any, str]] = {
+    "truncated": (lambda text: text[: len(text) // 2], "is no JSON: EOF while parsing"),
+    "empty": (lambda text: "", "is no JSON: EOF while parsing a value at line 1 column 0"),
+    "{}": (lambda text: "{}", "model: missing; it has to be given"),
+    "[]": (lambda text: "[]", "must be a mapping (key: value), got []"),
+    "a string": (
+        lambda text: text.replace('"parameters": ', '"parameters": "many", "was": '),
+        "parameters: must be a whole number, got 'many'",
+    ),
+    "a key less": (lambda text: text.replace('"comparison"', '"comparisons"'), "comparison: missing"),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damaged_metrics(run: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...], damage: str) -> None:
+    monkeypatch.chdir(run.parent)
+    change, what = DAMAGE[damage]
+    path = run / "metrics.json"
+    path.write_text(change(path.read_text()))
+    refused(run, command, path, what)
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"[" * 100_000, b'{"model": NaN}', b"\x00" * 100])
+def test_metrics_that_are_no_text(run: Path, content: bytes) -> None:
+    (run / "metrics.json").write_bytes(content)
+    refused(run, COMMANDS["report"], run / "metrics.json", "")
+
+
+def test_damaged_metrics_of_a_baseline(run: Path) -> None:
+    path = run / "baselines" / "flat" / "metrics.json"
+    path.write_text("{}")
+    refused(run, COMMANDS["report"], path, "model: missing")
+
+
+def test_metrics_of_another_hierarchy(run: Path) -> None:
+    path = run / "metrics.json"
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps(data | {"options": [[*data["options"][0], data["options"][0][-1]]]}))
+    refused(run, COMMANDS["report"], path, "is not about levels with 2 options")
+
+
+def places(data: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    yield place
+    items = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
+    for key, value in items:
+        yield from places(value, (*place, key))
+
+
+REMOVED = object()
+
+
+def changed(data: Any, place: tuple[Any, ...], value: Any) -> Any:
+    copy = json.loads(json.dumps(data))
+    node = copy
+    for key in place[:-1]:
+        node = node[key]
+    if value is REMOVED:
+        del node[place[-1]]
+    else:
+        node[place[-1]] = value
+    return copy
+
+
+def read_all(fit: Fit, metrics: dict[str, Any]) -> None:
+    """Everything that is read from ``metrics.json``, short of drawing it."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        _read_all(fit, metrics)
+
+
+def _read_all(fit: Fit, metrics: dict[str, Any]) -> None:
+    words.verdict(metrics), words.success(metrics)
+    sections.degeneracies(fit.spec, metrics), sections.header(fit, metrics), sections.particulars(fit, metrics)
+    sections._agreement(metrics, ["option"])
+    rows = plot_likelihood.likelihoods(metrics, {name: one.metrics for name, one in fit.baselines.items()})
+    tables.likelihood(rows)
+    tables.option_use(["option"], metrics["options"], sum(metrics["demonstrations"][part] for part in sections.PARTS))
+    found = metrics.get("rollouts")
+    if found:
+        tables.measures(found["methods"]), tables.against(found["methods"], metrics["model"])
+        console.successes(found)
+    console.log_likelihoods(metrics)
+
+
+def test_whatever_is_damaged_is_refused_or_makes_no_difference_to_readers(run: Path) -> None:
+    path, fit = run / "metrics.json", ddco_pyro.load(run)
+    data = json.loads(path.read_text())
+    assert fit.baselines
+    counts = {"refused": 0, "read": 0}
+    for place in list(places(data))[1:]:
+        for value in (REMOVED, None, "text", 1.5, -1, [], {}, [[]], True):
+            path.write_text(json.dumps(changed(data, place, value)))
+            try:
+                metrics = read_metrics(run, [2])
+            except Damaged:
+                counts["refused"] += 1
+            else:
+                read_all(fit, metrics)
+                counts["read"] += 1
+    assert min(counts.values()) > 100, counts
+
+
+def test_what_is_removed_is_made_again(run: Path) -> None:
+    """As the line says that is to be done."""
+    metrics = json.loads((run / "metrics.json").read_text())
+    model = (run / "model.safetensors").read_bytes()
+    for name in ("metrics.json", "model.safetensors"):
+        (run / name).write_text("damaged")
+        ended = call("report", run)
+        command = ended.err.partition("; remove it and fit again: ddco-pyro ")[2].split()
+        (run / name).unlink()
+        assert call(*command).status == 0
+        assert (run / "model.safetensors").read_bytes() == model
+        again = json.loads((run / "metrics.json").read_text())
+        aside = {"seconds": ..., "rollouts": ..., "engine_check": ...}
+        assert again | aside == metrics | aside
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"method,seed,success\nddco,x,1\n",
+        b"method,seed,success\nddco,1,yes\n",
+        b"a\n1\n",
+        b"\xff\xfe",
+        b"method,seed\nddco",
+    ],
+)
+def test_damaged_rollouts(run: Path, monkeypatch: pytest.MonkeyPatch, content: bytes) -> None:
+    monkeypatch.chdir(run.parent)
+    (run / "rollouts.csv").write_bytes(content)
+    refused(run, COMMANDS["compare"], run / "rollouts.csv", "")
+    assert call("report", run).err.startswith(f"ddco-pyro: {run / 'rollouts.csv'}: is damaged: ")
+
+
+def test_rollouts_without_success_are_no_damage(run: Path) -> None:
+    assert {seed for method, seed in read_successes(run) if method == "ddco"} == {1000, 1001}
+    (run / "rollouts.csv").write_text("method,seed,error\nddco,1000,0.5\n")
+    assert read_successes(run) == {}
+    (run / "rollouts.csv").unlink()
+    assert read_successes(run) == {}
+
+
+@pytest.mark.parametrize("content", [b"restart,stage,epoch,train,tune\n0,joint,1,x,1\n", b"a\n1\n", b"\xff\xfe\n1"])
+def test_a_damaged_history(run: Path, content: bytes) -> None:
+    (run / "history.csv").write_bytes(content)
+    ended = call("report", run)
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert ended.err.startswith(f"ddco-pyro: {run / 'history.csv'}: is damaged: ")
+    assert "; remove it and metrics.json and fit again: ddco-pyro fit" in ended.err
+    for name in ("history.csv", "metrics.json"):
+        (run / name).unlink()
+    assert call(*ended.err.partition("fit again: ddco-pyro ")[2].split()).status == 0
+
+
+# --- tensors ----------------------------------------------------------------------------------------------------------
+
+
+def same(
+    ours: tuple[dict[str, torch.Tensor], dict[str, str]], theirs: tuple[dict[str, torch.Tensor], dict[str, str]]
+) -> bool:
+    return (
+        ours[1] == theirs[1]
+        and ours[0].keys() == theirs[0].keys()
+        and all(
+            value.dtype == theirs[0][name].dtype and torch.equal(value, theirs[0][name])
+            for name, value in ours[0].items()
+        )
+    )
+
+
+@pytest.mark.parametrize("name", ["model.safetensors", "checkpoints/latest.safetensors"])
+def test_a_flipped_bit_is_refused_or_makes_no_difference(toy_run: Fit, tmp_path: Path, name: str) -> None:
+    """Of every 37th byte, in the header too."""
+    path, content = tmp_path / "file", (toy_run.folder / name).read_bytes()
+    whole = read_tensors(toy_run.folder / name)
+    header = 8 + struct.unpack("<Q", content[:8])[0]
+    messages, read = [], 0
+    for at in [*range(header), *range(header, len(content), 37)]:
+        path.write_bytes(content[:at] + bytes([content[at] ^ (1 << at % 8)]) + content[at + 1 :])
+        try:
+            found = read_tensors(path)
+        except Damaged as error:
+            messages.append(str(error))
+        else:
+            assert at < header  # such as in the name of the checksum, without which a file is believed
+            assert found[0].keys() == whole[0].keys()
+            assert all(torch.equal(value, whole[0][name]) for name, value in found[0].items())
+            read += 1
+    assert all(message.startswith(f"{path}: is damaged: ") and "\n" not in message for message in messages)
+    assert len(messages) > 20 * read
+
+
+def test_a_damaged_model_is_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(run.parent)
+    path = run / "model.safetensors"
+    content = path.read_bytes()
+    path.write_bytes(content[:-3] + bytes([content[-3] ^ 1]) + content[-2:])
+    for command in COMMANDS.values():
+        refused(run, command, path, "its contents are not what was written")
+
+
+def test_a_damaged_checkpoint_is_refused(run: Path) -> None:
+    path = run / "checkpoints" / "latest.safetensors"
+    content = path.read_bytes()
+    path.write_bytes(content[:-3] + bytes([content[-3] ^ 1]) + content[-2:])
+    (run / "metrics.json").unlink()
+    again = ("fit", str(run / "spec.yaml"), "--out", str(run), "--resume")
+    refused(run, again, path, "its contents are not what was written")
+    path.unlink()
+    assert call(*again).status == 0
+
+
+def test_what_was_written_without_a_checksum_is_read(tmp_path: Path) -> None:
+    tensors, metadata = {"x": torch.arange(6.0).reshape(2, 3)}, {"steps": "7"}
+    save_file(tensors, tmp_path / "old", metadata)
+    write_tensors(tmp_path / "new", tensors, metadata)
+    assert same(read_tensors(tmp_path / "old"), read_tensors(tmp_path / "new"))
+
+
+def test_a_run_of_before_is_loaded(run: Path) -> None:
+    path = run / "model.safetensors"
+    tensors, metadata = read_tensors(path)
+    path.unlink()
+    save_file(tensors, path, metadata)
+    assert ddco_pyro.load(run).metrics["model"] == "ddco"
+
+
+# --- selections -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def selected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("selected")
+    data = data_at(folder) | {"selection": {"folds": 2, "grid": {"seed": [1, 2]}}}
+    (folder / "spec.yaml").write_text(yaml.safe_dump(data))
+    assert call("select", folder / "spec.yaml", "--out", folder / "run", "--jobs", "1").status == 0
+    return folder
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text[:40],
+        lambda text: "{}",
+        lambda text: "[]",
+        lambda text: text.replace('"fold": 1', '"fold": "1"'),
+        lambda text: text.replace('"fold": 1', '"fold": 0'),
+        lambda text: text.replace('"log_likelihood": [', '"log_likelihood": [1.0, '),
+        lambda text: text.replace('"steps": [', '"steps": [0, '),
+    ],
+)
+def test_a_damaged_score(selected: Path, tmp_path: Path, change: Any) -> None:
+    shutil.copytree(selected, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "run" / "folds" / "001-01.json"
+    content = path.read_text()
+    path.write_text(change(content))
+    assert path.read_text() != content
+    again = ("select", selected / "spec.yaml", "--out", tmp_path / "run", "--jobs", "1", "--resume")
+    ended = call(*again)
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert ended.err.startswith(f"ddco-pyro: {path}: is damaged: ")
+    assert "; remove it and do the same again: this fold alone is trained anew" in ended.err
+
+
+def test_damaged_folds(selected: Path, tmp_path: Path) -> None:
+    shutil.copytree(selected, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "run" / "folds.json"
+    content = path.read_bytes()
+    again = ("select", selected / "spec.yaml", "--out", tmp_path / "run", "--jobs", "1", "--resume")
+    for damaged in (b"", content[:50], b"[]", b"\xff\xfe"):
+        path.write_bytes(damaged)
+        ended = call(*again)
+        assert (ended.status, ended.err.count("\n")) == (2, 1)
+        assert ended.err.startswith(f"ddco-pyro: {path}: is damaged: ")
+    path.unlink()
+    assert call(*again).status == 0
+    assert path.read_bytes() == content

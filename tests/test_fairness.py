@@ -1,0 +1,209 @@
+"""Models that are compared have the same budget, one of them the same size, and who needed more of it is named."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from itertools import pairwise
+
+import pytest
+import toy_task
+import yaml
+from selecting import Told, score, spec_at
+from test_cli import call
+from test_selection_choice import candidate
+
+import ddco_pyro
+from ddco_pyro.comparison import compare, write
+from ddco_pyro.data import demonstrations
+from ddco_pyro.evaluate import roll_out
+from ddco_pyro.report import unconverged, write_report
+from ddco_pyro.selection import Workers, select
+from ddco_pyro.selection.choice import as_data, choose
+from ddco_pyro.selection.table import HEAD, cells, markdown
+from ddco_pyro.spec import dump_spec
+from ddco_pyro.widths import nearest_widths
+
+BASELINES = ["flat", "flat_equal", "per_timestep"]
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory):
+    path = tmp_path_factory.mktemp("specs") / "toy.yaml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(toy_task.SPEC) | {"compare_with": BASELINES}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def fitted(spec, tmp_path_factory):
+    """A run whose budget is far too small, and how ``fit`` ended."""
+    folder = tmp_path_factory.mktemp("runs") / "short"
+    ended = call("fit", spec, "--out", folder, "--set", "training.epochs=9")
+    return ddco_pyro.load(folder), ended
+
+
+@pytest.fixture(scope="module")
+def still(spec, tmp_path_factory):
+    """A run that goes nowhere: nothing rises."""
+    folder = tmp_path_factory.mktemp("runs") / "still"
+    ended = call(
+        "fit", spec, "--out", folder, "--set", "training.epochs=9", "--set", "training.optimizer.lr=1e-9",
+        "--set", "compare_with=[flat]",
+    )  # fmt: skip
+    return ddco_pyro.load(folder), ended
+
+
+# --- equal in size ----------------------------------------------------------------------------------------------------
+
+
+def perceptron(hidden, inputs=5, outputs=2):
+    """Weights and biases of a perceptron, counted by hand."""
+    return sum((below + 1) * above for below, above in pairwise([inputs, *hidden, outputs]))
+
+
+@pytest.mark.parametrize("hidden", [(64,), (64, 32), (8, 64), (1,), (3, 3, 3)])
+@pytest.mark.parametrize("target", [1, 8, 37, 300, 5000, 123_456])
+def test_widths_are_the_nearest_of_all(hidden, target):
+    """Of every width that the widest layer can have, the others in proportion."""
+    widest = max(hidden)
+    candidates = [tuple(max(1, round(size * width / widest)) for size in hidden) for width in range(1, 20_000)]
+    expected = min(candidates, key=lambda sizes: abs(perceptron(sizes) - target))
+    assert nearest_widths(hidden, target, perceptron) == expected
+
+
+def test_flat_equal_has_as_many_parameters_as_the_hierarchy(fitted):
+    run, _ = fitted
+    count, options = 8, 2
+    policies = options * perceptron((count,))
+    ours = policies + options * perceptron((), outputs=1) + perceptron((count,), outputs=options)
+    width = min(range(1, 1000), key=lambda h: abs(perceptron((h,)) - ours))
+    equal = run.baselines["flat_equal"]
+    assert run.metrics["parameters"] == ours
+    assert equal.metrics["parameters"] == run.metrics["comparison"]["flat_equal"]["parameters"] == perceptron((width,))
+    assert abs(perceptron((width,)) - ours) <= 4  # a unit has 8
+    assert equal.spec.baseline.policy.hidden == (width,)
+    assert equal.spec.baseline.kind == equal.name == "flat_equal"
+
+
+def test_check_shows_the_width_and_the_sizes(spec, fitted):
+    run, _ = fitted
+    printed = call("check", spec, "--set", "compare_with=[flat, flat_equal]").out  # the toy task does not say its steps
+    shown = [[cell.strip() for cell in line.split("│")] for line in printed.splitlines() if "│" in line]
+    sizes = {name: str(one.metrics["parameters"]) for name, one in run.baselines.items()}
+    width = run.baselines["flat_equal"].spec.baseline.policy.hidden[0]
+    assert shown[-3:] == [
+        ["all networks", str(run.metrics["parameters"])],
+        ["compare_with.0: flat, hidden: [64]", sizes["flat"]],
+        [f"compare_with.1: flat_equal, hidden: [{width}]", sizes["flat_equal"]],
+    ]
+
+
+def test_flat_equal_is_a_run_of_its_own(fitted, tmp_path):
+    run, _ = fitted
+    alone = ddco_pyro.load(shutil.copytree(run.folder / "baselines" / "flat_equal", tmp_path / "alone"))
+    demos = demonstrations(run.spec)
+    assert alone.log_likelihood(demos) == pytest.approx(run.baselines["flat_equal"].log_likelihood(demos))
+    assert "flat of equal size" in write_report(alone, demos).read_text().lower()
+    again = call("fit", alone.folder / "spec.yaml", "--out", tmp_path / "again")
+    assert again.status == 0, again.err
+    assert ddco_pyro.load(tmp_path / "again").metrics["parameters"] == alone.metrics["parameters"]
+    assert (tmp_path / "again" / "spec.yaml").read_text() == dump_spec(alone.spec)
+
+
+def test_flat_equal_is_rolled_out_and_compared(fitted, tmp_path):
+    copy = ddco_pyro.load(shutil.copytree(fitted[0].folder, tmp_path / "run"))
+    assert set(roll_out(copy, 2, 0, lambda name: None, jobs=1)["methods"]) >= {"ddco", *BASELINES}
+    found = compare([copy.folder, *(copy.folder / "baselines" / name for name in BASELINES)])
+    assert {row.model for row in found.rows} == {"ddco", *BASELINES}
+    assert len(found.rollouts) == 3
+
+
+# --- equal budgets ----------------------------------------------------------------------------------------------------
+
+
+def test_every_method_has_the_same_budget(fitted):
+    """Eight training demonstrations in minibatches of three: three gradient steps in an epoch."""
+    metrics = fitted[0].metrics
+    for row in (metrics, *metrics["comparison"].values()):
+        assert row["training"]["budget"] == row["training"]["spent"] == {"epochs": 9, "gradient_steps": 27}
+    assert [stage["cap"] for stage in metrics["training"]["stages"]] == [2, 2, 2, 3]
+
+
+def test_candidates_of_a_selection_have_the_same_budget(tmp_path):
+    """One level of options or two: four stages or six."""
+    level = {"count": 2, "policy": {"network": "linear"}, "termination": {"network": "linear"}}
+    upper = {**level, "name": "upper", "policy": {"network": "linear", "emits": ["options"]}}
+    spec = spec_at(tmp_path, folds=2, grid={"hierarchy.levels": [[level], [level, upper]], "training.epochs": [13]})
+    found = select(spec, tmp_path / "run", Told(), Workers(1))
+    assert [row.gradient_steps for row in found.choice.rows] == [13.0, 13.0]  # five to train with are one minibatch
+
+
+# --- not converged ----------------------------------------------------------------------------------------------------
+
+
+def test_stages_that_needed_more_are_named_on_the_console(fitted):
+    run, ended = fitted
+    said = " ".join(ended.out.split())
+    for name, row in {"ddco": run.metrics, **run.metrics["comparison"]}.items():
+        assert not row["training"]["converged"]
+        assert re.search(rf" {name} │[^┃]*│ 27, not converged ", said)
+        last = row["training"]["stages"][-1]
+        where = f"over the last {last['epochs']} epochs of stage {last['stage']}, which the budget ended after"
+        assert f"{last['rising']:.2f} nats per step {where} {last['epochs']}. Raise training.epochs" in said
+    assert "warning: DDCO had not converged before its later stages: " in said
+    assert "warning: Flat of equal size has not converged: " in said
+
+
+def test_the_report_says_so_too(fitted):
+    run, _ = fitted
+    shown = (run.folder / "report.html").read_text()
+    for text, advice in unconverged(run.metrics):
+        assert text in shown
+        assert advice in shown
+    assert shown.count("<td>27, not converged</td>") == 4
+    assert "DDCO, flat, flat of equal size and per-timestep had not converged: more epochs can change this." in shown
+
+
+def test_where_nothing_rises_nothing_is_said(still, tmp_path):
+    run, ended = still
+    assert run.metrics["training"]["converged"]
+    assert unconverged(run.metrics) == []
+    assert "converged" not in ended.out
+    assert "converged" not in (run.folder / "report.html").read_text()
+    assert "converged" not in write_markdown(compare([run.folder, run.folder / "baselines" / "flat"]), tmp_path)
+
+
+def write_markdown(found, folder):
+    return (write(found, folder / "comparison").parent / "compare.md").read_text()
+
+
+def test_a_comparison_marks_them(fitted, tmp_path):
+    run, _ = fitted
+    found = compare([run.folder, run.folder / "baselines" / "flat"])
+    text = write_markdown(found, tmp_path)
+    assert text.count("| 27, not converged |") == 2
+    assert "A run that had not converged may rank higher with more epochs." in text
+    data = json.loads((tmp_path / "comparison" / "compare.json").read_text())
+    assert [row["training"]["converged"] for row in data["rows"]] == [False, False]
+    assert (tmp_path / "comparison" / "compare.html").read_text().count("27, not converged") == 2
+
+
+def test_a_selection_counts_the_folds(tmp_path):
+    scores = [score(0, f, 1.0, steps=s, converged=c) for f, (s, c) in enumerate([(10, True), (12, False), (20, False)])]
+    scores += [score(1, f, 2.0, steps=5) for f in range(3)]
+    found = choose([candidate(0), candidate(1)], scores, 3)
+    data = as_data(found)
+    assert [(row["gradient_steps"], row["not_converged"]) for row in data["candidates"]] == [(14.0, 2), (5.0, 0)]
+    assert cells(found.rows[0], found)[-3:] == ["14", "3", "not converged in 2"]
+    assert "not converged" not in cells(found.rows[1], found)[-1]
+    assert len(cells(found.rows[0], found)) == len(HEAD)
+    text = markdown(found, {**data, "folds": 3, "demonstrations": 3, "stop_early": None})
+    assert "| 14 | 3 | not converged in 2 |" in text
+
+
+def test_a_fold_says_whether_its_training_had_converged(tmp_path):
+    found = select(spec_at(tmp_path, folds=2), tmp_path / "run", Told(), Workers(1))
+    assert [len(row.unconverged) for row in found.choice.rows] == [2, 2]
+    kept = json.loads((tmp_path / "run" / "folds" / "000-00.json").read_text())
+    assert (kept["gradient_steps"], kept["converged"]) == (2, False)

@@ -1,0 +1,149 @@
+"""What a spec may say of a network is what the network's class takes."""
+
+from __future__ import annotations
+
+import inspect
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import pytest
+import torch
+from pydantic import Field
+from torch import nn
+
+from ddco_pyro.data import Dimensions, check_networks
+from ddco_pyro.networks import CLASSES, InputShape, build
+from ddco_pyro.spec import NetworkSpec, SpecError, parse_spec
+from ddco_pyro.spec.networks import SETTINGS
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable
+
+SHAPE = InputShape(3, {}, 5)
+
+
+# --- built-in ---------------------------------------------------------------------------------------------------------
+
+
+def test_every_built_in_network_takes_the_settings_that_a_spec_has_for_it():
+    assert list(CLASSES) == list(SETTINGS)
+    for name, built_in in CLASSES.items():
+        parameters = inspect.signature(built_in).parameters
+        settings = [key for key in SETTINGS[name].model_fields if key != "network"]
+        assert list(parameters) == ["shape", "outputs", "copies", *settings], name
+        assert all(one.default is inspect.Parameter.empty for one in parameters.values()), name  # the spec has them
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_the_settings_of_a_spec_reach_the_network(name):
+    other = {"hidden": [7, 9], "dropout": 0.25, "filters": 2, "kernel": 3}
+    given = {key: value for key, value in other.items() if key in SETTINGS[name].model_fields}
+    shape = InputShape(3, {"camera": (6, 6, 3)} if name == "conv" else {}, 5)
+    network = build(NetworkSpec(network=name, **given), shape, 2, 4)
+    sizes = [layer.weight.shape[1] for layer in network.layers if hasattr(layer, "weight")]
+    assert sizes == [3 + (2 * 64 if name == "conv" else 0), *given.get("hidden", [])]
+    assert {layer.p for layer in network.layers if isinstance(layer, nn.Dropout)} == (
+        {0.25} if "dropout" in given else set()
+    )
+    if name == "conv":
+        assert network.convolutions["camera"].weight.shape == (2 * 4, 3, 3, 3)
+
+
+# --- a user's ---------------------------------------------------------------------------------------------------------
+
+
+class Typed(nn.Module):
+    """A network of one's own, every option of another type."""
+
+    def __init__(
+        self,
+        shape,
+        outputs,
+        copies,
+        width: int,
+        sizes: tuple[int, ...] = (3,),
+        gain: Annotated[float, Field(gt=0)] = 1.0,
+        kind: Literal["plain", "gated"] = "plain",
+        mixed: int | str = 0,
+        module: nn.Module | None = None,
+        unknown: Hashable = None,
+        *,
+        anything=None,
+    ):
+        super().__init__()
+        self.given = {"width": width, "sizes": sizes, "gain": gain, "kind": kind, "mixed": mixed, "anything": anything}
+        self.size = (copies, outputs)
+
+    def forward(self, inputs):
+        return torch.zeros(*inputs.batch, *self.size)
+
+
+class Untyped(Typed):
+    """A network that passes on what it is given."""
+
+    def __init__(self, shape, outputs, copies, **options):
+        super().__init__(shape, outputs, copies, **options)
+
+
+def made(options, name="Typed"):
+    return build(NetworkSpec(network=f"test_network_options:{name}", options=options), SHAPE, 2, 4)
+
+
+def test_options_are_of_the_types_that_the_class_says():
+    options = {"width": 3, "sizes": [4, 5], "gain": 2, "kind": "gated", "mixed": "a", "anything": [1]}
+    given = made(options).given
+    assert given == {**options, "sizes": (4, 5)}
+    assert isinstance(given["gain"], float)
+    assert made({"width": 3, "module": 4, "unknown": [5]}).given["sizes"] == (3,)  # what cannot be checked is passed on
+
+
+WRONG = [
+    ({}, "options.width: missing; it has to be given"),
+    (
+        {"width": 1, "sizse": [1]},
+        "options.sizse: unknown option (did you mean 'sizes'?); the class takes: width, sizes, ",
+    ),
+    ({"width": 1, "shape": [3]}, "options.shape: unknown option; the class takes: width, sizes, gain, kind, mixed, "),
+    ({"width": "3"}, "options.width: must be a whole number, got '3'"),
+    ({"width": 3.0}, "options.width: must be a whole number, got 3.0"),
+    ({"width": True}, "options.width: must be a whole number, got true"),
+    ({"width": None}, "options.width: must be a whole number, got null"),
+    ({"width": 1, "sizes": 3}, "options.sizes: must be a list, got 3"),
+    ({"width": 1, "sizes": [3, "a"]}, "options.sizes.1: must be a whole number, got 'a'"),
+    ({"width": 1, "gain": 0}, "options.gain: must be greater than 0, got 0"),
+    ({"width": 1, "kind": "gatde"}, "options.kind: must be plain or gated, got 'gatde' (did you mean 'gated'?)"),
+    ({"width": 1, "mixed": [1.5]}, "options.mixed: must be int | str, got [1.5]"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), WRONG)
+def test_options_that_the_class_does_not_take_are_one_line_each(options, message):
+    with pytest.raises(SpecError) as caught:
+        made(options)
+    assert len(caught.value.problems) == 1
+    assert caught.value.problems[0].startswith(message)
+
+
+def test_options_that_are_passed_on_are_checked_by_the_class_alone():
+    assert made({"width": "3"}, "Untyped").given["width"] == "3"
+
+
+WRONG_OPTIONS = {"network": "test_network_options:Typed", "options": {"width": "a", "gian": 1}}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "place"),
+    [
+        ({"hierarchy.levels.0.policy": WRONG_OPTIONS}, "hierarchy.levels.0.policy"),
+        ({"hierarchy.levels.0.termination": WRONG_OPTIONS}, "hierarchy.levels.0.termination"),
+        ({"hierarchy.meta_policy": WRONG_OPTIONS}, "hierarchy.meta_policy"),
+        ({"hierarchy": None, "baseline": {"kind": "flat", "policy": WRONG_OPTIONS}}, "baseline.policy"),
+        ({"compare_with": ["flat", {"kind": "flat", "policy": WRONG_OPTIONS}]}, "compare_with.1.policy"),
+    ],
+)
+def test_what_is_wrong_with_options_is_said_with_their_place_in_the_spec(wrong, place):
+    spec = parse_spec({"task": "toy", "observations": ["pose"], "hierarchy": {"levels": [{"count": 2}]}}, wrong)
+    with pytest.raises(SpecError) as caught:
+        check_networks(spec, Dimensions({"pose": (3,)}, control_size=2, steps=5))
+    width, gian = caught.value.problems
+    assert width == f"{place}.options.width: must be a whole number, got 'a'"
+    assert gian.startswith(f"{place}.options.gian: unknown option (did you mean 'gain'?); the class takes: width, ")

@@ -1,0 +1,186 @@
+"""User code (``module:name``) is imported only where that is allowed, and nothing is imported before that is known."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import toy_task
+import yaml
+from test_cli import call, with_set
+
+import ddco_pyro
+from ddco_pyro.data import demonstrations
+from ddco_pyro.spec import SpecError, load_spec, parse_spec, user_code, with_overrides
+
+HERE = Path(__file__).parent
+MODULE = """
+from pathlib import Path
+
+(Path(__file__).parent / "imported").touch()
+from test_networks import Own as Network
+from toy_task import task
+"""
+TASK, NETWORK = "careless:task", "careless:Network"
+LEVEL = f"[{{count: 1, policy: {{network: '{NETWORK}'}}}}]"
+
+
+@pytest.fixture
+def imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file that is there once the module ``careless``, which could be imported, has been."""
+    (tmp_path / "careless.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "careless", raising=False)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "imported"
+
+
+@pytest.fixture
+def spec(tmp_path: Path) -> Path:
+    path = tmp_path / "toy.yaml"
+    path.write_text(toy_task.SPEC)
+    return path
+
+
+PLACES = [
+    (f"task={TASK}", "task", TASK),
+    (f"demonstrations.task={TASK}", "demonstrations.task", TASK),
+    (f"hierarchy.levels.0.policy.network={NETWORK}", "hierarchy.levels.0.policy.network", NETWORK),
+    (f"hierarchy.levels.0.termination.network={NETWORK}", "hierarchy.levels.0.termination.network", NETWORK),
+    (f"hierarchy.meta_policy.network={NETWORK}", "hierarchy.meta_policy.network", NETWORK),
+    (
+        f"compare_with=[flat, {{kind: flat, policy: {{network: '{NETWORK}'}}}}]",
+        "compare_with.1.policy.network",
+        NETWORK,
+    ),
+    (f"selection.grid.task=[toy, '{TASK}']", "selection.grid.task", TASK),
+    (
+        f"selection.grid.hierarchy.levels.0.policy.network=[mlp, '{NETWORK}']",
+        "selection.grid.hierarchy.levels.0.policy.network",
+        NETWORK,
+    ),
+    (f"selection.grid.hierarchy.levels=[{LEVEL}]", "selection.grid.hierarchy.levels", NETWORK),
+]
+WORK = ["check", "collect", "fit", "select"]
+
+
+@pytest.mark.parametrize(("override", "place", "name"), PLACES, ids=lambda value: value)
+@pytest.mark.parametrize("command", WORK)
+def test_a_spec_that_names_code_is_refused(
+    spec: Path, imported: Path, command: str, override: str, place: str, name: str
+) -> None:
+    line = (
+        f"ddco-pyro: {spec}: {place}: would import user code ({name}); pass --allow-code if you trust it "
+        "(in Python: allow_code=True)\n"
+    )
+    before = sorted(imported.parent.iterdir())
+    assert call(command, spec, *with_set(override)) == (2, "", line)
+    assert sorted(imported.parent.iterdir()) == before
+
+
+def test_a_baseline_that_names_code_is_refused(spec: Path, imported: Path) -> None:
+    baseline = f"baseline={{kind: flat, policy: {{network: '{NETWORK}'}}}}"
+    ended = call("check", spec, *with_set("hierarchy=null", "compare_with=[]", baseline))
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert f"baseline.policy.network: would import user code ({NETWORK})" in ended.err
+    assert not imported.exists()
+
+
+def test_every_place_has_its_line(spec: Path, imported: Path) -> None:
+    ended = call("check", spec, *with_set(PLACES[0][0], PLACES[2][0]))
+    assert ended.status == 2
+    assert [line.split(": ")[2] for line in ended.err.splitlines()] == [PLACES[0][1], PLACES[2][1]]
+    assert not imported.exists()
+
+
+@pytest.mark.parametrize("override", [PLACES[0][0], PLACES[1][0], PLACES[2][0]])
+def test_what_is_allowed_is_imported(spec: Path, imported: Path, override: str) -> None:
+    ended = call("check", spec, "--allow-code", *with_set(override, "demonstrations.seed=500"))
+    assert (ended.status, ended.err) == (0, "")
+    assert imported.exists()
+
+
+# --- run folders ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("override", [PLACES[0][0], PLACES[2][0]])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("rollout", "RUN"),
+        ("report", "RUN"),
+        ("segment", "RUN", "DEMOS", "--csv", "a.csv"),
+        ("export", "RUN", "--out", "controller"),
+        ("compare", "RUN/baselines/flat", "RUN"),
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_run_that_names_code_is_refused(
+    toy_run: Any, toy_spec: Any, imported: Path, command: tuple[str, ...], override: str
+) -> None:
+    run, demos = imported.parent / "run", imported.parent / "demos.hdf5"
+    shutil.copytree(toy_run.folder, run)
+    demonstrations(toy_spec).write(demos)
+    path, _, name = override.partition("=")
+    (run / "spec.yaml").write_text(yaml.safe_dump(with_overrides(toy_spec, {path: name}).model_dump()))
+    before = sorted(imported.parent.rglob("*"))
+    ended = call(*(one.replace("RUN", str(run)).replace("DEMOS", str(demos)) for one in command))
+    line = f"ddco-pyro: {run / 'spec.yaml'}: {path}: would import user code ({name}); pass --allow-code if you trust it"
+    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
+    assert ended.err.startswith(line)
+    with pytest.raises(SpecError, match="would import user code"):
+        ddco_pyro.load(run)
+    assert sorted(imported.parent.rglob("*")) == before
+
+
+def test_a_baseline_in_a_run_that_names_code_which_the_run_does_not(
+    toy_run: Any, toy_spec: Any, imported: Path
+) -> None:
+    run = imported.parent / "run"
+    shutil.copytree(toy_run.folder, run)
+    other = run / "baselines" / "flat" / "spec.yaml"
+    baseline = {"kind": "flat", "policy": {"network": NETWORK}}
+    other.write_text(yaml.safe_dump(yaml.safe_load(other.read_text()) | {"baseline": baseline}))
+    ended = call("report", run)
+    assert ended.status == 2
+    assert f"{other}: baseline.policy.network: would import user code ({NETWORK})" in ended.err
+    assert not imported.exists()
+
+
+# --- what is no user code ---------------------------------------------------------------------------------------------
+
+
+def test_what_is_built_in_or_registered_is_no_user_code(toy_spec: Any) -> None:
+    assert user_code(toy_spec) == {}
+    assert user_code(with_overrides(toy_spec, {"task": "needle"})) == {}
+    assert user_code(with_overrides(toy_spec, {"task": "toy_task:task"})) == {"task": "toy_task:task"}
+
+
+def test_in_python_code_is_allowed_by_name(spec: Path, imported: Path) -> None:
+    with pytest.raises(SpecError, match=r"task: would import user code \(careless:task\)"):
+        load_spec(spec, [PLACES[0][0]])
+    assert load_spec(spec, [PLACES[0][0]], allow_code=True).task == TASK
+    assert not imported.exists()
+    assert parse_spec(yaml.safe_load(toy_task.SPEC.replace("task: toy", f"task: {TASK}"))).task == TASK
+
+
+def test_the_working_folder_is_searched_only_where_code_is_allowed(spec: Path, tmp_path: Path) -> None:
+    """Else what lies there could register itself, or stand in for an optional package that is not installed."""
+    folder = tmp_path / "hostile"
+    about = folder / "careless-1.0.dist-info"
+    about.mkdir(parents=True)
+    (folder / "careless.py").write_text(MODULE)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: careless\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[ddco_pyro.tasks]\nharmless = careless:task\n")
+    command = [Path(sys.executable).with_name("ddco-pyro"), "check", spec, *with_set("task=harmless")]
+    ended = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr.count("\n")) == (2, 1)
+    assert "no task is registered as 'harmless'" in ended.stderr
+    assert not (folder / "imported").exists()
+    ended = subprocess.run([*command, "--allow-code"], cwd=folder, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert (folder / "imported").exists()
