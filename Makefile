@@ -9,7 +9,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 DEMO := .venv/.demo
 DEV := .venv/.dev
-# Python compiles what it imports, and keeps it; doing that beforehand for all takes twice as long as the rest of the installation.
+# Python compiles what it imports, once; to do that beforehand for everything takes longer than all the rest.
 PIP := $(BIN)/pip install -q --no-compile -c constraints.txt
 # A torch wheel without the several GB of CUDA packages. Where this page cannot be reached pip takes torch from its usual index.
 TORCH_CPU := https://download.pytorch.org/whl/cpu/torch/
@@ -41,7 +41,8 @@ lint: $(DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	@$(BIN)/python benchmarks/provenance.py
+	$(BIN)/lint-imports
+	@$(BIN)/python studies/provenance.py
 
 format: $(DEV)
 	$(BIN)/ruff check --fix .

@@ -15,15 +15,17 @@ from pathlib import Path
 
 import peers
 import torch
-from provenance import record, sentence, text
 
-from ddco_pyro.ahmm import Tables, complete
-from ddco_pyro.encoding import Batch
-from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference import Engine, direct, fused, total_log_likelihood
 from ddco_pyro.inference.structure import structure_of
-from ddco_pyro.networks import Inputs
+from ddco_pyro.model.ahmm import Tables, complete
+from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import Inputs
 from ddco_pyro.spec import parse_spec
+
+sys.path.append(str(Path(__file__).parents[1] / "studies"))
+from provenance import record, sentence, text
 
 HERE = Path(__file__).parent
 SIZES = ((100, 15), (50, 200), (50, 2000))

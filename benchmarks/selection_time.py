@@ -13,22 +13,24 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
-from provenance import record, text
-
-from ddco_pyro.data import demonstrations
-from ddco_pyro.files import write_text
-from ddco_pyro.run import claim
+from ddco_pyro.data.files import write_text
+from ddco_pyro.fitting.prepare import demonstrations
+from ddco_pyro.fitting.run import claim
 from ddco_pyro.selection import Workers, folds, grid, scoring, select
 from ddco_pyro.spec import load_spec
 
+sys.path.append(str(Path(__file__).parents[1] / "studies"))
+from provenance import record, text
+
 OUT = Path("docs/results")
 GRID = "selection.grid.hierarchy.levels.0.count=[1, 2, 3, 4, 5, 6, 7, 8]"
-SHORT = ("selection.grid.hierarchy.levels.0.count=[2, 3, 4, 5]", "selection.folds=4", "training.epochs=25")
+SHORT = ("selection.grid.hierarchy.levels.0.count=[2, 3, 4, 5]", "selection.folds=4", "training.epochs=100")
 
 
 def one_fold() -> dict[str, Any]:

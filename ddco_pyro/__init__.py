@@ -7,20 +7,20 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ddco_pyro import inference
-    from ddco_pyro.controller import Controller
-    from ddco_pyro.demonstrations import Demonstration, Demonstrations
-    from ddco_pyro.run import Fit, load
+    from ddco_pyro.acting.controller import Controller
+    from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+    from ddco_pyro.fitting.run import Fit, load
     from ddco_pyro.spec import Spec, load_spec
 
 __all__ = ["Controller", "Demonstration", "Demonstrations", "Fit", "Spec", "inference", "load", "load_spec"]
 
 _MODULES = {
-    "Controller": "controller",
-    "Demonstration": "demonstrations",
-    "Demonstrations": "demonstrations",
-    "Fit": "run",
+    "Controller": "acting.controller",
+    "Demonstration": "data.demonstrations",
+    "Demonstrations": "data.demonstrations",
+    "Fit": "fitting.run",
     "Spec": "spec",
-    "load": "run",
+    "load": "fitting.run",
     "load_spec": "spec",
 }
 

@@ -25,7 +25,7 @@ import typer
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
-from ddco_pyro.cli import app
+from ddco_pyro.cli.app import app
 from ddco_pyro.spec import spec_schema
 
 SECONDS = 300

@@ -26,10 +26,11 @@ from IPython.display import Image, Markdown
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
 from ddco_pyro import load_spec
-from ddco_pyro.console import Fitting
-from ddco_pyro.data import demonstrations
-from ddco_pyro.report import tables, words, write_report
-from ddco_pyro.run import fit
+from ddco_pyro.cli.console import Fitting
+from ddco_pyro.drawing import words
+from ddco_pyro.fitting.prepare import demonstrations
+from ddco_pyro.fitting.run import fit
+from ddco_pyro.report import tables, write_report
 
 RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))
 SMALLER = os.environ.get("NOTEBOOK_SMALLER", "").split()  # a test makes the fits smaller

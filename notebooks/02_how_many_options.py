@@ -27,7 +27,7 @@ from IPython.display import Image, Markdown
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
 from ddco_pyro import load_spec
-from ddco_pyro.console import Selecting
+from ddco_pyro.cli.console import Selecting
 from ddco_pyro.selection import Workers, select
 
 RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))
@@ -39,7 +39,7 @@ SMALLER = os.environ.get("NOTEBOOK_SMALLER", "").split()  # a test makes the fit
 
 # %%
 LINEAR = [f"hierarchy.{place}.network=linear" for place in ("levels.0.policy", "levels.0.termination", "meta_policy")]
-GRID = ["selection.folds=5", "selection.grid.hierarchy.levels.0.count=[1, 2, 3, 5, 8]", "training.epochs=150"]
+GRID = ["selection.folds=5", "selection.grid.hierarchy.levels.0.count=[1, 2, 3, 5, 8]", "training.epochs=600"]
 spec = load_spec("../specs/needle.yaml", [*LINEAR, *GRID, "compare_with=[]", *SMALLER])
 
 # %%

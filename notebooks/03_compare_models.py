@@ -26,9 +26,9 @@ from IPython.display import Image, Markdown
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
 from ddco_pyro import load_spec
+from ddco_pyro.cli.console import Fitting
 from ddco_pyro.comparison import compare, write
-from ddco_pyro.console import Fitting
-from ddco_pyro.run import fit
+from ddco_pyro.fitting.run import fit
 
 RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))
 SMALLER = os.environ.get("NOTEBOOK_SMALLER", "").split()  # a test makes the fits smaller

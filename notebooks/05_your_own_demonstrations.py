@@ -28,10 +28,11 @@ from IPython.display import Image, Markdown
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
 from ddco_pyro import Demonstrations, load_spec
-from ddco_pyro.collect import collect
-from ddco_pyro.console import Fitting
-from ddco_pyro.report import words, write_report
-from ddco_pyro.run import fit
+from ddco_pyro.cli.console import Fitting
+from ddco_pyro.drawing import words
+from ddco_pyro.fitting.run import fit
+from ddco_pyro.report import write_report
+from ddco_pyro.simulation.collect import collect
 from ddco_pyro.spec import DemonstrationsSpec
 
 RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))
@@ -65,7 +66,7 @@ hierarchy:
   levels:
     - {{count: 4, policy: {{network: linear}}, termination: {{network: linear}}}}
   meta_policy: {{network: linear}}
-training: {{initialize: vq_controls, optimizer: {{lr: 1.0e-2}}, epochs: 100}}
+training: {{initialize: vq_controls, optimizer: {{lr: 1.0e-2}}, epochs: 400}}
 compare_with: [flat]
 """
 RUNS.mkdir(parents=True, exist_ok=True)

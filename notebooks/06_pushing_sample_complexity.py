@@ -16,7 +16,7 @@
 # A 3-link arm pushes a box to goals on its left and right. How many demonstrations of one goal each does a policy
 # need, with and without options (§5.1, figure Top-A)? Every method has the same observations, gradient steps and sweep.
 #
-# This page only shows what `python benchmarks/pushing_studies.py sample_complexity` measured; the command resumes, so
+# This page only shows what `python studies/pushing_studies.py sample_complexity` measured; the command resumes, so
 # it also adds seeds and settings that are still missing.
 
 # %%
@@ -49,7 +49,7 @@ plt.show()
 
 # %% [markdown]
 # What else matters? One thing changed at a time, for every method alike
-# (`python benchmarks/pushing_studies.py variants`).
+# (`python studies/pushing_studies.py variants`).
 
 # %%
 Image(str(RESULTS / "variants.png"))

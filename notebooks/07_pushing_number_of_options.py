@@ -16,7 +16,7 @@
 # Goals and held-out log-likelihood against the number of options (§5.1, figures Top-B and Top-C). The paper picks k by
 # the likelihood; that works as far as the two curves agree.
 #
-# This page only shows what `python benchmarks/pushing_studies.py number_of_options` measured; the command resumes, so
+# This page only shows what `python studies/pushing_studies.py number_of_options` measured; the command resumes, so
 # it also adds seeds and settings that are still missing.
 
 # %%

@@ -16,7 +16,7 @@
 # The hybrid meta-policy (§4.2, §5.1 "Control Space Augmentation") may select an option or apply the physical control
 # itself. How much does it use that freedom, and does it help?
 #
-# This page only shows what `python benchmarks/pushing_studies.py augmentation` measured; the command resumes, so
+# This page only shows what `python studies/pushing_studies.py augmentation` measured; the command resumes, so
 # it also adds seeds and settings that are still missing.
 
 # %%

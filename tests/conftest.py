@@ -15,7 +15,7 @@ import toy_task
 import yaml
 from hypothesis import settings
 
-from ddco_pyro.run import fit
+from ddco_pyro.fitting.run import fit
 from ddco_pyro.spec import parse_spec
 
 HERE = Path(__file__).parent

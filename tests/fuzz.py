@@ -196,9 +196,9 @@ EDITS: tuple[Edit, ...] = (
 WORKER = """
 import json, resource, sys, traceback
 from pathlib import Path
-import ddco_pyro.demonstrations, ddco_pyro.inspection, ddco_pyro.starting, ddco_pyro.importing
+import ddco_pyro.data.demonstrations, ddco_pyro.data.inspection, ddco_pyro.data.starting, ddco_pyro.data.importing
 from ddco_pyro.errors import BadInput
-from ddco_pyro.sources.recording import BLOCK_BYTES
+from ddco_pyro.data.sources.recording import BLOCK_BYTES
 
 def tried(what):
     try:
@@ -214,11 +214,11 @@ for line in sys.stdin:
     path = Path(line.strip())
     out = path.with_suffix(".imported")
     def started():
-        ddco_pyro.starting.starting_spec(ddco_pyro.inspection.inspect(path), path)
+        ddco_pyro.data.starting.starting_spec(ddco_pyro.data.inspection.inspect(path), path)
     found = [
-        tried(lambda: ddco_pyro.demonstrations.Demonstrations.read(path)),
+        tried(lambda: ddco_pyro.data.demonstrations.Demonstrations.read(path)),
         tried(started),
-        tried(lambda: ddco_pyro.importing.import_demonstrations(path, out)),
+        tried(lambda: ddco_pyro.data.importing.import_demonstrations(path, out)),
     ]
     out.unlink(missing_ok=True)
     print(json.dumps([found, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss]), flush=True)

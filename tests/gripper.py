@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 
 PHASES = ("reach", "lift", "carry", "lower")
 GAINS = (0.5, 0.3, 0.25, 0.4)

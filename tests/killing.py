@@ -43,7 +43,7 @@ def whole(arguments: Sequence[object], folder: Path, cache: Path) -> float:
 
 STRIKES_ITSELF = """
 import os, signal
-from ddco_pyro import cli, console
+from ddco_pyro.cli.app import app as cli, console
 
 left, go_on = {after}, console.{watcher}
 
@@ -62,7 +62,7 @@ cli.main()
 def struck(arguments: Sequence[object], folder: Path, watcher: str, after: int, strike: str) -> tuple[int, str]:
     """Run a command that is struck by a signal at a moment of its own, whatever else the machine does.
 
-    :param watcher: the method of :mod:`ddco_pyro.console` whose call is the moment, such as ``Fitting.epoch``.
+    :param watcher: the method of :mod:`ddco_pyro.cli.console` whose call is the moment, such as ``Fitting.epoch``.
     :param after: which of its calls.
     :param strike: Python that sends the signal.
     :returns: its exit status, and what it printed to stderr.

@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from sklearn.metrics import normalized_mutual_info_score
 
-from ddco_pyro.ahmm import choose, complete
-from ddco_pyro.data import Dimensions, build_hierarchy
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.encoding import encode
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy
+from ddco_pyro.fitting.training import Trainer
 from ddco_pyro.inference import log_likelihood, segment
-from ddco_pyro.networks import Inputs
+from ddco_pyro.model.ahmm import choose, complete
+from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.networks import Inputs
 from ddco_pyro.spec import parse_spec
-from ddco_pyro.training import Trainer
 
 CONTROL = {"std": 0.05, "scale": "none"}
 TRAINING = {"epochs": 900, "restarts": 3, "patience": 25, "initialize": "vq_controls"}

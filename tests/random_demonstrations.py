@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 
 
 def demonstration(name: str, steps: int = 4, seed: int = 0) -> Demonstration:

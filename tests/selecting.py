@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.selection.scoring import Score, Unwatched
 from ddco_pyro.spec import parse_spec
 
@@ -46,7 +46,7 @@ DATA = {
         "levels": [{"count": 2, "policy": {"network": "linear"}, "termination": {"network": "linear"}}],
         "meta_policy": {"network": "linear"},
     },
-    "training": {"initialize": "vq", "epochs": 2, "batch_size": 6, "optimizer": {"lr": 0.05}},
+    "training": {"initialize": "vq", "epochs": 8, "batch_size": 6, "optimizer": {"lr": 0.05}},
     "selection": {"folds": 4, "grid": {"hierarchy.levels.0.count": [1, 2]}},
 }
 

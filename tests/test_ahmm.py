@@ -11,8 +11,8 @@ import pytest
 import torch
 from oracle import brute_force, paths, random_tables
 
-from ddco_pyro.ahmm import NEVER, Tables, Tabulated, ahmm, complete
 from ddco_pyro.inference import log_likelihood
+from ddco_pyro.model.ahmm import NEVER, Tables, Tabulated, ahmm, complete
 
 SAMPLES = 4000
 

@@ -10,9 +10,9 @@ import pytest
 import torch
 from oracle import brute_force, random_tables
 
-from ddco_pyro.analysis import agreement, as_rows, divergences, option_use, paired
+from ddco_pyro.fitting.analysis import agreement, as_rows, divergences, option_use, paired
 from ddco_pyro.inference import Posterior, posterior
-from ddco_pyro.outputs import Decision, Outputs
+from ddco_pyro.model.outputs import Decision, Outputs
 
 
 def test_use_of_options_by_sums_over_every_path():

@@ -23,7 +23,7 @@ import yaml
 from killing import HANGS, struck
 
 import ddco_pyro
-from ddco_pyro.cli import app, main
+from ddco_pyro.cli.app import app, main
 from ddco_pyro.spec import dump_spec, load_spec
 
 HERE = Path(__file__).parent
@@ -323,7 +323,7 @@ def test_training_that_fails_says_why(spec, tmp_path):
     ],
 )
 def test_what_fails_otherwise_has_one_line_too(monkeypatch, spec, error, message):
-    monkeypatch.setattr("ddco_pyro.data.dimensions", mock.Mock(side_effect=error))
+    monkeypatch.setattr("ddco_pyro.fitting.prepare.dimensions", mock.Mock(side_effect=error))
     assert call("check", spec) == (1, "", f"ddco-pyro: {message}\n")
 
 
@@ -351,7 +351,7 @@ def test_a_command_ends_with_its_status_and_finds_tasks_beside_it(spec):
 
 
 def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
-    longer = with_set("compare_with=[]", "training.epochs=60", "training.patience=null")
+    longer = with_set("compare_with=[]", "training.epochs=240", "training.patience=null")
     folder = tmp_path / "cut"
     interrupt = "os.kill(os.getpid(), signal.SIGINT)"
     status, err = struck(["fit", spec, "--out", folder, *longer], HERE, "Fitting.epoch", 100, interrupt)
@@ -370,7 +370,7 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
 LIGHT = """
 import sys
 sys.argv = {arguments!r}
-from ddco_pyro.cli import main
+from ddco_pyro.cli.app import main
 try:
     main()
 finally:

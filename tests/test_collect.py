@@ -11,9 +11,9 @@ import pytest
 import toy_task
 from scipy import stats
 
-from ddco_pyro.collect import cache_folder, cache_path, collect
-from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError
-from ddco_pyro.rollout import run_episode
+from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.simulation.collect import cache_folder, cache_path, collect
+from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import DemonstrationsSpec
 
 TASK = "toy_task:task"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from ddco_pyro.colours import CONTROL, OPTIONS, option_colour, option_rgb
+from ddco_pyro.drawing.colours import CONTROL, OPTIONS, option_colour, option_rgb
 
 # What dichromats see, in linear RGB (Machado, Oliveira & Fernandes 2009, severity 1).
 SIGHTS = {

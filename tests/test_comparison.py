@@ -17,11 +17,12 @@ from test_cli import call
 from ddco_pyro import load
 from ddco_pyro.comparison import CompareError, Comparison, Row, compare, page, write
 from ddco_pyro.comparison.shared import NotShared
-from ddco_pyro.data import demonstrations, parts
-from ddco_pyro.demonstrations import Demonstrations
-from ddco_pyro.evaluate import roll_out
-from ddco_pyro.report import words, write_report
-from ddco_pyro.run import fit
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.drawing import words
+from ddco_pyro.fitting.prepare import demonstrations, parts
+from ddco_pyro.fitting.rollouts import roll_out
+from ddco_pyro.fitting.run import fit
+from ddco_pyro.report import write_report
 from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import with_overrides
 

@@ -6,14 +6,14 @@ import itertools
 
 import pytest
 
-from ddco_pyro import console
+from ddco_pyro.cli import console
 
 
 @pytest.fixture
 def clock(monkeypatch):
     """Every look at the clock finds it four seconds later."""
     ticks = itertools.count(0, 4)
-    monkeypatch.setattr("ddco_pyro.console.time.monotonic", lambda: float(next(ticks)))
+    monkeypatch.setattr("ddco_pyro.cli.console.time.monotonic", lambda: float(next(ticks)))
 
 
 def test_plain_lines_come_now_and_then_and_at_the_end(clock, capsys):
@@ -36,6 +36,18 @@ def test_a_fit_that_stops_early_says_so(clock, capsys):
         progress.trained("ddco")
     assert capsys.readouterr().err.splitlines() == [
         "training ddco: 3/100, at most 388 s left  level-1: training 1.250, tuning -0.500 nats/step",
+        "training ddco: done after 3, 16 s",
+    ]
+
+
+def test_where_nobody_knows_how_far_it_goes_there_is_no_time_left(clock, capsys):
+    with console.Fitting() as progress:
+        progress.training("ddco", None)
+        for _ in range(3):
+            progress.epoch({"stage": "level-1", "train": 1.25, "tune": -0.5})
+        progress.trained("ddco")
+    assert capsys.readouterr().err.splitlines() == [
+        "training ddco: 3  level-1: loss -1.250, held out -0.500 nats/step",
         "training ddco: done after 3, 16 s",
     ]
 

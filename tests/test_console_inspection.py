@@ -7,8 +7,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ddco_pyro.console_inspection import show
-from ddco_pyro.inspection import inspect
+from ddco_pyro.cli.console_inspection import show
+from ddco_pyro.data.inspection import inspect
 
 
 def test_each_field_has_its_range_and_what_is_odd_about_it(tmp_path: Path, capsys) -> None:

@@ -17,13 +17,13 @@ from safetensors.torch import save_file
 from test_cli import call
 
 import ddco_pyro
+from ddco_pyro.acting.controller import Controller
+from ddco_pyro.acting.lockstep import Actors
 from ddco_pyro.comparison import compare
 from ddco_pyro.comparison.shared import NotShared
-from ddco_pyro.controller import Controller
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.export import TOLERANCE, export, runner
-from ddco_pyro.lockstep import Actors
-from ddco_pyro.run import Fit, fit
+from ddco_pyro.fitting.run import Fit, fit
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import RolloutSpec, Spec, parse_spec, with_overrides

@@ -10,11 +10,11 @@ import torch
 from oracle import brute_force
 from scipy import stats
 
-from ddco_pyro.controller import Controller
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.encoding import encode
-from ddco_pyro.hierarchy import Hierarchy
-from ddco_pyro.observing import ObservationError
+from ddco_pyro.acting.controller import Controller
+from ddco_pyro.acting.window import ObservationError
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import parse_spec
 
 STATE = {"state": np.array([0.5, -1.0, 2.0])}
@@ -171,26 +171,6 @@ def test_the_lowest_option_acts(top, middle, choices, control):
     controller = Controller(hierarchy)
     np.testing.assert_allclose(controller.act(STATE), control)
     assert controller.choices == choices
-
-
-@pytest.mark.parametrize("network", ["mlp", "per_timestep"])
-@pytest.mark.parametrize("differences", [False, True])
-def test_the_control_is_the_active_options_mean_in_the_controls_own_units(network, differences):
-    """Step by step against the whole demonstration at once; differences are those to the observation before."""
-    hierarchy = make(network=network, observation={"key": "state", "differences": differences})
-    random = np.random.default_rng(0)
-    demos = demonstrations(random.normal(5, 2, (2, 4, 3)), random.normal(40, 9, (2, 4, 2)))
-    hierarchy.encoder.fit(demos)
-    hierarchy.scaling.fit(demos)
-    with torch.no_grad():
-        outputs = hierarchy(encode(demos, hierarchy.encoder, hierarchy.scaling).inputs)
-    means = hierarchy.scaling.unscaled(outputs.decisions[0].mean)
-    controller = Controller(hierarchy)
-    for n, demo in enumerate(demos):
-        controller.reset(n)
-        for t in range(len(demo)):
-            control = controller.act({"state": demo.observations["state"][t]})
-            np.testing.assert_allclose(control, means[n, t, controller.choices[0] - 1], rtol=1e-5)
 
 
 def test_a_sample_has_the_models_deviation():

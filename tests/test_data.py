@@ -6,8 +6,8 @@ import h5py
 import numpy as np
 import pytest
 
-from ddco_pyro.data import Dimensions, build_hierarchy, check_networks, demonstrations, dimensions
-from ddco_pyro.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy, check_networks, demonstrations, dimensions
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 
 TASK = "toy_task:task"

@@ -10,13 +10,13 @@ import torch
 from oracle import paths
 from scipy import stats
 
-from ddco_pyro.data import Dimensions
-from ddco_pyro.decomposition import decompose
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.encoding import Batch, encode
-from ddco_pyro.hierarchy import Hierarchy
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.fitting.prepare import Dimensions
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.outputs import Outputs
+from ddco_pyro.inference.decomposition import decompose
+from ddco_pyro.model.encoding import Batch, encode
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.spec import parse_spec
 
 LENGTHS = (3, 2)

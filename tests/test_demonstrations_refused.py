@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from random_demonstrations import demonstration, demonstrations
 
-from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 
 
 @pytest.fixture

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from ddco_pyro.analysis import as_rows, option_use
-from ddco_pyro.diagnostics import Finding, diagnose
+from ddco_pyro.fitting.analysis import as_rows, option_use
+from ddco_pyro.fitting.diagnostics import Finding, diagnose
 from ddco_pyro.inference import Posterior
 
 

@@ -10,7 +10,7 @@ import pytest
 import typer
 
 import ddco_pyro
-from ddco_pyro.cli import app
+from ddco_pyro.cli.app import app
 from ddco_pyro.spec import spec_schema
 
 ROOT = Path(ddco_pyro.__file__).parents[1]

@@ -7,10 +7,10 @@ import pytest
 import torch
 from scipy import stats
 
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.encoding import ControlScaling, ObservationEncoder, encode
-from ddco_pyro.hierarchy import Hierarchy
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood
+from ddco_pyro.model.encoding import ControlScaling, ObservationEncoder, encode
+from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import ControlSpec, ObservationSpec, parse_spec
 
 LENGTHS = (5, 3, 4)

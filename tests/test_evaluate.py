@@ -14,10 +14,10 @@ import pytest
 import toy_task
 
 import ddco_pyro
-from ddco_pyro.evaluate import policies, roll_out
-from ddco_pyro.files import read_tensors, write_tensors
-from ddco_pyro.rollout import run_episode, run_episodes
-from ddco_pyro.run import Fit, RunError
+from ddco_pyro.data.files import read_tensors, write_tensors
+from ddco_pyro.fitting.rollouts import policies, roll_out
+from ddco_pyro.fitting.run import Fit, RunError
+from ddco_pyro.simulation.episodes import run_episode, run_episodes
 from ddco_pyro.spec import with_overrides
 
 METHODS = ["open_loop", "supervisor", "flat", "per_timestep", "ddco"]
@@ -137,7 +137,7 @@ def contents(folder):
 def test_rollouts_that_the_run_holds_are_not_done_again_if_asked(copied, rolled, monkeypatch):
     _, results, *_ = rolled
     before = contents(copied.folder)
-    monkeypatch.setattr("ddco_pyro.evaluate.run_episodes", refuse)
+    monkeypatch.setattr("ddco_pyro.fitting.rollouts.run_episodes", refuse)
     assert roll_out(copied, EPISODES, 2, refuse, jobs=1, resume=True) == results
     assert contents(copied.folder) == before
 
@@ -192,7 +192,7 @@ def test_what_was_interrupted_goes_on_with_the_next_method(rolled, fresh, monkey
         begun.append(policy)
         return run_episodes(task, policy, *rest)
 
-    monkeypatch.setattr("ddco_pyro.evaluate.run_episodes", counted)
+    monkeypatch.setattr("ddco_pyro.fitting.rollouts.run_episodes", counted)
     assert roll_out(fresh, EPISODES, 2, told.append, jobs=1) == results
     assert len(begun) == len(METHODS) - 2
     assert Counter(told) == dict.fromkeys(METHODS, EPISODES)
@@ -214,6 +214,6 @@ def test_what_was_interrupted_is_not_mixed_with_anything_else(fresh, change):
         begun.append(policy)
         raise KeyboardInterrupt
 
-    with mock.patch("ddco_pyro.evaluate.run_episodes", stop), pytest.raises(KeyboardInterrupt):
+    with mock.patch("ddco_pyro.fitting.rollouts.run_episodes", stop), pytest.raises(KeyboardInterrupt):
         roll_out(ddco_pyro.load(fresh.folder), episodes, film, lambda name: None, jobs=1)
     assert begun == [METHODS[0]]

@@ -22,7 +22,7 @@ import torch
 
 sys.path.append({tests!r})
 import toy_task
-from ddco_pyro.task import Task
+from ddco_pyro.simulation.task import Task
 
 task = Task("reach", toy_task.Point, {{"supervisor": toy_task.Supervisor}}, toy_task.outcome, toy_task.frame, (), 12)
 

@@ -16,14 +16,14 @@ from test_selection_choice import candidate
 
 import ddco_pyro
 from ddco_pyro.comparison import compare, write
-from ddco_pyro.data import demonstrations
-from ddco_pyro.evaluate import roll_out
+from ddco_pyro.fitting.prepare import demonstrations
+from ddco_pyro.fitting.rollouts import roll_out
+from ddco_pyro.fitting.widths import nearest_widths
 from ddco_pyro.report import unconverged, write_report
 from ddco_pyro.selection import Workers, select
 from ddco_pyro.selection.choice import as_data, choose
 from ddco_pyro.selection.table import HEAD, cells, markdown
 from ddco_pyro.spec import dump_spec
-from ddco_pyro.widths import nearest_widths
 
 BASELINES = ["flat", "flat_equal", "per_timestep"]
 
@@ -148,11 +148,27 @@ def test_stages_that_needed_more_are_named_on_the_console(fitted):
     for name, row in {"ddco": run.metrics, **run.metrics["comparison"]}.items():
         assert not row["training"]["converged"]
         assert re.search(rf" {name} │[^┃]*│ 27, not converged ", said)
-        last = row["training"]["stages"][-1]
-        where = f"over the last {last['epochs']} epochs of stage {last['stage']}, which the budget ended after"
-        assert f"{last['rising']:.2f} nats per step {where} {last['epochs']}. Raise training.epochs" in said
-    assert "warning: DDCO had not converged before its later stages: " in said
-    assert "warning: Flat of equal size has not converged: " in said
+        for stage in row["training"]["stages"]:
+            rise = f"{stage['rising']:.2f} nats per step over the last {stage['epochs']})"
+            assert f"stage {stage['stage']} after {stage['epochs']} epochs (tuning log-likelihood up by {rise}" in said
+    assert said.count("warning: ") >= 4
+    assert "warning: DDCO has not converged: the budget ended stage vq-1 after 2 epochs" in said
+    assert "warning: Flat of equal size has not converged: the budget ended stage policy after 9 epochs" in said
+
+
+def test_earlier_stages_are_named_where_the_last_one_has_converged(fitted):
+    metrics = {key: fitted[0].metrics[key] for key in ("model", "training")} | {"comparison": {}}
+    metrics["training"]["stages"][1] |= {"converged": True}
+    metrics["training"]["stages"][2] |= {"epochs": 0}
+    metrics["training"]["stages"][3] |= {"converged": True}
+    metrics["training"]["converged"] = True
+    ((text, _),) = unconverged(metrics)
+    assert text.startswith(
+        "Earlier stages of DDCO had not converged: the budget ended stage vq-1 after 2 epochs (tuning log-"
+    )
+    assert text.endswith(") and stage meta-policy after 0 epochs.")
+    assert "level-1" not in text
+    assert "joint" not in text
 
 
 def test_the_report_says_so_too(fitted):
@@ -206,4 +222,4 @@ def test_a_fold_says_whether_its_training_had_converged(tmp_path):
     found = select(spec_at(tmp_path, folds=2), tmp_path / "run", Told(), Workers(1))
     assert [len(row.unconverged) for row in found.choice.rows] == [2, 2]
     kept = json.loads((tmp_path / "run" / "folds" / "000-00.json").read_text())
-    assert (kept["gradient_steps"], kept["converged"]) == (2, False)
+    assert (kept["gradient_steps"], kept["converged"]) == (8, False)

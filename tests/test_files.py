@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from ddco_pyro.files import NotWritable, read_tensors, whole_file, whole_folder, write_tensors, write_text
+from ddco_pyro.data.files import NotWritable, read_tensors, whole_file, whole_folder, write_tensors, write_text
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
@@ -71,7 +71,7 @@ def test_a_folder_that_is_cut_off_leaves_what_was_there(tmp_path, error):
 KILLED = """
 import os, signal
 from pathlib import Path
-from ddco_pyro.files import whole_folder
+from ddco_pyro.data.files import whole_folder
 with whole_folder(Path("folder")) as temporary:
     (temporary / "file").write_text("half")
     os.kill(os.getpid(), signal.SIGKILL)

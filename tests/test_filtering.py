@@ -9,9 +9,9 @@ import pytest
 import torch
 from oracle import brute_force, random_tables
 
-from ddco_pyro.ahmm import NEVER, complete
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.filtering import Filter
+from ddco_pyro.model.ahmm import NEVER, complete
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,11 @@ import torch
 from oracle import brute_force
 from torch.distributions import Normal
 
-from ddco_pyro.encoding import STEPS_AT_ONCE, Batch
-from ddco_pyro.hierarchy import Hierarchy
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
-from ddco_pyro.networks import Inputs
-from ddco_pyro.outputs import TERMINATION_BOUND
+from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.outputs import TERMINATION_BOUND
 from ddco_pyro.spec import parse_spec
 
 SHAPES = {"state": (3,)}
@@ -155,7 +155,7 @@ def test_what_goes_through_together_is_counted_in_bytes(monkeypatch):
     assert wide.step_bytes == pytest.approx(10 * narrow.step_bytes, rel=0.05)
     assert narrow.step_bytes >= 3 * 100 * 4  # what a hidden layer gives, once kept and twice in passing
     assert narrow.steps_at_once == wide.steps_at_once == STEPS_AT_ONCE
-    monkeypatch.setattr("ddco_pyro.hierarchy.BYTES_AT_ONCE", 9 * wide.step_bytes)
+    monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", 9 * wide.step_bytes)
     assert wide.steps_at_once == 9
     sizes = [len(piece) for _, piece in make_batch(trajectories=5).pieces(wide.steps_at_once)]
     assert sizes == [2, 2, 1]

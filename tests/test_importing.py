@@ -21,11 +21,11 @@ from minari.data_collector.episode_buffer import EpisodeBuffer
 from random_demonstrations import demonstrations
 from test_cli import call
 
-from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.data.importing import Choice, import_demonstrations
+from ddco_pyro.data.inspection import inspect
+from ddco_pyro.data.sources.video import _frames
 from ddco_pyro.errors import BadInput
-from ddco_pyro.importing import Choice, import_demonstrations
-from ddco_pyro.inspection import inspect
-from ddco_pyro.sources.video import _frames
 
 FIXTURES = Path(__file__).parent / "fixtures"
 ROBOMIMIC, LEROBOT = FIXTURES / "robomimic.hdf5", FIXTURES / "lerobot"
@@ -281,7 +281,7 @@ def stop_after(number: int):
 
 @pytest.mark.parametrize("number", [1, 2, 5])
 def test_an_interrupted_import_goes_on(out: Path, tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ddco_pyro.parts.PART_BYTES", 8000)  # one or two demonstrations in a part
+    monkeypatch.setattr("ddco_pyro.data.resumable.PART_BYTES", 8000)  # one or two demonstrations in a part
     whole = tmp_path / "whole.hdf5"
     import_demonstrations(ROBOMIMIC, whole)
     with pytest.raises(Stopped):

@@ -9,9 +9,9 @@ import pytest
 import torch
 from sklearn.metrics import adjusted_rand_score
 
-from ddco_pyro.encoding import Batch
-from ddco_pyro.initialize import POOLED, Clusters
-from ddco_pyro.networks import Inputs
+from ddco_pyro.fitting.clusters import POOLED, Clusters
+from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.networks import Inputs
 
 LENGTHS = (7, 4, 6)
 PLACES = np.array([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
@@ -146,7 +146,7 @@ def test_it_does_not_matter_how_many_images_are_looked_at_together(monkeypatch):
     images = np.random.default_rng(8).integers(0, 256, (sum(LENGTHS), 16, 16, 3), dtype=np.uint8)
     batch = make_batch(random_rows(9, 2), random_rows(10, 2), {"camera": images})
     together = Clusters(batch, 3, seed=0).choices(batch)
-    monkeypatch.setattr("ddco_pyro.initialize.FRAMES_AT_ONCE", 2)
+    monkeypatch.setattr("ddco_pyro.fitting.clusters.FRAMES_AT_ONCE", 2)
     assert torch.equal(Clusters(batch, 3, seed=0).choices(batch), together)
 
 

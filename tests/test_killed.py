@@ -20,8 +20,8 @@ import yaml
 from killing import Kept, Killed, until_done, whole
 from random_demonstrations import demonstrations
 
-from ddco_pyro.files import read_tensors
-from ddco_pyro.importing import import_demonstrations
+from ddco_pyro.data.files import read_tensors
+from ddco_pyro.data.importing import import_demonstrations
 
 HERE = Path(__file__).parent
 
@@ -113,7 +113,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory, toy_run) -> dict[str, Case]:
     folder = tmp_path_factory.mktemp("inputs")
     (folder / "toy.yaml").write_text(toy_task.SPEC.replace("task: toy", "task: toy_task:task"))
     demonstrations(300).write(folder / "source.hdf5")
-    short = [one for key in ("training.epochs=25", "compare_with=[flat]") for one in ("--set", key)]
+    short = [one for key in ("training.epochs=100", "compare_with=[flat]") for one in ("--set", key)]
     shutil.copytree(toy_run.folder, folder / "run")
     import_demonstrations(_toy_demonstrations(folder), folder / "toy.hdf5")
     data = selecting.data_at(folder)
@@ -162,7 +162,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory, toy_run) -> dict[str, Case]:
 
 
 def _toy_demonstrations(folder: Path) -> Path:
-    from ddco_pyro.data import demonstrations as of
+    from ddco_pyro.fitting.prepare import demonstrations as of
     from ddco_pyro.spec import load_spec
 
     path = folder / "toy_source.hdf5"

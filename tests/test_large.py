@@ -15,11 +15,11 @@ from large import measured, zeros
 from random_demonstrations import demonstrations as random_demonstrations
 from test_cli import call
 
-from ddco_pyro.data import demonstrations, memory_needed
-from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.data.inspection import inspect
+from ddco_pyro.data.memory import PROGRAM, allowed
 from ddco_pyro.errors import BadInput
-from ddco_pyro.inspection import inspect
-from ddco_pyro.memory import PROGRAM, allowed
+from ddco_pyro.fitting.prepare import demonstrations, memory_needed
 from ddco_pyro.spec import load_spec, parse_spec
 
 GIGABYTE = 10**9

@@ -9,10 +9,10 @@ import pytest
 import torch
 import toy_task
 
-from ddco_pyro.controller import Controller
-from ddco_pyro.hierarchy import Hierarchy
-from ddco_pyro.lockstep import play
-from ddco_pyro.rollout import run_episode
+from ddco_pyro.acting.controller import Controller
+from ddco_pyro.acting.lockstep import play
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import RolloutSpec, parse_spec
 
 SEEDS = (3, 4, 5, 6)

@@ -12,9 +12,9 @@ from pyro.infer.autoguide import AutoDelta, AutoNormal
 from test_hierarchy import make_batch, make_hierarchy
 from torch.func import functional_call
 
-from ddco_pyro.ahmm import ahmm, complete
 from ddco_pyro.inference import log_likelihood, posterior
-from ddco_pyro.marginal import EliminatedAHMM
+from ddco_pyro.inference.marginal import EliminatedAHMM
+from ddco_pyro.model.ahmm import ahmm, complete
 
 PRIOR = 0.5
 

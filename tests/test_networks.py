@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from ddco_pyro.networks import CLASSES, Inputs, InputShape, ShapeError, build
-from ddco_pyro.networks.conv import POOLED
-from ddco_pyro.networks.stacked import StackedLinear
+from ddco_pyro.model.networks import CLASSES, Inputs, InputShape, ShapeError, build
+from ddco_pyro.model.networks.conv import POOLED
+from ddco_pyro.model.networks.stacked import StackedLinear
 from ddco_pyro.spec import NetworkSpec
 
 FEATURES, OUTPUTS, COPIES, LONGEST = 3, 2, 4, 5

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.encoding import ObservationEncoder
-from ddco_pyro.observing import ObservationError, Window
+from ddco_pyro.acting.window import ObservationError, Window
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.model.encoding import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec
 
 

@@ -11,7 +11,7 @@ from oracle import brute_force
 
 from ddco_pyro.inference import direct, fused, total_log_likelihood
 from ddco_pyro.inference.check import compare_engines
-from ddco_pyro.outputs import Decision, Outputs
+from ddco_pyro.model.outputs import Decision, Outputs
 
 VOLUME = torch.tensor(0.3, dtype=torch.float64)
 EMITS = ["options", "both", "control"]

@@ -12,8 +12,8 @@ from oracle import paths, random_tables
 from pyro.infer import TraceEnum_ELBO, infer_discrete
 from scipy import stats
 
-from ddco_pyro.ahmm import NEVER, Tables, ahmm, complete
 from ddco_pyro.inference import most_likely_path, posterior, sample_paths
+from ddco_pyro.model.ahmm import NEVER, Tables, ahmm, complete
 
 CASES = [
     ((1,), (True,), 4),

@@ -20,7 +20,7 @@ from killing import HANGS
 from random_demonstrations import demonstrations
 from test_cli import call
 
-from ddco_pyro.files import Busy, NoSpace, NotWritable, only_one, whole_file, write_text
+from ddco_pyro.data.files import Busy, NoSpace, NotWritable, only_one, whole_file, write_text
 
 NOBODY = 65534
 
@@ -60,7 +60,7 @@ def test_a_full_disk_while_importing(source: Path, tmp_path: Path, size: int) ->
 
 @pytest.mark.parametrize("size", [0, 3000])
 def test_a_full_disk_while_segmenting(toy_run, toy_spec, tmp_path: Path, size: int) -> None:
-    from ddco_pyro.data import demonstrations as of
+    from ddco_pyro.fitting.prepare import demonstrations as of
 
     path = tmp_path / "demos.hdf5"
     of(toy_spec).write(path)
@@ -98,7 +98,7 @@ def test_what_was_there_before_stays_when_the_disk_is_full(tmp_path: Path) -> No
 AS_NOBODY = """
 import os, sys
 from pathlib import Path
-from ddco_pyro.files import NotWritable, only_one, write_text
+from ddco_pyro.data.files import NotWritable, only_one, write_text
 os.setuid(int(sys.argv[2])) if os.getuid() == 0 else None
 folder = Path(sys.argv[1])
 for attempt in (lambda: write_text(folder / "file", "x"), lambda: only_one(folder / "run").__enter__()):

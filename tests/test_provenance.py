@@ -21,7 +21,7 @@ FILES = {
     "benchmarks/helper.py": "NAME = 'helped.json'\n",
     "benchmarks/helped.json": "{}",
     "benchmarks/unrelated.py": "",
-    "benchmarks/provenance.py": "import unrelated\n",
+    "studies/provenance.py": "import unrelated\n",
     "ddco_pyro/__init__.py": "",
     "ddco_pyro/first.py": "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from ddco_pyro.typed import T\n"
     "def run(x):\n    from ddco_pyro.room import second\n    return second\n",
@@ -275,7 +275,8 @@ def test_every_result_says_what_made_it():
 
 
 def test_every_script_that_writes_results_says_what_made_them():
-    scripts = [path for path in (ROOT / "benchmarks").glob("*.py") if "write_text(" in path.read_text()]
+    folders = [ROOT / "benchmarks", ROOT / "studies"]
+    scripts = [path for folder in folders for path in folder.glob("*.py") if "write_text(" in path.read_text()]
     writing = [path for path in scripts if re.search(r"\.(json|md)\"", path.read_text())]
     assert len(writing) > 8
     for path in writing:

@@ -11,7 +11,7 @@ import toy_task
 from scipy import stats
 from toy_task import task
 
-from ddco_pyro.rollout import paired_difference, rate, run_episode, run_episodes, summarize
+from ddco_pyro.simulation.episodes import paired_difference, rate, run_episode, run_episodes, summarize
 
 
 class Noted:

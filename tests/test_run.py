@@ -15,10 +15,10 @@ import torch
 from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
-from ddco_pyro.data import Dimensions, demonstrations
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.files import Damaged
-from ddco_pyro.run import RunError, claim, fit, train
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.files import Damaged
+from ddco_pyro.fitting.prepare import Dimensions, demonstrations
+from ddco_pyro.fitting.run import RunError, claim, fit, train
 from ddco_pyro.spec import dump_spec, load_spec, with_overrides
 
 

@@ -16,9 +16,9 @@ from killing import struck
 from selecting import Told, data_at, kept, score, spec_at, two_skills
 
 import ddco_pyro
-from ddco_pyro.data import Dimensions
 from ddco_pyro.errors import Failed
-from ddco_pyro.run import log_likelihoods, train
+from ddco_pyro.fitting.prepare import Dimensions
+from ddco_pyro.fitting.run import log_likelihoods, train
 from ddco_pyro.selection import SelectionFailed, Workers, check, final_spec, parallel, scoring, select
 from ddco_pyro.selection.folds import FoldError
 from ddco_pyro.selection.parallel import BackendError
@@ -215,7 +215,7 @@ def test_everything_is_checked_before_any_work(tmp_path):
 def written(folder):
     """A spec file of a selection that takes a while."""
     data = data_at(folder)
-    data |= {"training": data["training"] | {"epochs": 4, "patience": None}}
+    data |= {"training": data["training"] | {"epochs": 16, "patience": None}}
     (folder / "spec.yaml").write_text(yaml.safe_dump(data))
     return folder / "spec.yaml"
 

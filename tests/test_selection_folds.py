@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from selecting import two_skills
 
-from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.selection.folds import FoldError, assign, digest, divide, keep
 
 

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import yaml
+from gripper import planted
 from random_demonstrations import demonstrations
 from scipy import stats
 from test_cli import call
 
 import ddco_pyro
-from ddco_pyro.demonstrations import Demonstration, Demonstrations, DemonstrationsError
-from ddco_pyro.inspection import inspect
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.data.inspection import inspect
+from ddco_pyro.data.starting import _batch, _epochs, starting_spec
 from ddco_pyro.spec import load_spec
-from ddco_pyro.starting import starting_spec
 
 
 @pytest.fixture
@@ -66,8 +68,35 @@ def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Pa
     side = [np.where(demo.labels["skill"] == 5, 1, -1)[:, None] * demo.observations["place"] for demo in held_out]
     truth = stats.norm.logpdf(np.concatenate([demo.actions for demo in held_out]), np.concatenate(side), NOISE).mean()
     assert fit.metrics["log_likelihood_per_step"]["valid"] > truth - 0.1
-    assert list(fit.baselines) == ["flat"]
+    assert list(fit.baselines) == ["flat", "flat_equal"]
     assert "agreement" in fit.metrics  # with the labels in the file
+
+
+@pytest.mark.slow
+def test_what_it_writes_lets_every_method_converge(tmp_path: Path) -> None:
+    """Two-valued and constant controls are what took longest."""
+    planted().write(tmp_path / "gripper.hdf5")
+    assert call("init", tmp_path / "gripper.hdf5", "--out", tmp_path / "spec.yaml").status == 0
+    ended = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run")
+    assert ended.status == 0, ended.err
+    metrics = ddco_pyro.load(tmp_path / "run").metrics
+    trainings = [metrics["training"], *(one["training"] for one in metrics["comparison"].values())]
+    assert [one["converged"] for one in trainings] == [True, True, True]
+    assert len({json.dumps(one["budget"]) for one in trainings}) == 1
+
+
+@pytest.mark.parametrize(
+    ("lengths", "epochs"),
+    [
+        ([22] * 120, 2000),  # 3 gradient steps in an epoch: 6000 in all
+        ([57] * 100, 1000),  # 6
+        ([100] * 1000, 200),  # 100, and 200 epochs at least
+        ([10] * 5, 2000),  # 3, in minibatches of 2
+    ],
+)
+def test_epochs_follow_from_the_gradient_steps(lengths: list[int], epochs: int) -> None:
+    found = np.array(lengths)
+    assert _epochs(found, _batch(found)) == epochs
 
 
 def test_three_demonstrations_are_enough(tmp_path: Path) -> None:

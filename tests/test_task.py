@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import toy_task
 
-from ddco_pyro.rollout import run_episode
+from ddco_pyro.simulation.episodes import run_episode
+from ddco_pyro.simulation.task import OutcomeError, UnknownTask, find_task
 from ddco_pyro.spec.types import TASKS
-from ddco_pyro.task import OutcomeError, UnknownTask, find_task
 
 not_a_task = "text"
 
@@ -31,7 +31,7 @@ def test_a_registered_task_is_found_by_its_name(monkeypatch):
         assert group == TASKS
         return [Point]
 
-    monkeypatch.setattr("ddco_pyro.task.entry_points", entry_points)
+    monkeypatch.setattr("ddco_pyro.simulation.task.entry_points", entry_points)
     assert find_task("toy") is toy_task.task
     with pytest.raises(
         UnknownTask, match=r"^no task is registered as 'toi' \(registered: toy\); module:name works too$"

@@ -9,10 +9,10 @@ import pytest
 import torch
 from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plant, recovered
 
-from ddco_pyro.convergence import RISING, StageEnd
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.fitting.convergence import RISING, StageEnd
+from ddco_pyro.fitting.training import TrainingError, plan
 from ddco_pyro.spec import parse_spec
-from ddco_pyro.training import TrainingError, plan
 
 
 def random_demonstrations(number=10, steps=8, seed=0):

@@ -14,7 +14,7 @@ import yaml
 from test_cli import call, with_set
 
 import ddco_pyro
-from ddco_pyro.data import demonstrations
+from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.spec import SpecError, load_spec, parse_spec, user_code, with_overrides
 
 HERE = Path(__file__).parent

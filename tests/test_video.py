@@ -6,10 +6,10 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from ddco_pyro.colours import option_rgb
-from ddco_pyro.demonstrations import Demonstration
-from ddco_pyro.rollout import Episode
-from ddco_pyro.video import FRAMES_PER_SECOND, captioned, write_film
+from ddco_pyro.data.demonstrations import Demonstration
+from ddco_pyro.drawing.colours import option_rgb
+from ddco_pyro.simulation.episodes import Episode
+from ddco_pyro.simulation.film import FRAMES_PER_SECOND, captioned, write_film
 
 HEIGHT, WIDTH = 121, 161
 

@@ -9,7 +9,7 @@ import dm_env
 import numpy as np
 from dm_env import specs
 
-from ddco_pyro.task import Task
+from ddco_pyro.simulation.task import Task
 
 STEPS = 12
 SPEED = 0.3  # distance at full control, in each direction

@@ -17,9 +17,9 @@ import numpy as np
 from ddco_pyro.comparison import page, plot
 from ddco_pyro.comparison.rollouts import paired_rollouts
 from ddco_pyro.comparison.shared import Held, held_out
+from ddco_pyro.data.files import write_text
 from ddco_pyro.errors import BadInput
-from ddco_pyro.files import write_text
-from ddco_pyro.run import load
+from ddco_pyro.fitting.run import load
 
 __all__ = ["CompareError", "Comparison", "Row", "compare", "write"]
 

@@ -10,16 +10,16 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ddco_pyro.analysis import paired
-from ddco_pyro.convergence import effort
-from ddco_pyro.report import words
+from ddco_pyro.drawing import words
+from ddco_pyro.drawing.templates import render
+from ddco_pyro.fitting.analysis import paired
+from ddco_pyro.fitting.convergence import effort
 from ddco_pyro.report.demonstration_list import SHOWN
 from ddco_pyro.segmenting.timeline import anchor
-from ddco_pyro.templates import render
 
 if TYPE_CHECKING:
     from ddco_pyro.comparison import Comparison, Row
-    from ddco_pyro.report.pictures import Picture
+    from ddco_pyro.drawing.pictures import Picture
 
 HEAD = ("rank", "run", "model", "parameters", "total", "se", "diff", "dse", "nats/step", "gradient steps")
 ROLLOUT_HEAD = ("run", "succeeds", "other", "succeeds", "only run", "only other", "states", "p")
@@ -56,8 +56,8 @@ def verdict(found: Comparison) -> str:
     best, *others = found.rows
     lengths = np.array(found.steps, dtype=float)
     differences = {row.name: paired(np.array(best.each), np.array(row.each), lengths) for row in others}
-    rising = [row.name for row in found.rows if row.training and not row.training["converged"]]
-    return words.explains(best.name, differences, len(found.trajectories), rising)
+    rising = words.rising(row.name for row in found.rows if row.training and not row.training["converged"])
+    return f"{words.explains(best.name, differences, len(found.trajectories))}{rising}"
 
 
 def list_head(found: Comparison) -> list[str]:

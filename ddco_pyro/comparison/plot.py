@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from ddco_pyro.report.pictures import FAINT, INK, Picture, blank, keep, style
+from ddco_pyro.drawing.pictures import FAINT, INK, Picture, blank, keep, style
 
 if TYPE_CHECKING:
     from ddco_pyro.comparison import Comparison, Row

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ddco_pyro.records import read_successes
-from ddco_pyro.rollout import paired_difference, rate
-from ddco_pyro.run import Fit
+from ddco_pyro.fitting.records import read_successes
+from ddco_pyro.fitting.run import Fit
+from ddco_pyro.simulation.episodes import paired_difference, rate
 
 Outcomes = Mapping[int, float]
 """Success (1) or not (0) by the seed of the initial state."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ddco_pyro.data import demonstrations, parts
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput
-from ddco_pyro.run import Fit
+from ddco_pyro.fitting.prepare import demonstrations, parts
+from ddco_pyro.fitting.run import Fit
 
 
 class NotShared(BadInput):

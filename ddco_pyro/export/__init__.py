@@ -15,17 +15,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from ddco_pyro.controller import Controller
-from ddco_pyro.encoding import ObservationEncoder
+from ddco_pyro.acting.controller import Controller
+from ddco_pyro.data.files import whole_folder
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.export import runner
 from ddco_pyro.export.program import StepProgram, example, input_names
 from ddco_pyro.export.runner import TOLERANCE
 from ddco_pyro.export.weights import weights_and_networks
-from ddco_pyro.files import whole_folder
-from ddco_pyro.hierarchy import Hierarchy
-from ddco_pyro.outputs import TERMINATION_BOUND
-from ddco_pyro.run import Fit
+from ddco_pyro.fitting.run import Fit
+from ddco_pyro.model.encoding import ObservationEncoder
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.outputs import TERMINATION_BOUND
 from ddco_pyro.spec import RolloutSpec
 
 __all__ = ["TOLERANCE", "Exported", "export"]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ddco_pyro.encoding import ObservationEncoder
-from ddco_pyro.hierarchy import Hierarchy
-from ddco_pyro.networks import Inputs
+from ddco_pyro.model.encoding import ObservationEncoder
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import Inputs
 
 
 class StepProgram(nn.Module):

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.hierarchy import Hierarchy
-from ddco_pyro.networks.numpy_form import HasNumpyForm
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks.numpy_form import HasNumpyForm
 
 Arrays = dict[str, np.ndarray]
 

@@ -7,10 +7,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ddco_pyro.ahmm import Tables, complete
 from ddco_pyro.inference import enumeration, fused
 from ddco_pyro.inference.paths import Path, most_likely_path, sample_paths, segment
 from ddco_pyro.inference.posteriors import Posterior, posterior
+from ddco_pyro.model.ahmm import Tables, complete
 
 __all__ = [
     "Engine",

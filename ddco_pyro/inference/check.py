@@ -8,9 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ddco_pyro.ahmm import Tables, complete
 from ddco_pyro.inference import direct, enumeration, fused
-from ddco_pyro.outputs import Outputs
+from ddco_pyro.model.ahmm import Tables, complete
+from ddco_pyro.model.outputs import Outputs
 
 TRAJECTORIES = 3
 STEPS = 12

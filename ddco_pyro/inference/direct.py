@@ -15,7 +15,7 @@ from ddco_pyro.inference import fused, links
 from ddco_pyro.inference.once import once
 from ddco_pyro.inference.structure import Structure, structure
 from ddco_pyro.inference.threads import as_many_threads_as_torch
-from ddco_pyro.outputs import TERMINATION_BOUND, Decision, Outputs, bounded
+from ddco_pyro.model.outputs import TERMINATION_BOUND, Decision, Outputs, bounded
 
 
 def log_likelihood(outputs: Outputs, actions: Tensor, log_volume: Tensor, lengths: Tensor) -> Tensor:

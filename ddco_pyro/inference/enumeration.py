@@ -1,11 +1,11 @@
-"""The definition of the likelihood: Pyro eliminates the latents of :func:`ddco_pyro.ahmm.ahmm` by enumeration."""
+"""The definition of the likelihood: Pyro eliminates the latents of :func:`ddco_pyro.model.ahmm.ahmm` by enumeration."""
 
 from __future__ import annotations
 
 from pyro.infer import TraceEnum_ELBO
 from torch import Tensor
 
-from ddco_pyro.ahmm import Chain, ahmm
+from ddco_pyro.model.ahmm import Chain, ahmm
 
 BATCH_DIMENSIONS = 1
 """Dimensions of the model's plate; enumeration takes those further left."""

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ddco_pyro.ahmm import Step
 from ddco_pyro.inference.logspace import Arrival, arrive, log_sum
+from ddco_pyro.model.ahmm import Step
 
 
 class Belief(NamedTuple):

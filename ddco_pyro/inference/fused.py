@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.ahmm import Tables, complete
 from ddco_pyro.inference import logspace
 from ddco_pyro.inference.kernel import forward_backward
 from ddco_pyro.inference.once import once
 from ddco_pyro.inference.structure import Structure, structure_of
 from ddco_pyro.inference.threads import as_many_threads_as_torch
+from ddco_pyro.model.ahmm import Tables, complete
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ddco_pyro.ahmm import NEVER, Chain, Step
+from ddco_pyro.model.ahmm import NEVER, Chain, Step
 
 
 def log_sum(values: Tensor) -> Tensor:

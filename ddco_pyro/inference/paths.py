@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.ahmm import Tables
 from ddco_pyro.inference.structure import Structure, structure_of
 from ddco_pyro.inference.threads import as_many_threads_as_torch
 from ddco_pyro.inference.trace import trace
+from ddco_pyro.model.ahmm import Tables
 
 
 class Path(NamedTuple):

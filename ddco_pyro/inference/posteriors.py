@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ddco_pyro.ahmm import Tables
 from ddco_pyro.inference import fused
+from ddco_pyro.model.ahmm import Tables
 
 
 class Posterior(NamedTuple):

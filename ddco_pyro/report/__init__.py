@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ddco_pyro.demonstrations import Demonstrations
-from ddco_pyro.files import write_text
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.files import write_text
+from ddco_pyro.drawing.pictures import style
+from ddco_pyro.drawing.templates import render
+from ddco_pyro.drawing.words import unconverged
+from ddco_pyro.fitting.run import Fit
 from ddco_pyro.report import activity, demonstration_list, dimensions, sections
-from ddco_pyro.report.pictures import style
 from ddco_pyro.report.sections import degeneracies
-from ddco_pyro.report.words import unconverged
-from ddco_pyro.run import Fit
-from ddco_pyro.templates import render
 
 __all__ = ["degeneracies", "unconverged", "write_report"]
 

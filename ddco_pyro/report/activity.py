@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ddco_pyro.demonstrations import Demonstrations
-from ddco_pyro.encoding import encode
-from ddco_pyro.hierarchy import Hierarchy
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.fitting.run import Fit
 from ddco_pyro.inference import most_likely_path, posterior
-from ddco_pyro.run import Fit
+from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.hierarchy import Hierarchy
 
 MOST_BINS = 60
 

@@ -6,10 +6,10 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.drawing.words import method, number
+from ddco_pyro.fitting.run import Fit
 from ddco_pyro.report.activity import Activity
-from ddco_pyro.report.words import method, number
-from ddco_pyro.run import Fit
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
 from ddco_pyro.segmenting.timeline import Timeline, anchor
 from ddco_pyro.segmenting.timeline import timelines as drawn

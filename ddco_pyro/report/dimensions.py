@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ddco_pyro.control_dimensions import ControlDimension
+from ddco_pyro.data.control_dimensions import ControlDimension
+from ddco_pyro.drawing.words import method, number
 from ddco_pyro.report.tables import Table
-from ddco_pyro.report.words import method, number
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from ddco_pyro.records import read_table, refit
-from ddco_pyro.report import words
-from ddco_pyro.report.pictures import INK, blank
+from ddco_pyro.drawing import words
+from ddco_pyro.drawing.pictures import INK, blank
+from ddco_pyro.fitting.records import read_table, refit
 
 COLUMNS = 4
 TUNE = "#c2410c"

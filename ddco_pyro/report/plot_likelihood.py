@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ddco_pyro.report.pictures import FAINT, INK, blank
-from ddco_pyro.report.words import method
+from ddco_pyro.drawing.pictures import FAINT, INK, blank
+from ddco_pyro.drawing.words import method
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 
-from ddco_pyro.colours import option_colour
+from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.drawing.pictures import blank
 from ddco_pyro.report.activity import Activity, LevelActivity
-from ddco_pyro.report.pictures import blank
 from ddco_pyro.report.strips import draw_labels, draw_path, legend
 
 MOST_POINTS = 400

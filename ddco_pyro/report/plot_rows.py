@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ddco_pyro.drawing.pictures import blank
 from ddco_pyro.report.activity import Activity
-from ddco_pyro.report.pictures import blank
 from ddco_pyro.report.strips import colour_image, label_image, legend
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ddco_pyro.report.pictures import INK, blank
-from ddco_pyro.report.words import method
+from ddco_pyro.drawing.pictures import INK, blank
+from ddco_pyro.drawing.words import method
 
 
 def draw(rates: Mapping[str, Mapping[str, Any]]) -> Figure:

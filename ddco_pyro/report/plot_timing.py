@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ddco_pyro.colours import option_colour
+from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.drawing.pictures import blank
 from ddco_pyro.report.activity import Activity, Bins, LevelActivity, bins
-from ddco_pyro.report.pictures import blank
 from ddco_pyro.report.strips import legend
 
 LEAST_SHARE = 0.01

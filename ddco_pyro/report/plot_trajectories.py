@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-from ddco_pyro.colours import option_colour
-from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.drawing.pictures import FAINT, INK, blank
 from ddco_pyro.report.activity import Activity, LevelActivity
-from ddco_pyro.report.pictures import FAINT, INK, blank
 from ddco_pyro.report.strips import legend
 
 MOST_TRAJECTORIES = 40

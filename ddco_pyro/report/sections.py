@@ -6,8 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.diagnostics import diagnose
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.drawing import words
+from ddco_pyro.drawing.pictures import Picture, keep
+from ddco_pyro.fitting.diagnostics import diagnose
+from ddco_pyro.fitting.run import Fit
 from ddco_pyro.report import (
     film,
     plot_learning,
@@ -18,11 +21,9 @@ from ddco_pyro.report import (
     plot_timing,
     plot_trajectories,
     tables,
-    words,
 )
 from ddco_pyro.report.activity import Activity
-from ddco_pyro.report.pictures import Picture, keep
-from ddco_pyro.run import Fit
+from ddco_pyro.report.signs import warning
 from ddco_pyro.spec import Spec, dump_spec
 
 EXAMPLES = 4
@@ -278,7 +279,7 @@ def degeneracies(spec: Spec, metrics: Mapping[str, Any]) -> list[tuple[str, str]
         return []
     names = [level.name for level in spec.hierarchy.levels]
     found = diagnose(metrics["options"], metrics.get("divergences", ()))  # runs of before have no divergences
-    return [(words.warning(one, names[one.level - 1]), one.advice) for one in found]
+    return [(warning(one, names[one.level - 1]), one.advice) for one in found]
 
 
 def films(fit: Fit) -> Films | None:

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Patch
 
-from ddco_pyro.colours import option_colour
-from ddco_pyro.report.pictures import FAINT, hide_frame
+from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.drawing.pictures import FAINT, hide_frame
 
 LABEL_SHADES = ("#ffffff", "#d4d4d4")
 """Ground truth has no colours: those belong to options. Its segments alternate in shade and carry their label."""

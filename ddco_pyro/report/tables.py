@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ddco_pyro.colours import option_colour
-from ddco_pyro.convergence import effort
+from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.drawing.words import interval, measure, method, number, p_value, percent, rate, signed
+from ddco_pyro.fitting.convergence import effort
 from ddco_pyro.report.plot_likelihood import Likelihood
 from ddco_pyro.report.strips import choice_name
-from ddco_pyro.report.words import interval, measure, method, number, p_value, percent, rate, signed
 
 
 @dataclass(frozen=True)

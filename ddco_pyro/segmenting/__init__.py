@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from ddco_pyro.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.encoding import STEPS_AT_ONCE, encode
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.hdf5 import DemonstrationsError
+from ddco_pyro.data.memory import INFERENCE, PROGRAM, Extent, refuse_too_much
+from ddco_pyro.data.sources import Recording, Source
 from ddco_pyro.errors import BadInput, nearest
-from ddco_pyro.hdf5 import DemonstrationsError
+from ddco_pyro.fitting.run import Fit
 from ddco_pyro.inference import log_likelihood, most_likely_path, posterior
-from ddco_pyro.memory import INFERENCE, PROGRAM, Extent, refuse_too_much
-from ddco_pyro.run import Fit
-from ddco_pyro.sources import Recording, Source
+from ddco_pyro.model.encoding import STEPS_AT_ONCE, encode
 
 __all__ = ["LevelLabels", "Segmented", "Segments", "segments"]
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ddco_pyro.data.files import whole_file
+from ddco_pyro.data.hdf5 import opened, written
 from ddco_pyro.errors import BadInput
-from ddco_pyro.files import whole_file
-from ddco_pyro.hdf5 import opened, written
 from ddco_pyro.segmenting import Segmented, Segments
 
 BOUNDARY = "_boundary"

@@ -1,35 +1,37 @@
-"""Segments as subtasks in a copy of a LeRobot dataset: ``subtask_index`` of each frame, ``meta/subtasks.parquet``."""
+"""Segments as subtasks in a copy of a LeRobot dataset, in the form that LeRobot reads from 0.6 on, or up to 0.5."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow
 from pyarrow import parquet
 
+from ddco_pyro.data.files import whole_folder, write_text
+from ddco_pyro.data.sources.lerobot import SUBTASK, LeRobot
 from ddco_pyro.errors import BadInput
-from ddco_pyro.files import whole_folder, write_text
 from ddco_pyro.segmenting import Segmented
-from ddco_pyro.sources.lerobot import SUBTASK, LeRobot
-
-FEATURE = {"dtype": "int64", "shape": [1], "names": None}
+from ddco_pyro.segmenting.lerobot_forms import PERSISTENT, Form, subtask_names
 
 
-def annotate(source: LeRobot, out: Path, found: Segmented, level: str) -> None:
+def annotate(source: LeRobot, out: Path, found: Segmented, level: str, form: Form) -> None:
     """Write the dataset with its subtasks to ``out``, a new folder, whole or not at all.
 
     Videos are linked where the file system can, else copied. A copy that has these very subtasks stays as it is.
 
     :raises BadInput: ``out`` is something else, or the dataset has subtasks of its own.
     """
-    check_target(source, out, level, found.counts[level])
+    names = subtask_names(level, found.counts[level])
+    check_target(source, out, names, form)
+    options = {one.name.removeprefix("demo_"): one.levels[level].options for one in found.segments}
     if out.exists():
-        if not _has(source, out, found, level):
+        if not all(_has(source.folder / path, out / path, options, names, form) for path in _data(source)):
             raise _taken(out)
         return
     with whole_folder(out) as temporary:
@@ -37,50 +39,44 @@ def annotate(source: LeRobot, out: Path, found: Segmented, level: str) -> None:
         for path in (Path("meta/info.json"), *_data(source)):
             (temporary / path).unlink()
         for path in _data(source):
-            _write_data(source.folder / path, temporary / path, found, level)
-        _write_names(temporary / "meta" / "subtasks.parquet", level, found.counts[level])
-        write_text(temporary / "meta" / "info.json", _info(source))
+            _write(source.folder / path, temporary / path, options, names, form)
+        for path, table in form.tables(names).items():
+            parquet.write_table(table, temporary / path)
+        write_text(temporary / "meta" / "info.json", _info(source, form))
 
 
-def check_target(source: LeRobot, out: Path, level: str, count: int) -> None:
-    """See that ``out`` is not there, or is a copy with such subtasks: options 1 to ``count`` of this level.
+def check_target(source: LeRobot, out: Path, names: list[str], form: Form) -> None:
+    """See that ``out`` is not there, or is a copy with such subtasks.
 
     :raises BadInput: it is something else, or the dataset has subtasks of its own.
     """
-    if SUBTASK in source.features:
+    if {SUBTASK, PERSISTENT} & source.features.keys():
         raise BadInput(f"{source.folder}: has subtasks already; name a dataset without them")
-    info, names = out / "meta" / "info.json", out / "meta" / "subtasks.parquet"
+    info = out / "meta" / "info.json"
     if out.exists() and not (
-        (info.is_file() and info.read_text(encoding="utf-8") == _info(source))
-        and (names.is_file() and parquet.read_table(names)["subtask"].to_pylist() == _option_names(level, count))
+        (info.is_file() and info.read_text(encoding="utf-8") == _info(source, form))
+        and all((out / path).is_file() and _equal(out / path, table) for path, table in form.tables(names).items())
     ):
         raise _taken(out)
+
+
+def _equal(path: Path, table: pyarrow.Table) -> bool:
+    return parquet.read_table(path).to_pylist() == table.to_pylist()
 
 
 def _taken(out: Path) -> BadInput:
     return BadInput(f"{out}: is there already; choose another --lerobot")
 
 
-def _info(source: LeRobot) -> str:
+def _info(source: LeRobot, form: Form) -> str:
     """``meta/info.json`` with the subtasks."""
-    return json.dumps({**source.info, "features": {**source.features, SUBTASK: FEATURE}}, indent=4) + "\n"
+    return json.dumps({**source.info, "features": {**source.features, **form.features}}, indent=4) + "\n"
 
 
 def _data(source: LeRobot) -> list[Path]:
     """The files of the dataset that hold steps."""
     data = source.folder / "data"
     return sorted(path.relative_to(source.folder) for path in source.files if path.is_relative_to(data))
-
-
-def _has(source: LeRobot, out: Path, found: Segmented, level: str) -> bool:
-    """Whether a copy with such subtasks, which is whole, has these very ones."""
-    return all(
-        np.array_equal(
-            parquet.read_table(out / path, columns=[SUBTASK])[SUBTASK].to_numpy(),
-            _options(parquet.read_table(source.folder / path, columns=["episode_index"]), found, level),
-        )
-        for path in _data(source)
-    )
 
 
 def _link(source: str, target: str) -> None:
@@ -93,46 +89,38 @@ def _link(source: str, target: str) -> None:
     shutil.copy2(source, target)
 
 
-def _write_data(source: Path, target: Path, found: Segmented, level: str) -> None:
-    """The same rows with a column that says which option is active."""
+def _write(source: Path, target: Path, options: Mapping[str, np.ndarray], names: list[str], form: Form) -> None:
+    """The same rows with the form's columns, a row group for each episode, as LeRobot writes them."""
     table = parquet.read_table(source)
-    index = _options(table, found, level)
-    schema = _with_feature(table.schema.metadata or {})
-    parquet.write_table(table.append_column(SUBTASK, pyarrow.array(index)).replace_schema_metadata(schema), target)
+    writer = None
+    for rows, columns in _episodes(table, options, names, form):
+        for name, values in columns.items():
+            rows = rows.append_column(name, values)
+        rows = rows.replace_schema_metadata(form.metadata(table.schema.metadata or {}))
+        writer = writer or parquet.ParquetWriter(target, rows.schema)
+        writer.write_table(rows)
+    assert writer is not None  # a file of a dataset holds an episode
+    writer.close()
 
 
-def _options(table: pyarrow.Table, found: Segmented, level: str) -> np.ndarray:
-    """The option of each row."""
-    episodes = table["episode_index"].to_numpy()
-    index = np.zeros(len(table), np.int64)
-    for one in found.segments:
-        rows = episodes == int(one.name.removeprefix("demo_"))
-        if rows.any():
-            index[rows] = one.levels[level].options
-    return index
+def _has(source: Path, target: Path, options: Mapping[str, np.ndarray], names: list[str], form: Form) -> bool:
+    """Whether a data file of a copy, which is whole, has these very subtasks."""
+    there = parquet.read_table(target)
+    expected = _episodes(parquet.read_table(source, columns=["episode_index", "timestamp"]), options, names, form)
+    start = 0
+    for rows, columns in expected:
+        if not there.select(list(columns)).slice(start, len(rows)).equals(pyarrow.table(columns)):
+            return False
+        start += len(rows)
+    return start == len(there)
 
 
-def _with_feature(metadata: dict[bytes, bytes]) -> dict[bytes, bytes]:
-    """What the ``datasets`` library says of the columns, with the new one."""
-    said = metadata.get(b"huggingface")
-    if said is None:
-        return metadata
-    info: dict[str, Any] = json.loads(said)
-    info["info"]["features"][SUBTASK] = {"dtype": "int64", "_type": "Value"}
-    return {**metadata, b"huggingface": json.dumps(info).encode()}
-
-
-def _write_names(path: Path, level: str, count: int) -> None:
-    """The name of each option, as a pandas index, which is how LeRobot reads them."""
-    table = pyarrow.table({"subtask": _option_names(level, count), SUBTASK: list(range(1 + count))})
-    columns = [_column("subtask", "unicode", "object"), _column(SUBTASK, "int64", "int64")]
-    pandas = {"index_columns": ["subtask"], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
-    parquet.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), path)
-
-
-def _option_names(level: str, count: int) -> list[str]:
-    return [f"{level} {choice}" if choice else "control" for choice in range(1 + count)]
-
-
-def _column(name: str, kind: str, numpy_kind: str) -> dict[str, Any]:
-    return {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_kind, "metadata": None}
+def _episodes(
+    table: pyarrow.Table, options: Mapping[str, np.ndarray], names: list[str], form: Form
+) -> Iterator[tuple[pyarrow.Table, dict[str, pyarrow.Array]]]:
+    """The rows of each episode in a data file, and the columns that go with them."""
+    index = table["episode_index"].to_numpy()
+    bounds = [0, *(np.flatnonzero(np.diff(index)) + 1).tolist(), len(index)]
+    for start, stop in pairwise(bounds):
+        rows = table.slice(start, stop - start)
+        yield rows, form.columns(rows, options[str(index[start])], names)

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.analysis import agreement
-from ddco_pyro.colours import option_colour
-from ddco_pyro.files import write_text
+from ddco_pyro.data.files import write_text
+from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.drawing.templates import render
+from ddco_pyro.fitting.analysis import agreement
 from ddco_pyro.segmenting import Segmented, Segments
 from ddco_pyro.segmenting.timeline import duration, option_name, timelines
-from ddco_pyro.templates import render
 
 MOST_BOXES = 100_000
 """Segments that a page shows, about: more are slow in any browser, and take much memory to write."""

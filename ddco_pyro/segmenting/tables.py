@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ddco_pyro.data.files import whole_file
 from ddco_pyro.errors import BadInput
-from ddco_pyro.files import whole_file
 from ddco_pyro.segmenting import Segmented
 
 

@@ -10,7 +10,7 @@ from urllib.parse import quote
 import matplotlib
 import numpy as np
 
-from ddco_pyro.colours import option_colour
+from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
 
 SHADES = ("#f2f2f2", "#d4d4d4")

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from ddco_pyro.data import demonstrations, dimensions
+from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.errors import Failed
-from ddco_pyro.files import only_one, write_text
+from ddco_pyro.fitting.prepare import demonstrations, dimensions
 from ddco_pyro.selection import choice as choosing
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.selection import grid, parallel, plot, scoring, table

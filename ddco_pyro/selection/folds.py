@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from sklearn.model_selection import KFold
 
-from ddco_pyro.data import Dimensions
-from ddco_pyro.demonstrations import Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.files import write_text
 from ddco_pyro.errors import BadInput
-from ddco_pyro.files import write_text
-from ddco_pyro.records import Record, read_record
+from ddco_pyro.fitting.prepare import Dimensions
+from ddco_pyro.fitting.records import Record, read_record
 
 
 class FoldError(BadInput):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from ddco_pyro.data import Dimensions, build_hierarchy, parameters
+from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy, parameters
 from ddco_pyro.spec import Spec, SpecError, with_overrides
 from ddco_pyro.spec.messages import show
 

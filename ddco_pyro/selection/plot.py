@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ddco_pyro.report.pictures import FAINT, INK, blank, keep, style
+from ddco_pyro.drawing.pictures import FAINT, INK, blank, keep, style
 from ddco_pyro.selection.choice import Choice, Row
 
 CHOSEN = "#e76300"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ddco_pyro.report.words import number, signed
+from ddco_pyro.drawing.words import number, signed
 from ddco_pyro.selection.choice import Choice, Row
 
 HEAD = ("Candidate", "Parameters", "Held-out nats/step", "Minus the best", "Gradient steps", "Folds", "")

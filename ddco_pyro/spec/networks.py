@@ -1,7 +1,7 @@
 """The networks that a spec can name, the settings of each, and the policies made of them.
 
-The settings of a network are the keyword arguments of its class in :mod:`ddco_pyro.networks`. Their types, defaults and
-bounds stand here and nowhere else: reading a spec, or its schema, is to do without importing torch.
+The settings of a network are the keyword arguments of its class in :mod:`ddco_pyro.model.networks`. Their types,
+defaults and bounds stand here and nowhere else: reading a spec, or its schema, is to do without importing torch.
 """
 
 from __future__ import annotations

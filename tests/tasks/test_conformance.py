@@ -8,8 +8,8 @@ import dm_env
 import numpy as np
 import pytest
 
+from ddco_pyro.simulation.task import Policy, Task, find_task
 from ddco_pyro.spec.types import TASKS
-from ddco_pyro.task import Policy, Task, find_task
 
 NAMES = sorted(point.name for point in entry_points(group=TASKS))
 

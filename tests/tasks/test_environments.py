@@ -8,16 +8,16 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from tasks.test_conformance import NAMES
 
-from ddco_pyro import environments
-from ddco_pyro.environments import TaskEnvironment
-from ddco_pyro.rollout import run_episode
-from ddco_pyro.task import find_task
+from ddco_pyro.simulation import environments
+from ddco_pyro.simulation.environments import TaskEnvironment
+from ddco_pyro.simulation.episodes import run_episode
+from ddco_pyro.simulation.task import find_task
 
 
 @pytest.mark.filterwarnings("ignore:.*:UserWarning:gymnasium.*")
 @pytest.mark.parametrize("name", NAMES)
 def test_gymnasiums_own_check(name: str) -> None:
-    environment = gymnasium.make(f"ddco_pyro.environments:ddco/{name}-v0", render_mode="rgb_array")
+    environment = gymnasium.make(f"ddco_pyro.simulation.environments:ddco/{name}-v0", render_mode="rgb_array")
     check_env(environment.unwrapped, skip_render_check=True)
     environment.reset(seed=1)
     frame = environment.render()

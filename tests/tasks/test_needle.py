@@ -4,9 +4,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from ddco_tasks import needle, needle_supervisor, planning, psm, vision
-from ddco_tasks import needle_geometry as geometry
-from ddco_tasks.needle import STEPS, Environment, task
+from ddco_tasks import planning, psm, vision
+from ddco_tasks.needle import environment as needle
+from ddco_tasks.needle import geometry as geometry
+from ddco_tasks.needle import supervisor as needle_supervisor
+from ddco_tasks.needle.environment import STEPS, Environment, task
 from ddco_tasks.psm import Pose
 
 AWAY = Pose(psm.rotation(2, 0.8), np.array([-0.015, -0.040, 0.045]))

@@ -46,7 +46,7 @@ def ended(*command: str | Path, **environment: str) -> subprocess.CompletedProce
 @pytest.mark.parametrize("cause", LIBRARIES)
 def test_without_opengl_libraries_one_line_names_the_packages(cause: str) -> None:
     before = WITHOUT.format(missing=LIBRARIES[cause])
-    command = "sys.argv = ['ddco-pyro', 'check', 'specs/needle.yaml']; from ddco_pyro.cli import main; main()"
+    command = "sys.argv = ['ddco-pyro', 'check', 'specs/needle.yaml']; from ddco_pyro.cli.app import main; main()"
     looking = "import runpy; runpy.run_path('tasks/opengl.py', run_name='__main__')"
     for script, head in ((command, "ddco-pyro: "), (looking, "")):
         found = ended(sys.executable, "-c", before + script)

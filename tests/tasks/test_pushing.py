@@ -9,13 +9,15 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from ddco_tasks import pushing, pushing_geometry, pushing_planner
 from ddco_tasks.planning import plan_path, points_along
-from ddco_tasks.pushing import Environment, limited, single, task
-from ddco_tasks.pushing_rules import PUSH_HEIGHT, Scene
+from ddco_tasks.pushing import environment as pushing
+from ddco_tasks.pushing import geometry as pushing_geometry
+from ddco_tasks.pushing import planner as pushing_planner
+from ddco_tasks.pushing.environment import Environment, limited, single, task
+from ddco_tasks.pushing.rules import PUSH_HEIGHT, Scene
 from ddco_tasks.rendering import render
 
-from ddco_pyro.rollout import run_episode
+from ddco_pyro.simulation.episodes import run_episode
 
 GRAVITY, FRICTION = 9.81, 0.4
 BEHIND_BOX = np.array([-0.3, PUSH_HEIGHT])  # of the tip, for a box at 0
@@ -336,8 +338,8 @@ def test_shortcuts_make_paths_shorter() -> None:
 
 DIGEST = """
 import hashlib, json
-from ddco_pyro.rollout import run_episode
-from ddco_tasks.pushing import single
+from ddco_pyro.simulation.episodes import run_episode
+from ddco_tasks.pushing.environment import single
 names = ("supervisor", "supervisor_noisy", "scripted_noisy", "supervisor_every_step")
 print(json.dumps([hashlib.sha256(run_episode(single, name, 4).record.actions.tobytes()).hexdigest() for name in names]))
 """

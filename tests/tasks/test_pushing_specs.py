@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ddco_tasks import pushing
+from ddco_tasks.pushing import environment as pushing
 
-from ddco_pyro.data import check_networks, dimensions
-from ddco_pyro.demonstrations import Demonstrations
-from ddco_pyro.lockstep import play
-from ddco_pyro.rollout import run_episode
-from ddco_pyro.run import fit
+from ddco_pyro.acting.lockstep import play
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.fitting.prepare import check_networks, dimensions
+from ddco_pyro.fitting.run import fit
 from ddco_pyro.selection.scoring import Unwatched
+from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import Spec, load_spec
 
 SPECS = sorted((Path(__file__).parents[2] / "specs").glob("pushing*.yaml"))
@@ -31,8 +31,8 @@ def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def short(path: Path, demonstrations: Path) -> Spec:
-    """The spec, on these demonstrations, for two epochs."""
-    return load_spec(path, [f"demonstrations.path={demonstrations}", "training.epochs=2"])
+    """The spec, on these demonstrations, for six epochs in all."""
+    return load_spec(path, [f"demonstrations.path={demonstrations}", "training.epochs=6"])
 
 
 def test_all_specs_are_here() -> None:

@@ -1,0 +1,1 @@
+"""A fitted hierarchy that acts, and one that watches somebody else act."""

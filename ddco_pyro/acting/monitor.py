@@ -1,0 +1,62 @@
+"""A live monitor: which options are active now, given what has been observed and done so far."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ddco_pyro.acting.window import ObservationError, Window
+from ddco_pyro.inference.filtering import Belief, Filter
+from ddco_pyro.model.ahmm import Chain, complete
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.outputs import Outputs
+
+
+class Monitor:
+    """Watches somebody act: :meth:`step` with each observation and the control that was applied before it."""
+
+    def __init__(self, hierarchy: Hierarchy) -> None:
+        self.hierarchy = hierarchy.eval()
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self._window, self._filter = Window(self.hierarchy.encoder), Filter()
+        self._outputs: Outputs | None = None
+
+    @property
+    def log_likelihood(self) -> float:
+        """log-density of the controls so far, nats."""
+        return float(self._filter.log_likelihood)
+
+    def step(self, observation: Mapping[str, np.ndarray], control: np.ndarray | None = None) -> Belief:
+        """p(h_t, b_t | s_0..t, a_0..t-1) of every level.
+
+        :param control: a_{t-1} [A], in the control's own units; None at the first step, and only there.
+        :raises ObservationError: an observation or the control is missing or has an unseen shape.
+        """
+        with torch.no_grad():
+            inputs = self._window.inputs(observation)
+            if self._outputs is not None:
+                self._filter.update(self._chain(self._outputs, self._scaled(control)).steps()[0].emission)
+            elif control is not None:
+                raise ObservationError("no control comes before the first observation: leave it out")
+            self._outputs = self.hierarchy(inputs)
+            size = len(self.hierarchy.scaling.scale)
+            return self._filter.predict(self._chain(self._outputs, torch.zeros(1, 1, size)).steps()[0])
+
+    def _scaled(self, control: np.ndarray | None) -> Tensor:
+        size = self.hierarchy.scaling.size
+        if control is None or np.shape(control) != (size,):
+            got = "none" if control is None else f"one of shape {np.shape(control)}"
+            raise ObservationError(
+                f"the control applied since the last observation is needed, shape ({size},); got {got}"
+            )
+        scaled = self.hierarchy.scaling.scaled(np.asarray(control, float)[None])
+        return torch.as_tensor(scaled).float().reshape(1, 1, -1)
+
+    def _chain(self, outputs: Outputs, actions: Tensor) -> Chain:
+        return complete(outputs.tables(actions, self.hierarchy.scaling.log_volume), torch.tensor([1]))

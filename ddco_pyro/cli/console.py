@@ -1,0 +1,260 @@
+"""What the command line shows: progress with the time left on a terminal, plain lines elsewhere, and small tables."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from ddco_pyro.data.control_dimensions import notes
+from ddco_pyro.fitting.convergence import effort
+
+if TYPE_CHECKING:
+    from ddco_pyro.fitting.prepare import Dimensions
+    from ddco_pyro.model.hierarchy import Hierarchy
+    from ddco_pyro.selection import Choice
+    from ddco_pyro.spec import Spec
+
+PLAIN_SECONDS = 10.0
+"""Time between two plain lines of progress."""
+
+
+class _Bar:
+    """A progress bar on a terminal; elsewhere a plain line now and then, with the time left."""
+
+    def __init__(self) -> None:
+        self.console = Console(stderr=True)
+        columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
+        self._progress = Progress(
+            *columns, TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=self.console
+        )
+        self._task: TaskID | None = None
+        self._label, self._done = "", 0
+        self._total: int | None = 0
+        self._start = self._said = 0.0
+
+    def __enter__(self) -> Self:
+        if self.console.is_terminal:
+            self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.console.is_terminal:
+            self._progress.stop()
+
+    def begin(self, label: str, total: int | None) -> None:
+        """Begin to count up to ``total``; None where nobody knows how far it goes."""
+        self.end()
+        self._label, self._total, self._done = label, total, 0
+        self._start = self._said = time.monotonic()
+        self._task = self._progress.add_task(label, total=total, note="")
+
+    def advance(self, done: int, note: str = "") -> None:
+        """So much is done."""
+        self._done = done
+        if self._task is not None:
+            self._progress.update(self._task, completed=done, note=note)
+        now = time.monotonic()
+        if not self.console.is_terminal and (now - self._said > PLAIN_SECONDS or done == self._total):
+            self._said = now
+            self._say(f"{self._place(now)}  {note}".rstrip())
+
+    def _place(self, now: float) -> str:
+        """How far it has come, and the time left."""
+        if self._total is None:
+            return str(self._done)
+        left = (now - self._start) / max(self._done, 1) * (self._total - self._done)
+        return f"{self._done}/{self._total}, at most {left:.0f} s left"
+
+    def end(self) -> None:
+        """Whatever was counted is over, however far it came."""
+        if self._task is not None:
+            self._progress.update(self._task, total=max(self._done, 1), completed=max(self._done, 1))
+            if not self.console.is_terminal and self._done != self._total:
+                self._say(f"done after {self._done}, {time.monotonic() - self._start:.0f} s")
+        self._task = None
+
+    def _say(self, text: str) -> None:
+        self.console.print(f"{self._label}: {text}", markup=False, highlight=False, soft_wrap=True)
+
+
+class Collecting(_Bar):
+    """Shows how many demonstrations have been collected, or whatever else is done with them one by one."""
+
+    def __init__(self, label: str = "collecting demonstrations") -> None:
+        super().__init__()
+        self._what = label
+
+    def collected(self, done: int, total: int) -> None:
+        """So many of the demonstrations have been collected."""
+        if self._task is None:
+            self.begin(self._what, total)
+        self.advance(done)
+
+
+class Fitting(Collecting):
+    """Shows how a fit goes on (a :class:`ddco_pyro.fitting.run.Watcher`)."""
+
+    def training(self, name: str, epochs: int | None) -> None:
+        """A model begins to be trained, for at most so many epochs in all; None for no limit."""
+        self.begin(f"training {name}", epochs)
+
+    def epoch(self, row: Mapping[str, Any]) -> None:
+        """An epoch has ended; its row of the history."""
+        note = f"{row['stage']}: training {row['train']:.3f}, tuning {row['tune']:.3f} nats/step"
+        self.advance(self._done + 1, note)
+
+    def trained(self, name: str) -> None:
+        """A model has been trained."""
+        self.end()
+
+
+class Selecting(Fitting):
+    """Shows how a cross-validation goes on (a :class:`ddco_pyro.selection.Watcher`), and the fit that follows."""
+
+    def selecting(self, total: int, kept: int) -> None:
+        """So many (candidate, fold) are to be scored in all, of which some were kept from before."""
+        note = f" ({kept} of {total} kept from before)" if kept else ""
+        self.begin(f"cross-validation{note}", total - kept)
+
+    def scored(self, candidate: str, fold: int, failed: str) -> None:
+        """One has been scored, or has failed."""
+        if failed:
+            self._say(f"{candidate}, fold {fold} failed: {failed}")
+        self.advance(self._done + 1, f"{candidate}, fold {fold}")
+
+    def given_up(self, candidate: str, folds: int) -> None:
+        """A candidate has been stopped early: so many of its folds need not be scored."""
+        self._say(f"{candidate}: stopped early, {folds} folds less")
+        self.advance(self._done + folds)
+
+
+class Rolling(_Bar):
+    """Shows how many episodes have been rolled out."""
+
+    def __init__(self, total: int) -> None:
+        super().__init__()
+        self._episodes = total
+
+    def episode(self, name: str) -> None:
+        """An episode of the method so named has ended."""
+        if self._task is None:
+            self.begin("rolling out", self._episodes)
+        self.advance(self._done + 1, name)
+
+
+def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Sequence[tuple[Spec, Hierarchy]]) -> None:
+    """Shapes of observations and control, and the parameters of each network and of each baseline."""
+    from ddco_pyro.fitting.prepare import parameters
+
+    table = Table("", "shape or parameters", show_edge=False)
+    for one in spec.observations:
+        table.add_row(f"observation {one.key}", str(list(size.shapes[one.key])))
+    table.add_row("features", str(len(hierarchy.encoder.mean)))
+    table.add_row("control", str([size.control_size]))
+    for name, network in hierarchy.named_networks():
+        table.add_row(name, str(parameters(network)))
+    table.add_row("all networks", str(parameters(hierarchy)))
+    for number, (other, policy) in enumerate(baselines):
+        table.add_row(f"compare_with.{number}: {_baseline(other)}", str(parameters(policy)))
+    _show(table)
+
+
+def _baseline(spec: Spec) -> str:
+    """A baseline's kind and the sizes of its hidden layers."""
+    assert spec.baseline is not None
+    hidden = list(spec.baseline.policy.hidden)
+    return f"{spec.baseline.kind}, {f'hidden: {hidden}' if hidden else spec.baseline.policy.network}"
+
+
+def control(size: Dimensions) -> None:
+    """What is odd about dimensions of the control, a line each."""
+    for note in notes(size.control):
+        Console().print(Text(note), soft_wrap=True)
+
+
+def log_likelihoods(metrics: Mapping[str, Any]) -> None:
+    """Log-likelihood of the model and of what it is compared with, in training and on what was held out."""
+    head = ("model", "training", "validation (held out)", "ours - this, validation", "gradient steps")
+    table = Table(*head, title="log-likelihood, nats per step", show_edge=False)
+    rows = {metrics["model"]: metrics, **metrics["comparison"]}
+    for name, row in rows.items():
+        values, difference = row["log_likelihood_per_step"], row.get("difference")
+        shown = _difference(difference) if difference else ""
+        numbers = [_number(values[part]) for part in ("train", "valid")]
+        table.add_row(name, *numbers, shown, effort(row.get("training")))
+    _show(table)
+
+
+def _difference(found: Mapping[str, float]) -> str:
+    error = found["standard_error"]
+    shown = f"{error:.3f}" if math.isfinite(error) else "unknown (one held out)"
+    return f"{found['nats_per_step']:+.3f} ± {shown}"
+
+
+def selection(choice: Choice, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """The candidates of a selection, with what has to be known to read the numbers."""
+    table = Table(*head, title="held-out log-likelihood by cross-validation, nats per step", show_edge=False)
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    _show(table)
+    for note in choice.notes:
+        Console().print(Text(f"note: {note}"), soft_wrap=True)
+
+
+def comparison(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Runs, the best first."""
+    table = Table(*head, show_edge=False)
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    _show(table)
+
+
+WIDE = 200
+"""Columns of a file or a pipe, which have no width of their own."""
+
+
+def _show(table: Table) -> None:
+    """Nothing is cut: what is too long for a terminal goes on in the next line."""
+    for column in table.columns:
+        column.overflow = "fold"
+    Console(width=None if Console().is_terminal else WIDE).print(table)
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def warnings(found: Sequence[tuple[str, str]]) -> None:
+    """Signs of a degenerate solution, each in words and with what usually helps."""
+    console = Console()
+    for what, advice in found:
+        console.print(Text(f"warning: {what} {advice}"), soft_wrap=True)
+
+
+def successes(results: Mapping[str, Any]) -> None:
+    """What came of each method's rollouts."""
+    methods: Mapping[str, Any] = results["methods"]
+    measures = list(dict.fromkeys(name for one in methods.values() for name in one["measures"]))
+    table = Table("method", *measures, title=f"{results['episodes']} episodes each", show_edge=False)
+    for name, one in methods.items():
+        table.add_row(name, *(_measure(one["measures"].get(measure)) for measure in measures))
+    _show(table)
+
+
+def _measure(one: Mapping[str, Any] | None) -> str:
+    if one is None or one["trials"] == 0:
+        return "-"
+    if "successes" in one:
+        low, high = one["interval"]
+        return f"{one['successes']}/{one['trials']} [{low:.0%}, {high:.0%}]"
+    return f"{one['mean']:.2f}" + (f" ± {one['std']:.2f}" if one["std"] is not None else "")

@@ -1,0 +1,105 @@
+"""What comes in: ``inspect``, ``init`` and ``import``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from enum import StrEnum
+from pathlib import Path
+from shlex import quote
+from typing import Annotated
+
+import typer
+
+from ddco_pyro.errors import BadInput
+
+
+class FormatName(StrEnum):
+    """What a file or folder was written by."""
+
+    robomimic = "robomimic"
+    minari = "minari"
+    lerobot = "lerobot"
+
+
+SourcePath = Annotated[
+    Path, typer.Argument(metavar="FILE", help="An HDF5 file, or the folder of a Minari or LeRobot dataset.")
+]
+FormatOption = Annotated[
+    FormatName | None, typer.Option("--format", help="What wrote it; recognised unless given.", show_default=False)
+]
+
+
+def inspect(
+    file: SourcePath,
+    form: FormatOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print all of it as JSON.")] = False,
+) -> None:
+    """Say what is in a file: keys, shapes, lengths, ranges, NaN, constant dimensions, masks, a spec to start with."""
+    from ddco_pyro.data.hdf5 import DemonstrationsError
+    from ddco_pyro.data.inspection import inspect as look
+    from ddco_pyro.data.starting import starting_spec
+
+    found = look(file, form.value if form else None)
+    if as_json:
+        print(json.dumps(found.as_json(), indent=1))
+        return
+    from ddco_pyro.cli.console_inspection import show
+
+    show(found)
+    if found.format != "robomimic":
+        print(f"\nto fit to it, import it first: ddco-pyro import {file} --out demos.hdf5")
+        return
+    try:
+        print(f"\n{starting_spec(found, file)}\nnext: ddco-pyro init {quote(str(file))} --out {quote(file.stem)}.yaml")
+    except DemonstrationsError as error:
+        print(f"\nno spec to start with: {str(error).removeprefix(f'{file}: ')}")
+
+
+def init(
+    file: SourcePath,
+    out: Annotated[Path, typer.Option(help="Where to write the spec.")] = Path("spec.yaml"),
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
+) -> None:
+    """Write a commented spec for a file of demonstrations that fits as it is."""
+    from ddco_pyro.data.files import write_text
+    from ddco_pyro.data.inspection import inspect as look
+    from ddco_pyro.data.starting import starting_spec
+
+    if out.exists() and not force:
+        raise BadInput(f"{out}: is there already; choose another --out, or replace it with --force")
+    found = look(file)
+    if found.format != "robomimic":
+        raise BadInput(f"{file}: is a {found.format} dataset; first: ddco-pyro import {file} --out demos.hdf5")
+    text = starting_spec(found, file).replace("THIS_FILE", str(out))
+    write_text(out, text)
+    print(f"{out}: fit it with: ddco-pyro fit {out} --out runs/{out.stem}")
+
+
+def import_(
+    source: SourcePath,
+    out: Annotated[Path, typer.Option(help="The HDF5 file to write.", show_default=False)],
+    form: FormatOption = None,
+    observations: Annotated[
+        list[str], typer.Option("--observation", metavar="KEY", help="Import only this one; repeatable.")
+    ] = [],  # noqa: B006 (typer reads the default, nobody changes it)
+    mask: Annotated[str | None, typer.Option(help="Import only the demonstrations of this mask (filter key).")] = None,
+    videos: Annotated[bool, typer.Option("--videos", help="Decode the videos of a LeRobot dataset too.")] = False,
+    image_size: Annotated[
+        int | None, typer.Option(min=8, max=4096, help="Scale pictures to so many pixels in height and width.")
+    ] = None,
+    skip_broken: Annotated[
+        bool, typer.Option("--skip-broken", help="Leave out demonstrations that cannot be used, and say which.")
+    ] = False,
+) -> None:
+    """Write somebody else's demonstrations into this project's layout; goes on where it was interrupted."""
+    from ddco_pyro.cli import console
+    from ddco_pyro.data.importing import Choice, import_demonstrations
+
+    size = (image_size, image_size) if image_size else None
+    choice = Choice(tuple(observations), mask, videos, size, skip_broken)
+    with console.Collecting("importing") as progress:
+        found = import_demonstrations(source, out, form.value if form else None, choice, progress.collected)
+    for name, reason in found.left_out.items():
+        print(f"left out {name}: {reason}", file=sys.stderr)
+    print(f"{out}: {len(found.names)} demonstrations")

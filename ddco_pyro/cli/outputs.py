@@ -1,0 +1,158 @@
+"""What goes out: ``segment`` and ``export``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ddco_pyro.cli.options import AllowCode, RunPath
+from ddco_pyro.errors import BadInput
+
+if TYPE_CHECKING:
+    from ddco_pyro.data.sources import Source
+    from ddco_pyro.fitting.run import Fit
+    from ddco_pyro.segmenting import Segmented
+
+
+class LeRobotFormat(StrEnum):
+    """The first version of LeRobot that reads it."""
+
+    LANGUAGE = "0.6"
+    SUBTASK_INDEX = "0.4"
+
+
+def segment(
+    run: RunPath,
+    demos: Annotated[
+        Path, typer.Argument(metavar="DEMOS", help="Demonstrations: an HDF5 file, or a Minari or LeRobot dataset.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="A copy of the HDF5 file with labels for each step.", show_default=False),
+    ] = None,
+    in_place: Annotated[bool, typer.Option("--in-place", help="Write the labels into the HDF5 file itself.")] = False,
+    csv: Annotated[Path | None, typer.Option(help="A table with a row for each step.", show_default=False)] = None,
+    parquet: Annotated[Path | None, typer.Option(help="The same table as Parquet.", show_default=False)] = None,
+    html: Annotated[
+        Path | None, typer.Option(help="A page with the timeline of every demonstration.", show_default=False)
+    ] = None,
+    lerobot: Annotated[
+        Path | None,
+        typer.Option(help="A copy of the LeRobot dataset with options as subtasks.", show_default=False),
+    ] = None,
+    lerobot_format: Annotated[
+        LeRobotFormat,
+        typer.Option("--lerobot-format", help="Subtasks as LeRobot reads them from 0.6 on, or in 0.4 and 0.5."),
+    ] = LeRobotFormat.LANGUAGE,
+    level: Annotated[
+        str | None, typer.Option(help="The level that gives the subtasks; the lowest by default.", show_default=False)
+    ] = None,
+    allow_code: AllowCode = False,
+) -> None:
+    """Label every step of demonstrations with a run's options: as a page, a table, labels in HDF5, or subtasks.
+
+    Only what is asked for is written; DEMOS is left as it is unless --in-place says otherwise.
+    """
+    if not (out or in_place or csv or parquet or html or lerobot):
+        raise BadInput(
+            "name what to write: --html PAGE, --csv FILE or --parquet FILE; labels for each step go to --out FILE (a "
+            "copy) or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset"
+        )
+    labelled = _labelled(demos, out, in_place)
+    from ddco_pyro.cli import console
+    from ddco_pyro.data.sources import open_source
+    from ddco_pyro.fitting.run import load
+    from ddco_pyro.segmenting import segments
+    from ddco_pyro.segmenting.hdf5 import write_labels
+    from ddco_pyro.segmenting.page import write_page
+    from ddco_pyro.segmenting.tables import write_csv, write_parquet
+
+    fit = load(run, allow_code)
+    with open_source(demos) as source, console.Collecting("segmenting") as progress:
+        if labelled and source.format != "robomimic":
+            raise BadInput(f"{demos}: labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot")
+        if lerobot:
+            found = _annotate(fit, source, lerobot, (level, lerobot_format.value), progress.collected)
+        else:
+            found = segments(fit, source, progress.collected)
+    if csv:
+        write_csv(csv, found)
+        print(csv)
+    if parquet:
+        write_parquet(parquet, found)
+        print(parquet)
+    if html:
+        write_page(html, found, str(run), str(demos))
+        print(html)
+    if labelled:
+        write_labels(demos, labelled, found)
+        print(f"{labelled}: labels/{', labels/'.join(found.counts)}")
+
+
+def _labelled(demos: Path, out: Path | None, in_place: bool) -> Path | None:
+    """The HDF5 file that is to have the labels, if any.
+
+    :raises BadInput: it is said in two ways, or the copy is the file itself.
+    """
+    if out and in_place:
+        raise BadInput("--out and --in-place exclude each other; keep one")
+    if out and out.resolve() == demos.resolve():
+        raise BadInput(f"--out {out}: is the file itself; to write labels into it, say --in-place")
+    return demos if in_place else out
+
+
+def _annotate(
+    fit: Fit, source: Source, out: Path, how: tuple[str | None, str], on_demonstration: Callable[[int, int], None]
+) -> Segmented:
+    """The segments of a LeRobot dataset, after a copy with a level's options as subtasks was written.
+
+    :param how: the level, the lowest where it is None, and the format.
+    """
+    from ddco_pyro.segmenting import segments
+
+    if source.format != "lerobot":
+        raise BadInput(f"{source.files[0]}: is no LeRobot dataset; --lerobot annotates a copy of one")
+    from ddco_pyro.data.sources.lerobot import LeRobot
+    from ddco_pyro.segmenting.lerobot import annotate, check_target
+    from ddco_pyro.segmenting.lerobot_forms import FORMS, subtask_names
+
+    assert isinstance(source, LeRobot)
+    level, form = how[0], FORMS[how[1]]
+    counts = {one.name: one.count for one in fit.spec.hierarchy.levels} if fit.spec.hierarchy else {}
+    if level is not None and level not in counts:
+        raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(counts)})")
+    chosen = level or next(iter(counts), "")
+    check_target(source, out, subtask_names(chosen, counts.get(chosen, 0)), form)
+    found = segments(fit, source, on_demonstration)
+    annotate(source, out, found, chosen, form)
+    print(out)
+    return found
+
+
+def export(
+    run: RunPath,
+    out: Annotated[Path, typer.Option(help="The folder to write.", show_default=False)],
+    onnx: Annotated[bool, typer.Option("--onnx", help="Write ONNX too (pip install 'ddco-pyro\\[export]').")] = False,
+    allow_code: AllowCode = False,
+) -> None:
+    """Write the controller as files that need nothing of this library: numpy with a runner, torch.export, ONNX.
+
+    Every form is loaded again and acts in three episodes of made-up
+    observations, by the loop of runner.py. It has to choose the options
+    that the run's controller chooses, with probabilities within 1e-6 and
+    controls within 1e-6 of the largest of 1, their spread, and their
+    distance from their mean; else nothing is written and what was there
+    stays.
+    """
+    from ddco_pyro.export import export as write
+    from ddco_pyro.fitting.run import load
+
+    exported = write(load(run, allow_code), out, onnx)
+    for form, (difference, seconds) in exported.items():
+        print(f"{form}: largest difference {difference:.1e}, a step takes {1e3 * seconds:.3f} ms")
+    form = next(iter(exported))
+    print(f"{out}: try it with: python {out / 'runner.py'} {out}{'' if form == 'numpy' else f' {form}'}")

@@ -1,1 +1,0 @@
-"""Commands of the command line about a user's own files; :mod:`ddco_pyro.cli` gathers them."""

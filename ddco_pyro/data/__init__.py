@@ -1,0 +1,1 @@
+"""Demonstrations: files, HDF5, sources, importing, inspection, the starting spec."""

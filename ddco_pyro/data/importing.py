@@ -1,0 +1,218 @@
+"""Other libraries' demonstrations into one HDF5 file of this project's layout, block by block and resumable."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, opened
+from ddco_pyro.data.resumable import Parts, discard, parts_of
+from ddco_pyro.data.sources import Column, Format, Recording, Source, open_source
+from ddco_pyro.data.values import LARGEST, usable
+from ddco_pyro.errors import BadInput, nearest
+
+FREQUENCY = "control_frequency"
+IDENTITY = "imported"
+KEPT = ("env_args",)
+"""Attributes of robomimic's group ``data`` that its own tools look for there."""
+
+OnRecording = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What of a source is imported.
+
+    :param observations: keys; all that hold numbers, without pictures from videos, if empty.
+    :param mask: only the demonstrations of this mask (robomimic: filter key).
+    :param videos: decode the videos too.
+    :param image_size: height and width to which pictures are scaled; as they are if None.
+    :param skip_broken: leave out demonstrations that cannot be used rather than refuse them.
+    """
+
+    observations: tuple[str, ...] = ()
+    mask: str | None = None
+    videos: bool = False
+    image_size: tuple[int, int] | None = None
+    skip_broken: bool = False
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What an import did: the demonstrations in the file, and those left out, with the reason."""
+
+    path: Path
+    names: tuple[str, ...]
+    left_out: Mapping[str, str]
+
+
+def import_demonstrations(
+    source: str | Path,
+    out: Path,
+    form: Format | None = None,
+    choice: Choice = Choice(),
+    on_recording: OnRecording = lambda done, total: None,
+) -> Imported:
+    """Write the demonstrations of a file or folder into ``out``; what an interrupted import has done is kept.
+
+    Memory holds one block of an array at a time, whatever the size of the files.
+
+    :raises DemonstrationsError: the source cannot be read, or a demonstration cannot be used.
+    :raises BadInput: ``out`` is there already and is something else, or another process is writing it.
+    """
+    with open_source(source, form) as opened_source:
+        identity = _identity(opened_source, choice)
+        if out.exists():
+            discard(out)
+            return _already(out, identity)
+        with parts_of(out, identity) as parts:
+            if parts is None:
+                return _already(out, identity)
+            left_out = _keep(opened_source, choice, parts, on_recording)
+            if not parts.done:
+                raise DemonstrationsError(f"{source}: none of its demonstrations can be used")
+            done = tuple(parts.done)
+            parts.finish(
+                _attributes(opened_source, source, identity), _masks(opened_source, done), _kept(opened_source)
+            )
+    return Imported(out, done, left_out)
+
+
+def _keep(source: Source, choice: Choice, parts: Parts, on_recording: OnRecording) -> dict[str, str]:
+    """Add every demonstration that is not there yet; those that had to be left out, with the reason."""
+    names = _names(source, choice)
+    left_out: dict[str, str] = {}
+    first: Recording | None = None
+    for number, name in enumerate(names):
+        try:
+            recording = _chosen(source.recording(name), choice)
+            _check(recording, first or recording)
+            if name not in parts.done:
+                _check_values(recording)
+                parts.add(recording)
+            first = first or recording
+        except DemonstrationsError as error:
+            if not choice.skip_broken:
+                raise DemonstrationsError(f"{error}; or leave such ones out with --skip-broken") from None
+            left_out[name] = str(error)
+        on_recording(number + 1, len(names))
+    parts.close()
+    return left_out
+
+
+def _identity(source: Source, choice: Choice) -> str:
+    """What decides the contents of an import."""
+    files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in source.files]
+    return json.dumps({"format": source.format, "files": files, "choice": asdict(choice)})
+
+
+def _digest(identity: str) -> str:
+    return hashlib.sha256(identity.encode()).hexdigest()
+
+
+def _already(out: Path, identity: str) -> Imported:
+    with opened(out) as file:
+        if file.attrs.get(IDENTITY) != _digest(identity):
+            raise BadInput(f"{out}: is there already and is not this import; choose another --out")
+        return Imported(out, tuple(file["data"]), {})
+
+
+def _names(source: Source, choice: Choice) -> tuple[str, ...]:
+    if choice.mask is None:
+        return source.names
+    if choice.mask not in source.masks:
+        known = ", ".join(source.masks) or "none"
+        raise DemonstrationsError(
+            f"there is no mask {choice.mask!r}{nearest(choice.mask, source.masks)}; there is: {known}"
+        )
+    members = set(source.masks[choice.mask])
+    return tuple(name for name in source.names if name in members)
+
+
+def _masks(source: Source, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """The masks, of those demonstrations that were imported."""
+    present = set(names)
+    found = {mask: tuple(name for name in members if name in present) for mask, members in source.masks.items()}
+    return {mask: members for mask, members in found.items() if members}
+
+
+def _attributes(source: Source, path: str | Path, identity: str) -> dict[str, Attribute]:
+    own = {name: value for name, value in source.attributes.items() if name not in (*KEPT, "total", IDENTITY)}
+    frequency = {FREQUENCY: source.frequency} if source.frequency else {}
+    said = {"source": Path(path).name, "source_format": source.format, IDENTITY: _digest(identity)}
+    return {**own, **frequency, **said}
+
+
+def _kept(source: Source) -> dict[str, Attribute]:
+    return {name: source.attributes[name] for name in KEPT if name in source.attributes}
+
+
+def _chosen(recording: Recording, choice: Choice) -> Recording:
+    """The recording with the observations that are wanted."""
+    known = recording.observations
+    for key in choice.observations:
+        if key not in known:
+            raise DemonstrationsError(
+                f"{recording.name}: there is no observation {key!r}{nearest(key, known)}; there is: {', '.join(known)}"
+            )
+    wanted = choice.observations or tuple(
+        key for key, one in known.items() if one.dtype.kind in "fiub" and (choice.videos or not one.video)
+    )
+    if not wanted:
+        raise DemonstrationsError(f"{recording.name}: has no observation that can be used")
+    observations = {key: _scaled(known[key], choice.image_size) for key in wanted}
+    return replace(recording, observations=observations)
+
+
+def _scaled(column: Column, size: tuple[int, int] | None) -> Column:
+    if size is None or not column.image or column.shape[1:3] == size:
+        return column
+
+    def blocks() -> Iterator[np.ndarray]:
+        for block in column.blocks():
+            yield np.stack([_resized(frame, size) for frame in block])
+
+    return Column((column.shape[0], *size, column.shape[3]), column.dtype, blocks)
+
+
+def _resized(frame: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    found: np.ndarray = cv2.resize(frame, size[::-1], interpolation=cv2.INTER_AREA)
+    return found.reshape(*size, frame.shape[-1])
+
+
+def _check(recording: Recording, first: Recording) -> None:
+    """What :class:`ddco_pyro.data.demonstrations.Demonstrations` asks for, of shapes alone."""
+    name, steps = recording.name, recording.actions.shape[0]
+    if len(recording.actions.shape) != 2 or not recording.actions.shape[1]:
+        raise DemonstrationsError(
+            f"{name}: actions has shape {recording.actions.shape}, it has to be [steps, dimensions]"
+        )
+    if steps == 0:
+        raise DemonstrationsError(f"{name}: actions has no steps")
+    theirs = dict(first.columns())
+    for place, column in recording.columns():
+        if column.dtype.kind not in "fiub":
+            raise DemonstrationsError(f"{name}: {place} holds {column.dtype}, it has to hold real numbers")
+        if column.shape[:1] != (steps,):
+            raise DemonstrationsError(f"{name}: {place} has {column.shape[0]} steps, but actions has {steps}")
+        if place not in theirs or theirs[place].shape[1:] != column.shape[1:]:
+            raise DemonstrationsError(
+                f"{name}: {place} is not as in {first.name}: shape {column.shape[1:]} at each step"
+            )
+    if set(theirs) - {place for place, _ in recording.columns()}:
+        missing = sorted(set(theirs) - {place for place, _ in recording.columns()})
+        raise DemonstrationsError(f"{name}: {', '.join(missing)} is missing, which {first.name} has")
+
+
+def _check_values(recording: Recording) -> None:
+    for place, column in recording.columns():
+        if not all(bool(usable(block).all()) for block in column.blocks()):
+            raise DemonstrationsError(
+                f"{recording.name}: {place} has NaN or infinite values, or some beyond ±{LARGEST:g}; repair them first"
+            )

@@ -1,0 +1,279 @@
+"""What is in a file of demonstrations: keys, shapes, lengths, ranges, and what would be in the way of a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddco_pyro.data.control_dimensions import ControlDimension, ControlStatistics, notes
+from ddco_pyro.data.hdf5 import DemonstrationsError
+from ddco_pyro.data.sources import Column, Format, Source, open_source
+from ddco_pyro.data.values import LARGEST, usable
+
+NUMBERS = "fiub"
+"""Kinds of numpy types that are real numbers."""
+
+
+@dataclass
+class Field:
+    """One array over all demonstrations that have it: ``actions``, ``obs/<key>`` or ``labels/<name>``.
+
+    :param shape: of one step.
+    :param minimum: smallest finite value of each dimension, flattened, of the array's own type; empty where there is
+        none, infinite where none is finite.
+    :param nan: number of NaN.
+    :param infinite: number of infinite values.
+    :param huge: number of finite values that are larger than any that can be used.
+    :param first: demonstration and step of the first value that cannot be used; None where all can.
+    :param affected: names of the demonstrations with such values.
+    :param constant: dimensions (flattened) that have one value in the whole file.
+    :param still: whether it never changes within a demonstration.
+    :param demonstrations: how many demonstrations have it.
+    :param video: whether it lies in videos, which are not looked into.
+    """
+
+    place: str
+    shape: tuple[int, ...]
+    dtype: str
+    minimum: np.ndarray
+    maximum: np.ndarray
+    nan: int = 0
+    infinite: int = 0
+    huge: int = 0
+    first: tuple[str, int] | None = None
+    affected: list[str] = field(default_factory=list)
+    still: bool = True
+    demonstrations: int = 0
+    video: bool = False
+
+    @property
+    def key(self) -> str:
+        """Its name without the folder."""
+        return self.place.partition("/")[2] or self.place
+
+    @property
+    def image(self) -> bool:
+        """Whether a step of it is a picture, uint8 [H, W, C]."""
+        return self.dtype == "uint8" and len(self.shape) == 3
+
+    @property
+    def numeric(self) -> bool:
+        """Whether it holds real numbers."""
+        return np.dtype(self.dtype).kind in NUMBERS
+
+    @property
+    def constant(self) -> list[int]:
+        """Dimensions that never change in the whole file."""
+        return [int(index) for index in np.flatnonzero(self.minimum == self.maximum)]
+
+    @property
+    def unusable(self) -> str:
+        """How many values cannot be used, in words; empty where all can."""
+        if not self.affected:
+            return ""
+        huge = f" and {self.huge} beyond ±{LARGEST:g}" if self.huge else ""
+        return f"{self.nan} NaN and {self.infinite} infinite values{huge}"
+
+    def add(self, column: Column, name: str) -> None:
+        """Take in the values of the demonstration of this name."""
+        self.demonstrations += 1
+        self.video = self.video or column.video
+        if column.video or column.dtype.kind not in NUMBERS:
+            return
+        first: np.ndarray | None = None
+        step = 0
+        for block in column.blocks():
+            values = block.reshape(len(block), -1)
+            first = values[:1] if first is None and len(values) else first
+            self._take(values)
+            self._look_for_unusable(values, name, step)
+            self.still = self.still and (first is None or bool((values == first).all()))
+            step += len(values)
+
+    def _look_for_unusable(self, values: np.ndarray, name: str, step: int) -> None:
+        """Where values [steps, dimensions] from this step on cannot be used."""
+        bad = ~usable(values)
+        if bad.any():
+            self.huge += int((bad & np.isfinite(values)).sum())
+            self.first = self.first or (name, step + int(bad.any(1).argmax()))
+            self.affected += [name] if name not in self.affected[-1:] else []
+
+    def _take(self, values: np.ndarray) -> None:
+        if values.dtype.kind == "f":
+            nan, infinite = np.isnan(values), np.isinf(values)
+            self.nan, self.infinite = self.nan + int(nan.sum()), self.infinite + int(infinite.sum())
+            bad = nan | infinite
+            low, high = np.where(bad, np.inf, values), np.where(bad, -np.inf, values)
+        else:
+            low = high = values
+        if len(values):
+            low, high = low.min(0), high.max(0)
+            self.minimum = np.minimum(self.minimum, low) if len(self.minimum) else low
+            self.maximum = np.maximum(self.maximum, high) if len(self.maximum) else high
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What was found.
+
+    :param lengths: steps of each demonstration by name.
+    :param problems: what a fit would refuse, one line each.
+    :param frequency: control steps in a second, Hz, where the file says it.
+    :param control: what each dimension of the control does.
+    :param excluded: names of demonstrations that were not looked at.
+    """
+
+    path: Path
+    format: Format
+    lengths: Mapping[str, int]
+    fields: Mapping[str, Field]
+    masks: Mapping[str, tuple[str, ...]]
+    frequency: float | None
+    problems: list[str] = field(default_factory=list)
+    control: tuple[ControlDimension, ...] = ()
+    excluded: tuple[str, ...] = ()
+
+    @property
+    def notes(self) -> list[str]:
+        """What is odd about dimensions of the control, one line each."""
+        return notes(self.control)
+
+    @property
+    def affected(self) -> list[str]:
+        """Names of the demonstrations in which some value cannot be used, in order."""
+        names = {name for one in self.fields.values() for name in one.affected}
+        return [name for name in self.lengths if name in names]
+
+    @property
+    def observations(self) -> list[Field]:
+        """The arrays under ``obs``."""
+        return [one for place, one in self.fields.items() if place.startswith("obs/")]
+
+    @property
+    def labels(self) -> list[Field]:
+        """The arrays under ``labels``."""
+        return [one for place, one in self.fields.items() if place.startswith("labels/")]
+
+    @property
+    def actions(self) -> Field | None:
+        """The control."""
+        return self.fields.get("actions")
+
+    def everywhere(self, one: Field) -> bool:
+        """Whether every demonstration has this array."""
+        return one.demonstrations == len(self.lengths)
+
+    def as_json(self) -> dict[str, Any]:
+        """The same as plain data."""
+        return {
+            "path": str(self.path),
+            "format": self.format,
+            "demonstrations": dict(self.lengths),
+            "control_frequency": self.frequency,
+            "masks": {name: list(names) for name, names in self.masks.items()},
+            "fields": [_as_json(one) for one in self.fields.values()],
+            "control_dimensions": [one.as_data() for one in self.control],
+            "notes": self.notes,
+            "problems": self.problems,
+        }
+
+
+def _as_json(one: Field) -> dict[str, Any]:
+    found = asdict(one)
+    ends = {name: [float(value) if np.isfinite(value) else None for value in found[name]] for name in _ENDS}
+    return found | ends | {"shape": list(one.shape), "constant": one.constant}
+
+
+_ENDS = ("minimum", "maximum")
+
+
+def inspect(path: str | Path, form: Format | None = None, exclude: Sequence[str] = ()) -> Inspection:
+    """Look at every array of a file or folder once, in blocks.
+
+    :param exclude: names of demonstrations that are not looked at.
+    :raises DemonstrationsError: it cannot be read, or holds no demonstrations.
+    """
+    with open_source(path, form) as source:
+        return _inspect(Path(path), source, tuple(exclude))
+
+
+def _inspect(path: Path, source: Source, exclude: tuple[str, ...]) -> Inspection:
+    lengths: dict[str, int] = {}
+    fields: dict[str, Field] = {}
+    problems: list[str] = []
+    control = ControlStatistics()
+    for name in (name for name in source.names if name not in exclude):
+        try:
+            recording = source.recording(name)
+            lengths[name] = recording.actions.shape[0] if recording.actions.shape else 0
+            for place, column in recording.columns():
+                watched = _watched(column, control) if place == "actions" else column
+                _add(fields, place, watched, name, lengths[name], problems)
+        except DemonstrationsError as error:
+            problems.append(str(error))
+    for mask, names in source.masks.items():
+        unknown = [name for name in names if name not in source.names]
+        if unknown:
+            problems.append(f"mask/{mask}: there is no demonstration {unknown[0]!r}")
+    masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in source.masks.items()}
+    found = Inspection(
+        path, source.format, lengths, fields, masks, source.frequency, problems, control.dimensions(), exclude
+    )
+    found.problems.extend(_problems(found))
+    return found
+
+
+def _watched(column: Column, control: ControlStatistics) -> Column:
+    """The same column, whose values are gathered when they are read."""
+
+    def blocks() -> Iterator[np.ndarray]:
+        for block in column.blocks():
+            if block.dtype.kind in NUMBERS:
+                control.add(block)
+            yield block
+
+    return replace(column, blocks=blocks)
+
+
+def _add(fields: dict[str, Field], place: str, column: Column, name: str, steps: int, problems: list[str]) -> None:
+    if column.shape[:1] != (steps,):
+        had = column.shape[0] if column.shape else "no"
+        problems.append(f"{name}: {place} has {had} steps, but actions has {steps}")
+        return
+    known = fields.get(place)
+    if known is None:
+        none = np.zeros(0)
+        known = fields[place] = Field(place, tuple(column.shape[1:]), str(column.dtype), none, none)
+    if known.shape != tuple(column.shape[1:]):
+        problems.append(
+            f"{name}: {place} has shape {list(column.shape[1:])} at each step, but {list(known.shape)} elsewhere"
+        )
+        return
+    known.add(column, name)
+
+
+def _problems(found: Inspection) -> list[str]:
+    problems = []
+    for one in found.fields.values():
+        if not one.numeric:
+            problems.append(f"{one.place} holds {one.dtype}, not numbers")
+        if one.first is not None:
+            name, step = one.first
+            number = len(one.affected)
+            problems.append(
+                f"{one.place} has {one.unusable}, the first in {name} at step {step}; "
+                f"{number} of {one.demonstrations} demonstrations {'is' if number == 1 else 'are'} affected"
+            )
+        if not found.everywhere(one):
+            missing = len(found.lengths) - one.demonstrations
+            problems.append(f"{one.place} cannot be used in {missing} of {len(found.lengths)} demonstrations")
+    empty = [name for name, steps in found.lengths.items() if steps == 0]
+    if empty:
+        problems.append(f"{', '.join(empty[:3])}{' ...' if len(empty) > 3 else ''}: no steps")
+    if found.actions is not None and len(found.actions.shape) != 1:
+        problems.append(f"actions has shape {list(found.actions.shape)} at each step, it has to be [dimensions]")
+    return problems

@@ -1,0 +1,152 @@
+"""Whether demonstrations fit into memory, by their shapes: said before they are read."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ddco_pyro.data.hdf5 import DemonstrationsError
+from ddco_pyro.errors import BadInput
+
+VARIABLE = "DDCO_PYRO_MEMORY"
+ALLOWED = 2.0
+"""GB that may be taken where ``$DDCO_PYRO_MEMORY`` says nothing else."""
+
+PROGRAM = 680e6
+"""Bytes that a fit of next to nothing takes: mostly torch, Pyro and compiled code."""
+
+KEPT = 4.0
+"""Bytes that a fit keeps of a feature or control of a padded step, beside the demonstrations: float32."""
+
+MAKING = 16.0
+"""Bytes that a number takes on the way there, two float64, or while it is clustered: float64 and k-means' copy."""
+
+INFERENCE = 5e3
+"""Bytes that inference takes for a step of trajectories that are processed together."""
+
+
+class Array(Protocol):
+    """An array that need not be in memory."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """[T, ...]."""
+
+    @property
+    def dtype(self) -> np.dtype:
+        """What it holds."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """What training and evaluating a model takes beside the demonstrations.
+
+    :param batch: trajectories in a gradient step.
+    :param steps: steps that go through the networks together, where trajectories are short enough.
+    :param bytes_per_step: bytes that the networks take for each of them.
+    :param clustered: numbers at each step that are clustered to begin with; 0 where nothing is.
+    """
+
+    batch: int
+    steps: int
+    bytes_per_step: int
+    clustered: int
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How much there is of demonstrations, by their headers.
+
+    :param lengths: steps of each.
+    :param size: bytes of all that is read, as it is in memory.
+    :param shapes: by place (``actions``, ``obs/<key>``) the shape of a step.
+    :param pictures: the places that hold pictures, uint8.
+    """
+
+    lengths: tuple[int, ...]
+    size: int
+    shapes: Mapping[str, tuple[int, ...]]
+    pictures: frozenset[str]
+
+    @classmethod
+    def of(cls, demonstrations: Iterable[Mapping[str, Array]]) -> Extent:
+        """Of arrays by place for each demonstration; labels count where they are read only."""
+        lengths, size = [], 0
+        shapes: dict[str, tuple[int, ...]] = {}
+        pictures: set[str] = set()
+        for arrays in demonstrations:
+            lengths.append(arrays["actions"].shape[0] if arrays["actions"].shape else 0)
+            for place, one in arrays.items():
+                plain = one.dtype == np.uint8
+                size += math.prod(one.shape) * (1 if plain else 8)
+                if not place.startswith("labels/"):
+                    shapes[place] = max(shapes.get(place, ()), tuple(one.shape[1:]), key=math.prod)
+                    pictures |= {place} if plain and len(one.shape) == 4 else set()
+        return cls(tuple(lengths), size, shapes, frozenset(pictures))
+
+    @property
+    def picture_bytes(self) -> int:
+        """Bytes of all pictures of a step."""
+        return sum(math.prod(self.shapes[place]) for place in self.pictures)
+
+    def features(self, differences: Collection[str] = ()) -> int:
+        """Numbers of a step that are no pictures.
+
+        :param differences: places of observations whose differences are appended.
+        """
+        numbers = {place: math.prod(shape) for place, shape in self.shapes.items() if place not in self.pictures}
+        return sum(one * (2 if place in differences else 1) for place, one in numbers.items())
+
+    def step(self, differences: Collection[str] = ()) -> float:
+        """Bytes that networks are given for a step, and what is made on the way there."""
+        return (KEPT + MAKING) * self.features(differences) + self.picture_bytes
+
+    def fit(self, works: Iterable[Work], differences: Collection[str] = ()) -> float:
+        """Bytes that a fit takes, about: the most that one of its models, which are trained one after the other, does.
+
+        The demonstrations are there as they were read, and padded. What else there is comes one after the other: what
+        is made of them, clusters, and gradient steps.
+        """
+        longest, features = max(1, *self.lengths), self.features(differences)
+        padded, given = len(self.lengths) * longest, KEPT * features + self.picture_bytes
+        passing = [MAKING * features * padded]
+        for work in works:
+            batch, together = (min(n, len(self.lengths)) for n in (work.batch, max(work.steps // longest, 1)))
+            networks = together * (work.bytes_per_step + given + INFERENCE)
+            passing += [MAKING * work.clustered * sum(self.lengths), longest * (batch * given + networks)]
+        return PROGRAM + self.size + padded * given + max(passing)
+
+
+def allowed() -> float:
+    """Bytes that may be taken.
+
+    :raises BadInput: ``$DDCO_PYRO_MEMORY`` is not a positive number.
+    """
+    text = os.environ.get(VARIABLE, str(ALLOWED))
+    try:
+        found = float(text)
+    except ValueError:
+        found = math.nan
+    if not found > 0:
+        raise BadInput(f"{VARIABLE}={text}: has to be a positive number of GB")
+    return 1e9 * found
+
+
+def refuse_too_much(needed: float, what: str, remedy: str) -> None:
+    """See that so many bytes may be taken.
+
+    :param what: what takes them, the beginning of a sentence.
+    :param remedy: what can be done about it.
+    :raises DemonstrationsError: they are more than are allowed.
+    """
+    if needed > allowed():
+        more = math.ceil(needed / 1e8) / 10
+        raise DemonstrationsError(
+            f"{what} takes about {more:g} GB of memory, and {allowed() / 1e9:g} are allowed; {remedy}, "
+            f"or allow more with {VARIABLE}={more:g}"
+        )

@@ -1,0 +1,95 @@
+"""Demonstrations as other libraries store them, each behind the same face: names, masks, and recordings read in blocks.
+
+``robomimic`` HDF5 files (this project's own layout too), ``minari`` datasets and ``lerobot`` v3 datasets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Protocol
+
+from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
+from ddco_pyro.data.sources.recording import Column, Format, Recording
+
+__all__ = ["Column", "Format", "Recording", "Source", "open_source"]
+
+
+class Source(Protocol):
+    """A set of recordings that is open for reading."""
+
+    @property
+    def format(self) -> Format:
+        """What wrote it."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its recordings, in order."""
+
+    @property
+    def masks(self) -> Mapping[str, tuple[str, ...]]:
+        """Name to names of recordings (robomimic: filter keys)."""
+
+    @property
+    def frequency(self) -> float | None:
+        """Control steps in a second, Hz, where the files say it."""
+
+    @property
+    def attributes(self) -> Mapping[str, Attribute]:
+        """What is known of all of it."""
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files it is read from: their sizes and times tell whether it is still the same."""
+
+    def recording(self, name: str) -> Recording:
+        """One of them; its arrays can be read while the source is open."""
+
+
+def format_of(path: Path) -> Format:
+    """Which library wrote this.
+
+    :raises DemonstrationsError: there is nothing, or nothing known.
+    """
+    if (path / "meta" / "info.json").is_file():
+        return "lerobot"
+    if (path / "data" / "metadata.json").is_file() or (path / "metadata.json").is_file():
+        return "minari"
+    if path.name == "main_data.hdf5" and path.with_name("metadata.json").is_file():
+        return "minari"
+    if path.is_file():
+        return "robomimic"
+    if not path.exists():
+        raise DemonstrationsError(f"{path}: there is no such file or folder; check the path")
+    raise DemonstrationsError(
+        f"{path}: is a folder of no known format; name an HDF5 file, a Minari dataset's folder (with "
+        "data/metadata.json), or a LeRobot dataset's folder (with meta/info.json)"
+    )
+
+
+@contextmanager
+def open_source(path: str | Path, form: Format | None = None) -> Iterator[Source]:
+    """Open a file or folder; the format is recognised unless it is given.
+
+    :raises DemonstrationsError: it cannot be read, or is not of this format.
+    """
+    path = Path(path)
+    form = form or format_of(path)
+    with _opener(form)(path) as source:
+        yield source
+
+
+def _opener(form: Format) -> Callable[[Path], AbstractContextManager[Source]]:
+    """Each imports what it needs: a library that is not installed is missed only by who needs it."""
+    if form == "robomimic":
+        from ddco_pyro.data.sources.robomimic import open_robomimic
+
+        return open_robomimic
+    if form == "minari":
+        from ddco_pyro.data.sources.minari import open_minari
+
+        return open_minari
+    from ddco_pyro.data.sources.lerobot import open_lerobot
+
+    return open_lerobot

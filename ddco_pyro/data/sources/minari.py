@@ -1,0 +1,103 @@
+"""Minari datasets, read with Minari itself (``pip install 'ddco-pyro[minari]'``)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError
+from ddco_pyro.data.sources.recording import Column, Format, Recording, of_array
+
+BARE = "observation"
+"""Key of observations that are one array without a name."""
+
+
+class Minari:
+    """Episodes of a dataset's folder; an observation of ``{"arm": {"joints": ...}}`` becomes ``obs/arm/joints``.
+
+    An episode of T steps has T + 1 observations: the last, after which nothing is done, is left out.
+    """
+
+    format: Format = "minari"
+    frequency: float | None = None
+    masks: Mapping[str, tuple[str, ...]] = {}
+
+    def __init__(self, folder: Path, storage: Any) -> None:
+        self.folder, self._storage = folder, storage
+        self.names = tuple(f"demo_{index}" for index in range(int(storage.total_episodes)))
+        if not self.names:
+            raise DemonstrationsError(f"{folder}: holds no episodes; at least one is needed")
+        self.attributes: Mapping[str, Attribute] = {"dataset_id": str(storage.metadata.get("dataset_id", ""))}
+        self.files = tuple(sorted(path for path in folder.rglob("*") if path.is_file()))
+
+    def recording(self, name: str) -> Recording:
+        """One episode, wholly in memory.
+
+        :raises DemonstrationsError: it is damaged, or its actions are not one array of numbers.
+        """
+        index = int(name.removeprefix("demo_"))
+        try:
+            (episode,) = self._storage.get_episodes([index])
+            (facts,) = self._storage.get_episode_metadata([index])
+        except (*DAMAGE, AssertionError) as error:
+            raise _damaged(self.folder, name, error) from error
+        actions, steps = episode["actions"], len(episode["rewards"])
+        if not isinstance(actions, np.ndarray) or actions.dtype.kind != "f":
+            what = actions.dtype if isinstance(actions, np.ndarray) else "several arrays"
+            raise DemonstrationsError(f"{self.folder}: {name}: actions are {what}, they have to be one array of reals")
+        observations = {key: of_array(one[:steps]) for key, one in _leaves(episode["observations"], "")}
+        seed = facts.get("seed")
+        known: dict[str, Attribute] = {"episode_index": index}
+        if seed is not None:
+            known["seed"] = int(seed)
+        return Recording(name, observations, _rows(actions), {}, known)
+
+
+def _rows(actions: np.ndarray) -> Column:
+    return of_array(actions.reshape(len(actions), -1))
+
+
+def _leaves(observations: Any, key: str) -> Iterator[tuple[str, np.ndarray]]:
+    """The arrays of nested observations by their path; text is left out."""
+    if isinstance(observations, dict):
+        for name, below in observations.items():
+            yield from _leaves(below, f"{key}/{name}" if key else str(name))
+    elif isinstance(observations, tuple):
+        for number, below in enumerate(observations):
+            yield from _leaves(below, f"{key}/{number}" if key else str(number))
+    elif isinstance(observations, np.ndarray):
+        yield key or BARE, observations if observations.ndim > 1 else observations[:, None]
+
+
+def _damaged(folder: Path, where: str, error: BaseException) -> DemonstrationsError:
+    text = " ".join(str(error).split()) or type(error).__name__
+    return DemonstrationsError(f"{folder}: {where + ': ' if where else ''}cannot be read, or is damaged: {text}")
+
+
+@contextmanager
+def open_minari(path: Path) -> Iterator[Minari]:
+    """Open a dataset's folder, its folder ``data``, or the ``main_data.hdf5`` in there.
+
+    :raises DemonstrationsError: Minari is not installed, or cannot read it.
+    """
+    try:
+        from minari.dataset.minari_storage import MinariStorage
+    except ImportError:
+        raise DemonstrationsError(
+            "reading Minari datasets needs minari; install it with: pip install 'ddco-pyro[minari]'"
+        ) from None
+    folder = path.parent if path.is_file() else path / "data" if (path / "data").is_dir() else path
+    try:
+        spaces = MinariStorage.read_raw_metadata(folder).keys() & {"observation_space", "action_space"}
+        if len(spaces) < 2:  # Minari would make the environment to ask for them, which runs the data's code
+            raise DemonstrationsError(f"{folder}: metadata.json does not say its observation and action spaces")
+        storage = MinariStorage.read(folder)
+    except DemonstrationsError:
+        raise
+    except (*DAMAGE, AssertionError, ImportError, AttributeError, RecursionError) as error:
+        raise _damaged(folder, "", error) from error
+    yield Minari(folder, storage)

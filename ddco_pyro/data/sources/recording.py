@@ -1,0 +1,96 @@
+"""One recorded episode as some library stored it: arrays that are read in blocks, not yet checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import h5py
+import numpy as np
+
+from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError
+
+Format = Literal["robomimic", "minari", "lerobot"]
+
+BLOCK_BYTES = 16 * 2**20
+"""Most bytes of an array that are in memory at once, one step at least."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """An array [T, ...] of a recording, read in blocks of consecutive steps.
+
+    :param blocks: begins anew at each call; what it yields has T steps in all.
+    :param video: whether reading it means decoding a film.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    blocks: Callable[[], Iterator[np.ndarray]]
+    video: bool = False
+
+    @property
+    def image(self) -> bool:
+        """Whether a step of it is a picture: uint8 [H, W, C]."""
+        return self.dtype == np.uint8 and len(self.shape) == 4
+
+    def array(self) -> np.ndarray:
+        """The whole array."""
+        whole, at = np.zeros(self.shape, self.dtype), 0
+        for block in self.blocks():
+            whole[at : at + len(block)] = block
+            at += len(block)
+        return whole
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One episode of T steps, under the names of the HDF5 layout.
+
+    :param observations: key to [T, ...].
+    :param actions: [T, A].
+    :param labels: name to [T].
+    :param attributes: what is known of the whole episode.
+    """
+
+    name: str
+    observations: Mapping[str, Column]
+    actions: Column
+    labels: Mapping[str, Column] = field(default_factory=dict)
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+
+    def columns(self) -> Iterator[tuple[str, Column]]:
+        """Every array with its place: ``actions``, ``obs/<key>``, ``labels/<name>``."""
+        yield "actions", self.actions
+        yield from ((f"obs/{key}", column) for key, column in self.observations.items())
+        yield from ((f"labels/{key}", column) for key, column in self.labels.items())
+
+
+def of_array(array: np.ndarray) -> Column:
+    """A column that is in memory already."""
+    return Column(array.shape, array.dtype, lambda: iter([array]))
+
+
+def of_dataset(dataset: h5py.Dataset, where: str, steps: int | None = None) -> Column:
+    """A dataset of an open file, or its first ``steps`` steps.
+
+    Reading it raises :class:`DemonstrationsError` where the file is damaged.
+    """
+    length = len(dataset) if steps is None else min(steps, len(dataset))
+    at_once = block_steps(dataset.shape[1:], dataset.dtype)
+
+    def blocks() -> Iterator[np.ndarray]:
+        for start in range(0, length, at_once):
+            try:
+                block = np.asarray(dataset[start : min(start + at_once, length)])
+            except DAMAGE as error:
+                raise DemonstrationsError(f"{where} cannot be read ({error}); the file may be damaged") from error
+            yield block
+
+    return Column((length, *dataset.shape[1:]), dataset.dtype, blocks)
+
+
+def block_steps(shape: tuple[int, ...], dtype: np.dtype) -> int:
+    """Steps in a block of an array whose steps have this shape."""
+    return max(1, BLOCK_BYTES // max(1, int(np.prod(shape, dtype=np.int64)) * dtype.itemsize))

@@ -1,0 +1,1 @@
+"""What pages and figures share: colours, numbers in words, pictures."""

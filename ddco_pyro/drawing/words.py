@@ -1,0 +1,190 @@
+"""Numbers in words: the page's verdict and how its numbers are written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from scipy import stats
+
+CONFIDENCE = 0.95
+"""A difference is called one where this interval about it leaves out 0."""
+
+METHODS = {
+    "ddco": "DDCO",
+    "flat": "flat",
+    "flat_equal": "flat of equal size",
+    "per_timestep": "per-timestep",
+    "open_loop": "open loop",
+}
+
+ABOUT = {
+    "ddco": "the hierarchy of options",
+    "flat": "one policy without options",
+    "per_timestep": "a policy for each time step",
+}
+
+
+def about(names: Iterable[str]) -> str:
+    """A sentence on what the methods are."""
+    return "; ".join(f"{method(name)}: {ABOUT[name]}" for name in names if name in ABOUT) + "."
+
+
+def stage(name: str) -> str:
+    """What a stage of training is called in the page: ``vq-1`` is ``level 1 from clusters``."""
+    kind, _, level = name.partition("-")
+    whole = {"meta-policy": "meta-policy alone", "joint": "all together"}
+    return {"vq": f"level {level} from clusters", "level": f"level {level} alone"}.get(kind) or whole.get(name, name)
+
+
+def method(name: str) -> str:
+    """What a method is called in the page."""
+    return METHODS.get(name, name.replace("_", " "))
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """A number with a fixed number of digits after the point and a real minus sign; a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    text = f"{value:.{digits}f}"
+    return (text.lstrip("-") if float(text) == 0 else text).replace("-", "−")
+
+
+def signed(value: float, digits: int = 2) -> str:
+    """The same with a plus sign where it is positive."""
+    text = number(value, digits)
+    return text if text.startswith(("−", "–")) or float(text) == 0 else f"+{text}"
+
+
+def percent(value: float | None, digits: int = 0) -> str:
+    """A share in percent."""
+    return "–" if value is None or not math.isfinite(value) else f"{number(100 * value, digits)} %"
+
+
+def interval(value: list[float] | None, scale: float = 1.0, digits: int = 2) -> str:
+    """``low to high``."""
+    return "–" if value is None else f"{number(scale * value[0], digits)} to {number(scale * value[1], digits)}"
+
+
+def p_value(value: float) -> str:
+    """A p-value with two significant digits."""
+    return "< 0.001" if value < 0.001 else f"{value:.2g}"
+
+
+def rate(found: Mapping[str, Any], of: str = "") -> str:
+    """``41 of 50 (69 to 90 %)``: successes, trials (``of`` what) and the 95 % interval of the rate."""
+    text = f"{found['successes']} of {found['trials']} {of}".rstrip()
+    return text if found["interval"] is None else f"{text} ({interval(found['interval'], 100, 0)} %)"
+
+
+def measure(name: str) -> str:
+    """``accuracy_mm`` as ``Accuracy (mm)``."""
+    base, _, unit = name.rpartition("_")
+    units = {"mm", "cm", "m", "s", "rad", "deg", "steps"}
+    text = f"{base} ({unit})" if base and unit in units else name
+    return text.replace("_", " ").capitalize() if "(" not in text else _capital(text.replace("_", " "))
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def verdict(metrics: Mapping[str, Any]) -> str:
+    """How well the model explains held-out demonstrations, with the error of that, and who would have needed more
+    epochs.
+    """
+    names = (method(name) for name, training in trainings(metrics).items() if not training["converged"])
+    return f"{_explained(metrics)}{rising(names)}"
+
+
+def rising(names: Iterable[str]) -> str:
+    """A sentence, after a space, on those whose training ended while they still rose; nothing where there are none."""
+    listed = list(names)
+    return f" {_capital(_listed(listed))} had not converged: more epochs can change this." if listed else ""
+
+
+def _explained(metrics: Mapping[str, Any]) -> str:
+    name, held_out = _capital(method(metrics["model"])), len(metrics["valid"])
+    if not held_out:
+        value = number(metrics["log_likelihood_per_step"]["train"])
+        return f"{name} was fitted to all demonstrations ({value} nats per step): none was held out to judge it by."
+    if not metrics["comparison"]:
+        value = number(metrics["log_likelihood_per_step"]["valid"])
+        return (
+            f"{name} gives held-out demonstrations {value} nats per step; no other model was trained to compare with."
+        )
+    differences = {method(other): one["difference"] for other, one in metrics["comparison"].items()}
+    return explains(name, differences, held_out)
+
+
+def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out: int) -> str:
+    """One sentence on how much better than others a model explains held-out demonstrations.
+
+    :param differences: what the others are called to ``nats_per_step`` and ``standard_error`` of the paired difference.
+    """
+    clauses = [_clause(other, difference, held_out) for other, difference in differences.items()]
+    text = f"{name} explains held-out demonstrations {_listed(clauses)}"
+    return f"{text} ({held_out} held-out demonstration{'s' * (held_out != 1)}; ± is one standard error)."
+
+
+def trainings(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """How the model and what it is compared with were trained, by name; runs of before do not say."""
+    rows = {metrics["model"]: metrics, **metrics["comparison"]}
+    return {name: row["training"] for name, row in rows.items() if "training" in row}
+
+
+def spent(training: Mapping[str, Any]) -> str:
+    """Epochs and gradient steps, and how many were allowed."""
+    took, allowed = training["spent"], training["budget"]
+    of = "" if allowed["epochs"] is None else f" of at most {allowed['epochs']} ({allowed['gradient_steps']})"
+    return f"{took['epochs']} epochs ({took['gradient_steps']} gradient steps){of}"
+
+
+RAISE = "Raise training.epochs: it is the budget of every model that is compared, whatever its number of stages."
+
+
+def unconverged(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Every model of which the budget ended a stage too early, in words with the numbers, and what to do."""
+    found = []
+    for name, training in trainings(metrics).items():
+        stages = [_too_short(stage) for stage in training["stages"] if not stage["converged"]]
+        if stages:
+            who = method(name)
+            verdict = f"Earlier stages of {who} had" if training["converged"] else f"{_capital(who)} has"
+            found.append((f"{verdict} not converged: the budget ended {_listed(stages)}.", RAISE))
+    return found
+
+
+def _too_short(stage: Mapping[str, Any]) -> str:
+    text = f"stage {stage['stage']} after {stage['epochs']} epochs"
+    if not stage["epochs"]:
+        return text
+    return f"{text} (tuning log-likelihood up by {number(stage['rising'])} nats per step over the last {stage['over']})"
+
+
+def _clause(other: str, difference: Mapping[str, float], held_out: int) -> str:
+    mean, error = difference["nats_per_step"], difference["standard_error"]
+    direction = "better" if mean > 0 else "worse"
+    if not math.isfinite(error):
+        return f"{number(abs(mean))} nats per step {direction} than {other} (error unknown)"
+    if abs(mean) <= error * stats.t.ppf((1 + CONFIDENCE) / 2, held_out - 1):
+        return f"with no clear difference from {other} ({signed(mean)} ± {number(error)} nats per step)"
+    return f"{number(abs(mean))} ± {number(error)} nats per step {direction} than {other}"
+
+
+def _listed(items: list[str]) -> str:
+    return items[0] if len(items) == 1 else ", ".join(items[:-1]) + " and " + items[-1]
+
+
+def success(metrics: Mapping[str, Any]) -> str:
+    """One sentence on rollouts; empty where there are none."""
+    methods = metrics.get("rollouts", {}).get("methods", {})
+    rates = {name: one["measures"].get("success") for name, one in methods.items()}
+    rates = {name: one for name, one in rates.items() if one and "successes" in one}
+    ours = metrics["model"]
+    if ours not in rates:
+        return ""
+    others = [f"{method(name)} in {rate(one)}" for name, one in rates.items() if name != ours]
+    text = f"In rollouts {method(ours)} succeeds in {rate(rates[ours], 'episodes')}"
+    return f"{text}{'; ' if others else ''}{_listed(others) if others else ''}."

@@ -1,0 +1,83 @@
+"""Vector quantisation (SM 2.2): clusters of the observations say, to begin with, which option is active when.
+
+The paper clones one policy from each cluster. Here the whole model is trained with the choices of a level clamped to
+the clusters, which clones those policies and starts the terminations from the clusters' boundaries in the same way,
+at any level.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from sklearn.cluster import KMeans
+from torch import Tensor
+
+from ddco_pyro.model.encoding import Batch
+
+POOLED = 8
+"""Images are clustered by their POOLED × POOLED block means."""
+
+
+class Clusters:
+    """k-means clusters of the observations of every step of a batch, named as the options 1 to k.
+
+    :param controls: cluster observations and controls together, with as much weight on the controls as on the
+        observations: steps that look alike but are acted on differently are then told apart.
+
+    Fewer than ``options`` clusters are found where there are fewer distinct observations.
+    """
+
+    def __init__(self, batch: Batch, options: int, seed: int, controls: bool = False) -> None:
+        self._controls = controls
+        rows = self._rows(batch)
+        self._kmeans = KMeans(_distinct(rows, options), n_init=10, random_state=seed).fit(rows)
+
+    def choices(self, batch: Batch) -> Tensor:
+        """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
+        found = torch.zeros(batch.inputs.batch, dtype=torch.long)
+        found[_alive(batch)] = torch.as_tensor(self._kmeans.predict(self._rows(batch)), dtype=torch.long) + 1
+        return found
+
+    def _rows(self, batch: Batch) -> np.ndarray:
+        seen = _observations(batch)
+        if not self._controls:
+            return seen
+        actions = batch.actions[_alive(batch)].double().numpy()
+        return np.concatenate([seen, np.sqrt(seen.shape[1] / actions.shape[1]) * actions], axis=1)
+
+
+def _alive(batch: Batch) -> Tensor:
+    return batch.inputs.time < batch.lengths[:, None]
+
+
+FRAMES_AT_ONCE = 64
+"""Pictures whose pixels are floating-point numbers at the same time."""
+
+
+def _observations(batch: Batch) -> np.ndarray:
+    """Observations of every step, [steps, features]; pictures by their block means."""
+    each = []
+    for row, length in enumerate(batch.lengths.tolist()):
+        means = [_block_means(image[row, :length]) for image in batch.inputs.images.values()]
+        each.append(torch.cat([batch.inputs.vector[row, :length], *means], dim=-1))
+    rows: np.ndarray = torch.cat(each).double().numpy()
+    return rows
+
+
+def _block_means(frames: Tensor) -> Tensor:
+    """uint8 [T, H, W, C] to [T, C · POOLED²], in [0, 1]."""
+    pooled = [
+        torch.nn.functional.adaptive_avg_pool2d(block.permute(0, 3, 1, 2).float() / 255, POOLED).flatten(1)
+        for block in frames.split(FRAMES_AT_ONCE)
+    ]
+    return torch.cat(pooled)
+
+
+def _distinct(rows: np.ndarray, most: int) -> int:
+    """How many different rows there are, counted up to ``most``."""
+    seen: set[bytes] = set()
+    for row in rows:
+        seen.add((row + 0.0).tobytes())  # + 0.0: minus zero is zero
+        if len(seen) == most:
+            break
+    return len(seen)

@@ -1,0 +1,254 @@
+"""The demonstrations a spec asks for, and what is known of their shapes before any work starts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from ddco_pyro.data.control_dimensions import ControlDimension, all_constant, control_dimensions
+from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError, extent
+from ddco_pyro.data.memory import Work, refuse_too_much
+from ddco_pyro.fitting.clusters import POOLED
+from ddco_pyro.fitting.widths import nearest_widths
+from ddco_pyro.model.encoding import STEPS_AT_ONCE, Shapes
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import ShapeError
+from ddco_pyro.simulation.collect import OnDemonstration, collect
+from ddco_pyro.simulation.task import find_task
+from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code
+
+
+@dataclass(frozen=True)
+class Dimensions:
+    """Shapes of the observations by name, control dimensions A, and the longest demonstration where it is known.
+
+    :param constant: the control dimensions that are constant in all demonstrations, and their values: they are no part
+        of the model.
+    :param control: what each control dimension does in the demonstrations; empty where that is not known.
+    """
+
+    shapes: Shapes
+    control_size: int
+    steps: int
+    constant: Mapping[int, float] = field(default_factory=dict)
+    control: tuple[ControlDimension, ...] = field(default=(), compare=False)
+
+    @classmethod
+    def of(cls, demonstrations: Demonstrations) -> Dimensions:
+        """The dimensions of these demonstrations.
+
+        :raises DemonstrationsError: every dimension of the control is constant.
+        """
+        control = control_dimensions(demo.actions for demo in demonstrations)
+        constant = {one.number: one.minimum for one in control if one.constant}
+        if len(constant) == len(control):
+            raise DemonstrationsError(all_constant(control))
+        shapes, size = demonstrations.observation_shapes, demonstrations.control_size
+        return cls(shapes, size, max(demonstrations.lengths), constant, control)
+
+
+def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
+    """The spec's networks for these dimensions, randomly initialised.
+
+    :raises SpecError: something in the spec does not fit the observations or the control.
+    """
+    missing = [one.key for one in spec.observations if one.key not in dimensions.shapes]
+    if missing:
+        known = ", ".join(sorted(dimensions.shapes))
+        raise SpecError(f"observations: there is no {', '.join(missing)} (there are: {known})")
+    drawn = spec.report.trajectory
+    shape = dimensions.shapes[drawn] if drawn else (3,)
+    if len(shape) != 1 or shape[0] < 3:
+        raise SpecError(
+            f"report.trajectory: {drawn!r} has shape {list(shape)} at each step; name a vector of three numbers or more"
+        )
+    scale = spec.control.scale
+    if isinstance(scale, tuple) and len(scale) != dimensions.control_size:
+        raise SpecError(
+            f"control.scale: has {len(scale)} numbers, but the control has {dimensions.control_size} dimensions"
+        )
+    _refuse_giants(spec, dimensions)
+    try:
+        return Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps, dimensions.constant)
+    except ShapeError as error:
+        raise SpecError(str(error)) from error
+
+
+MOST_PARAMETERS = 50_000_000
+"""Of all networks together. Training holds each five times: itself, its gradient, Adam's moments, the best so far."""
+
+MOST_CHOICES = 10_000
+"""Joint choices of all levels, Π(1 + k): every step of a demonstration has so many entries in the inference."""
+
+
+def _refuse_giants(spec: Spec, dimensions: Dimensions) -> None:
+    """A typing error in a size is refused before it fills the memory: networks are made without their numbers first.
+
+    :raises SpecError: the model is larger than any that can be trained here.
+    """
+    choices = math.prod(1 + level.count for level in spec.hierarchy.levels) if spec.hierarchy else 1
+    if choices > MOST_CHOICES:
+        raise SpecError(
+            f"hierarchy.levels: the levels have {choices} joint choices, at most {MOST_CHOICES} can be summed over; "
+            "lower count"
+        )
+    if any(place.endswith(".network") for place in user_code(spec)):
+        return  # its sizes are its own affair
+    try:
+        number = _counted(spec, dimensions)
+    except ShapeError:
+        return  # it is said better where the networks are made
+    except (RuntimeError, MemoryError, TypeError):  # sizes that no tensor can have
+        said = "more parameters than a machine can count"
+    else:
+        if number <= MOST_PARAMETERS:
+            return
+        said = f"{number} parameters, more than {MOST_PARAMETERS}"
+    raise SpecError(f"the networks have {said}; lower count, hidden, filters or kernel, or scale the images down")
+
+
+def _counted(spec: Spec, dimensions: Dimensions) -> int:
+    """The number of parameters of the spec's networks, which are made without their numbers."""
+    with torch.device("meta"):
+        size = dimensions.shapes, dimensions.control_size, dimensions.steps, dimensions.constant
+        return parameters(Hierarchy(spec, *size))
+
+
+def parameters(network: nn.Module) -> int:
+    """The number of trained parameters."""
+    return sum(parameter.numel() for parameter in network.parameters())
+
+
+def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
+    """The spec's networks, after those of its baselines were made too.
+
+    :raises SpecError: something in the spec does not fit the observations or the control.
+    """
+    hierarchy = build_hierarchy(spec, dimensions)
+    baselines(spec, dimensions)
+    return hierarchy
+
+
+def baselines(spec: Spec, dimensions: Dimensions) -> list[tuple[Spec, Hierarchy]]:
+    """The spec and the networks of each baseline that is trained beside.
+
+    :raises SpecError: a baseline's network does not fit the observations.
+    """
+    found = []
+    for number, baseline in enumerate(spec.compare_with):
+        try:
+            beside = baseline_spec(spec, baseline, dimensions)
+            found.append((beside, build_hierarchy(beside, dimensions)))
+        except SpecError as error:  # what it shares with the spec is in order: it is about its own network
+            problems = (problem.removeprefix("baseline.") for problem in error.problems)
+            raise SpecError(*(f"compare_with.{number}.{problem}" for problem in problems)) from error
+    return found
+
+
+def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) -> Spec:
+    """The spec of a baseline trained beside: the same but for the model.
+
+    :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
+    """
+    alone = spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": ()})
+    if baseline.kind != "flat_equal":
+        return alone
+
+    def resized(hidden: tuple[int, ...]) -> Spec:
+        policy = baseline.policy.model_copy(update={"hidden": hidden})
+        return alone.model_copy(update={"baseline": baseline.model_copy(update={"policy": policy})})
+
+    build_hierarchy(alone, dimensions)  # what is wrong with it is said here
+    target = parameters(build_hierarchy(spec, dimensions))
+    return resized(nearest_widths(baseline.policy.hidden, target, lambda hidden: _counted(resized(hidden), dimensions)))
+
+
+def dimensions(spec: Spec) -> Dimensions:
+    """The dimensions of what the spec names, without collecting anything: from its file, or else from its task.
+
+    A task that does not say how long its episodes are counts as having one step.
+    """
+    path = spec.demonstrations.path
+    if spec.demonstrated_task is None or (path is not None and Path(path).exists()):
+        return Dimensions.of(demonstrations(spec))
+    task = find_task(spec.demonstrated_task)
+    environment = task.load(spec.demonstrations.seed)
+    try:
+        shapes = {name: tuple(one.shape) for name, one in environment.observation_spec().items()}
+        return Dimensions(shapes, environment.action_spec().shape[0], task.steps)
+    finally:
+        environment.close()
+
+
+def parts(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
+    """The demonstrations to train with, ``train``, and those held out, ``valid``, left out where there are none."""
+    if spec.demonstrations.valid_fraction == 0 and not demos.masks.keys() & {"train", "valid"}:
+        return {"train": demos}
+    train, valid = demos.split(spec.demonstrations.valid_fraction, spec.seed)
+    return {"train": train, "valid": valid}
+
+
+def demonstrations(spec: Spec, on_demonstration: OnDemonstration | None = None) -> Demonstrations:
+    """The spec's demonstrations: read from its file, collected from its task's supervisor where there is none.
+
+    :raises DemonstrationsError: the file is missing or wrong, lacks an observation or label that the spec names, or a
+        fit to it would take more memory than is allowed.
+    """
+    own = spec.demonstrations
+    path = Path(own.path) if own.path else None
+    if spec.demonstrated_task is not None and (path is None or not path.exists()):
+        path = collect(spec.demonstrated_task, own, path, on_demonstration)
+    assert path is not None  # a spec has a task or a file
+    if not path.exists():
+        raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
+    _refuse_what_is_larger_than_memory(spec, path)
+    labels = (own.labels,) if own.labels else ()
+    return Demonstrations.read(path, [one.key for one in spec.observations], labels, own.exclude)
+
+
+def _needed(spec: Spec) -> str:
+    """What to do about a file that is not there."""
+    labels = [spec.demonstrations.labels] if spec.demonstrations.labels else []
+    read = ["actions", *(f"obs/{one.key}" for one in spec.observations), *(f"labels/{name}" for name in labels)]
+    return (
+        "put it there, or fit to another with --set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, "
+        f"with {', '.join(read)} in each data/<demonstration>"
+    )
+
+
+def _refuse_what_is_larger_than_memory(spec: Spec, path: Path) -> None:
+    remedy = (
+        "leave observations out, make its demonstrations fewer, shorter or equally long, scale pictures down, or lower "
+        "filters or hidden"
+    )
+    what = f"{path}: a fit to {', '.join(one.key for one in spec.observations)}"
+    refuse_too_much(memory_needed(spec, path), what, remedy)
+
+
+def memory_needed(spec: Spec, path: Path) -> float:
+    """Bytes that a fit of the spec and its baselines to a file of demonstrations takes, about, by the file's headers.
+
+    :raises DemonstrationsError: the file cannot be read or does not hold what the spec names.
+    """
+    found = extent(path, [one.key for one in spec.observations], spec.demonstrations.exclude)
+    shapes = {place.removeprefix("obs/"): shape for place, shape in found.shapes.items() if place != "actions"}
+    size = Dimensions(shapes, math.prod(found.shapes["actions"]), max(1, *found.lengths))
+    try:
+        with torch.random.fork_rng(devices=[]):
+            works = [_work(*model, size) for model in ((spec, build_hierarchy(spec, size)), *baselines(spec, size))]
+    except SpecError:  # it is said where networks are checked
+        works = [Work(spec.training.batch_size, STEPS_AT_ONCE, 0, 0)]
+    return found.fit(works, {f"obs/{one.key}" for one in spec.observations if one.differences})
+
+
+def _work(spec: Spec, hierarchy: Hierarchy, dimensions: Dimensions) -> Work:
+    """What training a model takes."""
+    features = len(hierarchy.encoder.mean) + sum(shape[-1] * POOLED**2 for shape in hierarchy.encoder.images.values())
+    kind = spec.training.initialize if hierarchy.depth else "random"
+    clustered = {"random": 0, "vq": features, "vq_controls": features + dimensions.control_size}[kind]
+    return Work(spec.training.batch_size, hierarchy.steps_at_once, hierarchy.step_bytes, clustered)

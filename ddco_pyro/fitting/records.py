@@ -1,0 +1,232 @@
+"""Files that a run or a selection keeps, read back: what is damaged is one line with the file, the place, the remedy.
+
+Keys that are not named here are kept as they are.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+
+from ddco_pyro.data.files import Damaged
+from ddco_pyro.spec.messages import invalid, lines
+
+T = TypeVar("T")
+
+
+def read_record(path: Path, kind: type[T], remedy: str) -> T:
+    """What a JSON file holds, which has to be of this kind.
+
+    :param remedy: what to do where it is not.
+    :raises Damaged: it is not.
+    """
+    try:
+        return TypeAdapter(kind).validate_json(path.read_bytes(), strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        no_json = f"is no JSON: {first['ctx']['error']}" if first["type"] == "json_invalid" else ""
+        raise Damaged(path, no_json or next(lines(error, Record)).removeprefix("spec: "), remedy) from None
+
+
+def read_table(path: Path, row: Callable[[dict[str, str]], T], remedy: str) -> list[T]:
+    """The rows of a CSV file.
+
+    :param row: what is made of a row; KeyError, TypeError and ValueError say that it is damaged.
+    :param remedy: what to do where it is.
+    :raises Damaged: it is.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return [row(one) for one in csv.DictReader(file)]
+    except (csv.Error, KeyError, TypeError, ValueError) as error:
+        raise Damaged(path, f"{type(error).__name__}: {error}", remedy) from error
+
+
+def read_successes(folder: Path) -> dict[tuple[str, int], float]:
+    """Success (1) or not (0) by method and seed, from a run's ``rollouts.csv``; nothing where it says nothing of it.
+
+    :raises Damaged: it cannot be read.
+    """
+    path = folder / "rollouts.csv"
+    if not path.exists():
+        return {}
+    rows = read_table(path, _success, f"remove it and roll out again: ddco-pyro rollout {folder}")
+    return {(method, seed): value for method, seed, value in rows if value is not None}
+
+
+def _success(row: Mapping[str, str]) -> tuple[str, int, float | None]:
+    said = row.get("success")
+    return row["method"], int(row["seed"]), float(said) if said else None
+
+
+def read_metrics(folder: Path, counts: Sequence[int]) -> dict[str, Any]:
+    """The contents of a run's ``metrics.json``.
+
+    :param counts: the number of options of each level, lowest first.
+    :raises Damaged: it cannot be read, or lacks something that a reader needs.
+    """
+    path, remedy = folder / "metrics.json", refit(folder)
+    found = read_record(path, Metrics, remedy)
+    levels = [[use.choice for use in level] for level in found.options]
+    scores = [found.agreement.train, found.agreement.valid] if found.agreement else []
+    each_level = [one for one in (*scores, found.divergences or None) if one is not None]
+    if levels != [list(range(1 + count)) for count in counts] or {len(one) for one in each_level} - {len(counts)}:
+        raise Damaged(path, f"is not about levels with {', '.join(map(str, counts)) or 'no'} options", remedy)
+    data: dict[str, Any] = json.loads(path.read_bytes())
+    return data
+
+
+def refit(folder: Path, remove: str = "it") -> str:
+    """What to do about a damaged file of a run: what its checkpoint holds need not be trained again."""
+    return f"remove {remove} and fit again: ddco-pyro fit {folder / 'spec.yaml'} --out {folder} --resume"
+
+
+def _not_null(value: Any) -> Any:
+    if value is None:
+        raise invalid(("", "must not be null; where there is none the key is left out"))
+    return value
+
+
+NOT_NULL = AfterValidator(_not_null)
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+AtLeastOne = Annotated[int, Field(ge=1)]
+
+
+class Record(BaseModel):
+    """Part of such a file."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+
+class PerStep(Record):
+    """Log-likelihood in nats per step; ``valid`` where demonstrations were held out."""
+
+    train: Finite
+    valid: Finite | None
+
+
+class HeldOut(Record):
+    """A demonstration that was held out."""
+
+    name: str
+    steps: AtLeastOne
+    log_likelihood: Finite
+
+
+class Difference(Record):
+    """Paired, in nats per step; the error of a single demonstration is NaN."""
+
+    nats_per_step: Finite
+    standard_error: float
+
+
+class BothParts(PerStep):
+    """Baselines are trained only where demonstrations are held out."""
+
+    valid: Finite
+
+
+class Compared(Record):
+    """A baseline."""
+
+    log_likelihood_per_step: BothParts
+    difference: Difference
+
+
+class Use(Record):
+    """How a choice of a level is used."""
+
+    choice: int
+    share: Finite
+    selected: Finite
+    duration: Finite | None
+
+
+class Alike(Record):
+    """How differently two options act."""
+
+    options: tuple[int, int]
+    divergence: Finite | None
+
+
+class Measure(Record):
+    """What episodes came to: a rate (``successes``) or a ``mean``."""
+
+    trials: int
+    interval: tuple[Finite, Finite] | None
+    successes: int = 0
+    rate: Finite | None = None
+    mean: Finite = 0.0
+    std: Finite | None = None
+
+    @model_validator(mode="after")
+    def _rate_or_mean(self) -> Measure:
+        given = self.model_fields_set
+        rate = {"successes", "rate"} <= given and (self.trials == 0 or None not in (self.rate, self.interval))
+        if not rate and not {"mean", "std"} <= given:
+            raise invalid(("", "is neither a rate nor a mean"))
+        return self
+
+
+class Against(Record):
+    """Successes of two methods on the same initial states."""
+
+    only_ours: int
+    only_theirs: int
+    trials: int
+    p_value: Finite
+
+
+class Method(Record):
+    """The rollouts of a method."""
+
+    measures: dict[str, Measure]
+    against: Annotated[Against | None, NOT_NULL] = None
+
+
+class Rollouts(Record):
+    """Those of all methods, from the same initial states."""
+
+    seed: int
+    episodes: AtLeastOne
+    methods: dict[str, Method]
+
+
+class Counts(Record):
+    """Demonstrations, and how often their supervisor succeeded."""
+
+    train: AtLeastOne
+    tune: int
+    valid: int
+    supervisor: dict[str, Measure] = {}
+
+
+class Agreement(Record):
+    """NMI of each level with the labels so named."""
+
+    labels: str
+    train: list[Finite]
+    valid: Annotated[list[Finite] | None, NOT_NULL] = None
+
+
+class Metrics(Record):
+    """What ``metrics.json`` has to have for those who read it."""
+
+    model: str
+    log_likelihood_per_step: PerStep
+    valid: list[HeldOut]
+    comparison: dict[str, Compared]
+    options: list[list[Use]] = []
+    divergences: list[list[Alike]] = []
+    agreement: Annotated[Agreement | None, NOT_NULL] = None
+    engine_check: dict[str, float]
+    demonstrations: Counts
+    parameters: int
+    seconds: dict[str, float]
+    versions: dict[str, str]
+    rollouts: Annotated[Rollouts | None, NOT_NULL] = None

@@ -1,0 +1,141 @@
+"""Rollouts of a run: its model, its baselines and the task's scripted policies on the same initial states."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ddco_pyro.data.files import write_text
+from ddco_pyro.fitting.run import Fit, RunError, write_metrics
+from ddco_pyro.simulation.episodes import paired_difference, run_episodes, summarize
+from ddco_pyro.simulation.film import write_film
+from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task
+
+OnEpisode = Callable[[str], None]
+
+Outcomes = dict[str, list[dict[str, float]]]
+"""What came of each method's episodes, in the order of their seeds."""
+
+
+def policies(fit: Fit) -> dict[str, Policy | str]:
+    """Every method to roll out, by name: scripted policies, baselines, and the model itself last.
+
+    :raises RunError: the spec has no task, or names a scripted policy that the task lacks.
+    """
+    if fit.spec.task is None:
+        raise RunError(f"{fit.folder}: its spec has no task, so there is nothing to roll out in")
+    known = find_task(fit.spec.task).policies
+    unknown = [name for name in fit.spec.rollout.policies if name not in known]
+    if unknown:
+        raise RunError(
+            f"rollout.policies: task {fit.spec.task!r} has no {', '.join(unknown)} (it has: {', '.join(known)})"
+        )
+    scripted: dict[str, Policy | str] = {name: name for name in fit.spec.rollout.policies}
+    return scripted | {name: one.controller() for name, one in fit.baselines.items()} | {fit.name: fit.controller()}
+
+
+def roll_out(
+    fit: Fit, episodes: int, film: int, on_episode: OnEpisode, jobs: int = -1, resume: bool = False
+) -> dict[str, Any]:
+    """Roll every method out from the same ``episodes`` initial states; fills ``rollouts.csv``, ``videos/`` and
+    ``metrics.json``. Methods that were done when this was interrupted are not done again.
+
+    :param film: how many episodes of each method to film.
+    :param resume: where the run holds all of these rollouts, leave them as they are.
+    :returns: what ``metrics.json`` now has under ``rollouts``.
+    """
+    seeds = range(fit.spec.rollout.seed, fit.spec.rollout.seed + episodes)
+    methods = policies(fit)
+    held = fit.metrics.get("rollouts", {})
+    whole = (held.get("seed"), held.get("episodes"), set(held.get("methods", ()))) == (
+        seeds.start,
+        episodes,
+        {*methods},
+    )
+    if resume and whole and all(_filmed(fit, name, seeds[:film]) for name in methods):
+        return dict(held)
+    rolled = _Unfinished(fit, seeds)
+    for name, policy in methods.items():
+        if name in rolled.outcomes and _filmed(fit, name, seeds[:film]):
+            for _ in seeds:
+                on_episode(name)
+            continue
+        outcomes = []
+        for episode in run_episodes(str(fit.spec.task), policy, seeds, film, jobs):
+            outcomes.append(episode.outcome)
+            if episode.frames:
+                write_film(_film(fit, name, episode.seed), episode)
+            on_episode(name)
+        rolled.keep(name, outcomes)
+    found = {name: rolled.outcomes[name] for name in methods}
+    write_text(fit.folder / "rollouts.csv", _table(found, seeds))
+    results = {
+        "seed": seeds.start,
+        "episodes": episodes,
+        "methods": _methods(find_task(str(fit.spec.task)), found, fit.name),
+    }
+    write_metrics(fit.folder, fit.metrics | {"rollouts": results})
+    rolled.end()
+    return results
+
+
+def _film(fit: Fit, name: str, seed: int) -> Path:
+    return fit.folder / "videos" / f"{name}-{seed}.mp4"
+
+
+def _filmed(fit: Fit, name: str, seeds: Sequence[int]) -> bool:
+    return all(_film(fit, name, seed).exists() for seed in seeds)
+
+
+class _Unfinished:
+    """``outcomes`` of the methods that have been rolled out so far, kept in a file until all have been."""
+
+    def __init__(self, fit: Fit, seeds: Sequence[int]) -> None:
+        self._path = fit.folder / "rollouts.unfinished.json"
+        models = b"".join(path.read_bytes() for path in sorted(fit.folder.rglob("model.safetensors")))
+        self._key = {"models": hashlib.sha256(models).hexdigest(), "seeds": list(seeds)}
+        kept = json.loads(self._path.read_text()) if self._path.exists() else {}
+        self.outcomes: Outcomes = kept["outcomes"] if kept | self._key == kept else {}
+
+    def keep(self, name: str, outcomes: list[dict[str, float]]) -> None:
+        """A method has been rolled out."""
+        self.outcomes[name] = outcomes
+        write_text(self._path, json.dumps(self._key | {"outcomes": self.outcomes}))
+
+    def end(self) -> None:
+        """All of them have been, and are kept elsewhere."""
+        self._path.unlink(missing_ok=True)
+
+
+def _methods(task: Task, found: Outcomes, ours: str) -> dict[str, Any]:
+    def successes(name: str) -> list[float]:
+        return [outcome[SUCCESS] for outcome in found[name]]
+
+    methods: dict[str, Any] = {}
+    for name, outcomes in found.items():
+        methods[name] = {"measures": summarize(task, outcomes)}
+        if name != ours and all(SUCCESS in outcome for outcome in outcomes):
+            methods[name]["against"] = paired_difference(successes(ours), successes(name))
+    return methods
+
+
+def _table(found: Mapping[str, Sequence[Mapping[str, float]]], seeds: Sequence[int]) -> str:
+    text = io.StringIO()
+    measures = list(dict.fromkeys(key for outcomes in found.values() for one in outcomes for key in one))
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["method", "seed", *measures])
+    writer.writerows(_rows(found, seeds, measures))
+    return text.getvalue()
+
+
+def _rows(
+    found: Mapping[str, Sequence[Mapping[str, float]]], seeds: Sequence[int], measures: Sequence[str]
+) -> Iterator[list[Any]]:
+    for name, outcomes in found.items():
+        for seed, outcome in zip(seeds, outcomes, strict=True):
+            yield [name, seed, *(outcome.get(measure) for measure in measures)]

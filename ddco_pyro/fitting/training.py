@@ -1,0 +1,329 @@
+"""Expectation-gradient training (paper §4.1) in stages (SM 2.2, SM 2.3), with restarts, early stopping and checkpoints.
+
+The gradient of the marginal log-likelihood *is* the expectation-gradient step: the E-step's posteriors weight the
+networks' gradients. A gradient step sees a minibatch of whole trajectories.
+
+Everything random in an epoch is seeded by (seed, restart, stage, epoch), so a run that was interrupted and resumed from
+the end of any epoch gives the same result, bit for bit, as one that was not. Checkpoints are of ends of epochs.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ddco_pyro.data.files import read_tensors, write_tensors
+from ddco_pyro.errors import Failed
+from ddco_pyro.fitting.clusters import Clusters
+from ddco_pyro.fitting.convergence import StageEnd, share, summary
+from ddco_pyro.inference import direct, log_likelihood, total_log_likelihood
+from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.spec import OptimizerSpec, Spec
+
+SAVE_EVERY = 1.0  # s between checkpoints, at least: an epoch of a small model takes less time than its checkpoint
+
+State = dict[str, Tensor]
+
+
+class TrainingError(Failed):
+    """Training cannot go on: the message names the trajectory or the checkpoint and says what to do."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of training.
+
+    :param discovering: train levels 1 to d under a uniform meta-policy; None for the whole hierarchy.
+    :param clamped: the level whose choices are clamped to clusters of the observations; None for no level.
+    :param trained: prefixes of the names of the parameters that are trained.
+    """
+
+    name: str
+    discovering: int | None
+    clamped: int | None
+    trained: tuple[str, ...]
+
+
+WHOLE = Stage("whole", None, None, ())
+"""The whole hierarchy, as it is."""
+
+
+def plan(spec: Spec, depth: int) -> list[Stage]:
+    """The stages of training for D levels: from the lowest level up, the meta-policy last."""
+    training = spec.training
+    everything = ("levels.", "meta_policy.")
+    if depth == 0:
+        return [Stage("policy", None, None, everything)]
+    stages: list[Stage] = []
+    for level in range(1, depth + 1):
+        own = (f"levels.{level - 1}.",)
+        if training.initialize != "random":
+            stages.append(Stage(f"vq-{level}", level, level, own))
+        if training.layerwise:
+            stages.append(Stage(f"level-{level}", level, None, own))
+    if training.layerwise:
+        stages.append(Stage("meta-policy", None, None, ("meta_policy.",)))
+    if not training.layerwise or training.lower_levels == "fine_tuned":
+        stages.append(Stage("joint", None, None, everything))
+    return stages
+
+
+@dataclass
+class Progress:
+    """Where training stands at the end of an epoch; with the tensors of a checkpoint it is all that is needed.
+
+    ``start`` is the tuning log-likelihood per step from before this stage, ``best`` that of its best epoch, ``winner``
+    that of the best finished restart. ``ended`` has a :class:`StageEnd` for each stage of this restart that has ended,
+    ``winner_ended`` those of the best finished restart.
+    """
+
+    restart: int = 0
+    stage: int = 0
+    epoch: int = 0
+    stale: int = 0
+    start: float = -np.inf
+    best: float = -np.inf
+    winner: float = -np.inf
+    ended: list[dict[str, Any]] = field(default_factory=list)
+    winner_ended: list[dict[str, Any]] = field(default_factory=list)
+    history: list[dict[str, Any]] = field(default_factory=list)
+
+
+OnEpoch = Callable[[dict[str, Any]], None]
+
+
+class Trainer:
+    """Trains a hierarchy on ``train``, stopping and choosing among restarts by ``tune``.
+
+    :param make: a freshly initialised hierarchy; called under a seed of its own for each restart.
+    :param checkpoint: where the state is kept at the end of epochs; None for a training too short to be continued.
+    :param names: names of the demonstrations in ``train``, for messages.
+    :param on_epoch: called with each new row of the history.
+    """
+
+    def __init__(
+        self,
+        spec: Spec,
+        make: Callable[[], Hierarchy],
+        train: Batch,
+        tune: Batch,
+        checkpoint: Path | None,
+        names: list[str],
+        on_epoch: OnEpoch,
+    ) -> None:
+        self.spec, self.make, self.train, self.tune = spec, make, train, tune
+        self.checkpoint, self.names, self.on_epoch = checkpoint, names, on_epoch
+        self.progress = Progress()
+        self._saved: dict[str, State] = {}
+        self._saved_at = -np.inf  # the first epoch is saved
+
+    def run(self) -> Hierarchy:
+        """The best restart's hierarchy, in evaluation mode.
+
+        :raises TrainingError: where a log-likelihood is not finite.
+        """
+        self._load()
+        model = self._fresh()
+        stages = plan(self.spec, model.depth)
+        while self.progress.restart < self.spec.training.restarts:
+            if self.progress.stage == 0 and self.progress.epoch == 0:
+                model = self._fresh()
+            while self.progress.stage < len(stages):
+                self._run_stage(model, stages[self.progress.stage], len(stages) - self.progress.stage)
+                self.progress.stage += 1
+            self._finish_restart(model)
+        model.load_state_dict(self._saved["winner"])
+        return model.eval()
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """How the best restart was trained, for ``metrics.json``."""
+        ends = [StageEnd(**end) for end in self.progress.winner_ended]
+        return summary(self.spec.training, ends, math.ceil(len(self.train) / self.spec.training.batch_size))
+
+    def _fresh(self) -> Hierarchy:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self._seed(self.progress.restart))
+            return self.make().eval()
+
+    def _seed(self, *where: int) -> int:
+        return int(np.random.SeedSequence([self.spec.seed, *where]).generate_state(1)[0])
+
+    def _run_stage(self, model: Hierarchy, stage: Stage, stages_left: int) -> None:
+        now, training = self.progress, self.spec.training
+        cap = share(training.epochs, sum(end["epochs"] for end in now.ended), stages_left)
+        objective = _Objective(self, stage)
+        parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
+        optimizer = _optimizer(training.optimizer, parameters)
+        if now.epoch > 0:
+            model.load_state_dict(self._saved["model"])
+            _restore_optimizer(optimizer, self._saved["optimizer"])
+        else:
+            now.start, now.stale = objective.tune(model), 0
+            now.best = now.start
+            self._saved["best"] = _copy(model)
+        while (cap is None or now.epoch < cap) and (training.patience is None or now.stale < training.patience):
+            train = self._epoch(model, optimizer, parameters, objective)
+            self._record(stage, train, objective.tune(model), model)
+            if time.monotonic() - self._saved_at > SAVE_EVERY:
+                self._save(model, optimizer)
+        model.load_state_dict(self._saved["best"])
+        tune = [now.start, *(row["tune"] for row in now.history[len(now.history) - now.epoch :])]
+        now.ended.append(asdict(StageEnd.of(stage.name, cap, tune, training.patience)))
+        now.epoch = 0
+
+    def _epoch(
+        self, model: Hierarchy, optimizer: torch.optim.Optimizer, parameters: list[nn.Parameter], objective: _Objective
+    ) -> float:
+        """One pass over the training demonstrations; the log-likelihood per step seen on the way."""
+        now, total = self.progress, 0.0
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self._seed(now.restart, now.stage, now.epoch))
+            model.train()
+            for rows in torch.randperm(len(self.train)).split(self.spec.training.batch_size):
+                optimizer.zero_grad(set_to_none=True)
+                total += objective.ascend(model, rows)
+                if self.spec.training.clip_gradient is not None:
+                    nn.utils.clip_grad_norm_(parameters, self.spec.training.clip_gradient)
+                optimizer.step()
+            model.eval()
+        return total / self.train.steps
+
+    def _record(self, stage: Stage, train: float, tune: float, model: Hierarchy) -> None:
+        now = self.progress
+        now.epoch += 1
+        if tune > now.best:
+            now.best, now.stale = tune, 0
+            self._saved["best"] = _copy(model)
+        else:
+            now.stale += 1
+        row = {"restart": now.restart, "stage": stage.name, "epoch": now.epoch, "train": train, "tune": tune}
+        now.history.append(row)
+        self.on_epoch(row)
+
+    def _finish_restart(self, model: Hierarchy) -> None:
+        now = self.progress
+        value = _Objective(self, WHOLE).tune(model)
+        if "winner" not in self._saved or value > now.winner:
+            now.winner, now.winner_ended = value, now.ended
+            self._saved["winner"] = _copy(model)
+        now.restart, now.stage, now.epoch, now.ended = now.restart + 1, 0, 0, []
+        self._save(model, None)
+
+    def _save(self, model: Hierarchy, optimizer: torch.optim.Optimizer | None) -> None:
+        if self.checkpoint is None:
+            return
+        self._saved_at = time.monotonic()
+        self._saved["model"] = _copy(model)
+        self._saved["optimizer"] = {} if optimizer is None else _optimizer_state(optimizer)
+        tensors = {f"{part}/{name}": value for part, state in self._saved.items() for name, value in state.items()}
+        write_tensors(self.checkpoint, tensors, {"progress": json.dumps(asdict(self.progress))})
+
+    def _load(self) -> None:
+        if self.checkpoint is None or not self.checkpoint.exists():
+            return
+        remedy = "remove it and do the same again: training begins anew"
+        tensors, metadata = read_tensors(self.checkpoint, remedy)
+        self.progress = Progress(**json.loads(metadata["progress"]))
+        self._saved = {"optimizer": {}}
+        for name, value in tensors.items():
+            part, _, rest = name.partition("/")
+            self._saved.setdefault(part, {})[rest] = value
+
+
+class _Objective:
+    """What a stage maximises: the log-likelihood, with the choices of one level clamped where the stage says so."""
+
+    def __init__(self, trainer: Trainer, stage: Stage) -> None:
+        self.trainer, self.stage = trainer, stage
+        self.clusters: tuple[Tensor, Tensor] | None = None
+        if stage.clamped is not None:
+            hierarchy = trainer.spec.hierarchy
+            assert hierarchy is not None  # only levels are clamped
+            seed = trainer._seed(trainer.progress.restart, trainer.progress.stage)
+            options = hierarchy.levels[stage.clamped - 1].count
+            found = Clusters(trainer.train, options, seed, trainer.spec.training.initialize == "vq_controls")
+            self.clusters = found.choices(trainer.train), found.choices(trainer.tune)
+
+    def ascend(self, model: Hierarchy, rows: Tensor) -> float:
+        """Add the gradient of the loss of some training demonstrations to the parameters'; their log-likelihood.
+
+        The loss is minus the log-likelihood per step. A batch that is long is processed in parts.
+        """
+        batch, total = self.trainer.train.select(rows), 0.0
+        for part, piece in batch.pieces(model.steps_at_once):
+            value = self._total(model, piece, None if self.clusters is None else self.clusters[0][rows[part]])
+            if not bool(torch.isfinite(value.detach())):
+                raise self._not_finite(model, piece, rows[part])
+            (-value / batch.steps).backward()
+            total += float(value.detach())
+        return total
+
+    def tune(self, model: Hierarchy) -> float:
+        """Log-likelihood per step of the tuning demonstrations."""
+        choices = None if self.clusters is None else self.clusters[1]
+        with torch.no_grad():
+            values = [
+                float(self._total(model, piece, None if choices is None else choices[part]))
+                for part, piece in self.trainer.tune.pieces(model.steps_at_once)
+            ]
+        return sum(values) / self.trainer.tune.steps
+
+    def _total(self, model: Hierarchy, batch: Batch, choices: Tensor | None) -> Tensor:
+        outputs, volume = model(batch.inputs, self.stage.discovering), model.scaling.log_volume
+        engine = self.trainer.spec.inference.engine
+        if choices is None and engine == "fused":
+            return direct.log_likelihood(outputs, batch.actions, volume, batch.lengths).sum()
+        tables = outputs.tables(batch.actions, volume)
+        if choices is not None and self.stage.clamped is not None:
+            tables = tables.clamp(self.stage.clamped, choices[:, : batch.inputs.batch[1]])
+        return total_log_likelihood(tables, batch.lengths, engine)
+
+    def _not_finite(self, model: Hierarchy, batch: Batch, rows: Tensor) -> TrainingError:
+        with torch.no_grad():
+            values = log_likelihood(model.tabulate(batch, self.stage.discovering), batch.lengths)
+        bad = [self.trainer.names[int(row)] for row, ok in zip(rows, torch.isfinite(values), strict=True) if not ok]
+        where = ", ".join(bad) or "this minibatch (no trajectory alone)"
+        return TrainingError(
+            f"stage {self.stage.name}, epoch {self.trainer.progress.epoch + 1}: the log-likelihood of {where} is not "
+            "finite; look at these demonstrations, raise control.std, or lower training.optimizer.lr"
+        )
+
+
+def _optimizer(spec: OptimizerSpec, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
+    if spec.name == "adam":
+        return torch.optim.Adam(parameters, lr=spec.lr, weight_decay=spec.weight_decay)
+    return torch.optim.SGD(parameters, lr=spec.lr, momentum=spec.momentum, weight_decay=spec.weight_decay)
+
+
+def _copy(model: nn.Module) -> State:
+    return {name: value.detach().clone() for name, value in model.state_dict().items()}
+
+
+def _optimizer_state(optimizer: torch.optim.Optimizer) -> State:
+    """The optimiser's tensors by ``<parameter>.<name>``."""
+    state = optimizer.state_dict()["state"]
+    return {
+        f"{index}.{name}": torch.as_tensor(value).clone()
+        for index, values in state.items()
+        for name, value in values.items()
+        if value is not None
+    }
+
+
+def _restore_optimizer(optimizer: torch.optim.Optimizer, state: State) -> None:
+    nested: dict[int, State] = {}
+    for key, value in state.items():
+        index, _, name = key.partition(".")
+        nested.setdefault(int(index), {})[name] = value
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": nested})

@@ -1,0 +1,216 @@
+"""The networks of a hierarchy and the tables they give: levels of options under a meta-policy (paper §4).
+
+A baseline is a hierarchy without option levels whose meta-policy emits control.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cached_property
+from types import MappingProxyType
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from ddco_pyro.model.ahmm import Tables
+from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch, ControlScaling, ObservationEncoder, Shapes
+from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
+from ddco_pyro.model.networks.activations import training_bytes
+from ddco_pyro.model.outputs import Decision, Outputs
+from ddco_pyro.spec import ControlSpec, LearnedStd, LevelSpec, NetworkSpec, Spec, SpecError
+
+INITIAL_STD = 0.5
+"""A learned standard deviation starts here, in scaled units."""
+
+BYTES_AT_ONCE = 256 * 10**6
+"""Most bytes that networks take for the trajectories that go through them together, one trajectory at least."""
+
+Emits = Literal["options", "control"]
+
+
+class Caller(nn.Module):
+    """K policies over the options of the level below, the physical control, or both (§4.2).
+
+    One network gives the log-probabilities y_0 (control), y_1, ..., y_k and the mean control μ of each.
+    """
+
+    def __init__(
+        self,
+        network: NetworkSpec,
+        emits: tuple[Emits, ...],
+        options: int,
+        shape: InputShape,
+        control: ControlSpec,
+        control_size: int,
+        copies: int,
+    ) -> None:
+        super().__init__()
+        self.options = options
+        self.emits_control = "control" in emits
+        self.emits_options = "options" in emits and options > 0
+        logits = options + self.emits_control if self.emits_options else 0
+        self.sizes = (logits, control_size if self.emits_control else 0)
+        self.network = build(network, shape, sum(self.sizes), copies)
+        self.std = ControlStd(control, control_size)
+
+    def forward(self, inputs: Inputs) -> Decision:
+        """What the callers say at every step of the inputs."""
+        said = self.network(inputs)
+        logits, mean = said.split(self.sizes, dim=-1) if all(self.sizes) else (said, said)
+        return Decision(
+            self.options, logits if self.emits_options else None, mean if self.emits_control else None, self.std()
+        )
+
+
+class ControlStd(nn.Module):
+    """The standard deviation σ of the Gaussian control, [A] in scaled units: fixed, or learned above a floor.
+
+    The options of a level share it: otherwise one of them collects the steps where the control hardly varies (a
+    saturated actuator), whatever the skill (see docs/decisions.md).
+    """
+
+    fixed: Tensor
+
+    def __init__(self, spec: ControlSpec, size: int) -> None:
+        super().__init__()
+        self.floor = spec.std.floor if isinstance(spec.std, LearnedStd) else None
+        if isinstance(spec.std, LearnedStd):
+            start = math.log(math.expm1(max(INITIAL_STD - spec.std.floor, 1e-3)))
+            self.raw = nn.Parameter(torch.full((size,), start))
+        else:
+            self.register_buffer("fixed", torch.full((size,), float(spec.std)), persistent=False)
+
+    def forward(self) -> Tensor:
+        """σ [A]."""
+        return self.fixed if self.floor is None else self.floor + softplus(self.raw)
+
+
+class Level(nn.Module):
+    """The k options of one level: their policies π (or, above the lowest level, η) and terminations ψ."""
+
+    def __init__(
+        self,
+        place: str,
+        spec: LevelSpec,
+        options_below: int,
+        shape: InputShape,
+        control: ControlSpec,
+        control_size: int,
+    ) -> None:
+        super().__init__()
+        self.count = spec.count
+        with _named(f"{place}.policy"):
+            self.policy = Caller(
+                spec.policy, spec.policy.emits, options_below, shape, control, control_size, spec.count
+            )
+        with _named(f"{place}.termination"):
+            self.termination = build(spec.termination, shape, 1, spec.count)
+
+
+@contextmanager
+def _named(place: str) -> Iterator[None]:
+    """Errors about a network say where in the spec it stands."""
+    try:
+        yield
+    except SpecError as error:
+        raise SpecError(*(f"{place}.{problem}" for problem in error.problems)) from error
+    except ShapeError as error:
+        raise ShapeError(f"{place}: {error}") from error
+
+
+class Hierarchy(nn.Module):
+    """Levels of options, lowest first, and the meta-policy on top.
+
+    :param shapes: shapes of the observations by name, without time.
+    :param control_size: A, the number of control dimensions.
+    :param steps: the longest demonstration, for per-timestep networks.
+    :param constant: the control dimensions that are no part of the model, and the values that are emitted for them.
+    :raises ShapeError: where a network cannot read these observations.
+    :raises SpecError: where a user's network does not take its options.
+    """
+
+    def __init__(
+        self,
+        spec: Spec,
+        shapes: Shapes,
+        control_size: int,
+        steps: int,
+        constant: Mapping[int, float] = MappingProxyType({}),
+    ) -> None:
+        super().__init__()
+        self.steps = steps
+        self.encoder = ObservationEncoder(spec.observations, shapes)
+        self.scaling = ControlScaling(spec.control, control_size, constant)
+        self.input_shape = shape = self.encoder.shape(steps)
+        size = len(self.scaling.varying)
+        levels, below = [], 0
+        for number, level in enumerate(spec.hierarchy.levels if spec.hierarchy else ()):
+            levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, spec.control, size))
+            below = level.count
+        self.levels = nn.ModuleList(levels)
+        network, emits = _meta_policy(spec)
+        with _named("hierarchy.meta_policy" if levels else "baseline.policy"):
+            self.meta_policy = Caller(network, emits, below, shape, spec.control, size, copies=1)
+
+    @property
+    def depth(self) -> int:
+        """The number D of option levels."""
+        return len(self.levels)
+
+    def callers(self) -> list[Caller]:
+        """Who chooses: the policies of each level, lowest first, and the meta-policy."""
+        return [*(level.policy for level in self.option_levels()), self.meta_policy]
+
+    def option_levels(self) -> list[Level]:
+        """The levels of options, lowest first."""
+        return [level for level in self.levels if isinstance(level, Level)]
+
+    def named_networks(self) -> Iterator[tuple[str, nn.Module]]:
+        """Every network by its place in the spec."""
+        for number, level in enumerate(self.option_levels()):
+            yield f"hierarchy.levels.{number}.policy", level.policy
+            yield f"hierarchy.levels.{number}.termination", level.termination
+        yield "hierarchy.meta_policy" if self.depth else "baseline.policy", self.meta_policy
+
+    @cached_property
+    def step_bytes(self) -> int:
+        """Bytes that all networks take for a step in training."""
+        return training_bytes((network for _, network in self.named_networks()), self.input_shape)
+
+    @property
+    def steps_at_once(self) -> int:
+        """Steps that go through the networks together, where trajectories are short enough."""
+        return max(1, min(STEPS_AT_ONCE, BYTES_AT_ONCE // max(1, self.step_bytes)))
+
+    def forward(self, inputs: Inputs, discovering: int | None = None) -> Outputs:
+        """What the networks say about these observations.
+
+        :param discovering: d gives levels 1 to d alone under a uniform meta-policy (layer-wise training, SM 2.3).
+        """
+        levels = self.option_levels()[:discovering]
+        decisions = [level.policy(inputs) for level in levels]
+        top = _uniform(inputs, levels[-1].count, decisions[0].std) if discovering else self.meta_policy(inputs)
+        return Outputs((*decisions, top), tuple(level.termination(inputs).squeeze(-1) for level in levels))
+
+    def tabulate(self, batch: Batch, discovering: int | None = None) -> Tables:
+        """The tables of a batch: every network once, over all options, steps and trajectories."""
+        return self(batch.inputs, discovering).tables(batch.actions, self.scaling.log_volume)
+
+
+def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
+    if spec.hierarchy is not None:
+        return spec.hierarchy.meta_policy, spec.hierarchy.meta_policy.emits
+    assert spec.baseline is not None  # a spec has one or the other
+    policy = spec.baseline.policy
+    if spec.baseline.kind == "per_timestep":
+        policy = NetworkSpec(network="per_timestep", hidden=policy.hidden, dropout=policy.dropout)
+    return policy, ("control",)
+
+
+def _uniform(inputs: Inputs, options: int, like: Tensor) -> Decision:
+    """A meta-policy that selects each of the k options with probability 1/k."""
+    return Decision(options, like.new_zeros(*inputs.batch, 1, options), None, like)

@@ -1,0 +1,1 @@
+"""Tasks in simulation: the protocol, episodes, collecting demonstrations, films, Gymnasium."""

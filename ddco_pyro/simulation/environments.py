@@ -1,0 +1,99 @@
+"""The registered tasks as Gymnasium environments (``pip install 'ddco-pyro[gymnasium]'``).
+
+    import gymnasium
+    import ddco_pyro.simulation.environments    # registers ddco/<task>-v0 for every task
+
+    environment = gymnasium.make("ddco/needle-v0")
+
+``gymnasium.make("ddco_pyro.simulation.environments:ddco/needle-v0")`` does both at once.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from typing import Any
+
+import dm_env
+import gymnasium
+import numpy as np
+from dm_env import specs
+from gymnasium import spaces
+
+from ddco_pyro.simulation.task import find_task
+from ddco_pyro.spec.types import TASKS
+
+NAMESPACE = "ddco"
+
+Observation = dict[str, np.ndarray]
+
+
+class TaskEnvironment(gymnasium.Env[Observation, np.ndarray]):
+    """A task of this library as a Gymnasium environment.
+
+    A task's initial state depends on a seed alone: ``reset(seed=...)`` gives the one that rollouts with this seed
+    start from. The last step's ``info`` has the task's measures, such as ``success``.
+
+    :param task: a registered name or ``module:name``, as :func:`ddco_pyro.simulation.task.find_task` takes it.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (as Gymnasium has it)
+
+    def __init__(self, task: str, render_mode: str | None = None) -> None:
+        self.task = find_task(task)
+        self.render_mode = render_mode
+        self._environment = self.task.load(0)
+        shapes = self._environment.observation_spec()
+        boxes: Any = spaces.Dict({name: _box(one) for name, one in shapes.items()})
+        self.observation_space = boxes
+        self.action_space = _box(self._environment.action_spec())
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode; without a seed at an initial state drawn from the seeds before."""
+        super().reset(seed=seed)
+        self._environment.close()
+        self._environment = self.task.load(int(self.np_random.integers(2**31)) if seed is None else seed)
+        return _observation(self._environment.reset()), {}
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One control step; the environment's end is a truncation where it says that more could follow."""
+        step = self._environment.step(np.asarray(action))
+        ended = step.last() and step.discount == 0
+        info = self.task.measured(self._environment) if step.last() else {}
+        return _observation(step), float(step.reward or 0.0), bool(ended), bool(step.last() and not ended), info
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """The scene as it is, uint8 [H, W, 3]."""
+        return self.task.frame(self._environment) if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """End the simulation."""
+        self._environment.close()
+
+
+def _observation(step: dm_env.TimeStep) -> Observation:
+    return {name: np.array(value) for name, value in step.observation.items()}
+
+
+def _box(spec: specs.Array) -> spaces.Box:
+    """The space of arrays that a dm_env spec describes."""
+    dtype = np.dtype(spec.dtype)
+    if isinstance(spec, specs.BoundedArray):
+        low, high = (np.broadcast_to(end, spec.shape).astype(dtype) for end in (spec.minimum, spec.maximum))
+    elif dtype.kind in "iu":
+        low, high = (np.full(spec.shape, end, dtype) for end in (np.iinfo(dtype).min, np.iinfo(dtype).max))
+    else:
+        low, high = np.full(spec.shape, -np.inf, dtype), np.full(spec.shape, np.inf, dtype)
+    return spaces.Box(low, high, spec.shape, dtype.type)
+
+
+def register() -> None:
+    """Register every task that is not registered yet as ``ddco/<task>-v0``."""
+    for point in entry_points(group=TASKS):
+        name = f"{NAMESPACE}/{point.name}-v0"
+        if name not in gymnasium.registry:
+            gymnasium.register(name, "ddco_pyro.simulation.environments:TaskEnvironment", kwargs={"task": point.name})
+
+
+register()

@@ -1,0 +1,56 @@
+"""Films of episodes, with the active options written on each frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import imageio.v3 as imageio
+import numpy as np
+
+from ddco_pyro.data.files import whole_file
+from ddco_pyro.drawing.colours import option_rgb
+from ddco_pyro.simulation.episodes import Episode
+
+FRAMES_PER_SECOND = 3
+BORDER = 6
+
+
+def write_film(path: Path, episode: Episode) -> None:
+    """Write the episode's frames as an mp4 (H.264) that browsers play."""
+    frames = [_even(captioned(episode, t)) for t in range(len(episode.frames))]
+    with whole_file(path) as temporary:
+        imageio.imwrite(
+            temporary,
+            frames,
+            extension=".mp4",
+            plugin="FFMPEG",
+            fps=FRAMES_PER_SECOND,
+            macro_block_size=1,
+            output_params=["-f", "mp4"],  # the temporary name does not tell
+        )
+
+
+def captioned(episode: Episode, t: int) -> np.ndarray:
+    """Frame t with a border in the colour of the option active in it, and its name; uint8 [H, W, 3].
+
+    The last frame shows the end, where nothing is active any more.
+    """
+    frame = np.array(episode.frames[t], order="C")
+    active = episode.choices[t] if t < len(episode.choices) else episode.choices[:0].reshape(-1)
+    if len(active):
+        cv2.rectangle(frame, (0, 0), (frame.shape[1] - 1, frame.shape[0] - 1), option_rgb(active[0]), 2 * BORDER)
+    text = "end" if t >= len(episode.choices) else f"t={t}" + "".join(f"  h{d}={h}" for d, h in enumerate(active, 1))
+    for across, down in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        _write(frame, text, (12 + across, 26 + down), (255, 255, 255))
+    _write(frame, text, (12, 26), (20, 20, 20))
+    return frame
+
+
+def _write(frame: np.ndarray, text: str, place: tuple[int, int], colour: tuple[int, int, int]) -> None:
+    cv2.putText(frame, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, 1, cv2.LINE_AA)
+
+
+def _even(frame: np.ndarray) -> np.ndarray:
+    """H.264 takes even sizes only."""
+    return frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]

@@ -1,0 +1,128 @@
+"""What a task offers to the library: an environment, scripted policies for it, and how success is measured.
+
+The library never imports a task. It finds one by the name of an entry point in the group ``ddco_pyro.tasks``
+or by ``module:name``, and sees it only through :class:`Task`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Literal, Protocol, get_args
+
+import dm_env
+import numpy as np
+
+from ddco_pyro.errors import BadInput
+from ddco_pyro.spec.types import TASKS
+
+SUCCESS = "success"
+"""The measure by which methods are compared."""
+
+Kind = Literal["rate", "mean"]
+
+Observation = Mapping[str, np.ndarray]
+
+
+class Policy(Protocol):
+    """Anything that acts: a scripted supervisor, the open-loop plan, a fitted controller."""
+
+    def reset(self, seed: int) -> None:
+        """Forget the last episode. Equal seeds give equal episodes."""
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """The control for this observation, shape [A], in the task's own units."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task: ``load`` makes its environment, ``policies`` the scripted policies that act in it.
+
+    :param load: ``load(seed)`` gives a fresh environment; its first ``reset()`` depends on the seed alone.
+    :param policies: name to ``make(environment)``; a scripted policy may look at the environment's true state.
+        ``"supervisor"`` is the one whose demonstrations are collected. A policy may have an attribute
+        ``annotations`` (name to integer, for the step just decided): they are stored as ground-truth labels. One
+        whose moves are disturbed may have an attribute ``intended`` [A], the control without the disturbance: it is
+        recorded in place of the one that was executed (noise while collecting, clean labels).
+    :param outcome: measures of the episode that just ended, such as ``{"success": 1.0, "accuracy_mm": 2.1}``;
+        a measure that does not apply (the accuracy of an insertion that never happened) is NaN.
+    :param frame: a picture of the scene as it is now, uint8 [H, W, 3].
+    :param sources: the files whose contents decide what a demonstration looks like, for caching.
+    :param steps: the most control steps that an episode can have, where that is known; 1 otherwise.
+    :param measures: the kind of each measure in ``outcome``: a ``"rate"`` is 0 or 1 in every episode, a ``"mean"`` any
+        number. Without it every measure is a mean but ``success``, which is always a rate.
+    :raises OutcomeError: ``measures`` has another kind, or calls ``success`` a mean.
+    """
+
+    name: str
+    load: Callable[[int], dm_env.Environment]
+    policies: Mapping[str, Callable[[dm_env.Environment], Policy]]
+    outcome: Callable[[dm_env.Environment], dict[str, float]]
+    frame: Callable[[dm_env.Environment], np.ndarray]
+    sources: tuple[Path, ...] = field(default=())
+    steps: int = 1
+    measures: Mapping[str, Kind] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse a wrong declaration."""
+        for name, kind in self.measures.items():
+            if kind not in get_args(Kind):
+                raise self._wrong(f"{name} is declared a {kind!r}; it has to be a 'rate' or a 'mean'")
+        if self.kind(SUCCESS) != "rate":
+            raise self._wrong(f"{SUCCESS} is a rate, by which methods are compared; call the mean otherwise")
+
+    def kind(self, measure: str) -> Kind:
+        """Whether a measure is a rate or a mean."""
+        return self.measures.get(measure, "rate" if measure == SUCCESS else "mean")
+
+    def measured(self, environment: dm_env.Environment) -> dict[str, float]:
+        """The ``outcome`` of the episode that just ended.
+
+        :raises OutcomeError: it has other measures than were declared, or a rate that is not 0, 1 or NaN.
+        """
+        found = {name: float(value) for name, value in self.outcome(environment).items()}
+        if self.measures and found.keys() != self.measures.keys():
+            names = f"{', '.join(found)}, and its measures are {', '.join(self.measures)}"
+            raise self._wrong(f"its outcome has {names}; declare all of them")
+        for name, value in found.items():
+            if self.kind(name) == "rate" and not (value in (0.0, 1.0) or math.isnan(value)):
+                why = "a rate is 0 or 1 in every episode"
+                raise self._wrong(f"{name} is {value:g}, and {why}; make it a mean, which {SUCCESS} cannot be")
+        return found
+
+    def _wrong(self, what: str) -> OutcomeError:
+        return OutcomeError(f"task {self.name!r}: {what}")
+
+
+class OutcomeError(BadInput):
+    """What a task measures is not what it declares."""
+
+
+class UnknownTask(BadInput):
+    """No task of that name is registered, or ``module:name`` does not lead to a :class:`Task`."""
+
+
+def find_task(name: str) -> Task:
+    """The task registered under ``name``, or the one that ``module:name`` holds.
+
+    :raises UnknownTask: names what is registered.
+    """
+    registered = {point.name: point for point in entry_points(group=TASKS)}
+    if name in registered:
+        found: Any = registered[name].load()
+    elif ":" in name:
+        module, _, attribute = name.partition(":")
+        try:
+            found = getattr(importlib.import_module(module), attribute)
+        except Exception as error:  # whatever the user's code raises
+            raise UnknownTask(f"task {name!r} cannot be loaded: {error}") from error
+    else:
+        known = ", ".join(sorted(registered)) or "none"
+        raise UnknownTask(f"no task is registered as {name!r} (registered: {known}); module:name works too")
+    if not isinstance(found, Task):
+        raise UnknownTask(f"task {name!r} leads to a {type(found).__name__}, not to a ddco_pyro.simulation.task.Task")
+    return found

@@ -1,0 +1,226 @@
+"""Success and held-out log-likelihood on the needle task over training seeds (the table of SM 1.3).
+
+    python studies/needle_success.py [--seeds 5] [--episodes 200] [--jobs 2] [--set KEY=VALUE]... [--out DIR]
+
+Every seed is a fit of ``specs/needle.yaml`` with its baselines and a rollout of all methods from the same starts. What
+this code has done already with the same settings (``seed-N.json``, and fits under ``runs``) is not done again. Writes
+``summary.json``, ``summary.md`` and ``success.png``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from provenance import Record, record, sentence, text
+from scipy import stats
+
+from ddco_pyro.data.files import whole_file, write_text
+from ddco_pyro.fitting.rollouts import roll_out
+from ddco_pyro.fitting.run import fit
+from ddco_pyro.selection.scoring import Unwatched
+from ddco_pyro.simulation.episodes import rate
+from ddco_pyro.spec import load_spec
+
+OURS = "ddco"
+RATES = ("success", "grasped", "inserted")
+Seed = dict[str, Any]
+"""What is kept of one training seed: the ``results`` of ``seed-N.json``."""
+
+
+def run_seed(seed: int, arguments: argparse.Namespace, made_by: Record) -> None:
+    """Fit, roll out, and keep the numbers of one training seed."""
+    path = arguments.out / f"seed-{seed}.json"
+    settings = {"seed": seed, "episodes": arguments.episodes, "overrides": arguments.set}
+    if path.exists() and is_kept(json.loads(path.read_text()), settings, made_by):
+        return
+    overrides = [*arguments.set, f"seed={seed}"]
+    if seed > 0:
+        overrides.append("rollout.policies=[]")  # scripted policies know no training seed
+    folder = arguments.runs / made_by["code"][:12] / f"seed-{seed}"
+    fitted = fit(load_spec("specs/needle.yaml", overrides), folder, Unwatched())
+    rolled = roll_out(fitted, arguments.episodes, 0, lambda name: None, jobs=1)
+    metrics = fitted.metrics
+    likelihood = {name: one["log_likelihood_per_step"] for name, one in metrics["comparison"].items()}
+    likelihood[OURS] = metrics["log_likelihood_per_step"]
+    training = {name: one["training"] for name, one in metrics["comparison"].items()} | {OURS: metrics["training"]}
+    kept = settings | {
+        "log_likelihood_per_step": likelihood,
+        "difference": {name: one["difference"] for name, one in metrics["comparison"].items()},
+        "training": training,
+        "methods": rolled["methods"],
+        "options": metrics["options"],
+        "seconds": metrics["seconds"],
+        "engine_check": metrics["engine_check"],
+        "supervisor_demonstrations": metrics["demonstrations"]["supervisor"],
+    }
+    write_text(path, text(kept, [made_by]))
+
+
+def is_kept(content: Any, settings: dict[str, Any], made_by: Record) -> bool:
+    """Whether a ``seed-N.json`` is what this code gives with these settings."""
+    if [one and one.get("code") for one in content.get("provenance", [])] != [made_by["code"]]:
+        return False
+    return all(content["results"].get(key) == value for key, value in settings.items())
+
+
+def summarize(seeds: list[Seed]) -> dict[str, Any]:
+    """For each method: counts over all episodes, and every measure over training seeds.
+
+    A scripted method has no training seed: its counts have Wilson intervals, over episodes.
+    """
+    methods = seeds[0]["methods"]  # the scripted ones are in the first seed alone
+    learned = list(seeds[0]["log_likelihood_per_step"])
+    order = sorted(methods, key=lambda name: (name == "supervisor", name == OURS, name in learned))
+    return {name: _summary(name, [one for one in seeds if name in one["methods"]]) for name in order}
+
+
+def _summary(name: str, seeds: list[Seed]) -> dict[str, Any]:
+    measures = [one["methods"][name]["measures"] for one in seeds]
+    summary: dict[str, Any] = {}
+    for measure in RATES:
+        counts = rate(*(sum(one[measure][part] for one in measures) for part in ("successes", "trials")))
+        learned = name in seeds[0]["log_likelihood_per_step"]
+        values = [one[measure]["rate"] for one in measures if one[measure]["trials"]]
+        summary[measure] = over_seeds(values, (0.0, 1.0)) if learned else {"interval": counts["interval"]}
+        summary[measure] |= {"successes": counts["successes"], "trials": counts["trials"], "rate": counts["rate"]}
+    summary["accuracy_mm"] = over_seeds(
+        [one["accuracy_mm"]["mean"] for one in measures if one["accuracy_mm"]["trials"]]
+    )
+    for part in ("train", "valid"):
+        values = [one["log_likelihood_per_step"].get(name, {}).get(part) for one in seeds]
+        if None not in values:
+            summary[f"log_likelihood_{part}"] = over_seeds(values)
+    if name in seeds[0]["training"]:
+        summary["not_converged"] = sum(not one["training"][name]["converged"] for one in seeds)
+    return summary
+
+
+def over_seeds(values: list[float], bounds: tuple[float, float] = (-np.inf, np.inf)) -> dict[str, Any]:
+    """Mean over training seeds, its 95 % t ``interval``, the ``range``, and the interval that another fit falls into
+    with a probability of 95 % (``another``), were the seeds' values normal; intervals end at the ``bounds``.
+    """
+    found: dict[str, Any] = {"mean": float(np.mean(values)) if values else None, "by_seed": list(values)}
+    if len(values) < 2:
+        return found | {"range": None, "interval": None, "another": None}
+    half = stats.sem(values) * stats.t.ppf(0.975, len(values) - 1)
+    widths = {"interval": half, "another": half * np.sqrt(len(values) + 1)}  # s √(1/n) t, and s √(1 + 1/n) t
+    spans = {key: np.clip([found["mean"] - width, found["mean"] + width], *bounds) for key, width in widths.items()}
+    return found | {"range": [min(values), max(values)]} | {key: span.tolist() for key, span in spans.items()}
+
+
+def differences(seeds: list[Seed]) -> dict[str, dict[str, Any]]:
+    """Ours minus every other method that is trained, paired by seed: success, and held-out nats per step."""
+    others = [name for name in seeds[0]["log_likelihood_per_step"] if name != OURS]
+    return {
+        name: {
+            "success": over_seeds([_success(one, OURS) - _success(one, name) for one in seeds]),
+            "log_likelihood_valid": over_seeds([_valid(one, OURS) - _valid(one, name) for one in seeds]),
+        }
+        for name in others
+    }
+
+
+def _success(seed: Seed, name: str) -> float:
+    return float(seed["methods"][name]["measures"]["success"]["rate"])
+
+
+def _valid(seed: Seed, name: str) -> float:
+    return float(seed["log_likelihood_per_step"][name]["valid"])
+
+
+def page(results: dict[str, Any], seeds: int, made_by: str) -> str:
+    """The results as Markdown."""
+    head = ["method", "success", "range over seeds", "one fit elsewhere", "grasped", "inserted, of those",
+            "accuracy mm", "held-out nats/step"]  # fmt: skip
+    lines = [
+        made_by,
+        "",
+        f"Means over {seeds} training seeds with 95 % t intervals; those of scripted methods, which know no training "
+        "seed, are Wilson intervals over episodes. A fit is as sensitive to rounding as to its seed: on another "
+        "machine the same seed gives what another seed might have given here. So a single fit there falls into the "
+        "interval *one fit elsewhere* with a probability of 95 % (were seeds normally distributed), and the mean "
+        "over as many seeds differs from the one here by up to 1.4 times the half width of its interval.",
+        "",
+        f"| {' | '.join(head)} |",
+        "|---" * len(head) + "|",
+    ]
+    for name, one in results["methods"].items():
+        success, percent = one["success"], "{:.0%}"
+        rising = f", {one['not_converged']} not converged" if one.get("not_converged") else ""
+        cells = [name, spread(success, percent), span(success.get("range"), percent)]
+        cells += [span(success.get("another"), percent)]
+        cells += [spread(one[measure], percent) for measure in ("grasped", "inserted")]
+        cells += [spread(one["accuracy_mm"], "{:.1f}"), spread(one.get("log_likelihood_valid"), "{:.2f}") + rising]
+        lines.append(f"| {' | '.join(cells)} |")
+    lines.append("")
+    for name, one in results["differences"].items():
+        success = spread(one["success"], "{:+.1%}")
+        likelihood = spread(one["log_likelihood_valid"], "{:+.2f}")
+        lines.append(f"- {OURS} minus {name}, paired by seed: success {success}, {likelihood} held-out nats/step.")
+    return "\n".join(lines) + "\n"
+
+
+def spread(one: dict[str, Any] | None, form: str) -> str:
+    """A mean, or the rate where there are no seeds, and its interval."""
+    value = one and one.get("mean", one.get("rate"))
+    if not one or value is None:
+        return "-"
+    return form.format(value) + (f" [{span(one['interval'], form, ', ')}]" if one["interval"] else "")
+
+
+def span(ends: list[float] | None, form: str, between: str = " to ") -> str:
+    """Two numbers, or a dash."""
+    return between.join(form.format(end) for end in ends) if ends else "-"
+
+
+def draw(methods: dict[str, Any], path: Path) -> None:
+    """Success of each method: every training seed a dot, the mean and its interval a bar."""
+    figure = Figure(figsize=(7, 3), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    for place, one in enumerate(method["success"] for method in methods.values()):
+        values = one.get("by_seed", [])
+        if one["interval"]:
+            axes.plot(one["interval"], [place, place], lw=6, alpha=0.35, color="#3f6fb0", solid_capstyle="butt")
+        axes.plot(one.get("mean", one["rate"]), place, "|", ms=16, mew=2, color="#1f3f70")
+        axes.plot(values, [place] * len(values), "o", ms=4, color="#1f3f70", alpha=0.7)
+    axes.set(yticks=range(len(methods)), yticklabels=list(methods), xlim=(-0.02, 1.02))
+    axes.set_xlabel("success rate (dots: training seeds; bar: 95 % interval)")
+    axes.invert_yaxis()
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=120, format="png")
+
+
+def main() -> None:
+    """Run the study."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--out", type=Path, default=Path("docs/results/needle"))
+    parser.add_argument("--runs", type=Path, default=Path("runs/needle-success"))
+    arguments = parser.parse_args()
+    settings = "".join(f" --set '{one}'" for one in arguments.set)
+    command = f"python studies/needle_success.py --seeds {arguments.seeds} --episodes {arguments.episodes}{settings}"
+    made_by = record(command)
+    Parallel(n_jobs=arguments.jobs)(delayed(run_seed)(seed, arguments, made_by) for seed in range(arguments.seeds))
+    kept = [json.loads((arguments.out / f"seed-{seed}.json").read_text()) for seed in range(arguments.seeds)]
+    seeds, records = [one["results"] for one in kept], [one for each in kept for one in each["provenance"]]
+    results = {"methods": summarize(seeds), "differences": differences(seeds)}
+    summary = page(results, arguments.seeds, sentence(command, records))
+    write_text(arguments.out / "summary.json", text(results, records))
+    write_text(arguments.out / "summary.md", summary)
+    draw(results["methods"], arguments.out / "success.png")
+    print(summary)
+
+
+if __name__ == "__main__":
+    main()
