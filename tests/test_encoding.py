@@ -100,6 +100,11 @@ def test_images_stay_bytes():
         np.testing.assert_array_equal(found.images["camera"][n, : len(demo)], demo.observations["camera"])
 
 
+def test_images_alone_have_no_features():
+    found = fitted(ObservationSpec(key="camera")).inputs(d.observations for d in DEMOS)
+    assert (found.vector.shape, set(found.images)) == ((3, 5, 0), {"camera"})
+
+
 def batch():
     encoder = fitted(ObservationSpec(key="pose"), ObservationSpec(key="camera"))
     scaling = ControlScaling(ControlSpec(scale="none"), 3)
@@ -115,6 +120,13 @@ def test_batches_are_padded_with_zeros():
         for padded in (found.inputs.vector, found.inputs.images["camera"], found.actions):
             assert padded.shape[:2] == (3, 5)
             assert not padded[n, len(demo) :].any()
+
+
+def test_select_takes_the_first_steps_where_it_is_asked_to():
+    whole = batch()
+    found = whole.select(torch.tensor([0, 1]), 4)
+    assert (found.lengths.tolist(), found.inputs.time.tolist()) == ([4, 3], [0, 1, 2, 3])
+    assert torch.equal(found.inputs.images["camera"], whole.inputs.images["camera"][:2, :4])
 
 
 def test_select_trims_to_the_longest():

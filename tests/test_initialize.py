@@ -142,6 +142,14 @@ def test_other_demonstrations_go_to_the_nearest_mean():
     np.testing.assert_array_equal(alive(choices, (6, 8, 3)), distances.argmin(1) + 1)
 
 
+def test_it_does_not_matter_how_many_images_are_looked_at_together(monkeypatch):
+    images = np.random.default_rng(8).integers(0, 256, (sum(LENGTHS), 16, 16, 3), dtype=np.uint8)
+    batch = make_batch(random_rows(9, 2), random_rows(10, 2), {"camera": images})
+    together = Clusters(batch, 3, seed=0).choices(batch)
+    monkeypatch.setattr("ddco_pyro.fitting.clusters.FRAMES_AT_ONCE", 2)
+    assert torch.equal(Clusters(batch, 3, seed=0).choices(batch), together)
+
+
 def test_images_are_seen_as_block_means():
     """Mean brightness of each block of 2 × 3 pixels, by hand, in [0, 1]; beside it the vector."""
     random = np.random.default_rng(8)

@@ -17,17 +17,17 @@ VARIABLE = "DDCO_PYRO_MEMORY"
 ALLOWED = 2.0
 """GB that may be taken where ``$DDCO_PYRO_MEMORY`` says nothing else."""
 
-PROGRAM = 620e6
+PROGRAM = 680e6
 """Bytes that a fit of next to nothing takes: mostly torch, Pyro and compiled code."""
 
-COPIES = 20.0
-"""Bytes that a fit takes for a feature or control of a padded step, beside the demonstrations: 2 float64, 1 float32."""
+KEPT = 4.0
+"""Bytes that a fit keeps of a feature or control of a padded step, beside the demonstrations: float32."""
 
-PICTURES = 2.0
-"""Copies of the pictures that a fit takes, beside the demonstrations."""
+MAKING = 16.0
+"""Bytes that a number takes on the way there, two float64, or while it is clustered: float64 and k-means' copy."""
 
 INFERENCE = 5e3
-"""Bytes that networks and inference take for a step of the longest demonstration, which is never divided."""
+"""Bytes that inference takes for a step of trajectories that are processed together."""
 
 
 class Array(Protocol):
@@ -43,49 +43,83 @@ class Array(Protocol):
 
 
 @dataclass(frozen=True)
+class Work:
+    """What training and evaluating a model takes beside the demonstrations.
+
+    :param batch: trajectories in a gradient step.
+    :param steps: steps that go through the networks together, where trajectories are short enough.
+    :param bytes_per_step: bytes that the networks take for each of them.
+    :param clustered: numbers at each step that are clustered to begin with; 0 where nothing is.
+    """
+
+    batch: int
+    steps: int
+    bytes_per_step: int
+    clustered: int
+
+
+@dataclass(frozen=True)
 class Extent:
     """How much there is of demonstrations, by their headers.
 
     :param lengths: steps of each.
     :param size: bytes of all that is read, as it is in memory.
-    :param numbers: by place (``actions``, ``obs/<key>``) the numbers at each step.
-    :param pictures: the same for pictures, bytes.
+    :param shapes: by place (``actions``, ``obs/<key>``) the shape of a step.
+    :param pictures: the places that hold pictures, uint8.
     """
 
     lengths: tuple[int, ...]
     size: int
-    numbers: Mapping[str, int]
-    pictures: Mapping[str, int]
+    shapes: Mapping[str, tuple[int, ...]]
+    pictures: frozenset[str]
 
     @classmethod
     def of(cls, demonstrations: Iterable[Mapping[str, Array]]) -> Extent:
         """Of arrays by place for each demonstration; labels count where they are read only."""
         lengths, size = [], 0
-        numbers: dict[str, int] = {}
-        pictures: dict[str, int] = {}
+        shapes: dict[str, tuple[int, ...]] = {}
+        pictures: set[str] = set()
         for arrays in demonstrations:
             lengths.append(arrays["actions"].shape[0] if arrays["actions"].shape else 0)
             for place, one in arrays.items():
                 plain = one.dtype == np.uint8
                 size += math.prod(one.shape) * (1 if plain else 8)
-                kind = pictures if plain and len(one.shape) == 4 else numbers
                 if not place.startswith("labels/"):
-                    kind[place] = max(kind.get(place, 0), math.prod(one.shape[1:]))
-        return cls(tuple(lengths), size, numbers, pictures)
+                    shapes[place] = max(shapes.get(place, ()), tuple(one.shape[1:]), key=math.prod)
+                    pictures |= {place} if plain and len(one.shape) == 4 else set()
+        return cls(tuple(lengths), size, shapes, frozenset(pictures))
 
-    def step(self, differences: Collection[str] = ()) -> float:
-        """Bytes that networks are given for a step, and what is made on the way there.
+    @property
+    def picture_bytes(self) -> int:
+        """Bytes of all pictures of a step."""
+        return sum(math.prod(self.shapes[place]) for place in self.pictures)
+
+    def features(self, differences: Collection[str] = ()) -> int:
+        """Numbers of a step that are no pictures.
 
         :param differences: places of observations whose differences are appended.
         """
-        features = sum(one * (2 if place in differences else 1) for place, one in self.numbers.items())
-        return COPIES * features + PICTURES * sum(self.pictures.values())
+        numbers = {place: math.prod(shape) for place, shape in self.shapes.items() if place not in self.pictures}
+        return sum(one * (2 if place in differences else 1) for place, one in numbers.items())
 
-    def fit(self, differences: Collection[str] = ()) -> float:
-        """Bytes that a fit takes, about; measured with up to 200 observations of 100,000 steps."""
-        longest = max(self.lengths)
-        padded = len(self.lengths) * longest
-        return PROGRAM + self.size + padded * self.step(differences) + INFERENCE * longest
+    def step(self, differences: Collection[str] = ()) -> float:
+        """Bytes that networks are given for a step, and what is made on the way there."""
+        return (KEPT + MAKING) * self.features(differences) + self.picture_bytes
+
+    def fit(self, works: Iterable[Work], differences: Collection[str] = ()) -> float:
+        """Bytes that a fit takes, about: the most that one of its models, which are trained one after the other, does.
+
+        The demonstrations are there as they were read, and padded. What else there is comes one after the other: what
+        is made of them, clusters, and gradient steps.
+        """
+        longest, features = max(1, *self.lengths), self.features(differences)
+        padded, given = len(self.lengths) * longest, KEPT * features + self.picture_bytes
+        passing = [MAKING * features * padded]
+        for work in works:
+            batch, together = (min(n, len(self.lengths)) for n in (work.batch, max(work.steps // longest, 1)))
+            networks = together * (work.bytes_per_step + given + INFERENCE)
+            passing += [MAKING * work.clustered * sum(self.lengths), longest * (batch * given + networks)]
+        return PROGRAM + self.size + padded * given + max(passing)
 
 
 def allowed() -> float:

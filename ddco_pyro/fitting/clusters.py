@@ -30,8 +30,7 @@ class Clusters:
     def __init__(self, batch: Batch, options: int, seed: int, controls: bool = False) -> None:
         self._controls = controls
         rows = self._rows(batch)
-        distinct = len(np.unique(rows, axis=0))
-        self._kmeans = KMeans(min(options, distinct), n_init=10, random_state=seed).fit(rows)
+        self._kmeans = KMeans(_distinct(rows, options), n_init=10, random_state=seed).fit(rows)
 
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
@@ -51,12 +50,34 @@ def _alive(batch: Batch) -> Tensor:
     return batch.inputs.time < batch.lengths[:, None]
 
 
+FRAMES_AT_ONCE = 64
+"""Pictures whose pixels are floating-point numbers at the same time."""
+
+
 def _observations(batch: Batch) -> np.ndarray:
-    """Observations of every step, [steps, features]."""
-    columns = [batch.inputs.vector]
-    for image in batch.inputs.images.values():
-        pixels = image.flatten(0, 1).permute(0, 3, 1, 2).float() / 255
-        pooled = torch.nn.functional.adaptive_avg_pool2d(pixels, POOLED)
-        columns.append(pooled.reshape(*batch.inputs.batch, -1))
-    rows: np.ndarray = torch.cat(columns, dim=-1)[_alive(batch)].double().numpy()
+    """Observations of every step, [steps, features]; pictures by their block means."""
+    each = []
+    for row, length in enumerate(batch.lengths.tolist()):
+        means = [_block_means(image[row, :length]) for image in batch.inputs.images.values()]
+        each.append(torch.cat([batch.inputs.vector[row, :length], *means], dim=-1))
+    rows: np.ndarray = torch.cat(each).double().numpy()
     return rows
+
+
+def _block_means(frames: Tensor) -> Tensor:
+    """uint8 [T, H, W, C] to [T, C · POOLED²], in [0, 1]."""
+    pooled = [
+        torch.nn.functional.adaptive_avg_pool2d(block.permute(0, 3, 1, 2).float() / 255, POOLED).flatten(1)
+        for block in frames.split(FRAMES_AT_ONCE)
+    ]
+    return torch.cat(pooled)
+
+
+def _distinct(rows: np.ndarray, most: int) -> int:
+    """How many different rows there are, counted up to ``most``."""
+    seen: set[bytes] = set()
+    for row in rows:
+        seen.add((row + 0.0).tobytes())  # + 0.0: minus zero is zero
+        if len(seen) == most:
+            break
+    return len(seen)

@@ -12,9 +12,10 @@ from torch import nn
 
 from ddco_pyro.data.control_dimensions import ControlDimension, all_constant, control_dimensions
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError, extent
-from ddco_pyro.data.memory import refuse_too_much
+from ddco_pyro.data.memory import Work, refuse_too_much
+from ddco_pyro.fitting.clusters import POOLED
 from ddco_pyro.fitting.widths import nearest_widths
-from ddco_pyro.model.encoding import Shapes
+from ddco_pyro.model.encoding import STEPS_AT_ONCE, Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import ShapeError
 from ddco_pyro.simulation.collect import OnDemonstration, collect
@@ -114,7 +115,8 @@ def _refuse_giants(spec: Spec, dimensions: Dimensions) -> None:
 def _counted(spec: Spec, dimensions: Dimensions) -> int:
     """The number of parameters of the spec's networks, which are made without their numbers."""
     with torch.device("meta"):
-        return parameters(Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps))
+        size = dimensions.shapes, dimensions.control_size, dimensions.steps, dimensions.constant
+        return parameters(Hierarchy(spec, *size))
 
 
 def parameters(network: nn.Module) -> int:
@@ -220,7 +222,33 @@ def _needed(spec: Spec) -> str:
 
 
 def _refuse_what_is_larger_than_memory(spec: Spec, path: Path) -> None:
+    remedy = (
+        "leave observations out, make its demonstrations fewer, shorter or equally long, scale pictures down, or lower "
+        "filters or hidden"
+    )
+    what = f"{path}: a fit to {', '.join(one.key for one in spec.observations)}"
+    refuse_too_much(memory_needed(spec, path), what, remedy)
+
+
+def memory_needed(spec: Spec, path: Path) -> float:
+    """Bytes that a fit of the spec and its baselines to a file of demonstrations takes, about, by the file's headers.
+
+    :raises DemonstrationsError: the file cannot be read or does not hold what the spec names.
+    """
     found = extent(path, [one.key for one in spec.observations], spec.demonstrations.exclude)
-    needed = found.fit({f"obs/{one.key}" for one in spec.observations if one.differences})
-    remedy = "leave observations out, make its demonstrations fewer or equally long, or scale pictures down"
-    refuse_too_much(needed, f"{path}: a fit to {', '.join(one.key for one in spec.observations)}", remedy)
+    shapes = {place.removeprefix("obs/"): shape for place, shape in found.shapes.items() if place != "actions"}
+    size = Dimensions(shapes, math.prod(found.shapes["actions"]), max(1, *found.lengths))
+    try:
+        with torch.random.fork_rng(devices=[]):
+            works = [_work(*model, size) for model in ((spec, build_hierarchy(spec, size)), *baselines(spec, size))]
+    except SpecError:  # it is said where networks are checked
+        works = [Work(spec.training.batch_size, STEPS_AT_ONCE, 0, 0)]
+    return found.fit(works, {f"obs/{one.key}" for one in spec.observations if one.differences})
+
+
+def _work(spec: Spec, hierarchy: Hierarchy, dimensions: Dimensions) -> Work:
+    """What training a model takes."""
+    features = len(hierarchy.encoder.mean) + sum(shape[-1] * POOLED**2 for shape in hierarchy.encoder.images.values())
+    kind = spec.training.initialize if hierarchy.depth else "random"
+    clustered = {"random": 0, "vq": features, "vq_controls": features + dimensions.control_size}[kind]
+    return Work(spec.training.batch_size, hierarchy.steps_at_once, hierarchy.step_bytes, clustered)

@@ -29,12 +29,12 @@ from ddco_pyro.fitting.prepare import Dimensions, baseline_spec, build_hierarchy
 from ddco_pyro.fitting.records import read_metrics, refit
 from ddco_pyro.fitting.training import Trainer, TrainingError
 from ddco_pyro.inference import Posterior, log_likelihood, posterior, segment
-from ddco_pyro.inference.check import TRAJECTORIES as COMPARED
-from ddco_pyro.inference.check import EngineCheck, compare_engines
+from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.inference.decomposition import Decomposition, decompose
 from ddco_pyro.model.ahmm import Tables
 from ddco_pyro.model.encoding import Batch, encode, refuse_overflow
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.spec import Spec, dump_spec, load_spec, user_code
 
 TOLERANCE = 1e-4
@@ -124,8 +124,8 @@ class Fit:
     def divergences(self, demos: Demonstrations, posterior: Posterior) -> list[list[dict[str, Any]]]:
         """How differently each two options of a level act (:func:`ddco_pyro.fitting.analysis.divergences`)."""
         with torch.no_grad():
-            inputs = self.hierarchy.encoder.inputs(demo.observations for demo in demos)
-            return analysis.divergences(self.hierarchy(inputs), posterior)
+            said = [self.hierarchy(batch.inputs) for batch in _batches(self.hierarchy, demos)]
+            return analysis.divergences(_joined(said), posterior)
 
     def segment(self, demos: Demonstrations) -> tuple[np.ndarray, ...]:
         """Choices of the most likely path, a [N, T] for each level, lowest first; -1 past a demonstration's end."""
@@ -139,6 +139,15 @@ class Fit:
     def monitor(self) -> Monitor:
         """A live monitor of the active options, for somebody else's acting."""
         return Monitor(self.hierarchy)
+
+
+def _joined(parts: Sequence[Outputs]) -> Outputs:
+    """What the networks say of some demonstrations and of others, padded to the longest; σ is the same of all."""
+    leaves: list[Tensor | None] = []
+    for column in zip(*(part.leaves() for part in parts), strict=True):
+        tensors = [leaf for leaf in column if leaf is not None]
+        leaves.append(_stacked(tensors, 0.0) if tensors and tensors[0].dim() > 1 else column[0])
+    return Outputs.of(parts[0].options, leaves)
 
 
 def _stacked(parts: Sequence[Tensor], padding: float) -> Tensor:
@@ -162,7 +171,7 @@ def _tables(hierarchy: Hierarchy, demos: Demonstrations) -> Iterator[tuple[Table
 
 def _batches(hierarchy: Hierarchy, demos: Demonstrations) -> Iterator[Batch]:
     """The demonstrations as the networks see them, some at a time."""
-    for _, batch in encode(demos, hierarchy.encoder, hierarchy.scaling).pieces():
+    for _, batch in encode(demos, hierarchy.encoder, hierarchy.scaling).pieces(hierarchy.steps_at_once):
         yield batch
 
 
@@ -354,8 +363,9 @@ def _train(
         if held_out is not None:
             refuse_overflow(held_out, first.encoder, first.scaling)
         batches = [encode(part, first.encoder, first.scaling) for part in parts]
-        few = batches[0].select(torch.arange(min(len(batches[0]), COMPARED)))
-        outputs = first(few.inputs)
+        few = batches[0].select(torch.arange(min(len(batches[0]), TRAJECTORIES)), STEPS)
+        with torch.no_grad():
+            outputs = first(few.inputs)
         if not all(bool(torch.isfinite(leaf).all()) for leaf in outputs.leaves() if leaf is not None):
             raise TrainingError(
                 "before any training a network gives values that are NaN or infinite; look at its code, or at the "

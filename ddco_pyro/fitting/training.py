@@ -261,7 +261,7 @@ class _Objective:
         The loss is minus the log-likelihood per step. A batch that is long is processed in parts.
         """
         batch, total = self.trainer.train.select(rows), 0.0
-        for part, piece in batch.pieces():
+        for part, piece in batch.pieces(model.steps_at_once):
             value = self._total(model, piece, None if self.clusters is None else self.clusters[0][rows[part]])
             if not bool(torch.isfinite(value.detach())):
                 raise self._not_finite(model, piece, rows[part])
@@ -275,7 +275,7 @@ class _Objective:
         with torch.no_grad():
             values = [
                 float(self._total(model, piece, None if choices is None else choices[part]))
-                for part, piece in self.trainer.tune.pieces()
+                for part, piece in self.trainer.tune.pieces(model.steps_at_once)
             ]
         return sum(values) / self.trainer.tune.steps
 

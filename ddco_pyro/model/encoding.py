@@ -17,8 +17,9 @@ from ddco_pyro.spec import ControlSpec, ObservationSpec
 Shapes = Mapping[str, tuple[int, ...]]
 IMAGE_DIMENSIONS = 3
 STEPS_AT_ONCE = 8192
-"""Longer batches are processed in parts: memory stays bounded, and what the networks compute stays in the cache. With
-MLP-64 options over 50 × 2000 steps a gradient step takes 0.6 of the time that it takes in one piece."""
+"""Longer batches are processed in parts, in smaller ones where a step takes much memory
+(:attr:`ddco_pyro.model.hierarchy.Hierarchy.steps_at_once`): it stays bounded, and what the networks compute stays in the
+cache. With MLP-64 options over 50 × 2000 steps a gradient step takes 0.6 of the time that it takes in one piece."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +46,9 @@ class Batch:
         for rows in torch.arange(len(self)).split(max(steps // longest, 1)):
             yield rows, self.select(rows) if len(rows) < len(self) else self
 
-    def select(self, rows: Tensor) -> Batch:
-        """The demonstrations ``rows`` [M], padded to the longest among them."""
-        lengths = self.lengths[rows]
+    def select(self, rows: Tensor, at_most: int | None = None) -> Batch:
+        """The demonstrations ``rows`` [M], padded to the longest among them; their first ``at_most`` steps if given."""
+        lengths = self.lengths[rows].clamp(max=at_most or int(self.lengths.max()))
         steps = int(lengths.max())
         images = {key: image[rows, :steps] for key, image in self.inputs.images.items()}
         inputs = Inputs(self.inputs.vector[rows, :steps], images, self.inputs.time[:steps])
@@ -80,7 +81,7 @@ class ObservationEncoder(nn.Module):
     def fit(self, demonstrations: Demonstrations) -> None:
         """Take mean and standard deviation from every step of these demonstrations."""
         rows = np.concatenate([self.features(demo.observations) for demo in demonstrations])
-        standardize = np.repeat([spec.standardize for spec in self.specs], self.sizes)
+        standardize = np.repeat(np.array([spec.standardize for spec in self.specs], dtype=bool), self.sizes)
         spread = rows.std(0)
         changes = standardize & (spread > 1e-9 * np.maximum(np.abs(rows).max(0, initial=0.0), 1e-9))
         self.mean.copy_(torch.as_tensor(np.where(standardize, rows.mean(0), 0.0)))

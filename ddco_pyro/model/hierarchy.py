@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cached_property
 from types import MappingProxyType
 from typing import Literal
 
@@ -16,13 +17,17 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from ddco_pyro.model.ahmm import Tables
-from ddco_pyro.model.encoding import Batch, ControlScaling, ObservationEncoder, Shapes
+from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch, ControlScaling, ObservationEncoder, Shapes
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
+from ddco_pyro.model.networks.activations import training_bytes
 from ddco_pyro.model.outputs import Decision, Outputs
 from ddco_pyro.spec import ControlSpec, LearnedStd, LevelSpec, NetworkSpec, Spec, SpecError
 
 INITIAL_STD = 0.5
 """A learned standard deviation starts here, in scaled units."""
+
+BYTES_AT_ONCE = 256 * 10**6
+"""Most bytes that networks take for the trajectories that go through them together, one trajectory at least."""
 
 Emits = Literal["options", "control"]
 
@@ -140,7 +145,8 @@ class Hierarchy(nn.Module):
         self.steps = steps
         self.encoder = ObservationEncoder(spec.observations, shapes)
         self.scaling = ControlScaling(spec.control, control_size, constant)
-        shape, size = self.encoder.shape(steps), len(self.scaling.varying)
+        self.input_shape = shape = self.encoder.shape(steps)
+        size = len(self.scaling.varying)
         levels, below = [], 0
         for number, level in enumerate(spec.hierarchy.levels if spec.hierarchy else ()):
             levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, spec.control, size))
@@ -169,6 +175,16 @@ class Hierarchy(nn.Module):
             yield f"hierarchy.levels.{number}.policy", level.policy
             yield f"hierarchy.levels.{number}.termination", level.termination
         yield "hierarchy.meta_policy" if self.depth else "baseline.policy", self.meta_policy
+
+    @cached_property
+    def step_bytes(self) -> int:
+        """Bytes that all networks take for a step in training."""
+        return training_bytes((network for _, network in self.named_networks()), self.input_shape)
+
+    @property
+    def steps_at_once(self) -> int:
+        """Steps that go through the networks together, where trajectories are short enough."""
+        return max(1, min(STEPS_AT_ONCE, BYTES_AT_ONCE // max(1, self.step_bytes)))
 
     def forward(self, inputs: Inputs, discovering: int | None = None) -> Outputs:
         """What the networks say about these observations.

@@ -11,11 +11,8 @@ import torch
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.run import Fit
 from ddco_pyro.inference import most_likely_path, posterior
-from ddco_pyro.model.encoding import STEPS_AT_ONCE, encode
+from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.hierarchy import Hierarchy
-
-CHUNK = STEPS_AT_ONCE
-"""Steps that are looked at together."""
 
 MOST_BINS = 60
 
@@ -55,7 +52,7 @@ def activity(fit: Fit, demos: Demonstrations) -> Activity:
     """Posteriors, most likely paths and terminations of a fit with at least one level."""
     assert fit.spec.hierarchy is not None  # a baseline has no levels
     specs, steps = fit.spec.hierarchy.levels, max(demos.lengths)
-    size = max(1, CHUNK // steps)
+    size = max(1, fit.hierarchy.steps_at_once // steps)
     parts = [_chunk(fit.hierarchy, part, steps) for part in _chunks(demos, size)]
     levels = []
     for number, level in enumerate(specs):

@@ -133,6 +133,7 @@ def _steps_at_once(recording: Recording, fit: Fit, before: int) -> int:
     each = found.size / max(steps, 1) + found.step(
         {f"obs/{one.key}" for one in fit.spec.observations if one.differences}
     )
+    each += fit.hierarchy.step_bytes
     needed = PROGRAM + steps * (each + INFERENCE) + FOUND * fit.hierarchy.depth * (before + steps)
     refuse_too_much(needed, f"{recording.name}: segmenting its {steps} steps", "divide it, or the file")
     return int(min(STEPS_AT_ONCE, GROUP_BYTES / (each + INFERENCE)))

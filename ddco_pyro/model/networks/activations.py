@@ -1,0 +1,47 @@
+"""How much memory networks take for a step, found by looking at what torch keeps for the gradient."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor, nn
+
+from ddco_pyro.model.networks.inputs import Inputs, InputShape
+
+
+def training_bytes(networks: Iterable[nn.Module], shape: InputShape) -> int:
+    """Bytes that these networks take for each step while all of them are trained together.
+
+    Each keeps tensors until its gradient is computed; meanwhile what it computed, and the gradient of that, are there
+    too: measured with convolutions, that is at most twice what the largest network keeps.
+    """
+    kept = [_kept(network, _zeros(shape, 2)) - _kept(network, _zeros(shape, 1)) for network in networks]
+    return sum(kept) + 2 * max(kept)
+
+
+def _zeros(shape: InputShape, steps: int) -> Inputs:
+    """Observations that are 0, N = 1."""
+    images = {key: torch.zeros(1, steps, *image, dtype=torch.uint8) for key, image in shape.images.items()}
+    time = torch.arange(steps).clamp(max=shape.steps - 1)  # a network may have parameters for each step
+    return Inputs(torch.zeros(1, steps, shape.vector), images, time)
+
+
+def _kept(network: nn.Module, inputs: Inputs) -> int:
+    """Bytes of all tensors, parameters too, that are kept for the gradient."""
+    storages: dict[int, int] = {}
+
+    def keep(tensor: Tensor) -> Tensor:
+        storage = tensor.untyped_storage()
+        storages[storage._cdata] = storage.nbytes()
+        return tensor
+
+    training = network.training
+    network.eval()  # nothing it keeps track of is to change
+    try:
+        with torch.enable_grad(), torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+            outputs = network(inputs)  # while it is there, so is what was kept: no two tensors have the same place
+        del outputs
+    finally:
+        network.train(training)
+    return sum(storages.values())
