@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from ddco_pyro import inference
     from ddco_pyro.acting.controller import Controller
     from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-    from ddco_pyro.fitting.run import Fit, load
+    from ddco_pyro.fitting.fit import Fit, load
     from ddco_pyro.spec import Spec, load_spec
 
 __all__ = ["Controller", "Demonstration", "Demonstrations", "Fit", "Spec", "inference", "load", "load_spec"]
@@ -18,9 +18,9 @@ _MODULES = {
     "Controller": "acting.controller",
     "Demonstration": "data.demonstrations",
     "Demonstrations": "data.demonstrations",
-    "Fit": "fitting.run",
+    "Fit": "fitting.fit",
     "Spec": "spec",
-    "load": "fitting.run",
+    "load": "fitting.fit",
     "load_spec": "spec",
 }
 

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ddco_pyro.drawing.pictures import STYLE, keep
+from ddco_pyro.fitting.fit import load
 from ddco_pyro.fitting.prepare import demonstrations
-from ddco_pyro.fitting.run import load
 from ddco_pyro.report.activity import Activity, activity
 from ddco_pyro.report.plot_rows import order
 from ddco_pyro.report.plot_trajectories import panel

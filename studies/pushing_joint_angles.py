@@ -28,7 +28,7 @@ from ddco_pyro.acting.lockstep import play
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import whole_file, write_text
 from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.fitting.run import Fit
+from ddco_pyro.fitting.fit import Fit
 
 EPISODES = 3
 SIDES = ("goal on the left (backhand)", "goal on the right (forehand)")

@@ -23,7 +23,8 @@ from ddco_pyro.comparison import compare
 from ddco_pyro.comparison.shared import NotShared
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.export import TOLERANCE, export, runner
-from ddco_pyro.fitting.run import Fit, fit
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.run import fit
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import RolloutSpec, Spec, parse_spec, with_overrides

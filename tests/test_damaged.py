@@ -22,10 +22,10 @@ import ddco_pyro
 from ddco_pyro.cli import console
 from ddco_pyro.data.files import Damaged, read_tensors, write_tensors
 from ddco_pyro.drawing import words
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.fitting.records import read_metrics, read_successes
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.fitting.run import Fit
 from ddco_pyro.report import plot_likelihood, sections, tables
 
 LINE = r"ddco-pyro: {path}: is damaged: "

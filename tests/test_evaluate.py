@@ -15,8 +15,8 @@ import toy_task
 
 import ddco_pyro
 from ddco_pyro.data.files import read_tensors, write_tensors
+from ddco_pyro.fitting.fit import Fit, RunError
 from ddco_pyro.fitting.rollouts import policies, roll_out
-from ddco_pyro.fitting.run import Fit, RunError
 from ddco_pyro.simulation.episodes import run_episode, run_episodes
 from ddco_pyro.spec import with_overrides
 

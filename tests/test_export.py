@@ -16,7 +16,7 @@ import ddco_pyro
 import ddco_pyro.export as module
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.export import TOLERANCE, export, runner
-from ddco_pyro.fitting.run import Fit
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import parse_spec
 

@@ -11,8 +11,9 @@ import torch
 from test_cli import call
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.metrics import NotFinite, evaluate
-from ddco_pyro.fitting.run import Fit, TrainingError, fit
+from ddco_pyro.fitting.run import TrainingError, fit
 from ddco_pyro.model.networks import Inputs, InputShape
 from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import parse_spec

@@ -17,8 +17,9 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import Damaged
+from ddco_pyro.fitting.fit import RunError
 from ddco_pyro.fitting.prepare import Dimensions, demonstrations
-from ddco_pyro.fitting.run import RunError, claim, fit, train
+from ddco_pyro.fitting.run import claim, fit, train
 from ddco_pyro.spec import dump_spec, load_spec, with_overrides
 
 

@@ -218,9 +218,9 @@ def rollout(
 
     An unfinished rollout of as many episodes is continued.
     """
+    from ddco_pyro.fitting.fit import load
     from ddco_pyro.fitting.prepare import demonstrations
     from ddco_pyro.fitting.rollouts import policies, roll_out
-    from ddco_pyro.fitting.run import load
     from ddco_pyro.report import write_report
 
     fitted = load(run, allow_code)
@@ -238,8 +238,8 @@ FILMED = 3
 @app.command(epilog="Example: ddco-pyro report runs/needle")
 def report(run: RunPath, allow_code: AllowCode = False) -> None:
     """Write the report of a run again."""
+    from ddco_pyro.fitting.fit import load
     from ddco_pyro.fitting.prepare import demonstrations
-    from ddco_pyro.fitting.run import load
     from ddco_pyro.report import write_report
 
     fitted = load(run, allow_code)

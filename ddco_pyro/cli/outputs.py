@@ -14,7 +14,7 @@ from ddco_pyro.errors import BadInput
 
 if TYPE_CHECKING:
     from ddco_pyro.data.sources import Source
-    from ddco_pyro.fitting.run import Fit
+    from ddco_pyro.fitting.fit import Fit
     from ddco_pyro.segmenting import Segmented
 
 
@@ -65,7 +65,7 @@ def segment(
     labelled = _labelled(demos, out, in_place)
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
-    from ddco_pyro.fitting.run import load
+    from ddco_pyro.fitting.fit import load
     from ddco_pyro.segmenting import segments
     from ddco_pyro.segmenting.hdf5 import write_labels
     from ddco_pyro.segmenting.page import write_page
@@ -149,7 +149,7 @@ def export(
     stays.
     """
     from ddco_pyro.export import export as write
-    from ddco_pyro.fitting.run import load
+    from ddco_pyro.fitting.fit import load
 
     exported = write(load(run, allow_code), out, onnx)
     for form, (difference, seconds) in exported.items():

@@ -19,7 +19,7 @@ from ddco_pyro.comparison.rollouts import paired_rollouts
 from ddco_pyro.comparison.shared import Held, held_out
 from ddco_pyro.data.files import write_text
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.run import load
+from ddco_pyro.fitting.fit import load
 
 __all__ = ["CompareError", "Comparison", "Row", "compare", "write"]
 

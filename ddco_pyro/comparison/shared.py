@@ -9,8 +9,8 @@ import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.prepare import demonstrations, parts
-from ddco_pyro.fitting.run import Fit
 
 
 class NotShared(BadInput):

@@ -22,7 +22,7 @@ from ddco_pyro.export import runner
 from ddco_pyro.export.program import StepProgram, example, input_names
 from ddco_pyro.export.runner import TOLERANCE
 from ddco_pyro.export.weights import weights_and_networks
-from ddco_pyro.fitting.run import Fit
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.encoding import ObservationEncoder
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import TERMINATION_BOUND

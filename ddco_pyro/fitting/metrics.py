@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting import analysis
-
-if TYPE_CHECKING:
-    from ddco_pyro.fitting.run import Fit
+from ddco_pyro.fitting.fit import Fit
 
 
 class NotFinite(Failed):

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from ddco_pyro.data.files import write_text
-from ddco_pyro.fitting.run import Fit, RunError, write_metrics
+from ddco_pyro.fitting.fit import Fit, RunError
+from ddco_pyro.fitting.run import write_metrics
 from ddco_pyro.simulation.episodes import paired_difference, run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task

@@ -9,7 +9,7 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing.pictures import style
 from ddco_pyro.drawing.templates import render
 from ddco_pyro.drawing.words import unconverged
-from ddco_pyro.fitting.run import Fit
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.report import activity, demonstration_list, dimensions, sections
 from ddco_pyro.report.sections import degeneracies
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.fitting.run import Fit
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.inference import most_likely_path, posterior
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.hierarchy import Hierarchy

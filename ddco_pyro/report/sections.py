@@ -10,7 +10,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.pictures import Picture, keep
 from ddco_pyro.fitting.diagnostics import diagnose
-from ddco_pyro.fitting.run import Fit
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.report import (
     film,
     plot_learning,

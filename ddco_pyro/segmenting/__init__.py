@@ -13,7 +13,7 @@ from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.memory import INFERENCE, PROGRAM, Extent, refuse_too_much
 from ddco_pyro.data.sources import Recording, Source
 from ddco_pyro.errors import BadInput, nearest
-from ddco_pyro.fitting.run import Fit
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.inference import log_likelihood, most_likely_path, posterior
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, encode
 

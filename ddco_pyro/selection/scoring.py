@@ -13,8 +13,9 @@ from threadpoolctl import threadpool_limits
 
 from ddco_pyro.data.files import Damaged, write_text
 from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.fitting.fit import log_likelihoods
 from ddco_pyro.fitting.records import read_record
-from ddco_pyro.fitting.run import Watcher, log_likelihoods, one_thread, train
+from ddco_pyro.fitting.run import Watcher, one_thread, train
 from ddco_pyro.selection.folds import Folds
 from ddco_pyro.selection.grid import Candidate
 
