@@ -17,9 +17,9 @@ from ddco_pyro.spec import ControlSpec, ObservationSpec
 Shapes = Mapping[str, tuple[int, ...]]
 IMAGE_DIMENSIONS = 3
 STEPS_AT_ONCE = 8192
-"""Longer batches are processed in parts, in smaller ones where a step takes much memory
-(:attr:`ddco_pyro.model.hierarchy.Hierarchy.steps_at_once`): it stays bounded, and what the networks compute stays in the
-cache. With MLP-64 options over 50 × 2000 steps a gradient step takes 0.6 of the time that it takes in one piece."""
+"""Longer batches are processed in parts, in smaller ones where a step takes much memory: it stays bounded
+(:attr:`ddco_pyro.model.hierarchy.Hierarchy.steps_at_once`), and what the networks compute stays in the cache. With
+MLP-64 options over 50 × 2000 steps a gradient step takes 0.6 of the time that it takes in one piece."""
 
 
 @dataclass(frozen=True)
