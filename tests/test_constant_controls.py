@@ -133,6 +133,7 @@ def test_runs_of_before_have_every_dimension_in_them(reduced: Fit, tmp_path: Pat
         names = set(file.keys()) - {"scaling.varying", "scaling.constant"}
         assert len(names) == len(file.keys()) - 2
         tensors, metadata = {name: file.get_tensor(name) for name in names}, file.metadata()
+    del metadata["sha256"]
     save_file(tensors, run / "model.safetensors", metadata)
     again, demos = ddco_pyro.load(run), with_controls(make_demonstrations(), columns=FREE)
     np.testing.assert_array_equal(again.log_likelihood(demos), reduced.log_likelihood(demos))
@@ -181,7 +182,7 @@ def test_many_at_once_emit_them(whole: Fit, reduced: Fit, control: str) -> None:
 def test_exported_controllers_emit_them(whole: Fit, tmp_path: Path, control: str) -> None:
     changed = Fit(whole.folder, with_overrides(whole.spec, {"rollout.control": control}), whole.hierarchy)
     differences = export(changed, tmp_path, onnx=True)
-    assert set(differences) == {"numpy", "onnx"}
+    assert set(differences) == {"numpy", "torch", "onnx"}
     assert all(difference < TOLERANCE for difference, _ in differences.values())
     for form in differences:
         exported, original = runner.Runner(tmp_path, form), changed.controller()
@@ -189,10 +190,6 @@ def test_exported_controllers_emit_them(whole: Fit, tmp_path: Path, control: str
             found, expected = exported.act(observation), original.act(observation)
             assert {d: found[d] for d in STILL} == STILL
             np.testing.assert_allclose(found, expected, atol=1e-5)
-    program = torch.export.load(tmp_path / "controller.pt2").module()
-    outputs = program(torch.zeros(3, dtype=torch.float64), torch.zeros(1, dtype=torch.int64))
-    (means,) = [one for one in outputs if one.shape == (2, 4)]
-    assert {d: means[:, d].tolist() for d in STILL} == {d: [value] * 2 for d, value in STILL.items()}
 
 
 def test_the_monitor_takes_whole_controls(whole: Fit, reduced: Fit) -> None:
