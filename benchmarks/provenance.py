@@ -144,7 +144,7 @@ def _imported(files: Files, folder: str, imports: Iterable[tuple[int, str, str]]
         elif first in PACKAGES:
             places = [[PACKAGES[first], *rest]]
         elif _holds_scripts(files, folder):
-            places = [[folder, first, *rest], ["tests", first, *rest]]
+            places = [[folder, first, *rest], ["tests/support", first, *rest]]
         else:
             continue
         for place in places:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import toy_task
 import yaml
+from command_line import call
 from large import measured, zeros
 from random_demonstrations import demonstrations as random_demonstrations
-from test_cli import call
 
 from ddco_pyro.data import demonstrations
 from ddco_pyro.demonstrations import Demonstrations, DemonstrationsError

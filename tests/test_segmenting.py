@@ -13,9 +13,8 @@ import numpy as np
 import pyarrow.parquet as parquet
 import pytest
 import yaml
+from command_line import call
 from sklearn.metrics import normalized_mutual_info_score
-from test_cli import call
-from test_run import Silent
 
 import ddco_pyro
 from ddco_pyro.data import demonstrations, parts
@@ -23,6 +22,7 @@ from ddco_pyro.demonstrations import Demonstrations
 from ddco_pyro.importing import import_demonstrations
 from ddco_pyro.run import fit
 from ddco_pyro.segmenting import Segmented, segments
+from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.sources import open_source
 from ddco_pyro.spec import parse_spec
 
@@ -245,7 +245,7 @@ def lerobot_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lerobot")
     import_demonstrations(LEROBOT, folder / "demos.hdf5")
     spec = parse_spec(yaml.safe_load(SPEC.replace("PATH", str(folder / "demos.hdf5"))))
-    return fit(spec, folder / "run", Silent())
+    return fit(spec, folder / "run", Unwatched())
 
 
 def files(folder):

@@ -8,9 +8,9 @@ import h5py
 import numpy as np
 import pytest
 import yaml
+from command_line import call
 from random_demonstrations import demonstrations
 from scipy import stats
-from test_cli import call
 
 import ddco_pyro
 from ddco_pyro.demonstrations import Demonstration, Demonstrations, DemonstrationsError

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from importlib.metadata import entry_points
+
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from tasks.test_conformance import NAMES
 
 from ddco_pyro import environments
 from ddco_pyro.environments import TaskEnvironment
 from ddco_pyro.rollout import run_episode
+from ddco_pyro.spec.types import TASKS
 from ddco_pyro.task import find_task
+
+NAMES = sorted(point.name for point in entry_points(group=TASKS))
 
 
 @pytest.mark.filterwarnings("ignore:.*:UserWarning:gymnasium.*")
