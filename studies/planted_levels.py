@@ -20,7 +20,7 @@ from joblib import Parallel, delayed
 from provenance import record, sentence, text
 from scipy import stats
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plant, recovered
 
 from ddco_pyro.data.files import write_text

@@ -37,7 +37,7 @@ NO_NUMBERS = ("ddco_pyro/report/", "studies/provenance.py")
 """Left out of what a result depends on: this shows numbers, or says what made them."""
 
 FOLDERS = ("benchmarks", "ddco_pyro", "specs", "studies", "tasks", "tests")
-SHARED = ("studies", "tests", "tests/support")
+SHARED = ("studies", "tests/support")
 """Where scripts find modules beside those of their own folder."""
 ENDINGS = {".py", ".yaml", ".xml", ".json", ".toml", ".j2"}
 

@@ -19,11 +19,12 @@ from ddco_pyro.fitting.run import fit
 from ddco_pyro.spec import parse_spec
 
 HERE = Path(__file__).parent
+SUPPORT = HERE / "support"
 INSTALLED = HERE / "fixtures" / "installed"
 """Like a folder that packages are installed in: it registers the toy task under the name ``toy``."""
 
 sys.path.append(str(INSTALLED))
-os.environ["PYTHONPATH"] = f"{HERE}:{INSTALLED}"  # of the processes that tests start
+os.environ["PYTHONPATH"] = f"{SUPPORT}:{INSTALLED}"  # of the processes that tests start
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that run episodes
 torch.set_num_threads(1)
 settings.register_profile("deterministic", deadline=None, derandomize=True)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
-import os
 import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
 from unittest import mock
 
 import h5py
@@ -20,41 +16,14 @@ import pytest
 import toy_task
 import typer
 import yaml
+from command_line import HERE, call, start, with_set
 from killing import HANGS, struck
 
 import ddco_pyro
-from ddco_pyro.cli.app import app, main
+from ddco_pyro.cli.app import app
 from ddco_pyro.spec import dump_spec, load_spec
 
-HERE = Path(__file__).parent
-ROOT = HERE.parent
-COMMAND = Path(sys.executable).with_name("ddco-pyro")
-
-
-class Ended(NamedTuple):
-    status: int
-    out: str
-    err: str
-
-
-def call(*arguments):
-    """The command line in this process."""
-    out, err = io.StringIO(), io.StringIO()
-    with (
-        mock.patch.object(sys, "argv", ["ddco-pyro", *map(str, arguments)]),
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
-        pytest.raises(SystemExit) as ended,
-    ):
-        main()
-    return Ended(ended.value.code, out.getvalue(), err.getvalue())
-
-
-def start(*arguments):
-    """The command line in a process of its own, in the folder of the toy task."""
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    return subprocess.Popen([COMMAND, *map(str, arguments)], cwd=HERE, env=environment, **pipes)
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -191,12 +160,8 @@ def test_nothing_at_all_is_help():
 
 # --- what does not ----------------------------------------------------------------------------------------------------
 
-OWN = "hierarchy.levels.0.policy.network=test_networks:Own"
-WITH_MEMORY = "{network: 'test_networks:WithMemory', options: {how: over time}}"
-
-
-def with_set(*overrides):
-    return [argument for override in overrides for argument in ("--set", override)]
+OWN = "hierarchy.levels.0.policy.network=user_networks:Own"
+WITH_MEMORY = "{network: 'user_networks:WithMemory', options: {how: over time}}"
 
 
 GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
@@ -226,7 +191,7 @@ GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
         ),
         (
             ["check", "SPEC", *with_set(OWN)],
-            r"hierarchy\.levels\.0\.policy\.network: would import user code \(test_networks:Own\); pass --allow-code",
+            r"hierarchy\.levels\.0\.policy\.network: would import user code \(user_networks:Own\); pass --allow-code",
         ),
         (["check", "--foo"], "No such option: --foo; see ddco-pyro check --help"),
         (["fit"], "Missing argument 'SPEC'; see ddco-pyro fit --help"),
@@ -277,7 +242,7 @@ def test_bad_input_is_refused_in_one_line(arguments, message, spec, run):
     assert re.fullmatch(f"ddco-pyro: .*{message}.*\n", ended.err)
 
 
-WRONG = "{network: 'test_networks:Wrong', options: {how: joined}}"
+WRONG = "{network: 'user_networks:Wrong', options: {how: joined}}"
 
 
 @pytest.mark.parametrize(
@@ -289,7 +254,7 @@ WRONG = "{network: 'test_networks:Wrong', options: {how: joined}}"
 )
 def test_an_own_network_of_another_shape_is_refused_before_any_work(spec, tmp_path, cache, override, place, shapes):
     line = (
-        f"ddco-pyro: {place}: network 'test_networks:Wrong' gives shape {shapes[0]}; "
+        f"ddco-pyro: {place}: network 'user_networks:Wrong' gives shape {shapes[0]}; "
         f"it has to be a tensor [N, T, copies, outputs], here {shapes[1]}\n"
     )
     kept = sorted(cache.rglob("*"))

@@ -11,8 +11,8 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
+from command_line import call
 from scipy import stats
-from test_cli import call
 
 from ddco_pyro import load
 from ddco_pyro.comparison import CompareError, Comparison, Row, compare, page, write

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from command_line import call
 from safetensors import safe_open
 from safetensors.torch import save_file
-from test_cli import call
 
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller

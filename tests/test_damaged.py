@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from command_line import call
 from safetensors.torch import save_file
 from selecting import data_at
-from test_cli import call
 
 import ddco_pyro
 from ddco_pyro.cli import console

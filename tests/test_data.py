@@ -134,7 +134,7 @@ def test_labels_that_are_not_there_are_an_error(path):
 
 LEVEL = {"count": 2, "policy": {"network": "linear"}}
 CONV = {"network": "conv"}
-WRONG = {"network": "test_networks:Wrong", "options": {"how": "swapped"}}
+WRONG = {"network": "user_networks:Wrong", "options": {"how": "swapped"}}
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ WRONG = {"network": "test_networks:Wrong", "options": {"how": "swapped"}}
         ),
         (
             {"baseline": None, "hierarchy": {"levels": [LEVEL | {"termination": WRONG}]}},
-            r"^hierarchy\.levels\.0\.termination: network 'test_networks:Wrong' gives shape \[2, 3, 1, 2\]; .*, "
+            r"^hierarchy\.levels\.0\.termination: network 'user_networks:Wrong' gives shape \[2, 3, 1, 2\]; .*, "
             r"here \[2, 3, 2, 1\]$",
         ),
     ],
@@ -176,10 +176,10 @@ def test_a_spec_that_does_not_fit_says_where(changes, message):
 
 
 def test_the_networks_of_baselines_are_checked_too():
-    fits = {"kind": "flat", "policy": {"network": "test_networks:Own"}}
+    fits = {"kind": "flat", "policy": {"network": "user_networks:Own"}}
     assert check_networks(spec(compare_with=["per_timestep", fits]), SIZE).depth == 0
     refused = spec(compare_with=["per_timestep", {"kind": "flat", "policy": WRONG}])
-    with pytest.raises(SpecError, match=r"^compare_with\.1\.policy: network 'test_networks:Wrong' gives shape"):
+    with pytest.raises(SpecError, match=r"^compare_with\.1\.policy: network 'user_networks:Wrong' gives shape"):
         check_networks(refused, SIZE)
 
 

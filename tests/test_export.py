@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from test_cli import call
+from command_line import call
 
 import ddco_pyro
 import ddco_pyro.export as module

@@ -6,8 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
+import toy_task
+from command_line import call
 from joblib.externals.loky import get_reusable_executor
-from test_cli import call
 
 import ddco_pyro
 from ddco_pyro.spec import SpecError
@@ -62,7 +63,7 @@ def outside(tmp_path_factory: pytest.TempPathFactory) -> Path:
     package = site / "outside"
     package.mkdir()
     (package / "__init__.py").touch()
-    (package / "parts.py").write_text(PACKAGE.format(tests=str(Path(__file__).parent)))
+    (package / "parts.py").write_text(PACKAGE.format(tests=str(Path(toy_task.__file__).parent)))
     about = site / "outside-1.0.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: outside\nVersion: 1.0\n")

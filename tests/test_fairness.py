@@ -10,9 +10,8 @@ from itertools import pairwise
 import pytest
 import toy_task
 import yaml
-from selecting import Told, score, spec_at
-from test_cli import call
-from test_selection_choice import candidate
+from command_line import call
+from selecting import Told, candidate, score, spec_at
 
 import ddco_pyro
 from ddco_pyro.comparison import compare, write

@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 import yaml
+from command_line import call
 from fuzz import SECONDS, Worker, damaged_file, damaged_spec
 from random_demonstrations import demonstrations
-from test_cli import call
 
 SPEC = """
 demonstrations: {path: PATH, valid_fraction: 0.25, labels: phase}

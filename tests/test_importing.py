@@ -16,10 +16,10 @@ import minari
 import numpy as np
 import pyarrow.parquet as parquet
 import pytest
+from command_line import call
 from gymnasium import spaces
 from minari.data_collector.episode_buffer import EpisodeBuffer
 from random_demonstrations import demonstrations
-from test_cli import call
 
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.data.importing import Choice, import_demonstrations

@@ -8,8 +8,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from command_line import call
 from random_demonstrations import demonstrations
-from test_cli import call
 
 from ddco_pyro.data.demonstrations import DemonstrationsError
 from ddco_pyro.data.inspection import inspect

@@ -23,8 +23,6 @@ from random_demonstrations import demonstrations
 from ddco_pyro.data.files import read_tensors
 from ddco_pyro.data.importing import import_demonstrations
 
-HERE = Path(__file__).parent
-
 
 def same_hdf5(one: Path, other: Path) -> None:
     """Equal names, arrays and attributes."""
@@ -105,7 +103,7 @@ class Case:
     result: str
     same: Callable[[Path, Path], None]
     kept: Kept
-    inputs: tuple[Path, ...] = (HERE / "toy_task.py",)
+    inputs: tuple[Path, ...] = (Path(toy_task.__file__),)
 
 
 @pytest.fixture(scope="module")

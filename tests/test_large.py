@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import toy_task
 import yaml
+from command_line import call
 from large import measured, zeros
 from random_demonstrations import demonstrations as random_demonstrations
-from test_cli import call
 
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.data.inspection import inspect

@@ -7,9 +7,9 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from hierarchies import make_batch, make_hierarchy
 from pyro.infer import SVI, Trace_ELBO, TraceEnum_ELBO
 from pyro.infer.autoguide import AutoDelta, AutoNormal
-from test_hierarchy import make_batch, make_hierarchy
 from torch.func import functional_call
 
 from ddco_pyro.inference import log_likelihood, posterior

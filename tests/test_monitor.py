@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from test_controller import make
+from hierarchies import make_hierarchy
 
 from ddco_pyro.acting.monitor import Monitor
 from ddco_pyro.acting.window import ObservationError
@@ -22,7 +22,7 @@ def demonstration(steps):
 @pytest.mark.parametrize("counts", [(3,), (2, 2)])
 def test_what_it_says_at_the_end_is_what_the_demonstration_says(counts):
     """Before the last control is known, the belief is the posterior of the demonstration without that control."""
-    hierarchy, demo = make(counts, ("options", "control")), demonstration(6)
+    hierarchy, demo = make_hierarchy(counts, ("options", "control")), demonstration(6)
     monitor = Monitor(hierarchy)
     for t in range(6):
         belief = monitor.step({"state": demo.observations["state"][t]}, demo.actions[t - 1] if t else None)
@@ -40,7 +40,7 @@ def test_what_it_says_at_the_end_is_what_the_demonstration_says(counts):
 
 
 def test_reset_forgets():
-    hierarchy, demo = make((3,)), demonstration(3)
+    hierarchy, demo = make_hierarchy((3,)), demonstration(3)
     monitor = Monitor(hierarchy)
     first = monitor.step({"state": demo.observations["state"][0]})
     monitor.step({"state": demo.observations["state"][1]}, demo.actions[0])
@@ -49,7 +49,7 @@ def test_reset_forgets():
 
 
 def test_the_control_comes_with_every_observation_but_the_first():
-    monitor, state = Monitor(make((3,))), {"state": np.zeros(3)}
+    monitor, state = Monitor(make_hierarchy((3,))), {"state": np.zeros(3)}
     with pytest.raises(ObservationError, match="no control comes before the first observation"):
         monitor.step(state, np.zeros(2))
     monitor.reset()

@@ -85,7 +85,7 @@ class Untyped(Typed):
 
 
 def made(options, name="Typed"):
-    return build(NetworkSpec(network=f"test_network_options:{name}", options=options), SHAPE, 2, 4)
+    return build(NetworkSpec(network=f"{__name__}:{name}", options=options), SHAPE, 2, 4)
 
 
 def test_options_are_of_the_types_that_the_class_says():
@@ -127,7 +127,7 @@ def test_options_that_are_passed_on_are_checked_by_the_class_alone():
     assert made({"width": "3"}, "Untyped").given["width"] == "3"
 
 
-WRONG_OPTIONS = {"network": "test_network_options:Typed", "options": {"width": "a", "gian": 1}}
+WRONG_OPTIONS = {"network": f"{__name__}:Typed", "options": {"width": "a", "gian": 1}}
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
+from user_networks import Stateful
 
 from ddco_pyro.model.networks import CLASSES, Inputs, InputShape, ShapeError, build
 from ddco_pyro.model.networks.conv import POOLED
@@ -185,67 +186,13 @@ def test_an_image_may_be_called_as_a_layer_is():
 # --- a user's own -----------------------------------------------------------------------------------------------------
 
 
-class Own(nn.Module):
-    """A network as a user might write it."""
-
-    def __init__(self, shape, outputs, copies, gain=1.0):
-        super().__init__()
-        if gain <= 0:
-            raise ValueError("the gain has to be positive")
-        self.size, self.gain = (copies, outputs), nn.Parameter(torch.tensor(gain))
-
-    def forward(self, inputs):
-        return (self.gain * inputs.vector.sum(-1))[..., None, None].expand(*inputs.batch, *self.size)
-
-
-class Wrong(Own):
-    """A network of one's own that can be made, but whose output is not what it has to be."""
-
-    def __init__(self, shape, outputs, copies, how):
-        super().__init__(shape, outputs, copies)
-        self.how = how
-
-    def forward(self, inputs):
-        found = super().forward(inputs)
-        if self.how == "list":
-            return found.tolist()
-        return {
-            "joined": lambda: found.flatten(2),
-            "swapped": lambda: found.transpose(2, 3),
-            "one": lambda: found[:, :, :1],
-            "squeezed": lambda: found.squeeze(0),
-            "time first": lambda: found.transpose(0, 1),
-            "fails": lambda: found @ torch.ones(7),
-        }[self.how]()
-
-
-class Stateful(Own):
-    """Normalises by what it has seen, and has a table of the steps that there are."""
-
-    def __init__(self, shape, outputs, copies):
-        super().__init__(shape, outputs, copies)
-        self.norm = nn.BatchNorm1d(shape.vector)
-        self.bias = nn.Parameter(torch.zeros(shape.steps))
-        self.pictures = shape.images
-
-    def forward(self, inputs):
-        assert {key: image.shape[2:] for key, image in inputs.images.items()} == self.pictures
-        assert all(image.dtype == torch.uint8 for image in inputs.images.values())
-        seen = self.norm(inputs.vector.flatten(0, 1)).unflatten(0, inputs.batch)
-        return super().forward(Inputs(seen + self.bias[inputs.time, None], {}, inputs.time))
-
-
-class NotANetwork:
-    pass
-
-
 def test_a_network_of_ones_own():
-    network, inputs = make(network="test_networks:Own", options={"gain": 2.0}), make_inputs()
+    network, inputs = make(network="user_networks:Own", options={"gain": 2.0}), make_inputs()
     assert_close(network(inputs)[:, :, 3, 1], 2 * inputs.vector.sum(-1))
 
 
 def test_trying_a_network_of_ones_own_leaves_no_trace():
-    spec, shape = NetworkSpec(network="test_networks:Stateful"), InputShape(FEATURES, {"camera": PIXELS}, steps=1)
+    spec, shape = NetworkSpec(network="user_networks:Stateful"), InputShape(FEATURES, {"camera": PIXELS}, steps=1)
     torch.manual_seed(0)
     network = build(spec, shape, OUTPUTS, COPIES)
     drawn = torch.rand(3)
@@ -273,8 +220,8 @@ def test_trying_a_network_of_ones_own_leaves_no_trace():
 )
 def test_an_output_of_another_shape_is_refused_when_the_network_is_made(how, message):
     with pytest.raises(ShapeError) as caught:
-        make(network="test_networks:Wrong", options={"how": how})
-    assert str(caught.value).startswith(f"network 'test_networks:Wrong' {message}")
+        make(network="user_networks:Wrong", options={"how": how})
+    assert str(caught.value).startswith(f"network 'user_networks:Wrong' {message}")
     assert "\n" not in str(caught.value)
 
 
@@ -285,9 +232,9 @@ def test_an_output_of_another_shape_is_refused_when_the_network_is_made(how, mes
         (InputShape(3, {"camera": PIXELS}), {"network": "per_timestep"}, "reads vectors, but camera are images"),
         (SHAPE, {"network": "conv"}, "needs an image among the observations"),
         (SHAPE, {"network": "no_such_module:Net"}, "'no_such_module:Net' cannot be imported: No module named"),
-        (SHAPE, {"network": "test_networks:Missing"}, "'test_networks:Missing' cannot be imported: .*no attribute"),
-        (SHAPE, {"network": "test_networks:NotANetwork"}, "is not a torch.nn.Module class"),
-        (SHAPE, {"network": "test_networks:Own", "options": {"gain": -1}}, "the gain has to be positive"),
+        (SHAPE, {"network": "user_networks:Missing"}, "'user_networks:Missing' cannot be imported: .*no attribute"),
+        (SHAPE, {"network": "user_networks:NotANetwork"}, "is not a torch.nn.Module class"),
+        (SHAPE, {"network": "user_networks:Own", "options": {"gain": -1}}, "the gain has to be positive"),
     ],
 )
 def test_a_network_that_cannot_be_built_says_why(shape, settings, message):
@@ -328,7 +275,7 @@ perceptrons = st.fixed_dictionaries({"network": st.sampled_from(["mlp", "per_tim
 convolutions = st.fixed_dictionaries(
     {"network": st.just("conv"), "hidden": sizes, "filters": st.integers(1, 3), "kernel": st.integers(1, 5)}
 )
-users = st.just({"network": "test_networks:Own", "options": {"gain": 0.7}})
+users = st.just({"network": "user_networks:Own", "options": {"gain": 0.7}})
 assert set(CLASSES) == {"linear", "mlp", "per_timestep", "conv"}, "a new network belongs in every_kind"
 every_kind = st.one_of(
     st.tuples(st.just({"network": "linear"}) | perceptrons | users, vectors, st.just({})),
@@ -345,31 +292,6 @@ def test_a_call_for_many_steps_is_a_call_for_each(kind, longest, trajectories, s
     assert_close(network(inputs), step_by_step(network, inputs))
 
 
-class WithMemory(nn.Module):
-    """A network of one's own whose output at a step is not that of the step alone."""
-
-    def __init__(self, shape, outputs, copies, how, zero=False):
-        super().__init__()
-        self.how, self.size = how, (copies, outputs)
-        self.lstm = nn.LSTM(shape.vector, 16, batch_first=how != "over trajectories")
-        self.head = nn.Linear(16 if how in ("over time", "over trajectories") else shape.vector, copies * outputs)
-        if zero:
-            nn.init.zeros_(self.head.weight)
-            nn.init.zeros_(self.head.bias)
-
-    def forward(self, inputs):
-        features = {
-            "over time": lambda x: self.lstm(x)[0],
-            "over trajectories": lambda x: self.lstm(x)[0],
-            "differences": lambda x: torch.cat([x[:, :1], x[:, 1:] - x[:, :-1]], 1),
-            "later steps": lambda x: x.flip(1).cumsum(1).flip(1),
-            "whole trajectory": lambda x: x - x.mean(1, keepdim=True),
-            "whole batch": lambda x: x / (1 + x.square().sum()),
-            "chance": lambda x: nn.functional.dropout(x, 0.5, training=True),
-        }[self.how](inputs.vector)
-        return self.head(features).unflatten(-1, self.size)
-
-
 MEMORIES = ["over time", "over trajectories", "differences", "later steps", "whole trajectory", "whole batch", "chance"]
 
 
@@ -377,9 +299,9 @@ MEMORIES = ["over time", "over trajectories", "differences", "later steps", "who
 @pytest.mark.parametrize("how", MEMORIES)
 def test_a_network_with_a_memory_is_refused_when_it_is_made(how, zero):
     with pytest.raises(ShapeError) as caught:
-        make(network="test_networks:WithMemory", options={"how": how, "zero": zero})
+        make(network="user_networks:WithMemory", options={"how": how, "zero": zero})
     assert str(caught.value).startswith(
-        "network 'test_networks:WithMemory' gives a step alone other outputs than within its trajectory: it depends on "
+        "network 'user_networks:WithMemory' gives a step alone other outputs than within its trajectory: it depends on "
         "earlier steps"
     )
     assert "\n" not in str(caught.value)

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from test_cli import call
+from command_line import call
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.fitting.fit import Fit
@@ -138,7 +138,7 @@ def spec_of(path: Path, network: str):
 def test_networks_that_give_no_numbers_are_named_before_training(tmp_path: Path) -> None:
     demonstrations_for(tmp_path / "demos.hdf5")
     with pytest.raises(TrainingError, match="before any training a network gives values that are NaN or infinite; loo"):
-        fit(spec_of(tmp_path / "demos.hdf5", "test_overflow:Undefined"), tmp_path / "run", Unwatched())
+        fit(spec_of(tmp_path / "demos.hdf5", f"{__name__}:Undefined"), tmp_path / "run", Unwatched())
 
 
 def test_a_likelihood_that_is_none_is_not_reported(tmp_path: Path) -> None:

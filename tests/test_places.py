@@ -16,9 +16,9 @@ import pytest
 import selecting
 import toy_task
 import yaml
+from command_line import call
 from killing import HANGS
 from random_demonstrations import demonstrations
-from test_cli import call
 
 from ddco_pyro.data.files import Busy, NoSpace, NotWritable, only_one, whole_file, write_text
 

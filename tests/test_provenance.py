@@ -38,7 +38,7 @@ FILES = {
     "tasks/toy.py": "scene = 'toy.xml'\nnothing = 'absent.xml'\n",
     "tasks/toy.xml": "<mujoco/>",
     "tasks/other.py": "",
-    "tests/needed.py": "",
+    "tests/support/needed.py": "",
     "docs/results/study.md": f"Command: `{COMMAND}`\n\n| a |\n",
     "docs/results/study.json": "[1, 2]",
     "docs/results/README.md": "Not a result.\n",
@@ -109,7 +109,7 @@ def test_a_command_may_name_specs_too(project):
 
 def test_scripts_import_what_lies_beside_the_tests(project):
     write(project, "benchmarks/study.py", "from needed import one\n")
-    assert list(sources(tree(project), COMMAND)) == ["benchmarks/study.py", "tests/needed.py"]
+    assert list(sources(tree(project), COMMAND)) == ["benchmarks/study.py", "tests/support/needed.py"]
 
 
 @pytest.mark.parametrize(

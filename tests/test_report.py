@@ -19,17 +19,11 @@ from ddco_pyro.report.activity import Activity, LevelActivity, activity, bins
 from ddco_pyro.report.plot_rows import order
 from ddco_pyro.report.plot_timing import shares, terminations
 from ddco_pyro.report.plot_trajectories import movement, position_key, view
+from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.simulation.episodes import paired_difference, summarize
 from ddco_pyro.spec import parse_spec
 
 LINEAR = {"network": "linear"}
-
-
-class Quiet:
-    def collected(self, done, total): ...
-    def training(self, name, epochs): ...
-    def epoch(self, row): ...
-    def trained(self, name): ...
 
 
 def made(number=8, size=3):
@@ -56,7 +50,7 @@ def run(folder, demos, **changes):
         "compare_with": [{"kind": "flat", "policy": LINEAR}],
     }
     spec = parse_spec({key: value for key, value in (data | changes).items() if value is not None})
-    found = fit(spec, folder / changes.get("name", "run"), Quiet())
+    found = fit(spec, folder / changes.get("name", "run"), Unwatched())
     return found, demonstrations(spec)
 
 
@@ -359,7 +353,7 @@ def test_names_are_escaped(tmp_path):
             "training": {"epochs": 1, "initialize": "random"},
         }
     )
-    page = write_report(fit(spec, folder, Quiet()), demonstrations(spec)).read_text()
+    page = write_report(fit(spec, folder, Unwatched()), demonstrations(spec)).read_text()
     assert "<b>" not in page
     assert "<i>" not in page
     assert "<img>" not in page

@@ -20,6 +20,7 @@ from ddco_pyro.data.files import Damaged
 from ddco_pyro.fitting.fit import RunError
 from ddco_pyro.fitting.prepare import Dimensions, demonstrations
 from ddco_pyro.fitting.run import claim, fit, train
+from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import dump_spec, load_spec, with_overrides
 
 
@@ -39,21 +40,7 @@ def copied(toy_run, tmp_path):
     return shutil.copytree(toy_run.folder, tmp_path / "run")
 
 
-class Silent:
-    def collected(self, done, total):
-        pass
-
-    def training(self, name, epochs):
-        pass
-
-    def epoch(self, row):
-        pass
-
-    def trained(self, name):
-        pass
-
-
-class Interrupting(Silent):
+class Interrupting(Unwatched):
     """Ctrl-C at the end of some epoch."""
 
     def __init__(self, epochs):
@@ -234,7 +221,7 @@ def test_planted_skills_are_found(planted, tmp_path, toy_spec):
         "observations": ["side", "place"],
     }
     spec = with_overrides(toy_spec, given | {"compare_with": [], "training.epochs": 240} | LINEAR)
-    found = fit(spec, tmp_path / "run", Silent())
+    found = fit(spec, tmp_path / "run", Unwatched())
     assert found.metrics["agreement"]["valid"] == [pytest.approx(1)]
     assert "supervisor" not in found.metrics["demonstrations"]
 
@@ -250,7 +237,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(toy_run, toy_spec, tmp_pat
         fit(toy_spec, folder, Interrupting(epochs))
     with pytest.raises(RunError, match=r"run: an unfinished run: fit it again to continue it"):
         ddco_pyro.load(folder)
-    fit(toy_spec, folder, Silent())
+    fit(toy_spec, folder, Unwatched())
     for name in ("model.safetensors", "history.csv", "baselines/flat/model.safetensors", "spec.yaml"):
         assert (folder / name).read_bytes() == (toy_run.folder / name).read_bytes()
     for name in ("metrics.json", "baselines/flat/metrics.json"):
@@ -266,10 +253,10 @@ def test_the_engines_are_compared_on_a_model_that_the_seed_decides(toy_spec, dem
     for seed in (1, 2):
         torch.manual_seed(seed)
         before = torch.get_rng_state()
-        checks.append(train(spec, Dimensions.of(demos), demos, Silent()).check)
+        checks.append(train(spec, Dimensions.of(demos), demos, Unwatched()).check)
         assert torch.equal(torch.get_rng_state(), before)
     assert checks[0] == checks[1]
-    assert checks[0] != train(with_overrides(spec, {"seed": 1}), Dimensions.of(demos), demos, Silent()).check
+    assert checks[0] != train(with_overrides(spec, {"seed": 1}), Dimensions.of(demos), demos, Unwatched()).check
 
 
 def test_a_finished_run_is_left_as_it_is(copied, toy_spec):
@@ -283,7 +270,7 @@ def test_a_finished_run_is_left_as_it_is(copied, toy_spec):
 def test_a_run_of_another_spec_is_refused(copied, toy_spec):
     other = with_overrides(toy_spec, {"seed": 1})
     with pytest.raises(RunError, match=r"run: holds a run of another spec; choose another --out or remove it$"):
-        fit(other, copied, Silent())
+        fit(other, copied, Unwatched())
     assert load_spec(copied / "spec.yaml") == toy_spec
 
 

@@ -15,9 +15,8 @@ import pyarrow.compute
 import pyarrow.parquet as parquet
 import pytest
 import yaml
+from command_line import call
 from sklearn.metrics import normalized_mutual_info_score
-from test_cli import call
-from test_run import Silent
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
@@ -28,6 +27,7 @@ from ddco_pyro.fitting.run import fit
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
 from ddco_pyro.segmenting.lerobot import annotate
 from ddco_pyro.segmenting.lerobot_forms import FORMS
+from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import parse_spec
 
 LEROBOT = Path(__file__).parent / "fixtures" / "lerobot"
@@ -250,7 +250,7 @@ def lerobot_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lerobot")
     import_demonstrations(LEROBOT, folder / "demos.hdf5")
     spec = parse_spec(yaml.safe_load(SPEC.replace("PATH", str(folder / "demos.hdf5"))))
-    return fit(spec, folder / "run", Silent())
+    return fit(spec, folder / "run", Unwatched())
 
 
 def files(folder):

@@ -7,19 +7,11 @@ import math
 import numpy as np
 import pytest
 from scipy import stats
-from selecting import DATA, score
+from selecting import DATA, candidate, score
 
 from ddco_pyro.selection.choice import as_data, choose, hopeless
-from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.selection.table import cells, markdown
 from ddco_pyro.spec import parse_spec
-
-SPEC = parse_spec({**DATA, "demonstrations": {"path": "demos.hdf5"}})
-
-
-def candidate(number, parameters=None, spec=SPEC):
-    values = {"hierarchy.levels.0.count": number + 1}
-    return Candidate(number, values, spec, 10 * (number + 1) if parameters is None else parameters)
 
 
 def rows(table, lengths=(10,), parameters=None):

@@ -11,9 +11,9 @@ import sys
 
 import pytest
 import yaml
+from command_line import call
 from killing import HANGS
 from selecting import Told, data_at, kept, spec_at
-from test_cli import call
 
 from ddco_pyro.selection import Workers, select
 from ddco_pyro.selection.parallel import BackendError

@@ -9,10 +9,10 @@ import h5py
 import numpy as np
 import pytest
 import yaml
+from command_line import call
 from gripper import planted
 from random_demonstrations import demonstrations
 from scipy import stats
-from test_cli import call
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError

@@ -12,8 +12,6 @@ from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.simulation.task import OutcomeError, UnknownTask, find_task
 from ddco_pyro.spec.types import TASKS
 
-not_a_task = "text"
-
 
 def test_a_task_is_found_by_module_and_name():
     assert find_task("toy_task:task") is toy_task.task
@@ -45,7 +43,7 @@ def test_a_registered_task_is_found_by_its_name(monkeypatch):
         ("no_such_module:task", "^task 'no_such_module:task' cannot be loaded: No module named 'no_such_module'$"),
         ("toy_task:missing", "^task 'toy_task:missing' cannot be loaded: .*has no attribute 'missing'$"),
         (":task", "^task ':task' cannot be loaded: Empty module name$"),
-        ("test_task:not_a_task", r"leads to a str, not to a ddco_pyro\.task\.Task$"),
+        ("toy_task:SPEC", r"leads to a str, not to a ddco_pyro\.task\.Task$"),
     ],
 )
 def test_a_task_that_cannot_be_found_says_why(name, message):

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import toy_task
 import yaml
-from test_cli import call, with_set
+from command_line import call, with_set
 
 import ddco_pyro
 from ddco_pyro.fitting.prepare import demonstrations
@@ -22,7 +22,7 @@ MODULE = """
 from pathlib import Path
 
 (Path(__file__).parent / "imported").touch()
-from test_networks import Own as Network
+from user_networks import Own as Network
 from toy_task import task
 """
 TASK, NETWORK = "careless:task", "careless:Network"

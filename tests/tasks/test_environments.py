@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from importlib.metadata import entry_points
+
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from tasks.test_conformance import NAMES
 
 from ddco_pyro.simulation import environments
 from ddco_pyro.simulation.environments import TaskEnvironment
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.simulation.task import find_task
+from ddco_pyro.spec.types import TASKS
+
+NAMES = sorted(point.name for point in entry_points(group=TASKS))
 
 
 @pytest.mark.filterwarnings("ignore:.*:UserWarning:gymnasium.*")

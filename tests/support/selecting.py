@@ -7,6 +7,7 @@ import json
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.selection.scoring import Score, Unwatched
 from ddco_pyro.spec import parse_spec
 
@@ -75,3 +76,11 @@ def kept(folder):
     """The scores in a selection's folder, by candidate and fold."""
     found = [json.loads(path.read_text()) for path in sorted((folder / "folds").iterdir())]
     return {(one["candidate"], one["fold"]): one for one in found}
+
+
+SPEC = parse_spec({**DATA, "demonstrations": {"path": "demos.hdf5"}})
+
+
+def candidate(number, parameters=None, spec=SPEC):
+    values = {"hierarchy.levels.0.count": number + 1}
+    return Candidate(number, values, spec, 10 * (number + 1) if parameters is None else parameters)

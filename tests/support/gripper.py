@@ -1,6 +1,6 @@
 """Demonstrations of a planted pick and place whose control has a two-valued gripper and a constant dimension.
 
-    python tests/gripper.py OUT.hdf5
+    python tests/support/gripper.py OUT.hdf5
 
 writes a file of them.
 """

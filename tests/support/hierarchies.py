@@ -1,0 +1,41 @@
+"""Random hierarchies over three features and two control dimensions, and batches for them."""
+
+from __future__ import annotations
+
+import torch
+
+from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import Inputs
+from ddco_pyro.spec import parse_spec
+
+SHAPES = {"state": (3,)}
+
+
+def make_hierarchy(counts=(3,), emits=("options",), network="mlp", seed=0, **control):
+    """A random hierarchy over 3 features and 2 control dimensions; ``counts`` lowest level first."""
+    levels = [{"name": f"level-{d}", "count": k, "policy": {"network": network}} for d, k in enumerate(counts, 1)]
+    for level in levels[1:]:
+        level["policy"]["emits"] = list(emits)
+    spec = parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": ["state"],
+            "control": {"std": 0.7, **control},
+            **(
+                {"hierarchy": {"levels": levels, "meta_policy": {"network": network, "emits": list(emits)}}}
+                if counts
+                else {"baseline": "flat"}
+            ),
+        }
+    )
+    torch.manual_seed(seed)
+    return Hierarchy(spec, SHAPES, 2, steps=4)
+
+
+def make_batch(trajectories=2, steps=4, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    vector = torch.randn(trajectories, steps, 3, generator=generator)
+    actions = torch.randn(trajectories, steps, 2, generator=generator)
+    lengths = torch.tensor([steps, *[steps - 1] * (trajectories - 1)])
+    return Batch(Inputs(vector, {}, torch.arange(steps)), actions, lengths)

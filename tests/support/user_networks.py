@@ -1,0 +1,87 @@
+"""Networks as a user might write them, right and wrong; a spec names them as ``user_networks:Own``."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from ddco_pyro.model.networks import Inputs
+
+
+class Own(nn.Module):
+    """A network as a user might write it."""
+
+    def __init__(self, shape, outputs, copies, gain=1.0):
+        super().__init__()
+        if gain <= 0:
+            raise ValueError("the gain has to be positive")
+        self.size, self.gain = (copies, outputs), nn.Parameter(torch.tensor(gain))
+
+    def forward(self, inputs):
+        return (self.gain * inputs.vector.sum(-1))[..., None, None].expand(*inputs.batch, *self.size)
+
+
+class Wrong(Own):
+    """A network of one's own that can be made, but whose output is not what it has to be."""
+
+    def __init__(self, shape, outputs, copies, how):
+        super().__init__(shape, outputs, copies)
+        self.how = how
+
+    def forward(self, inputs):
+        found = super().forward(inputs)
+        if self.how == "list":
+            return found.tolist()
+        return {
+            "joined": lambda: found.flatten(2),
+            "swapped": lambda: found.transpose(2, 3),
+            "one": lambda: found[:, :, :1],
+            "squeezed": lambda: found.squeeze(0),
+            "time first": lambda: found.transpose(0, 1),
+            "fails": lambda: found @ torch.ones(7),
+        }[self.how]()
+
+
+class Stateful(Own):
+    """Normalises by what it has seen, and has a table of the steps that there are."""
+
+    def __init__(self, shape, outputs, copies):
+        super().__init__(shape, outputs, copies)
+        self.norm = nn.BatchNorm1d(shape.vector)
+        self.bias = nn.Parameter(torch.zeros(shape.steps))
+        self.pictures = shape.images
+
+    def forward(self, inputs):
+        assert {key: image.shape[2:] for key, image in inputs.images.items()} == self.pictures
+        assert all(image.dtype == torch.uint8 for image in inputs.images.values())
+        seen = self.norm(inputs.vector.flatten(0, 1)).unflatten(0, inputs.batch)
+        return super().forward(Inputs(seen + self.bias[inputs.time, None], {}, inputs.time))
+
+
+class NotANetwork:
+    pass
+
+
+class WithMemory(nn.Module):
+    """A network of one's own whose output at a step is not that of the step alone."""
+
+    def __init__(self, shape, outputs, copies, how, zero=False):
+        super().__init__()
+        self.how, self.size = how, (copies, outputs)
+        self.lstm = nn.LSTM(shape.vector, 16, batch_first=how != "over trajectories")
+        self.head = nn.Linear(16 if how in ("over time", "over trajectories") else shape.vector, copies * outputs)
+        if zero:
+            nn.init.zeros_(self.head.weight)
+            nn.init.zeros_(self.head.bias)
+
+    def forward(self, inputs):
+        features = {
+            "over time": lambda x: self.lstm(x)[0],
+            "over trajectories": lambda x: self.lstm(x)[0],
+            "differences": lambda x: torch.cat([x[:, :1], x[:, 1:] - x[:, :-1]], 1),
+            "later steps": lambda x: x.flip(1).cumsum(1).flip(1),
+            "whole trajectory": lambda x: x - x.mean(1, keepdim=True),
+            "whole batch": lambda x: x / (1 + x.square().sum()),
+            "chance": lambda x: nn.functional.dropout(x, 0.5, training=True),
+        }[self.how](inputs.vector)
+        return self.head(features).unflatten(-1, self.size)
