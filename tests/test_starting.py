@@ -141,6 +141,11 @@ def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path, ke
     assert ended.status == 0, ended.err
     numbers = ddco_pyro.load(tmp_path / "run").metrics["demonstrations"]
     assert sum(numbers[part] for part in ("train", "tune", "valid")) == 8
+    assert call("report", tmp_path / "run").status == 0
+    ended = call("segment", tmp_path / "run", path, "--csv", tmp_path / "segments.csv")
+    assert ended.status == 0, ended.err
+    rows = [line.split(",")[0] for line in (tmp_path / "segments.csv").read_text().splitlines()[1:]]
+    assert set(rows) == {f"demo_{number}" for number in range(10)} - {"demo_2", "demo_9"}
 
 
 def test_of_many_broken_demonstrations_the_key_is_left_out(path: Path) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -81,7 +82,8 @@ class Segmented:
 def segments(
     fit: Fit, source: Source, on_demonstration: Callable[[int, int], None] = lambda done, total: None
 ) -> Segmented:
-    """The options of a run over every demonstration of a source, some at a time.
+    """The options of a run over every demonstration of a source, some at a time; those that its spec leaves out of its
+    own file are left out here.
 
     :raises BadInput: the run has no options, or was fitted to other observations.
     :raises DemonstrationsError: a demonstration cannot be used.
@@ -90,18 +92,26 @@ def segments(
     if hierarchy is None:
         raise BadInput(f"{fit.folder}: is a {fit.name} policy without options; name a run with a hierarchy")
     counts = {level.name: level.count for level in hierarchy.levels}
+    names = _names(source, fit)
     found: list[Segments] = []
-    for group in _groups(source, fit):
+    for group in _groups(source, names, fit):
         found += _segment(fit, group, tuple(counts))
-        on_demonstration(len(found), len(source.names))
+        on_demonstration(len(found), len(names))
     return Segmented(tuple(found), counts, source.frequency, fit.spec.demonstrations.labels)
 
 
-def _groups(source: Source, fit: Fit) -> Iterator[list[Demonstration]]:
+def _names(source: Source, fit: Fit) -> list[str]:
+    """The demonstrations to segment: those that a spec excludes may hold anything."""
+    known = fit.spec.demonstrations
+    same = known.path is not None and Path(known.path).resolve() == source.files[0].resolve()
+    return [name for name in source.names if not (same and name in known.exclude)]
+
+
+def _groups(source: Source, names: Sequence[str], fit: Fit) -> Iterator[list[Demonstration]]:
     """Demonstrations of about so many steps together as the networks take at once."""
     group: list[Demonstration] = []
     before = 0
-    for name in source.names:
+    for name in names:
         recording = source.recording(name)
         at_once = _steps_at_once(recording, fit, before)
         demo = _demonstration(recording, fit)
