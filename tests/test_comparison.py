@@ -111,7 +111,7 @@ def test_the_verdict_says_whether_a_difference_is_outside_its_error(each, said):
 
 
 def row(name, rank, each, model="ddco"):
-    return Row(rank, name, model, 3, sum(each), 0.1, 0.0, 0.0, sum(each) / len(each), tuple(each))
+    return Row(rank, name, model, 3, sum(each), 0.1, 0.0, 0.0, sum(each) / len(each), tuple(each), None)
 
 
 def test_demonstrations_are_listed_worst_first_by_the_best_hierarchy(toy_run, found, folders, held_out):

@@ -47,7 +47,7 @@ def test_where_nobody_knows_how_far_it_goes_there_is_no_time_left(clock, capsys)
             progress.epoch({"stage": "level-1", "train": 1.25, "tune": -0.5})
         progress.trained("ddco")
     assert capsys.readouterr().err.splitlines() == [
-        "training ddco: 3  level-1: loss -1.250, held out -0.500 nats/step",
+        "training ddco: 3  level-1: training 1.250, tuning -0.500 nats/step",
         "training ddco: done after 3, 16 s",
     ]
 

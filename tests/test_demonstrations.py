@@ -14,6 +14,7 @@ from hypothesis.extra import numpy as hnp
 from random_demonstrations import demonstration, demonstrations
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.data.values import LARGEST
 
 METAWORLD = Path(__file__).parents[2] / "shared" / "data" / "metaworld_pick_place.hdf5"
 
@@ -49,7 +50,7 @@ def test_what_is_read_is_what_was_written(path: Path) -> None:
     hnp.arrays(
         np.float64,
         st.tuples(st.integers(1, 5), st.integers(1, 3)),
-        elements={"allow_nan": False, "allow_infinity": False},
+        elements={"min_value": -LARGEST, "max_value": LARGEST},
     )
 )
 def test_numbers_survive_exactly(tmp_path_factory: pytest.TempPathFactory, actions: np.ndarray) -> None:

@@ -51,6 +51,7 @@ def seeds():
             "log_likelihood_per_step": {
                 name: {"train": value + 1, "valid": value} for name, value in zip(("flat", "ddco"), values, strict=True)
             },
+            "training": {"flat": {"converged": number == 0}, "ddco": {"converged": True}},
         }
         for number, (methods, values) in enumerate(zip(learned, likelihoods, strict=True))
     ]
@@ -69,6 +70,7 @@ def test_learned_methods_vary_over_seeds_and_scripted_ones_over_episodes(seeds):
     assert likelihood["another"] == pytest.approx([21 - 12.7062 * 3**0.5, 21 + 12.7062 * 3**0.5], abs=1e-3)
     assert found["flat"]["inserted"]["by_seed"] == [0.5]  # the other seed has grasped nothing
     assert found["flat"]["accuracy_mm"]["by_seed"] == [1.0]
+    assert (found["flat"]["not_converged"], found["ddco"]["not_converged"]) == (1, 0)
     scripted = found["open_loop"]["success"]
     assert "by_seed" not in scripted
     assert scripted["interval"] == pytest.approx([0.0179, 0.4042], abs=1e-4)  # Wilson's of 1 in 10

@@ -154,10 +154,10 @@ def test_figures_are_also_files(labelled, deep):
 
 
 def test_sections_are_there_where_they_apply(labelled, deep):
-    some = ["likelihood", "demonstrations", "learning", "options", "warnings", "particulars", "segments"]
+    some = ["likelihood", "demonstrations", "dimensions", "learning", "options", "warnings", "particulars", "segments"]
     assert ids(labelled[1]) == some
-    more = ["likelihood", "demonstrations", "rollouts", "learning", "options", "warnings", "films", "particulars"]
-    assert ids(deep[1]) == [*more, "segments"]
+    before, after = ["likelihood", "demonstrations", "dimensions", "rollouts", "learning"], ["options", "warnings"]
+    assert ids(deep[1]) == [*before, *after, "films", "particulars", "segments"]
     assert "trajectories" not in {path.stem for path in (deep[0].folder / "figures").iterdir()}
     assert "mutual information" in labelled[1]
     assert "mutual information" not in deep[1]
@@ -168,7 +168,7 @@ def test_a_baseline_has_no_options(labelled):
     before = found.baselines["flat"].metrics
     page = write_report(found.baselines["flat"], demos).read_text()
     assert found.baselines["flat"].metrics == before
-    assert ids(page) == ["likelihood", "demonstrations", "learning", "warnings", "particulars"]
+    assert ids(page) == ["likelihood", "demonstrations", "dimensions", "learning", "warnings", "particulars"]
     assert "no other model was trained to compare with. Flat had not converged: more epochs can change this." in page
     assert "<strong>Flat has not converged: " in page
     assert "sign of a degenerate solution" not in page
@@ -258,7 +258,7 @@ def test_runs_of_before_have_no_list(labelled, tmp_path):
     copy = replace(found, folder=shutil.copytree(found.folder, tmp_path / "before"))
     write_metrics(copy.folder, before)
     page = write_report(copy, demos).read_text()
-    assert ids(page) == ["likelihood", "learning", "options", "warnings", "particulars"]
+    assert ids(page) == ["likelihood", "dimensions", "learning", "options", "warnings", "particulars"]
     assert 'href="#segments' not in page
 
 
@@ -433,7 +433,10 @@ def test_rows_are_sorted_by_length_then_by_the_first_change():
     low = np.array([[-1 if step == "-" else int(step) for step in path] for path in paths])
     high = np.array([[1, 2, 1, 1, 1]] * len(paths))
     nothing = np.zeros((len(paths), 5, 3))
-    levels = tuple(LevelActivity(name, nothing, path, nothing) for name, path in (("low", low), ("high", high)))
+    levels = tuple(
+        LevelActivity(name, nothing, path, np.zeros_like(path), nothing)
+        for name, path in (("low", low), ("high", high))
+    )
     found = order(Activity(levels, (low >= 0).sum(1)))
     assert [paths[row] for row in found] == ["1----", "1222-", "1121-", "1111-", "12111", "11222", "11111"]
 
@@ -455,7 +458,10 @@ def recorded(**keys):
     """Demonstrations of these observations, key to an array [T, ...] for each demonstration."""
     rows = [dict(zip(keys, values, strict=True)) for values in zip(*keys.values(), strict=True)]
     return Demonstrations(
-        tuple(Demonstration(f"demo_{n}", row, np.zeros((len(row[next(iter(keys))]), 1))) for n, row in enumerate(rows))
+        tuple(
+            Demonstration(f"demo_{n}", row, np.sin(np.arange(len(row[next(iter(keys))]))[:, None]))
+            for n, row in enumerate(rows)
+        )
     )
 
 

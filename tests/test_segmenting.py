@@ -268,7 +268,9 @@ def test_subtasks_are_written_as_lerobot_writes_them(tmp_path):
     """
     options = {int(key): np.array(value) for key, value in json.loads((LANGUAGE / "options.json").read_text()).items()}
     level = {key: LevelLabels(value, np.ones(len(value), bool), np.ones(len(value))) for key, value in options.items()}
-    found = Segmented(tuple(Segments(f"demo_{key}", {"skill": one}) for key, one in level.items()), {"skill": 2}, 10.0)
+    found = Segmented(
+        tuple(Segments(f"demo_{key}", {"skill": one}, 0.0, False) for key, one in level.items()), {"skill": 2}, 10.0
+    )
     with open_source(LEROBOT) as source:
         annotate(source, tmp_path / "out", found, "skill", FORMS["0.6"])
     ours, theirs = rows_of(tmp_path / "out"), parquet.read_table(LANGUAGE / "data.parquet")

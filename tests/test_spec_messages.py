@@ -106,7 +106,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"observations": ["a", "a"]}, "observations.1.key: 'a' is given twice; keep one"),
     (
         {"observations": ["hand_pos", "goal"], "report.trajectory": "hand_po"},
-        "report.trajectory: there is no observation 'hand_po' (did you mean hand_pos?); there is: hand_pos, goal",
+        "report.trajectory: there is no observation 'hand_po' (did you mean 'hand_pos'?); there is: hand_pos, goal",
     ),
     ({"report.trajektory": "pose"}, "report.trajektory: unknown key; did you mean report.trajectory?"),
     ({"control.std": -0.1}, "control.std: must be a positive number or {learn: true}, got -0.1"),

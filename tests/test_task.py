@@ -43,7 +43,7 @@ def test_a_registered_task_is_found_by_its_name(monkeypatch):
         ("no_such_module:task", "^task 'no_such_module:task' cannot be loaded: No module named 'no_such_module'$"),
         ("toy_task:missing", "^task 'toy_task:missing' cannot be loaded: .*has no attribute 'missing'$"),
         (":task", "^task ':task' cannot be loaded: Empty module name$"),
-        ("toy_task:SPEC", r"leads to a str, not to a ddco_pyro\.task\.Task$"),
+        ("toy_task:SPEC", r"leads to a str, not to a ddco_pyro\.simulation\.task\.Task$"),
     ],
 )
 def test_a_task_that_cannot_be_found_says_why(name, message):

@@ -9,7 +9,7 @@ import csv
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
@@ -131,11 +131,80 @@ class BothParts(PerStep):
     valid: Finite
 
 
+class Allowed(Record):
+    """What training may spend; None for no limit."""
+
+    epochs: int | None
+    gradient_steps: int | None
+
+
+class Spent(Record):
+    """What training has spent."""
+
+    epochs: int
+    gradient_steps: int
+
+
+class Stage(Record):
+    """How a stage of training ended (:class:`ddco_pyro.fitting.convergence.StageEnd`)."""
+
+    stage: str
+    epochs: int
+    cap: int | None
+    rising: Finite
+    over: int
+    converged: bool
+
+
+class Training(Record):
+    """What training spent of its budget, and whether it had converged then."""
+
+    budget: Allowed
+    spent: Spent
+    stages: Annotated[list[Stage], Field(min_length=1)]
+    converged: bool
+
+
 class Compared(Record):
     """A baseline."""
 
     log_likelihood_per_step: BothParts
     difference: Difference
+    training: Annotated[Training | None, NOT_NULL] = None
+
+
+class Dimensions(Record):
+    """Log-likelihood per step that each control dimension adds, None for constant ones, and choosing options."""
+
+    by_dimension: list[Finite | None]
+    options: Finite
+
+
+class ByDimension(Record):
+    """That of each part of the data."""
+
+    train: Dimensions
+    valid: Dimensions | None
+
+
+class Listed(Record):
+    """A demonstration and its log-likelihood per step under each method."""
+
+    name: str
+    part: Literal["train", "valid"]
+    steps: AtLeastOne
+    log_likelihood_per_step: dict[str, Finite]
+
+
+class ControlRange(Record):
+    """What a control dimension does in the demonstrations."""
+
+    number: int
+    minimum: Finite
+    maximum: Finite
+    at_minimum: int
+    at_maximum: int
+    steps: AtLeastOne
 
 
 class Use(Record):
@@ -161,14 +230,15 @@ class Measure(Record):
     interval: tuple[Finite, Finite] | None
     successes: int = 0
     rate: Finite | None = None
-    mean: Finite = 0.0
+    mean: Finite | None = None
     std: Finite | None = None
 
     @model_validator(mode="after")
     def _rate_or_mean(self) -> Measure:
         given = self.model_fields_set
         rate = {"successes", "rate"} <= given and (self.trials == 0 or None not in (self.rate, self.interval))
-        if not rate and not {"mean", "std"} <= given:
+        mean = {"mean", "std"} <= given and (self.trials == 0 or self.mean is not None)
+        if not rate and not mean:
             raise invalid(("", "is neither a rate nor a mean"))
         return self
 
@@ -219,14 +289,18 @@ class Metrics(Record):
 
     model: str
     log_likelihood_per_step: PerStep
+    log_likelihood_by_dimension: Annotated[ByDimension | None, NOT_NULL] = None
     valid: list[HeldOut]
+    demonstrations_by_likelihood: list[Listed] = []
     comparison: dict[str, Compared]
     options: list[list[Use]] = []
     divergences: list[list[Alike]] = []
     agreement: Annotated[Agreement | None, NOT_NULL] = None
     engine_check: dict[str, float]
     demonstrations: Counts
+    control_dimensions: list[ControlRange] = []
     parameters: int
+    training: Annotated[Training | None, NOT_NULL] = None
     seconds: dict[str, float]
     versions: dict[str, str]
     rollouts: Annotated[Rollouts | None, NOT_NULL] = None

@@ -43,7 +43,8 @@ def whole(arguments: Sequence[object], folder: Path, cache: Path) -> float:
 
 STRIKES_ITSELF = """
 import os, signal
-from ddco_pyro.cli.app import app as cli, console
+from ddco_pyro.cli import console
+from ddco_pyro.cli.app import main
 
 left, go_on = {after}, console.{watcher}
 
@@ -55,7 +56,7 @@ def strike(*arguments):
     go_on(*arguments)
 
 console.{watcher} = strike
-cli.main()
+main()
 """
 
 

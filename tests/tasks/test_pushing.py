@@ -271,7 +271,7 @@ def test_intentions_are_recorded_and_the_hand_is_inexact() -> None:
         offsets.append(executed - policy.intended)
         step = environment.step(executed)
     environment.close()
-    assert np.std(offsets) == pytest.approx(pushing.pushing_supervisor.HAND, rel=0.3)
+    assert np.std(offsets) == pytest.approx(pushing.supervisor.HAND, rel=0.3)
 
 
 def test_the_scripted_supervisor_is_a_function_of_the_observation() -> None:
