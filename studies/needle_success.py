@@ -97,7 +97,7 @@ def _summary(name: str, seeds: list[Seed]) -> dict[str, Any]:
         values = [one["log_likelihood_per_step"].get(name, {}).get(part) for one in seeds]
         if None not in values:
             summary[f"log_likelihood_{part}"] = over_seeds(values)
-    if name in seeds[0]["training"]:
+    if name in seeds[0].get("training", {}):  # results of before do not say
         summary["not_converged"] = sum(not one["training"][name]["converged"] for one in seeds)
     return summary
 

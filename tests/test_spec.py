@@ -383,7 +383,7 @@ def test_what_is_written_is_read_as_it_was(tmp_path_factory: pytest.TempPathFact
     spec = parse_spec(data)
     path = tmp_path_factory.mktemp("spec") / "spec.yaml"
     path.write_text(dump_spec(spec), encoding="utf-8")
-    assert load_spec(path) == spec
+    assert load_spec(path, allow_code=True) == spec
 
 
 def test_all_defaults_are_written() -> None:

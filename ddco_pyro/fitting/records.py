@@ -213,6 +213,7 @@ class Use(Record):
     choice: int
     share: Finite
     selected: Finite
+    demonstrations: Finite = 0.0
     duration: Finite | None
 
 

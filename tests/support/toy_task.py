@@ -97,7 +97,7 @@ def outcome(environment: Point) -> dict[str, float]:
 def frame(environment: Point) -> np.ndarray:
     picture = np.full((48, 65, 3), 255, np.uint8)
     column, row = np.clip((environment.position + 1.5) / 3 * [64, 47], 0, [64, 47]).astype(int)
-    picture[row, column] = 0
+    picture[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = 0
     return picture
 
 
