@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.model.ahmm import Chain
+from ddco_pyro.model.tables import Chain
 
 NEVER = -1e3
 """The others' gradients are NaN where a logarithm is -inf; this is as good as never here."""

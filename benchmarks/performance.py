@@ -16,12 +16,12 @@ from pathlib import Path
 import peers
 import torch
 
-from ddco_pyro.inference import Engine, direct, fused, total_log_likelihood
+from ddco_pyro.inference import Engine, fused, total_log_likelihood
 from ddco_pyro.inference.structure import structure_of
-from ddco_pyro.model.ahmm import Tables, complete
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.tables import Tables, complete
 from ddco_pyro.spec import parse_spec
 
 sys.path.append(str(Path(__file__).parents[1] / "studies"))
@@ -78,22 +78,8 @@ def networks_alone(hierarchy: Hierarchy, batch: Batch, pieces: bool = True) -> C
     return run
 
 
-def step(hierarchy: Hierarchy, batch: Batch) -> Callable[[], None]:
+def step(hierarchy: Hierarchy, batch: Batch, engine: Engine = "fused") -> Callable[[], None]:
     """A whole gradient step, as training does it."""
-    optimizer, volume = torch.optim.Adam(hierarchy.parameters(), lr=1e-3), hierarchy.scaling.log_volume
-
-    def run() -> None:
-        optimizer.zero_grad()
-        for _, piece in batch.pieces():
-            value = direct.log_likelihood(hierarchy(piece.inputs), piece.actions, volume, piece.lengths).sum()
-            (-value / batch.steps).backward()
-        optimizer.step()
-
-    return run
-
-
-def tables_step(hierarchy: Hierarchy, batch: Batch, engine: Engine) -> Callable[[], None]:
-    """The same step by way of log-tables."""
     optimizer = torch.optim.Adam(hierarchy.parameters(), lr=1e-3)
 
     def run() -> None:
@@ -172,10 +158,8 @@ def measured() -> Iterator[tuple[str, float]]:
             )
         hierarchy, batch = problem("mlp", number, steps)
         few = 1 if steps > 1000 else 5
-        slow = ratio(tables_step(hierarchy, batch, "enumerate"), step(hierarchy, batch), few, warm=few > 1)
+        slow = ratio(step(hierarchy, batch, "enumerate"), step(hierarchy, batch), few, warm=few > 1)
         yield f"enumerate_over_step mlp {size}", slow
-        by_tables = tables_step(hierarchy, batch, "fused")
-        yield f"step_with_tables_over_step mlp {size}", ratio(by_tables, step(hierarchy, batch))
         yield f"funsor_over_step mlp {size}", ratio(funsor_step(hierarchy, batch), step(hierarchy, batch), 3)
         tables, lengths = tables_of(number, steps)
         own = kernel(tables, lengths)

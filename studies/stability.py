@@ -95,7 +95,7 @@ def measure(fit: Fit, demos: Demonstrations, divided: dict[str, Demonstrations])
     posterior = fit.posterior(demos)
     with torch.no_grad():
         outputs = fit.hierarchy(fit.hierarchy.encoder.inputs(demo.observations for demo in demos))
-    selection = outputs.decisions[-1].selection
+    selection = outputs.callers[-1].selection
     assert selection is not None  # the meta-policy emits options
     steps = torch.arange(selection.shape[1]) < torch.tensor(demos.lengths)[:, None]
     control, *options = [one.share for one in option_use(posterior)[0]]

@@ -12,7 +12,9 @@ import torch
 from oracle import brute_force, paths, random_tables
 
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.model.ahmm import NEVER, Tables, Tabulated, ahmm, complete
+from ddco_pyro.inference.enumeration import known_controls
+from ddco_pyro.model.ahmm import Tabulated, ahmm
+from ddco_pyro.model.tables import NEVER, Tables, complete
 
 SAMPLES = 4000
 
@@ -20,7 +22,9 @@ SAMPLES = 4000
 def run_forward(tables, lengths, seed=0):
     """The trace of one run of the model."""
     pyro.set_rng_seed(seed)
-    return pyro.poutine.trace(ahmm).get_trace(complete(tables, lengths))
+    trace = pyro.poutine.trace(ahmm).get_trace(complete(tables, lengths), *known_controls(tables))
+    trace.compute_log_prob()
+    return trace
 
 
 def latents(trace, depth, steps):
@@ -92,7 +96,7 @@ def test_past_the_end_every_choice_is_kept():
     h, b = latents(trace, 2, steps)
     assert (b[:, length:] == 0).all()
     assert torch.equal(h[:, length:], h[:, length - 1 : length].expand(-1, steps - length, -1))
-    assert all(not trace.nodes[f"a_{t}"]["fn"].log_factor.any() for t in range(length, steps))
+    assert all(not trace.nodes[f"a_{t}"]["log_prob"].any() for t in range(length, steps))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,8 @@ from oracle import brute_force, random_tables
 
 from ddco_pyro.fitting.analysis import agreement, as_rows, divergences, option_use, paired
 from ddco_pyro.inference import Posterior, posterior
-from ddco_pyro.model.outputs import Decision, Outputs
+from ddco_pyro.model.emissions import Gaussian
+from ddco_pyro.model.outputs import CallerOutputs, Outputs
 
 
 def test_use_of_options_by_sums_over_every_path():
@@ -52,18 +53,19 @@ def hybrid():
     logits = torch.randn(2, 4, 3, 3, generator=random, dtype=torch.float64)
     mean = torch.randn(2, 4, 3, 2, generator=random, dtype=torch.float64)
     u = torch.rand(2, 4, 4, generator=random, dtype=torch.float64)
-    return Decision(2, logits, mean, torch.tensor([0.5, 2.0], dtype=torch.float64)), u
+    std = torch.tensor([0.5, 2.0], dtype=torch.float64)
+    return CallerOutputs(2, logits, Gaussian(mean, std, torch.zeros(2))), u
 
 
 def act(decision, n, t, i):
     """The distribution of what caller i does at a step: (probabilities of the choices, Gaussian of the control)."""
-    control = torch.distributions.Normal(decision.mean[n, t, i], decision.std)
+    control = torch.distributions.Normal(decision.emission.mean[n, t, i], decision.emission.std)
     return torch.distributions.Categorical(logits=decision.selection[n, t, i]), control
 
 
 def test_divergences_are_mean_kullback_leibler_divergences_in_both_directions(hybrid):
     decision, u = hybrid
-    (found,) = divergences(Outputs((decision, decision), ()), Posterior((u,), (u,), (u,)))
+    (found,) = divergences([(Outputs((decision, decision), ()), Posterior((u,), (u,), (u,)))])
     assert [one["options"] for one in found] == [[1, 2], [1, 3], [2, 3]]
     kl = torch.distributions.kl_divergence
     for one in found:
@@ -81,17 +83,17 @@ def test_divergences_are_mean_kullback_leibler_divergences_in_both_directions(hy
 def test_divergences_of_policies_that_emit_one_kind_of_thing(hybrid):
     decision, u = hybrid
     same = Posterior((u,), (u,), (u,))
-    apart = (decision.mean[:, :, 0] - decision.mean[:, :, 1]) / decision.std
+    apart = (decision.emission.mean[:, :, 0] - decision.emission.mean[:, :, 1]) / decision.emission.std
     weight = u[..., 1] + u[..., 2]
-    (found,) = divergences(Outputs((Decision(0, None, decision.mean, decision.std), decision), ()), same)
+    (found,) = divergences([(Outputs((CallerOutputs(0, None, decision.emission), decision), ()), same)])
     assert found[0]["divergence"] == pytest.approx(float((weight * apart.square().sum(-1) / 2).sum() / weight.sum()))
     options = decision.logits[..., 1:]
-    (found,) = divergences(Outputs((Decision(2, options, None, decision.std), decision), ()), same)
+    (found,) = divergences([(Outputs((CallerOutputs(2, options, None), decision), ()), same)])
     p, q = (options[:, :, i].log_softmax(-1) for i in (0, 1))
     both = ((p.exp() - q.exp()) * (p - q)).sum(-1) / 2
     assert found[0]["divergence"] == pytest.approx(float((weight * both).sum() / weight.sum()))
     never = torch.zeros_like(u)
-    (found,) = divergences(Outputs((decision, decision), ()), Posterior((never,), (never,), (never,)))
+    (found,) = divergences([(Outputs((decision, decision), ()), Posterior((never,), (never,), (never,)))])
     assert found[0]["divergence"] is None
 
 

@@ -74,7 +74,7 @@ def test_one_observation_at_a_time(trained):
         window = Window(hierarchy.encoder)
         for t in range(len(demo)):
             with torch.no_grad():
-                now = hierarchy(window.inputs({key: values[t] for key, values in demo.observations.items()}))
+                now = hierarchy(window.inputs([{key: values[t] for key, values in demo.observations.items()}]))
             for said, expected in zip(now.leaves(), whole.leaves(), strict=True):
                 if expected is not None and expected.dim() > 1:  # a deviation has no time
                     torch.testing.assert_close(said[0, 0], expected[number, t], atol=1e-5, rtol=1e-5)
@@ -91,7 +91,7 @@ def test_the_controller(trained):
                 control = controller.act({key: values[t] for key, values in demo.observations.items()})
                 choices = controller.choices
                 level = next((d for d, choice in enumerate(choices) if choice), -1)
-                mean = whole.decisions[level].mean[number, t, choices[level] - 1 if level >= 0 else 0]
+                mean = whole.emissions[level].mean[number, t, choices[level] - 1 if level >= 0 else 0]
                 np.testing.assert_allclose(control, hierarchy.scaling.unscaled(mean), atol=1e-4)
                 psi = [
                     log[number, t, h - 1, 1].exp() if h else 1

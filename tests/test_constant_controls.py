@@ -18,7 +18,6 @@ from safetensors.torch import save_file
 
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.acting.lockstep import Actors
 from ddco_pyro.comparison import compare
 from ddco_pyro.comparison.shared import NotShared
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
@@ -27,7 +26,7 @@ from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.selection.scoring import Unwatched
-from ddco_pyro.spec import RolloutSpec, Spec, parse_spec, with_overrides
+from ddco_pyro.spec import Spec, parse_spec, with_overrides
 
 STILL = {1: 0.1, 3: -7.0}
 """Dimension to value; 0.1 is no float32."""
@@ -170,10 +169,9 @@ def test_the_controller_emits_them(whole: Fit, reduced: Fit, control: str) -> No
 def test_many_at_once_emit_them(whole: Fit, reduced: Fit, control: str) -> None:
     controls = []
     for one in (whole, reduced):
-        torch.manual_seed(0)
-        actors = Actors(one.hierarchy, RolloutSpec(control=control), 6)
-        with torch.no_grad():
-            controls.append(actors.act(observations()))
+        controller = Controller(one.hierarchy, control)
+        controller.reset_all(range(6))
+        controls.append(controller.act_all(observations()))
     for found, expected in zip(*controls, strict=True):
         check_control(found, expected)
 

@@ -71,7 +71,7 @@ def exact(hierarchy: Hierarchy) -> tuple[Outputs, Batch]:
     batch = encode(DEMOS, hierarchy.encoder, hierarchy.scaling)
     with torch.no_grad():
         outputs = hierarchy(batch.inputs)
-    return Outputs.of(outputs.options, [None if leaf is None else leaf.double() for leaf in outputs.leaves()]), batch
+    return outputs.map(torch.Tensor.double), batch
 
 
 @pytest.mark.parametrize(
@@ -82,9 +82,9 @@ def exact(hierarchy: Hierarchy) -> tuple[Outputs, Batch]:
 def test_parts_are_those_of_every_path(counts: tuple[int, ...], emits: tuple[str, ...]) -> None:
     hierarchy = make(counts, emits)
     outputs, batch = exact(hierarchy)
-    found = decompose(outputs, batch, hierarchy.scaling)
+    found = decompose(outputs, batch)
     assert found.dimensions.shape == (2, 2)
-    tables = outputs.tables(batch.actions.double(), hierarchy.scaling.log_volume)
+    tables = outputs.tables(batch.actions.double())
     for n, length in enumerate(LENGTHS):
         densities = _densities(hierarchy, outputs, batch, n)
         every = [(path, joint) for path, _, joint in paths(tables, n, length, [1 + k for k in counts])]
@@ -114,11 +114,11 @@ def _densities(hierarchy: Hierarchy, outputs: Outputs, batch: Batch, n: int) -> 
     actions = units(batch.actions[n, : LENGTHS[n]])
     return {
         (level, option): stats.norm.logpdf(
-            actions, units(decision.mean[n, : LENGTHS[n], option]), decision.std.detach().numpy() * scale
+            actions, units(emission.mean[n, : LENGTHS[n], option]), emission.std.detach().numpy() * scale
         )
-        for level, decision in enumerate(outputs.decisions)
-        if decision.mean is not None
-        for option in range(decision.mean.shape[2])
+        for level, emission in enumerate(outputs.emissions)
+        if emission is not None
+        for option in range(emission.mean.shape[2])
     }
 
 
@@ -126,7 +126,7 @@ def _densities(hierarchy: Hierarchy, outputs: Outputs, batch: Batch, n: int) -> 
 def test_parts_sum_to_the_log_likelihood(counts: tuple[int, ...]) -> None:
     hierarchy = make(counts, ("options", "control") if counts else ("control",))
     outputs, batch = exact(hierarchy)
-    found = decompose(outputs, batch, hierarchy.scaling)
+    found = decompose(outputs, batch)
     whole = hierarchy.tabulate(batch)
     np.testing.assert_allclose(
         found.dimensions.sum(1) + found.options, log_likelihood(whole, batch.lengths).detach(), rtol=1e-6

@@ -11,7 +11,7 @@ from oracle import brute_force, random_tables
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.filtering import Filter
-from ddco_pyro.model.ahmm import NEVER, complete
+from ddco_pyro.model.tables import NEVER, complete
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from oracle import random_tables
 
 from ddco_pyro.inference import fused, logspace, posterior
 from ddco_pyro.inference.structure import structure_of
-from ddco_pyro.model.ahmm import NEVER, Tables, complete
+from ddco_pyro.model.tables import NEVER, Tables, complete
 
 SHAPES = [(1,), (3,), (20,), (1, 1), (2, 2), (4, 1), (2, 1, 2)]
 

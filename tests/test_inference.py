@@ -10,7 +10,7 @@ import torch
 from oracle import brute_force, random_tables
 
 from ddco_pyro.inference import log_likelihood, posterior, segment, total_log_likelihood
-from ddco_pyro.model.ahmm import NEVER, Tables
+from ddco_pyro.model.tables import NEVER, Tables
 
 CASES = [
     ((), (), 5),

@@ -17,6 +17,7 @@ from ddco_pyro.spec import RolloutSpec, parse_spec
 
 SEEDS = (3, 4, 5, 6)
 MEAN = RolloutSpec(control="mean", options="most_likely")
+SAMPLED = RolloutSpec(control="sample", options="sample")
 SHAPES = {"offsets": (4,), "visited": (1,)}
 OBSERVATIONS = [{"key": "offsets", "differences": True}, "visited"]
 
@@ -50,18 +51,19 @@ def ragged(task):
     return replace(task, load=lambda seed: toy_task.Point(seed, steps=seed))
 
 
+@pytest.mark.parametrize("spec", [MEAN, SAMPLED], ids=["most likely", "sampled"])
 @pytest.mark.parametrize(
     ("name", "weights", "actors"), [("flat", (0,), {0}), ("options", (4, 6, 8), {0}), ("hybrid", (0, 2, 10), {0, 1, 2})]
 )
-def test_together_as_alone(name, weights, actors):
+def test_together_as_alone(name, weights, actors, spec):
     """With models in which options change within an episode and, in the hybrid, an option of each level and the
     meta-policy act.
     """
     task, acted, changes = ragged(toy_task.task), set(), 0
     for seed in weights:
         hierarchy = make(MODELS[name], seed, gain=3.0)
-        for found in play(task, hierarchy, MEAN, SEEDS, keep=("offsets",)):
-            alone = run_episode(task, Controller.from_spec(hierarchy, MEAN), found.seed)
+        for found in play(task, hierarchy, spec, SEEDS, keep=("offsets",)):
+            alone = run_episode(task, Controller.from_spec(hierarchy, spec), found.seed)
             assert found.outcome == pytest.approx(alone.outcome, abs=1e-5, nan_ok=True)
             np.testing.assert_array_equal(found.choices, alone.choices)
             np.testing.assert_allclose(found.observations["offsets"], alone.record.observations["offsets"], atol=1e-5)
@@ -69,27 +71,6 @@ def test_together_as_alone(name, weights, actors):
             changes += (np.diff(found.choices, axis=0) != 0).any(1).sum()
     assert acted == actors
     assert changes > 1 or name == "flat"
-
-
-def test_equal_seeds_draw_equally():
-    sampled, hierarchy = RolloutSpec(control="sample", options="sample"), make(MODELS["hybrid"])
-    groups = (SEEDS, SEEDS, SEEDS[:3])
-    first, again, other = (play(toy_task.task, hierarchy, sampled, seeds, ("offsets",)) for seeds in groups)
-    for one, two in zip(first, again, strict=True):
-        np.testing.assert_array_equal(one.observations["offsets"], two.observations["offsets"])
-    assert not np.array_equal(first[0].observations["offsets"][1], other[0].observations["offsets"][1])
-
-
-def test_sampled_options_have_the_controllers_frequencies():
-    """The first choice of many episodes from one start, together and alone."""
-    task = replace(toy_task.task, load=lambda seed: toy_task.Point(0, steps=1))
-    sampled, hierarchy = RolloutSpec(options="sample"), make(MODELS["options"])
-    together = [tuple(one.choices[0]) for one in play(task, hierarchy, sampled, range(1500))]
-    controller = Controller.from_spec(hierarchy, sampled)
-    alone = [tuple(run_episode(task, controller, seed).choices[0]) for seed in range(500)]
-    for choice in set(alone) | set(together):
-        p, q = together.count(choice) / 1500, alone.count(choice) / 500
-        assert abs(p - q) < 4 * np.sqrt(0.25 / 500 + 0.25 / 1500)
 
 
 def test_environments_are_closed_when_one_fails():

@@ -14,7 +14,8 @@ from torch.func import functional_call
 
 from ddco_pyro.inference import log_likelihood, posterior
 from ddco_pyro.inference.marginal import EliminatedAHMM
-from ddco_pyro.model.ahmm import ahmm, complete
+from ddco_pyro.model.ahmm import ahmm
+from ddco_pyro.model.tables import complete
 
 PRIOR = 0.5
 
@@ -29,12 +30,11 @@ def bayesian(hierarchy, batch, eliminated):
             for name, shape in shapes.items()
         }
         outputs = functional_call(hierarchy, weights, (batch.inputs,))
-        volume = hierarchy.scaling.log_volume
         if eliminated:
             with pyro.plate("demonstrations", len(batch), dim=-1):
-                pyro.sample("controls", EliminatedAHMM(outputs, volume, batch.lengths), obs=batch.actions)
+                pyro.sample("controls", EliminatedAHMM(outputs, batch.lengths), obs=batch.actions)
         else:
-            ahmm(complete(outputs.tables(batch.actions, volume), batch.lengths))
+            ahmm(complete(outputs.tables(), batch.lengths), outputs.emissions, batch.actions)
 
     return model
 
@@ -79,7 +79,7 @@ def test_svi_reaches_the_posterior_mode():
         name: guide()[name.replace(".", "_")].detach().requires_grad_() for name, _ in hierarchy.named_parameters()
     }
     outputs = functional_call(hierarchy, found, (batch.inputs,))
-    likelihood = EliminatedAHMM(outputs, hierarchy.scaling.log_volume, batch.lengths).log_prob(batch.actions).sum()
+    likelihood = EliminatedAHMM(outputs, batch.lengths).log_prob(batch.actions).sum()
     pull = torch.autograd.grad(likelihood, list(found.values()))
     for value, gradient in zip(found.values(), pull, strict=True):
         torch.testing.assert_close(gradient, value.detach() / PRIOR**2, atol=2e-2, rtol=1e-2)
@@ -91,14 +91,14 @@ def test_draws_follow_the_model():
     hierarchy, batch = make_hierarchy((3,), ("options", "control")), make_batch()
     with torch.no_grad():
         outputs = hierarchy(batch.inputs)
-        distribution = EliminatedAHMM(outputs, hierarchy.scaling.log_volume, batch.lengths)
+        distribution = EliminatedAHMM(outputs, batch.lengths)
         drawn = torch.stack([distribution.sample() for _ in range(3000)])
-        tables = outputs.tables(batch.actions, hierarchy.scaling.log_volume)
+        tables = outputs.tables(batch.actions)
         uninformed = tables.__class__(
             tables.selection, tables.termination, tuple(torch.zeros_like(c) for c in tables.control)
         )
         weights = posterior(uninformed, batch.lengths).u[0]
-        means = torch.cat([outputs.decisions[1].mean, outputs.decisions[0].mean], dim=2).double()
+        means = torch.cat([outputs.emissions[1].mean, outputs.emissions[0].mean], dim=2).double()
         expected = (weights.unsqueeze(-1) * means).sum(2)
     for n, length in enumerate(batch.lengths.tolist()):
         np.testing.assert_allclose(drawn[:, n, :length].mean(0), expected[n, :length], atol=5 * 1.0 / 3000**0.5)
@@ -108,7 +108,7 @@ def test_draws_follow_the_model():
 
 def test_log_prob_is_the_likelihood_and_other_shapes_are_refused():
     hierarchy, batch = make_hierarchy((3,)), make_batch()
-    distribution = EliminatedAHMM(hierarchy(batch.inputs), hierarchy.scaling.log_volume, batch.lengths)
+    distribution = EliminatedAHMM(hierarchy(batch.inputs), batch.lengths)
     torch.testing.assert_close(
         distribution.log_prob(batch.actions), log_likelihood(hierarchy.tabulate(batch), batch.lengths)
     )

@@ -9,11 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import brute_force
 
-from ddco_pyro.inference import direct, fused, total_log_likelihood
+from ddco_pyro.inference import fused, logspace, total_log_likelihood
 from ddco_pyro.inference.check import compare_engines
-from ddco_pyro.model.outputs import Decision, Outputs
+from ddco_pyro.model.emissions import Gaussian
+from ddco_pyro.model.outputs import CallerOutputs, Outputs
+from ddco_pyro.model.tables import complete
 
-VOLUME = torch.tensor(0.3, dtype=torch.float64)
+LOG_SCALE = torch.tensor([0.1, 0.2], dtype=torch.float64)
 EMITS = ["options", "both", "control"]
 
 
@@ -24,14 +26,24 @@ def random_outputs(counts, emits, number=2, steps=4, seed=0, sharp=1.0, dtype=to
     def draw(*shape):
         return (sharp * torch.randn(*shape, generator=generator)).to(dtype).requires_grad_()
 
-    callers, decisions = [*counts, 1], []
+    number_of_callers, callers = [*counts, 1], []
     for level, k in enumerate([0, *counts]):
-        both = [number, steps, callers[level]]
+        both = [number, steps, number_of_callers[level]]
         said = emits[level - 1] if level else "control"
         logits = None if said == "control" else draw(*both, k + (said == "both"))
         std = (0.3 + torch.rand(2, generator=generator)).to(dtype).requires_grad_()
-        decisions.append(Decision(k, logits, None if said == "options" else draw(*both, 2), std))
-    return Outputs(tuple(decisions), tuple(draw(number, steps, k) for k in counts))
+        emission = None if said == "options" else Gaussian(draw(*both, 2), std, LOG_SCALE)
+        callers.append(CallerOutputs(k, logits, emission))
+    return Outputs(tuple(callers), tuple(draw(number, steps, k) for k in counts))
+
+
+def leaves(outputs):
+    """What a gradient can be taken of."""
+    return [tensor for tensor in outputs.tensors() if tensor.requires_grad]
+
+
+def log_likelihood(outputs, actions, lengths):
+    return fused.log_likelihood(outputs.tables(actions), lengths)
 
 
 def random_actions(number=2, steps=4, seed=9, dtype=torch.float64):
@@ -45,42 +57,42 @@ CASES = [
 
 
 @pytest.mark.parametrize(("counts", "emits"), CASES)
-def test_the_direct_way_is_the_sum_over_paths(counts, emits):
+def test_the_likelihood_is_the_sum_over_paths(counts, emits):
     steps = 4 - len(counts)
     outputs, actions = random_outputs(counts, emits, steps=steps), random_actions(steps=steps)
     lengths = torch.tensor([steps, 1])
-    tables = outputs.tables(actions, VOLUME)
+    tables = outputs.tables(actions)
     truth = [brute_force(tables, n, int(length)).log_likelihood for n, length in enumerate(lengths)]
-    found = direct.log_likelihood(outputs, actions, VOLUME, lengths).detach().numpy()
+    found = log_likelihood(outputs, actions, lengths).detach().numpy()
     np.testing.assert_allclose(found, truth, atol=1e-9, rtol=0)
 
 
 @pytest.mark.parametrize(("counts", "emits"), CASES)
 def test_every_gradient_is_that_of_pyros_enumeration(counts, emits):
     outputs, actions = random_outputs(counts, emits, number=3, steps=5), random_actions(3, 5)
-    check = compare_engines(outputs, actions, VOLUME, torch.tensor([5, 1, 4]))
+    check = compare_engines(outputs, actions, torch.tensor([5, 1, 4]))
     assert check.value < 1e-12
     assert check.gradient < 1e-10
 
 
 @settings(max_examples=60)
 @given(st.data())
-def test_both_ways_agree(data):
-    """Whatever is said, however sharply: with tables in between and without; underflow goes to log space."""
+def test_the_compiled_pass_is_the_one_in_log_space(data):
+    """Whatever is said, however sharply; underflow goes to log space."""
     counts = tuple(data.draw(st.lists(st.integers(1, 3), min_size=1, max_size=3)))
     emits = [data.draw(st.sampled_from(EMITS)) for _ in counts]
     steps, sharp = data.draw(st.integers(1, 6)), data.draw(st.sampled_from([0.1, 1.0, 10.0, 100.0]))
     outputs = random_outputs(counts, emits, 2, steps, data.draw(st.integers(0, 1000)), sharp)
     actions, lengths = random_actions(2, steps), torch.tensor([steps, data.draw(st.integers(1, steps))])
     weights = torch.tensor([1.0, -2.5], dtype=torch.float64)
-    leaves = [leaf for leaf in outputs.leaves() if leaf is not None]
     ways = (
-        direct.log_likelihood(outputs, actions, VOLUME, lengths),
-        fused.log_likelihood(outputs.tables(actions, VOLUME), lengths),
+        log_likelihood(outputs, actions, lengths),
+        logspace.log_likelihood(complete(outputs.tables(actions), lengths)),
     )
     torch.testing.assert_close(ways[0], ways[1], rtol=1e-9, atol=1e-9)
     found, expected = (
-        torch.autograd.grad((way * weights).sum(), leaves, allow_unused=True, materialize_grads=True) for way in ways
+        torch.autograd.grad((way * weights).sum(), leaves(outputs), allow_unused=True, materialize_grads=True)
+        for way in ways
     )
     for ours, theirs in zip(found, expected, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-6 * float(theirs.abs().max().clamp(min=1)))
@@ -90,31 +102,30 @@ def test_what_cannot_be_reached_does_not_overflow_into_the_gradient():
     """The meta-policy always acts itself, and all the options below would have done far better."""
     outputs = random_outputs((1, 1, 1), ("options", "both", "control"), 2, 4, seed=2, sharp=10.0)
     actions, lengths = random_actions(2, 4), torch.tensor([4, 1])
-    leaves = [leaf for leaf in outputs.leaves() if leaf is not None]
-    value = fused.log_likelihood(outputs.tables(actions, VOLUME), lengths).sum()
-    for gradient in torch.autograd.grad(value, leaves, allow_unused=True, materialize_grads=True):
+    value = fused.log_likelihood(outputs.tables(actions), lengths).sum()
+    for gradient in torch.autograd.grad(value, leaves(outputs), allow_unused=True, materialize_grads=True):
         assert gradient.isfinite().all()
 
 
 def test_single_precision_stays_close():
     single = random_outputs((3, 2), ("both", "options"), 4, 50, dtype=torch.float32)
     actions, lengths = random_actions(4, 50, dtype=torch.float32), torch.full((4,), 50)
-    double = Outputs.of(single.options, [None if leaf is None else leaf.double() for leaf in single.leaves()])
-    found = direct.log_likelihood(single, actions, VOLUME, lengths)
-    expected = direct.log_likelihood(double, actions.double(), VOLUME, lengths)
+    double = single.map(torch.Tensor.double)
+    found = log_likelihood(single, actions, lengths)
+    expected = log_likelihood(double, actions.double(), lengths)
     torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
-    (gradient,) = torch.autograd.grad(found.sum(), single.decisions[0].mean)
+    (gradient,) = torch.autograd.grad(found.sum(), single.emissions[0].mean)
     assert gradient.dtype == torch.float32
 
 
 def test_what_lies_beyond_a_length_is_ignored():
     outputs, actions, lengths = random_outputs((2,), ("both",)), random_actions(), torch.tensor([4, 2])
-    expected = direct.log_likelihood(outputs, actions, VOLUME, lengths)
+    expected = log_likelihood(outputs, actions, lengths)
     with torch.no_grad():
-        outputs.endings[0][1, 2:], actions[1, 2:] = 50.0, 1e3
-    found = direct.log_likelihood(outputs, actions, VOLUME, lengths)
+        outputs.termination_logits[0][1, 2:], actions[1, 2:] = 50.0, 1e3
+    found = log_likelihood(outputs, actions, lengths)
     torch.testing.assert_close(found, expected)
-    for gradient in torch.autograd.grad(found.sum(), [outputs.endings[0], outputs.decisions[0].mean]):
+    for gradient in torch.autograd.grad(found.sum(), [outputs.termination_logits[0], outputs.emissions[0].mean]):
         assert not gradient[1, 2:].any()
 
 
@@ -122,24 +133,20 @@ def test_underflow_is_left_to_log_space():
     """Controls that every option is 1000 deviations away from, each at other steps."""
     outputs, actions = random_outputs((2,), ("options",), 1, 4), random_actions(1, 4)
     with torch.no_grad():
-        outputs.decisions[0].std[:] = 1e-3
-        outputs.endings[0][:] = -60.0
-        outputs.decisions[0].mean[:] = torch.tensor([[0.0], [1.0]]).expand(1, 4, 2, 2)
+        outputs.emissions[0].std[:] = 1e-3
+        outputs.termination_logits[0][:] = -60.0
+        outputs.emissions[0].mean[:] = torch.tensor([[0.0], [1.0]]).expand(1, 4, 2, 2)
         actions[0] = torch.tensor([[0.0, 0], [1, 1], [0, 0], [1, 1]])
-    value = direct.log_likelihood(outputs, actions, VOLUME, torch.tensor([4]))
-    truth = brute_force(outputs.tables(actions, VOLUME), 0, 4).log_likelihood
+    value = log_likelihood(outputs, actions, torch.tensor([4]))
+    truth = brute_force(outputs.tables(actions), 0, 4).log_likelihood
     np.testing.assert_allclose(value.detach(), [truth], rtol=1e-9)
 
 
-@pytest.mark.parametrize("way", ["direct", "tables"])
-def test_a_second_derivative_is_never_left_out_in_silence(way):
+def test_a_second_derivative_is_never_left_out_in_silence():
     """A gradient penalty: a sum of something that has a second derivative and of the refused one."""
     outputs, actions, lengths = random_outputs((2,), ("options",)), random_actions(), torch.tensor([4, 4])
-    if way == "direct":
-        value = direct.log_likelihood(outputs, actions, VOLUME, lengths).sum()
-    else:
-        value = fused.log_likelihood(outputs.tables(actions, VOLUME), lengths).sum()
-    ending = outputs.endings[0]
+    value = log_likelihood(outputs, actions, lengths).sum()
+    ending = outputs.termination_logits[0]
     (gradient,) = torch.autograd.grad(value, ending, create_graph=True)
     with pytest.raises(RuntimeError, match="cannot differentiate again"):
         torch.autograd.grad(gradient.square().sum() + ending.square().sum(), ending)
@@ -149,7 +156,7 @@ def test_controls_that_want_a_gradient_get_it():
     """Through the tables: the gradient of a log-density with respect to the controls (a distribution's value)."""
     outputs, actions = random_outputs((2,), ("options",)), random_actions().requires_grad_()
     lengths = torch.tensor([4, 4])
-    (found,) = torch.autograd.grad(direct.log_likelihood(outputs, actions, VOLUME, lengths).sum(), actions)
-    tables = outputs.tables(actions, VOLUME)
+    (found,) = torch.autograd.grad(log_likelihood(outputs, actions, lengths).sum(), actions)
+    tables = outputs.tables(actions)
     (expected,) = torch.autograd.grad(total_log_likelihood(tables, lengths, "enumerate"), actions)
     torch.testing.assert_close(found, expected)

@@ -13,7 +13,9 @@ from pyro.infer import TraceEnum_ELBO, infer_discrete
 from scipy import stats
 
 from ddco_pyro.inference import most_likely_path, posterior, sample_paths
-from ddco_pyro.model.ahmm import NEVER, Tables, ahmm, complete
+from ddco_pyro.inference.enumeration import known_controls
+from ddco_pyro.model.ahmm import ahmm
+from ddco_pyro.model.tables import NEVER, Tables, complete
 
 CASES = [
     ((1,), (True,), 4),
@@ -90,7 +92,7 @@ def test_pyros_own_marginals_are_the_posterior(counts, hybrid):
     tables = random_tables(counts, hybrid, trajectories=2, steps=4, seed=14)
     lengths = torch.tensor([4, 3])
     elbo = TraceEnum_ELBO(max_plate_nesting=1, strict_enumeration_warning=False)
-    marginals = elbo.compute_marginals(ahmm, lambda chain: None, complete(tables, lengths))
+    marginals = elbo.compute_marginals(ahmm, lambda *_: None, complete(tables, lengths), *known_controls(tables))
     ours = posterior(tables, lengths)
     for t, d in itertools.product(range(4), range(len(counts))):
         alive = lengths > t
@@ -106,7 +108,7 @@ def test_pyros_own_most_likely_path_is_ours(counts, hybrid):
     tables = random_tables(counts, hybrid, trajectories=2, steps=4, seed=15)
     lengths = torch.tensor([4, 4])
     inferred = infer_discrete(ahmm, first_available_dim=-2, temperature=0)
-    sites = pyro.poutine.trace(inferred).get_trace(complete(tables, lengths)).nodes
+    sites = pyro.poutine.trace(inferred).get_trace(complete(tables, lengths), *known_controls(tables)).nodes
     found = most_likely_path(tables, lengths)
     for t, d in itertools.product(range(4), range(len(counts))):
         assert torch.equal(sites[f"h_{d + 1}_{t}"]["value"], found.choices[d][:, t])

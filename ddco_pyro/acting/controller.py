@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -11,9 +11,10 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from ddco_pyro.acting.window import Window
-from ddco_pyro.model.ahmm import Tabulated, choose, complete
+from ddco_pyro.model.ahmm import Tabulated, choose
+from ddco_pyro.model.emissions import Acting
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.outputs import Decision, Outputs
+from ddco_pyro.model.tables import complete
 from ddco_pyro.spec import RolloutSpec
 
 
@@ -23,6 +24,8 @@ class Controller:
     At each step the active options may terminate, new ones are selected, and the lowest of them gives the control.
     After it ``choices`` says which options are active, and ``terminations`` how likely each is to end in a state like
     the one just seen (ψ; 1 for choice 0), lowest level first.
+
+    With :meth:`reset_all` and :meth:`act_all` it acts in several episodes at once, in each as it would alone.
 
     :param control: execute the ``mean`` control or a ``sample``.
     :param options: ``sample`` terminations and selections, or take the ``most_likely``.
@@ -46,53 +49,67 @@ class Controller:
 
     def reset(self, seed: int = 0) -> None:
         """Begin an episode. Equal seeds and observations give equal controls."""
-        self.seed, self.time = seed, 0
+        self.reset_all([seed])
+
+    def reset_all(self, seeds: Sequence[int]) -> None:
+        """Begin N episodes, each with its own seed."""
+        self.seeds, self.time = list(seeds), 0
         self._window = Window(self.hierarchy.encoder)
         self._choices: tuple[Tensor, ...] | None = None
-        self.terminations: tuple[float, ...] = ()
+        self.all_terminations = np.zeros((len(seeds), 0))
 
     @property
     def choices(self) -> tuple[int, ...]:
         """The active choice of each level, lowest first: 1 to k_d, or 0 for control by the caller."""
-        return () if self._choices is None else tuple(int(choice) for choice in self._choices)
+        return tuple(self.all_choices[0].tolist())
+
+    @property
+    def terminations(self) -> tuple[float, ...]:
+        """ψ of each active choice, lowest level first."""
+        return tuple(self.all_terminations[0].tolist())
+
+    @property
+    def all_choices(self) -> np.ndarray:
+        """The active choices of every episode, [N, D], lowest level first."""
+        return _columns(self._choices or (), len(self.seeds)).astype(int)
 
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
         """The control [A], in the control's own units.
 
         :raises ObservationError: an observation is missing, is not finite, or has an unseen shape.
         """
-        generator = np.random.default_rng([self.seed, self.time])
+        control: np.ndarray = self.act_all([observation])[0]
+        return control
+
+    def act_all(self, observations: Sequence[Mapping[str, np.ndarray]]) -> np.ndarray:
+        """The controls [N, A] in all episodes.
+
+        :raises ObservationError: an observation is missing, is not finite, or has an unseen shape.
+        """
+        generators = [np.random.default_rng([seed, self.time]) for seed in self.seeds]
         with torch.no_grad():
-            outputs = self.hierarchy(self._window.inputs(observation))
-            self._choices = self._choose(outputs, generator)
-            scaled = self._control(*self._actor(outputs), generator)
-        self.terminations = tuple(
-            float(table[0, 0, choice - 1, 1].double().exp()) if choice else 1.0
-            for table, choice in zip(outputs.termination, self.choices, strict=True)
-        )
+            outputs = self.hierarchy(self._window.inputs(observations))
+            now = complete(outputs.tables(), torch.ones(len(self.seeds), dtype=torch.int64)).steps()[0]
+            with MostLikely() if self.options == "most_likely" else Drawn(generators):
+                self._choices = choose(self.time, now, self._choices)
+            steps = (None if emission is None else emission.steps()[0] for emission in outputs.emissions)
+            acting = Acting(tuple(steps), self._choices)
+            control = acting.mode if self.control == "mean" else acting.draw(_noise(generators, acting.event_shape[0]))
+        rows = torch.arange(len(self.seeds))
+        ended = [table[rows, choice, 1].exp() for table, choice in zip(now.termination, self._choices, strict=True)]
+        self.all_terminations = _columns(ended, len(self.seeds))
         self.time += 1
-        return self.hierarchy.scaling.unscaled(scaled)
+        return self.hierarchy.scaling.unscaled(control)
 
-    def _choose(self, outputs: Outputs, generator: np.random.Generator) -> tuple[Tensor, ...]:
-        actions = torch.zeros(1, 1, len(self.hierarchy.scaling.scale))
-        tables = outputs.tables(actions, self.hierarchy.scaling.log_volume)
-        now = complete(tables, torch.tensor([1])).steps()[0]
-        with MostLikely() if self.options == "most_likely" else _Drawn(generator):
-            return choose(self.time, now, self._choices)
 
-    def _actor(self, outputs: Outputs) -> tuple[Decision, int]:
-        """The lowest level whose choice is an option, and that option; else the meta-policy."""
-        for level, choice in enumerate(self.choices):
-            if choice > 0:
-                return outputs.decisions[level], choice - 1
-        return outputs.decisions[-1], 0
+def _columns(levels: Sequence[Tensor], number: int) -> np.ndarray:
+    """Values [N] of each level as [N, D]."""
+    return np.stack([level.numpy() for level in levels], axis=1) if levels else np.zeros((number, 0))
 
-    def _control(self, decision: Decision, actor: int, generator: np.random.Generator) -> Tensor:
-        assert decision.mean is not None  # a caller that emits no control never selects choice 0
-        mean = decision.mean[0, 0, actor].double()
-        if self.control == "mean":
-            return mean
-        return mean + decision.std.double() * torch.from_numpy(generator.standard_normal(len(mean)))
+
+def _noise(generators: Sequence[np.random.Generator], size: int) -> Tensor:
+    """Standard normal numbers for each episode, float64 [N, A]."""
+    return torch.from_numpy(np.stack([generator.standard_normal(size) for generator in generators]))
 
 
 class MostLikely(Messenger):
@@ -104,15 +121,16 @@ class MostLikely(Messenger):
         message["done"] = True
 
 
-class _Drawn(Messenger):
-    """Every choice is drawn with numpy's random numbers, which an exported controller has too."""
+class Drawn(Messenger):
+    """Every choice is drawn with numpy's random numbers, each episode's own, which an exported controller has too."""
 
-    def __init__(self, generator: np.random.Generator) -> None:
+    def __init__(self, generators: Sequence[np.random.Generator]) -> None:
         super().__init__()
-        self.generator = generator
+        self.generators = generators
 
     def _pyro_sample(self, message: dict[str, Any]) -> None:
         distribution: Tabulated = message["fn"]
         total = distribution.logits.exp().cumsum(-1)
-        message["value"] = (total <= self.generator.random() * total[..., -1:]).sum(-1)
+        uniform = torch.tensor([[generator.random()] for generator in self.generators], dtype=total.dtype)
+        message["value"] = (total <= uniform * total[..., -1:]).sum(-1)
         message["done"] = True

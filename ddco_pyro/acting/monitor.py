@@ -10,9 +10,9 @@ from torch import Tensor
 
 from ddco_pyro.acting.window import ObservationError, Window
 from ddco_pyro.inference.filtering import Belief, Filter
-from ddco_pyro.model.ahmm import Chain, complete
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
+from ddco_pyro.model.tables import complete
 
 
 class Monitor:
@@ -39,14 +39,15 @@ class Monitor:
         :raises ObservationError: an observation or the control is missing or has an unseen shape.
         """
         with torch.no_grad():
-            inputs = self._window.inputs(observation)
+            inputs = self._window.inputs([observation])
             if self._outputs is not None:
-                self._filter.update(self._chain(self._outputs, self._scaled(control)).steps()[0].emission)
+                emission = complete(self._outputs.tables(self._scaled(control)), ONE_STEP).steps()[0].emission
+                assert emission is not None  # the control is known
+                self._filter.update(emission)
             elif control is not None:
                 raise ObservationError("no control comes before the first observation: leave it out")
             self._outputs = self.hierarchy(inputs)
-            size = len(self.hierarchy.scaling.scale)
-            return self._filter.predict(self._chain(self._outputs, torch.zeros(1, 1, size)).steps()[0])
+            return self._filter.predict(complete(self._outputs.tables(), ONE_STEP).steps()[0])
 
     def _scaled(self, control: np.ndarray | None) -> Tensor:
         size = self.hierarchy.scaling.size
@@ -58,5 +59,5 @@ class Monitor:
         scaled = self.hierarchy.scaling.scaled(np.asarray(control, float)[None])
         return torch.as_tensor(scaled).float().reshape(1, 1, -1)
 
-    def _chain(self, outputs: Outputs, actions: Tensor) -> Chain:
-        return complete(outputs.tables(actions, self.hierarchy.scaling.log_volume), torch.tensor([1]))
+
+ONE_STEP = torch.tensor([1])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -17,24 +17,27 @@ class ObservationError(BadInput):
 
 
 class Window:
-    """The last observation is remembered for the encoder's differences; ``time`` counts the observations seen."""
+    """The last observations are remembered for the encoder's differences; ``time`` counts the observations seen."""
 
     def __init__(self, encoder: ObservationEncoder) -> None:
         self.encoder, self.time = encoder, 0
-        self._last: dict[str, np.ndarray] | None = None
+        self._last: Sequence[dict[str, np.ndarray]] | None = None
 
-    def inputs(self, observation: Mapping[str, np.ndarray]) -> Inputs:
-        """The networks' inputs for this observation, N = T = 1.
+    def inputs(self, observations: Sequence[Mapping[str, np.ndarray]]) -> Inputs:
+        """The networks' inputs for an observation of each of N episodes, T = 1.
 
         :raises ObservationError: an observation is missing, has an unseen shape, or is not finite.
         """
-        now = {key: self._checked(observation, key, shape) for key, shape in self.encoder.shapes.items()}
-        before = self._last or now
-        both = self.encoder.inputs([{key: np.stack([before[key], now[key]]) for key in now}])
+        now = [
+            {key: self._checked(observation, key, shape) for key, shape in self.encoder.shapes.items()}
+            for observation in observations
+        ]
+        pairs = zip(self._last or now, now, strict=True)
+        both = self.encoder.inputs({key: np.stack([old[key], new[key]]) for key in new} for old, new in pairs)
         images = {key: image[:, 1:] for key, image in both.images.items()}
-        found = Inputs(both.vector[:, 1:], images, torch.tensor([self.time]))
+        inputs = Inputs(both.vector[:, 1:], images, torch.tensor([self.time]))
         self._last, self.time = now, self.time + 1
-        return found
+        return inputs
 
     def _checked(self, observation: Mapping[str, np.ndarray], key: str, shape: tuple[int, ...]) -> np.ndarray:
         if key not in observation:

@@ -191,11 +191,11 @@ def _said(hierarchy: Hierarchy, episode: dict[str, np.ndarray]) -> runner.Output
     found: runner.Outputs = {}
     with torch.no_grad():
         said = hierarchy(hierarchy.encoder.inputs([episode]))
-    for level, decision in enumerate(said.decisions):
-        if decision.selection is not None:
-            found[f"selection_{level}"] = decision.selection[0].numpy()
-        if decision.mean is not None:
-            found[f"control_{level}"] = hierarchy.scaling.unscaled(decision.mean[0])
+    for level, caller in enumerate(said.callers):
+        if caller.selection is not None:
+            found[f"selection_{level}"] = caller.selection[0].numpy()
+        if caller.emission is not None:
+            found[f"control_{level}"] = hierarchy.scaling.unscaled(caller.emission.mode[0])
     return found | {f"termination_{level}": log[0, :, :, 1].exp().numpy() for level, log in enumerate(said.termination)}
 
 

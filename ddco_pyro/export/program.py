@@ -35,11 +35,11 @@ class StepProgram(nn.Module):
         pictures = {key: image.reshape(1, 1, *image.shape) for key, image in zip(self.keys, images, strict=True)}
         said = self.hierarchy(Inputs(vector, pictures, step))
         scaling, found = self.hierarchy.scaling, {}
-        for level, one in enumerate(said.decisions):
-            if one.selection is not None:
-                found[f"selection_{level}"] = one.selection[0, 0]
-            if one.mean is not None:
-                found[f"control_{level}"] = scaling.emitted(one.mean[0, 0])
+        for level, caller in enumerate(said.callers):
+            if caller.selection is not None:
+                found[f"selection_{level}"] = caller.selection[0, 0]
+            if caller.emission is not None:
+                found[f"control_{level}"] = scaling.emitted(caller.emission.mode[0, 0])
         for level, log in enumerate(said.termination):
             found[f"termination_{level}"] = log[0, 0, :, 1].double().exp()
         return found

@@ -4,7 +4,7 @@ ground truth.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import Any
@@ -15,7 +15,7 @@ from sklearn.metrics import normalized_mutual_info_score
 from torch import Tensor
 
 from ddco_pyro.inference import Posterior
-from ddco_pyro.model.outputs import Decision, Outputs
+from ddco_pyro.model.outputs import CallerOutputs, Outputs
 
 
 @dataclass(frozen=True)
@@ -57,34 +57,39 @@ def as_rows(use: Sequence[Sequence[OptionUse]]) -> list[list[dict[str, float | i
     return [[asdict(one) for one in level] for level in use]
 
 
-def divergences(outputs: Outputs, posterior: Posterior) -> list[list[dict[str, Any]]]:
+def divergences(parts: Iterable[tuple[Outputs, Posterior]]) -> list[list[dict[str, Any]]]:
     """How differently each two ``options`` of each level (lowest first) act, as ``divergence`` in nats per step.
 
     That is the mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i), averaged over steps with weights u_t(i) + u_t(j): over the
     time that one of the two is active; None where neither ever is. Two options of divergence 0 are the same skill
     under two numbers.
+
+    :param parts: what the networks say of some demonstrations, and the posterior of the same.
     """
-    return [_pairs(own, u) for own, u in zip(outputs.decisions[:-1], posterior.u, strict=True)]
+    sums: dict[tuple[int, int, int], Tensor] = {}
+    for outputs, posterior in parts:
+        for level, (own, u) in enumerate(zip(outputs.callers[:-1], posterior.u, strict=True)):
+            for i, j in combinations(range(u.shape[-1] - 1), 2):
+                weight = u[..., i + 1] + u[..., j + 1]
+                own_sums = torch.stack([(weight * _divergence(own, i, j)).sum(), weight.sum()])
+                sums[level, i, j] = sums.get((level, i, j), 0.0) + own_sums
+    levels: list[list[dict[str, Any]]] = [[] for _ in outputs.callers[:-1]]
+    for (level, i, j), (total, weight) in sums.items():
+        divergence = float(total / weight) if float(weight) > 0 else None
+        levels[level].append({"options": [i + 1, j + 1], "divergence": divergence})
+    return levels
 
 
-def _pairs(own: Decision, u: Tensor) -> list[dict[str, Any]]:
-    options = range(u.shape[-1] - 1)
-    return [{"options": [i + 1, j + 1], "divergence": _divergence(own, i, j, u)} for i, j in combinations(options, 2)]
-
-
-def _divergence(own: Decision, i: int, j: int, u: Tensor) -> float | None:
-    steps = torch.zeros(u.shape[:2], dtype=torch.float64)
-    control = torch.ones_like(steps)  # mean probability of emitting the control
+def _divergence(own: CallerOutputs, i: int, j: int) -> Tensor:
+    """That of two callers at each step, [N, T]."""
+    steps = torch.zeros((), dtype=torch.float64)
+    control = torch.ones((), dtype=torch.float64)  # mean probability of emitting the control
     if own.selection is not None:
         p, q = (own.selection[:, :, option].double() for option in (i, j))
         both = torch.isfinite(p) & torch.isfinite(q)  # callers of a level emit the same kinds of choices
-        steps += torch.where(both, 0.5 * (p.exp() - q.exp()) * (p - q), 0.0).sum(-1)
+        steps = torch.where(both, 0.5 * (p.exp() - q.exp()) * (p - q), 0.0).sum(-1)
         control = 0.5 * (p[..., 0].exp() + q[..., 0].exp())
-    if own.mean is not None:
-        apart = (own.mean[:, :, i] - own.mean[:, :, j]) / own.std
-        steps += control * 0.5 * apart.double().square().sum(-1)
-    weight = u[..., i + 1] + u[..., j + 1]
-    return float((weight * steps).sum() / weight.sum()) if float(weight.sum()) > 0 else None
+    return steps if own.emission is None else steps + control * own.emission.divergence(i, j)
 
 
 def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> float:

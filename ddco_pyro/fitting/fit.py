@@ -23,10 +23,10 @@ from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy
 from ddco_pyro.fitting.records import read_metrics, refit
 from ddco_pyro.inference import Posterior, log_likelihood, posterior, segment
 from ddco_pyro.inference.decomposition import Decomposition, decompose
-from ddco_pyro.model.ahmm import Tables
 from ddco_pyro.model.encoding import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
+from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import Spec, load_spec, user_code
 
 TOLERANCE = 1e-4
@@ -81,10 +81,9 @@ class Fit:
 
     def decompose(self, demos: Demonstrations) -> Decomposition:
         """What each control dimension and choosing options add to log p(ξ) of each demonstration."""
-        scaling = self.hierarchy.scaling
         with torch.no_grad():
             return Decomposition.joined(
-                decompose(self.hierarchy(batch.inputs), batch, scaling) for batch in _batches(self.hierarchy, demos)
+                decompose(self.hierarchy(batch.inputs), batch) for batch in _batches(self.hierarchy, demos)
             )
 
     def posterior(self, demos: Demonstrations) -> Posterior:
@@ -98,8 +97,18 @@ class Fit:
     def divergences(self, demos: Demonstrations, posterior: Posterior) -> list[list[dict[str, Any]]]:
         """How differently each two options of a level act (:func:`ddco_pyro.fitting.analysis.divergences`)."""
         with torch.no_grad():
-            said = [self.hierarchy(batch.inputs) for batch in _batches(self.hierarchy, demos)]
-            return analysis.divergences(_joined(said), posterior)
+            return analysis.divergences(self._with_posterior(demos, posterior))
+
+    def _with_posterior(self, demos: Demonstrations, posterior: Posterior) -> Iterator[tuple[Outputs, Posterior]]:
+        """What the networks say of the demonstrations, some at a time, and the same steps of the posterior."""
+        for rows, batch in encode(demos, self.hierarchy.encoder, self.hierarchy.scaling).pieces(
+            self.hierarchy.steps_at_once
+        ):
+            steps = batch.inputs.batch[1]
+            yield (
+                self.hierarchy(batch.inputs),
+                Posterior(*(tuple(u[rows, :steps] for u in table) for table in posterior)),
+            )
 
     def segment(self, demos: Demonstrations) -> tuple[np.ndarray, ...]:
         """Choices of the most likely path, a [N, T] for each level, lowest first; -1 past a demonstration's end."""
@@ -113,15 +122,6 @@ class Fit:
     def monitor(self) -> Monitor:
         """A live monitor of the active options, for somebody else's acting."""
         return Monitor(self.hierarchy)
-
-
-def _joined(parts: Sequence[Outputs]) -> Outputs:
-    """What the networks say of some demonstrations and of others, padded to the longest; σ is the same of all."""
-    leaves: list[Tensor | None] = []
-    for column in zip(*(part.leaves() for part in parts), strict=True):
-        tensors = [leaf for leaf in column if leaf is not None]
-        leaves.append(_stacked(tensors, 0.0) if tensors and tensors[0].dim() > 1 else column[0])
-    return Outputs.of(parts[0].options, leaves)
 
 
 def _stacked(parts: Sequence[Tensor], padding: float) -> Tensor:

@@ -186,12 +186,12 @@ def _train(
         few = batches[0].select(torch.arange(min(len(batches[0]), TRAJECTORIES)), STEPS)
         with torch.no_grad():
             outputs = first(few.inputs)
-        if not all(bool(torch.isfinite(leaf).all()) for leaf in outputs.leaves() if leaf is not None):
+        if not all(bool(torch.isfinite(values).all()) for values in outputs.tensors()):
             raise TrainingError(
                 "before any training a network gives values that are NaN or infinite; look at its code, or at the "
                 "ranges of the observations (ddco-pyro inspect)"
             )
-        check = compare_engines(outputs, few.actions, first.scaling.log_volume, few.lengths)
+        check = compare_engines(outputs, few.actions, few.lengths)
     if not check.agrees:
         raise TrainingError(
             f"the engines disagree (value {check.value:.1e}, gradient {check.gradient:.1e}): "

@@ -25,7 +25,7 @@ from ddco_pyro.data.files import read_tensors, write_tensors
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.clusters import Clusters
 from ddco_pyro.fitting.convergence import StageEnd, share, summary
-from ddco_pyro.inference import direct, log_likelihood, total_log_likelihood
+from ddco_pyro.inference import log_likelihood, total_log_likelihood
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import OptimizerSpec, Spec
@@ -280,14 +280,10 @@ class _Objective:
         return sum(values) / self.trainer.tune.steps
 
     def _total(self, model: Hierarchy, batch: Batch, choices: Tensor | None) -> Tensor:
-        outputs, volume = model(batch.inputs, self.stage.discovering), model.scaling.log_volume
-        engine = self.trainer.spec.inference.engine
-        if choices is None and engine == "fused":
-            return direct.log_likelihood(outputs, batch.actions, volume, batch.lengths).sum()
-        tables = outputs.tables(batch.actions, volume)
+        tables = model.tabulate(batch, self.stage.discovering)
         if choices is not None and self.stage.clamped is not None:
             tables = tables.clamp(self.stage.clamped, choices[:, : batch.inputs.batch[1]])
-        return total_log_likelihood(tables, batch.lengths, engine)
+        return total_log_likelihood(tables, batch.lengths, self.trainer.spec.inference.engine)
 
     def _not_finite(self, model: Hierarchy, batch: Batch, rows: Tensor) -> TrainingError:
         with torch.no_grad():

@@ -10,7 +10,7 @@ from torch import Tensor
 from ddco_pyro.inference import enumeration, fused
 from ddco_pyro.inference.paths import Path, most_likely_path, sample_paths, segment
 from ddco_pyro.inference.posteriors import Posterior, posterior
-from ddco_pyro.model.ahmm import Tables, complete
+from ddco_pyro.model.tables import Tables
 
 __all__ = [
     "Engine",
@@ -35,7 +35,7 @@ def log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") ->
     if engine == "fused":
         return fused.log_likelihood(tables, lengths)
     one_by_one = [
-        enumeration.total_log_likelihood(complete(tables.trajectory(n, int(length)), lengths[n : n + 1]))
+        enumeration.total_log_likelihood(tables.trajectory(n, int(length)), lengths[n : n + 1])
         for n, length in enumerate(lengths)
     ]
     return torch.stack(one_by_one)
@@ -44,5 +44,5 @@ def log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") ->
 def total_log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") -> Tensor:
     """Σ_n log p(ξ_n), a scalar; with ``engine="enumerate"`` in one elimination for the whole batch."""
     if engine == "enumerate":
-        return enumeration.total_log_likelihood(complete(tables, lengths))
+        return enumeration.total_log_likelihood(tables, lengths)
     return fused.log_likelihood(tables, lengths).sum()

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.inference.logspace import Arrival, arrive, log_sum
-from ddco_pyro.model.ahmm import Step
+from ddco_pyro.model.tables import Step
 
 
 class Belief(NamedTuple):
@@ -32,7 +32,7 @@ class Filter:
         """log p(a_0..t-1 | s) so far, [N] nats."""
 
     def predict(self, now: Step) -> Belief:
-        """The belief at step t; of ``now`` only selections and terminations are used."""
+        """The belief at step t; the control is not known yet."""
         arrival = arrive(self._before, now)
         self._now = arrival.message
         return Belief(tuple(_marginals(arrival, level) for level in range(len(now.selection))))

@@ -20,7 +20,7 @@ from ddco_pyro.inference.kernel import forward_backward
 from ddco_pyro.inference.once import once
 from ddco_pyro.inference.structure import Structure, structure_of
 from ddco_pyro.inference.threads import as_many_threads_as_torch
-from ddco_pyro.model.ahmm import Tables, complete
+from ddco_pyro.model.tables import Tables, complete
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,9 @@ class Elimination:
 def log_likelihood(tables: Tables, lengths: Tensor) -> Tensor:
     """log p(ξ) of each trajectory, [N], differentiable once in the tables."""
     if not tables.depth:
-        return complete(tables, lengths).emission.sum(1)
+        emission = complete(tables, lengths).emission
+        assert emission is not None  # nothing else can be scored
+        return emission.sum(1)
     if tables.control[-1].device.type != "cpu":
         return logspace.log_likelihood(complete(tables, lengths))
     value: Tensor = _Eliminate.apply(lengths, tables.depth, *tables.leaves())
@@ -151,6 +153,7 @@ def _again(tables: Tables, n: int, length: int, found: Elimination) -> None:
         chain = complete(Tables.of(tables.depth, leaves), ends)
         value = logspace.log_likelihood(chain)
         present = [leaf for leaf in leaves if leaf is not None]
+        assert chain.emission is not None  # it has just been scored
         gradients = torch.autograd.grad(value.sum(), [*present, chain.emission], allow_unused=True)
     *own, joint = gradients
     found.value[n] = value.detach()[0]

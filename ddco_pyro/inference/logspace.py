@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ddco_pyro.model.ahmm import NEVER, Chain, Step
+from ddco_pyro.model.tables import NEVER, Chain, Step
 
 
 def log_sum(values: Tensor) -> Tensor:
@@ -26,6 +26,7 @@ def log_likelihood(chain: Chain) -> Tensor:
     """log p(ξ) of each trajectory, [N], differentiable in the chain's tables."""
     message: Tensor | None = None
     for now in chain.steps():
+        assert now.emission is not None  # nothing else can be scored
         message = arrive(message, now).message + now.emission
     assert message is not None  # there is a step
     return log_sum(message.flatten(1)) if chain.selection else message
@@ -48,7 +49,7 @@ def arrive(message: Tensor | None, now: Step) -> Arrival:
     """From the log-mass over the joint choices at t - 1 to what is expected at t; None: t = 0."""
     kept: list[Tensor] = []
     if message is None:
-        message = now.emission.new_zeros(len(now.emission))  # everything is selected
+        message = torch.zeros(len(now.alive), dtype=torch.float64, device=now.alive.device)  # everything is selected
     else:
         for table in now.termination:
             keep, terminate = _along_last(table[..., 0], message), _along_last(table[..., 1], message)

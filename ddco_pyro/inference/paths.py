@@ -12,7 +12,7 @@ from torch import Tensor
 from ddco_pyro.inference.structure import Structure, structure_of
 from ddco_pyro.inference.threads import as_many_threads_as_torch
 from ddco_pyro.inference.trace import trace
-from ddco_pyro.model.ahmm import Tables
+from ddco_pyro.model.tables import Tables
 
 
 class Path(NamedTuple):
@@ -45,7 +45,7 @@ def segment(tables: Tables, lengths: Tensor) -> tuple[Tensor, ...]:
 
 
 def _steps(tables: Tables) -> int:
-    return tables.control[-1].shape[1]
+    return tables.steps
 
 
 def _two(tables: Tables) -> int:

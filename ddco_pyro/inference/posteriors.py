@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.inference import fused
-from ddco_pyro.model.ahmm import Tables
+from ddco_pyro.model.tables import Tables
 
 
 class Posterior(NamedTuple):

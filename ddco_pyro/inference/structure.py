@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ddco_pyro.model.ahmm import Tables
+from ddco_pyro.model.tables import Tables
 
 NOBODY = -1
 """The actor of a joint choice that cannot be: something other than choice 0 below a choice 0."""

@@ -147,9 +147,9 @@ class ControlScaling(nn.Module):
             self.scale.copy_(torch.as_tensor(np.where(spread > 1e-9, spread, 1.0)))
 
     @property
-    def log_volume(self) -> Tensor:
-        """Σ log scale: subtracted from a log-density in scaled units it gives the one in the control's own units."""
-        return self.scale.log().sum()
+    def log_scale(self) -> Tensor:
+        """log scale [A']: a log-density in the control's own units is that in scaled units less its sum."""
+        return self.scale.log()
 
     def scaled(self, actions: np.ndarray) -> np.ndarray:
         """[T, A] in the control's own units to [T, A'] in scaled ones."""

@@ -16,11 +16,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from ddco_pyro.model.ahmm import Tables
+from ddco_pyro.model.emissions import Gaussian
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch, ControlScaling, ObservationEncoder, Shapes
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
 from ddco_pyro.model.networks.activations import training_bytes
-from ddco_pyro.model.outputs import Decision, Outputs
+from ddco_pyro.model.outputs import CallerOutputs, Outputs
+from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import ControlSpec, LearnedStd, LevelSpec, NetworkSpec, Spec, SpecError
 
 INITIAL_STD = 0.5
@@ -57,13 +58,15 @@ class Caller(nn.Module):
         self.network = build(network, shape, sum(self.sizes), copies)
         self.std = ControlStd(control, control_size)
 
-    def forward(self, inputs: Inputs) -> Decision:
-        """What the callers say at every step of the inputs."""
+    def forward(self, inputs: Inputs, log_scale: Tensor) -> CallerOutputs:
+        """What the callers say at every step of the inputs.
+
+        :param log_scale: logarithms of the control's units, [A].
+        """
         said = self.network(inputs)
         logits, mean = said.split(self.sizes, dim=-1) if all(self.sizes) else (said, said)
-        return Decision(
-            self.options, logits if self.emits_options else None, mean if self.emits_control else None, self.std()
-        )
+        emission = Gaussian(mean, self.std(), log_scale) if self.emits_control else None
+        return CallerOutputs(self.options, logits if self.emits_options else None, emission)
 
 
 class ControlStd(nn.Module):
@@ -179,7 +182,8 @@ class Hierarchy(nn.Module):
     @cached_property
     def step_bytes(self) -> int:
         """Bytes that all networks take for a step in training."""
-        return training_bytes((network for _, network in self.named_networks()), self.input_shape)
+        networks = (one.network if isinstance(one, Caller) else one for _, one in self.named_networks())
+        return training_bytes(networks, self.input_shape)
 
     @property
     def steps_at_once(self) -> int:
@@ -191,14 +195,15 @@ class Hierarchy(nn.Module):
 
         :param discovering: d gives levels 1 to d alone under a uniform meta-policy (layer-wise training, SM 2.3).
         """
-        levels = self.option_levels()[:discovering]
-        decisions = [level.policy(inputs) for level in levels]
-        top = _uniform(inputs, levels[-1].count, decisions[0].std) if discovering else self.meta_policy(inputs)
-        return Outputs((*decisions, top), tuple(level.termination(inputs).squeeze(-1) for level in levels))
+        levels, log_scale = self.option_levels()[:discovering], self.scaling.log_scale
+        callers = [level.policy(inputs, log_scale) for level in levels]
+        top = _uniform(inputs, levels[-1].count) if discovering else self.meta_policy(inputs, log_scale)
+        return Outputs((*callers, top), tuple(level.termination(inputs).squeeze(-1) for level in levels))
 
     def tabulate(self, batch: Batch, discovering: int | None = None) -> Tables:
         """The tables of a batch: every network once, over all options, steps and trajectories."""
-        return self(batch.inputs, discovering).tables(batch.actions, self.scaling.log_volume)
+        outputs: Outputs = self(batch.inputs, discovering)
+        return outputs.tables(batch.actions)
 
 
 def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
@@ -211,6 +216,6 @@ def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
     return policy, ("control",)
 
 
-def _uniform(inputs: Inputs, options: int, like: Tensor) -> Decision:
+def _uniform(inputs: Inputs, options: int) -> CallerOutputs:
     """A meta-policy that selects each of the k options with probability 1/k."""
-    return Decision(options, like.new_zeros(*inputs.batch, 1, options), None, like)
+    return CallerOutputs(options, torch.zeros(*inputs.batch, 1, options), None)

@@ -70,7 +70,7 @@ def _chunk(hierarchy: Hierarchy, demos: Demonstrations, steps: int) -> tuple[lis
     with torch.no_grad():
         batch = encode(demos, hierarchy.encoder, hierarchy.scaling)
         outputs = hierarchy(batch.inputs)
-        tables = outputs.tables(batch.actions, hierarchy.scaling.log_volume)
+        tables = outputs.tables(batch.actions)
         active = [_padded(one.float().numpy(), steps, 0.0) for one in posterior(tables, batch.lengths).u]
         path = most_likely_path(tables, batch.lengths)
         choices, ended = ([_padded(one.numpy(), steps, -1) for one in part] for part in path)

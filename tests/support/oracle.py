@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from ddco_pyro.model.ahmm import NEVER, Tables
+from ddco_pyro.model.tables import NEVER, Tables
 
 
 def random_tables(

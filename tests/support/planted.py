@@ -9,9 +9,10 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy
 from ddco_pyro.fitting.training import Trainer
 from ddco_pyro.inference import log_likelihood, segment
-from ddco_pyro.model.ahmm import choose, complete
+from ddco_pyro.model.ahmm import choose
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.tables import complete
 from ddco_pyro.spec import parse_spec
 
 CONTROL = {"std": 0.05, "scale": "none"}
@@ -59,10 +60,11 @@ def plant(truth, number, steps, seed):
     for t in range(steps):
         with torch.no_grad():
             outputs = truth(Inputs(state[:, None], {}, torch.tensor([t])))
-            tables = outputs.tables(torch.zeros(number, 1, 2), truth.scaling.log_volume)
-            previous = choose(t, complete(tables, torch.ones(number, dtype=torch.long)).steps()[0], previous)
-            mean = outputs.decisions[0].mean[torch.arange(number), 0, previous[0] - 1]
-        action = torch.normal(mean, outputs.decisions[0].std.expand_as(mean), generator=generator)
+            chain = complete(outputs.tables(), torch.ones(number, dtype=torch.long))
+            previous = choose(t, chain.steps()[0], previous)
+            lowest = outputs.emissions[0]
+            mean = lowest.mean[torch.arange(number), 0, previous[0] - 1]
+        action = torch.normal(mean, lowest.std.expand_as(mean), generator=generator)
         states.append(state)
         actions.append(action)
         choices.append(torch.stack(previous, -1))

@@ -1,0 +1,204 @@
+"""Every log-probability that an AHMM needs, as arrays: what the engines in :mod:`ddco_pyro.inference` eliminate.
+
+Level 1 is the lowest, level D the highest option level; the meta-policy calls level D. At each step every level d
+has a choice h^d in {0, 1, ..., k_d}: options are 1 to k_d, and choice 0 is *control*: the caller emits the physical
+control itself, for this step. Below a choice 0 there is nothing left to choose, so every lower choice is 0 too.
+
+:class:`Tables` holds what the networks give; :class:`Chain` adds what the model fixes: choice 0 and padding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+NEVER = -torch.inf
+"""Log-probability of what cannot happen: a true zero, never a small number."""
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Every log-probability the networks give for N trajectories of at most T steps.
+
+    Tuples run over the levels, lowest first. K_d is the number of callers of level d: the k_{d+1} options of the
+    level above, or 1 (the meta-policy) for the highest level.
+
+    :param selection: log η^{d+1}(h^d | s_t, h^{d+1}), shapes [N, T, K_d, 1 + k_d]; the first choice is control.
+    :param termination: (log(1 - ψ^d(s_t)), log ψ^d(s_t)), shapes [N, T, k_d, 2]; unused at t = 0.
+    :param control: log π(a_t | s_t) of each level's options and, last, of the meta-policy, shapes [N, T, k_d] and
+        [N, T, 1]; -inf where that caller does not emit control; empty where no control is known.
+    :param evidence: what else is known of the choices, added to the log-likelihood of each choice, shapes
+        [N, T, 1 + k_d]; None where nothing is. Hard labels are 0 and -inf.
+    """
+
+    selection: tuple[Tensor, ...]
+    termination: tuple[Tensor, ...]
+    control: tuple[Tensor, ...] = ()
+    evidence: tuple[Tensor | None, ...] = field(default=())
+
+    @property
+    def depth(self) -> int:
+        """The number D of option levels; 0 is a flat policy."""
+        return len(self.selection)
+
+    @property
+    def steps(self) -> int:
+        """T, padding included."""
+        return (self.selection or self.control)[-1].shape[1]
+
+    @classmethod
+    def of(cls, depth: int, leaves: Sequence[Tensor | None]) -> Tables:
+        """The tables of a hierarchy of so many levels from their :meth:`leaves`."""
+        selection, termination = leaves[:depth], leaves[depth : 2 * depth]
+        control, evidence = leaves[2 * depth : 3 * depth + 1], leaves[3 * depth + 1 :]
+        return cls(_present(selection), _present(termination), _present(control), tuple(evidence))
+
+    def leaves(self) -> tuple[Tensor | None, ...]:
+        """Every table: selections, terminations, controls and, where there is any, the evidence."""
+        return (*self.selection, *self.termination, *self.control, *self.evidence)
+
+    def joint_evidence(self) -> Tensor | None:
+        """The evidence of every joint choice, float64 [N, T, C_D, ..., C_1]; None where there is none."""
+        total: Tensor | None = None
+        sizes = [table.shape[-1] for table in self.selection]
+        for level, evidence in enumerate(self.evidence, start=1):
+            if evidence is not None:
+                shape = evidence.shape[:2] + (1,) * (self.depth - level) + evidence.shape[2:] + (1,) * (level - 1)
+                own = evidence.double().reshape(shape)
+                total = own if total is None else total + own
+        return None if total is None else total.expand(*total.shape[:2], *reversed(sizes))
+
+    def clamp(self, level: int, choices: Tensor) -> Tables:
+        """These tables where the choices of one level (1 is the lowest) are known to be ``choices``, [N, T]."""
+        evidence = list(self.evidence or (None,) * self.depth)
+        size = self.selection[level - 1].shape[-1]
+        evidence[level - 1] = torch.where(one_hot(choices, size).bool(), 0.0, NEVER)
+        return replace(self, evidence=tuple(evidence))
+
+    def trajectory(self, n: int, length: int) -> Tables:
+        """The first ``length`` steps of trajectory ``n`` alone, as tables with N = 1."""
+
+        def cut(tables: Sequence[Tensor | None]) -> Any:
+            return tuple(None if table is None else table[n : n + 1, :length] for table in tables)
+
+        return Tables(cut(self.selection), cut(self.termination), cut(self.control), cut(self.evidence))
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The Markov chain over joint choices that :class:`Tables` describe, complete: what an engine eliminates.
+
+    C_d = 1 + k_d counts the choices of level d, control among them.
+
+    :param selection: log-probability of choosing h^d given the caller h^{d+1}, shapes [N, T, C_{d+1}, C_d];
+        the highest level's has one caller.
+    :param termination: log-probabilities of b^d = 0 and 1 given h^d, shapes [N, T, C_d, 2].
+    :param evidence: what else is known of the joint choice, [N, T, C_D, ..., C_1]; None where nothing is.
+    :param emission: log-probability of the control given the joint choice, evidence included, [N, T, C_D, ..., C_1];
+        None where no control is known.
+    :param alive: whether a step is one of its trajectory's, [N, T].
+    """
+
+    selection: tuple[Tensor, ...]
+    termination: tuple[Tensor, ...]
+    evidence: Tensor | None
+    emission: Tensor | None
+    alive: Tensor
+
+    @property
+    def depth(self) -> int:
+        """The number D of option levels."""
+        return len(self.selection)
+
+    def steps(self) -> list[Step]:
+        """The chain's T steps, unbound once: slicing inside a loop over time would make its gradient O(T²)."""
+        selection = [table.unbind(1) for table in self.selection]
+        termination = [table.unbind(1) for table in self.termination]
+        nothing = (None,) * self.alive.shape[1]
+        evidence = nothing if self.evidence is None else self.evidence.unbind(1)
+        emission = nothing if self.emission is None else self.emission.unbind(1)
+        return [
+            Step(tuple(s[t] for s in selection), tuple(b[t] for b in termination), evidence[t], emission[t], alive)
+            for t, alive in enumerate(self.alive.unbind(1))
+        ]
+
+
+class Step(NamedTuple):
+    """One step of a :class:`Chain`: its tables without the time dimension."""
+
+    selection: tuple[Tensor, ...]
+    termination: tuple[Tensor, ...]
+    evidence: Tensor | None
+    emission: Tensor | None
+    alive: Tensor
+
+
+def complete(tables: Tables, lengths: Tensor) -> Chain:
+    """The chain of these tables, in float64: choice 0 filled in, steps past ``lengths`` [N] made inert.
+
+    An inert step keeps every choice and emits nothing, so it changes no probability.
+    """
+    steps = tables.steps if tables.selection or tables.control else int(lengths.max())
+    alive = torch.arange(steps, device=lengths.device) < lengths[:, None]
+    selection = tuple(
+        _control_selects_control(table.double()) if level < tables.depth else table.double()
+        for level, table in enumerate(tables.selection, start=1)
+    )
+    termination = tuple(_keep_past_the_end(_control_lasts_one_step(t.double()), alive) for t in tables.termination)
+    evidence = _only(alive, tables.joint_evidence())
+    emission = _only(alive, _emission(tables.control)) if tables.control else None
+    if emission is not None and evidence is not None:
+        emission = emission + evidence
+    return Chain(selection, termination, evidence, emission, alive)
+
+
+def _only(alive: Tensor, table: Tensor | None) -> Tensor | None:
+    """The table, 0 past the lengths."""
+    return None if table is None else torch.where(_like(alive, table), table, 0.0)
+
+
+def _control_selects_control(selection: Tensor) -> Tensor:
+    """[N, T, K, C] to [N, T, 1 + K, C]: below a choice 0 only choice 0 is left."""
+    row = torch.full_like(selection[:, :, :1], NEVER)
+    row[..., 0] = 0.0
+    return torch.cat([row, selection], dim=2)
+
+
+def _control_lasts_one_step(termination: Tensor) -> Tensor:
+    """[N, T, k, 2] to [N, T, 1 + k, 2]: choice 0 terminates with probability 1."""
+    row = torch.full_like(termination[:, :, :1], NEVER)
+    row[..., 1] = 0.0
+    return torch.cat([row, termination], dim=2)
+
+
+def _keep_past_the_end(termination: Tensor, alive: Tensor) -> Tensor:
+    keep = torch.tensor([0.0, NEVER], dtype=termination.dtype, device=termination.device)
+    return torch.where(_like(alive, termination), termination, keep)
+
+
+def _emission(control: Sequence[Tensor]) -> Tensor:
+    """log p(a_t | h^D_t, ..., h^1_t): the lowest level whose choice is not 0 acts."""
+    depth = len(control) - 1
+    emission = control[-1].double().squeeze(-1)
+    for level in range(depth, 0, -1):
+        own = control[level - 1].double()
+        own = own.reshape(own.shape[:2] + (1,) * (emission.dim() - 2) + own.shape[-1:])
+        own = own.expand(*emission.shape, -1)
+        if level < depth:  # below a choice 0 nothing but choice 0 is possible
+            own = torch.cat([torch.full_like(own[..., :1, :], NEVER), own[..., 1:, :]], dim=-2)
+        emission = torch.cat([emission.unsqueeze(-1), own], dim=-1)
+    return emission
+
+
+def _present(tables: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
+    """Tables of which none is missing."""
+    return tuple(table for table in tables if table is not None)
+
+
+def _like(mask: Tensor, table: Tensor) -> Tensor:
+    return mask.reshape(mask.shape + (1,) * (table.dim() - mask.dim()))
