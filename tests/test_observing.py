@@ -26,7 +26,7 @@ def test_steps_are_those_of_the_whole_demonstration(differences):
     whole = encoder.inputs([{"state": states}])
     window = Window(encoder)
     for t, state in enumerate(states):
-        one = window.inputs({"state": state})
+        one = window.inputs([{"state": state}])
         assert one.time.tolist() == [t]
         torch.testing.assert_close(one.vector[0, 0], whole.vector[0, t])
 
@@ -42,10 +42,10 @@ def test_steps_are_those_of_the_whole_demonstration(differences):
 def test_what_cannot_be_used_is_refused_and_leaves_the_window_as_it_was(observation, message):
     encoder, states = make_encoder()
     refusing, other = Window(encoder), Window(encoder)
-    refusing.inputs({"state": states[0]})
-    other.inputs({"state": states[0]})
+    refusing.inputs([{"state": states[0]}])
+    other.inputs([{"state": states[0]}])
     with pytest.raises(ObservationError, match=message):
-        refusing.inputs(observation)
-    found, expected = refusing.inputs({"state": states[1]}), other.inputs({"state": states[1]})
+        refusing.inputs([observation])
+    found, expected = refusing.inputs([{"state": states[1]}]), other.inputs([{"state": states[1]}])
     torch.testing.assert_close(found.vector, expected.vector)
     assert found.time.tolist() == [1]
