@@ -20,6 +20,7 @@ class ControlDimension:
     :param minimum: the smallest value, in the control's own units; ``maximum`` likewise.
     :param at_minimum: the number of steps exactly there; ``at_maximum`` likewise.
     :param steps: the number of all steps.
+    :param distinct: its values in order, where they are at most :data:`MOST_DISTINCT`; else empty.
     """
 
     number: int
@@ -28,6 +29,12 @@ class ControlDimension:
     at_minimum: int
     at_maximum: int
     steps: int
+    distinct: tuple[float, ...] = ()
+
+    @property
+    def whole(self) -> bool:
+        """Whether it takes few values, and whole numbers from 0 on."""
+        return bool(self.distinct) and self.minimum >= 0 and all(value.is_integer() for value in self.distinct)
 
     @property
     def constant(self) -> bool:
@@ -74,11 +81,16 @@ def number(value: float) -> str:
     return f"{value + 0.0:.6g}"
 
 
+MOST_DISTINCT = 64
+"""Distinct values of a dimension that are kept."""
+
+
 class ControlStatistics:
     """Gathers, block by block, what is asked of each dimension of a control of any shape; only finite values count."""
 
     def __init__(self) -> None:
         self._columns: list[np.ndarray] = []  # minimum, maximum, steps there, steps: each [A]
+        self._distinct: list[np.ndarray] = []
 
     def add(self, controls: np.ndarray) -> None:
         """Take in some steps [T, A]."""
@@ -89,15 +101,25 @@ class ControlStatistics:
         low, high = np.where(finite, values, np.inf).min(0), np.where(finite, values, -np.inf).max(0)
         new = [low, high, (values == low).sum(0), (values == high).sum(0), finite.sum(0)]
         self._columns = _merged(self._columns, new) if self._columns else new
+        before = self._distinct or [np.empty(0)] * values.shape[1]
+        self._distinct = [
+            _distinct(old, column[use]) for old, column, use in zip(before, values.T, finite.T, strict=True)
+        ]
 
     def dimensions(self) -> tuple[ControlDimension, ...]:
         """What was gathered; a dimension without any finite value is left out."""
         columns = [column.tolist() for column in self._columns]
+        few = [tuple(values.tolist()) if len(values) <= MOST_DISTINCT else () for values in self._distinct]
         return tuple(
-            ControlDimension(index, low, high, at_low, at_high, steps)
-            for index, (low, high, at_low, at_high, steps) in enumerate(zip(*columns, strict=True))
+            ControlDimension(index, low, high, at_low, at_high, steps, distinct)
+            for index, (low, high, at_low, at_high, steps, distinct) in enumerate(zip(*columns, few, strict=True))
             if steps
         )
+
+
+def _distinct(before: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """The distinct values so far, in order; of too many just enough to know that they are."""
+    return before if len(before) > MOST_DISTINCT else np.union1d(before, values)[: MOST_DISTINCT + 1]
 
 
 def _merged(before: Sequence[np.ndarray], new: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import logging
+import math
 import shutil
 import warnings
 from collections.abc import Iterator
@@ -135,8 +136,29 @@ def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
         "shift": shift.tolist(),
         "control": control.control,
         "options": control.options,
-        "std": [(one.std().detach().numpy().astype(float) * scale).tolist() for one in hierarchy.callers()],
+        "constant": [float(value) for value in scaling.emitted(torch.zeros(len(scaling.varying)))],
+        "parts": [_part(hierarchy, number) for number in range(len(scaling.parts))],
         "termination_bound": TERMINATION_BOUND,
+    }
+
+
+def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
+    """What the runner has to know of a part of the control; σ of each level's callers, lowest first, if it has one."""
+    scaling = hierarchy.scaling
+    part, places = scaling.parts[number], list(scaling.groups[number])
+    first = sum(before.size for before in scaling.parts[:number] if before.continuous)
+    std = [caller.std()[..., first : first + part.size].tolist() for caller in hierarchy.callers()]
+    ends = ([None if math.isinf(end) else end for end in values] for values in (part.low, part.high))
+    return {
+        "kind": part.kind,
+        "dims": list(part.dims),
+        "places": places,
+        "size": part.size,
+        "values": list(part.values),
+        "ends": list(ends),
+        "shift": scaling.shift[places].tolist(),
+        "scale": scaling.scale[places].tolist(),
+        "std": std if part.continuous else [],
     }
 
 
@@ -195,7 +217,7 @@ def _said(hierarchy: Hierarchy, episode: dict[str, np.ndarray]) -> runner.Output
         if caller.selection is not None:
             found[f"selection_{level}"] = caller.selection[0].numpy()
         if caller.emission is not None:
-            found[f"control_{level}"] = hierarchy.scaling.unscaled(caller.emission.mode[0])
+            found[f"control_{level}"] = caller.emission.numbers[0].numpy()
     return found | {f"termination_{level}": log[0, :, :, 1].exp().numpy() for level, log in enumerate(said.termination)}
 
 

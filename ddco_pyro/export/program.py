@@ -13,7 +13,7 @@ from ddco_pyro.model.networks import Inputs
 class StepProgram(nn.Module):
     """Features [F] (float64, not yet standardised), step [1] and images [H, W, C] to the outputs in ``names``.
 
-    ``selection_d`` log-probabilities [K, 1 + k], ``control_d`` means [K, A] in the control's own units, both of the
+    ``selection_d`` log-probabilities [K, 1 + k], ``control_d`` the numbers of the control [K, size], both of the
     callers of level d (the last is the meta-policy), and ``termination_d`` ψ [k].
     """
 
@@ -34,12 +34,12 @@ class StepProgram(nn.Module):
         vector = ((features - self.mean) / self.std).float().reshape(1, 1, -1)
         pictures = {key: image.reshape(1, 1, *image.shape) for key, image in zip(self.keys, images, strict=True)}
         said = self.hierarchy(Inputs(vector, pictures, step))
-        scaling, found = self.hierarchy.scaling, {}
+        found = {}
         for level, caller in enumerate(said.callers):
             if caller.selection is not None:
                 found[f"selection_{level}"] = caller.selection[0, 0]
             if caller.emission is not None:
-                found[f"control_{level}"] = scaling.emitted(caller.emission.mode[0, 0])
+                found[f"control_{level}"] = caller.emission.numbers[0, 0]
         for level, log in enumerate(said.termination):
             found[f"termination_{level}"] = log[0, 0, :, 1].double().exp()
         return found

@@ -15,6 +15,7 @@ needs torch, or with ``Runner(".", networks="onnx")``, which needs onnxruntime.
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -28,8 +29,9 @@ TOLERANCE = 1e-6
 and its distance from where it is centred (networks are float32)."""
 
 Outputs = dict[str, np.ndarray]
-"""``selection_d`` log-probabilities [K, 1 + k], ``termination_d`` ψ [k], ``control_d`` means [K, A]; d counts levels
-from 0, and the last d is the meta-policy."""
+"""``selection_d`` log-probabilities [K, 1 + k], ``termination_d`` ψ [k], ``control_d`` the numbers of the control
+[K, size] (scaled means, logits of switches and of discrete actions); d counts levels from 0, and the last d is the
+meta-policy."""
 
 Networks = Callable[[np.ndarray, int, Mapping[str, np.ndarray]], Outputs]
 """Features [F], step, and images by key to :data:`Outputs`."""
@@ -113,13 +115,63 @@ class Runner:
         return int((total <= generator.random() * total[-1]).sum())
 
     def _control(self, outputs: Outputs, generator: np.random.Generator) -> np.ndarray:
-        """The mean of the lowest level whose choice is an option, else of the meta-policy, or a sample around it."""
+        """The most likely control, or a sample, of the lowest level whose choice is an option, else of the meta-policy."""
         level, actor = next(((d, h - 1) for d, h in enumerate(self.choices) if h > 0), (len(self.choices), 0))
-        found: np.ndarray = outputs[f"control_{level}"][actor].copy()
-        if self.about["control"] == "sample":  # dimensions that never varied in the demonstrations stay as they are
-            std, varying = np.array(self.about["std"][level]), self.about["varying"]
-            found[varying] += std * generator.standard_normal(len(varying))
-        return found
+        numbers, first = outputs[f"control_{level}"][actor].astype(np.float64), 0
+        sampled = self.about["control"] == "sample"
+        noise = generator.standard_normal(len(self.about["varying"])) if sampled else None
+        control = np.array(self.about["constant"])  # dimensions that never varied in the demonstrations stay so
+        for part in self.about["parts"]:
+            own, z = numbers[first : first + part["size"]], None if noise is None else noise[part["places"]]
+            std = np.array(part["std"][level]) if part["std"] else np.zeros(0)
+            control[part["dims"]] = KINDS[part["kind"]](part, own, std[actor] if std.ndim == 2 else std, z)
+            first += part["size"]
+        return control
+
+
+Part = Mapping[str, Any]
+
+
+def _continuous(part: Part, mean: np.ndarray, std: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+    """A mean, or a draw around it, within the bounds there are, in the control's own units."""
+    value, scale, shift = mean if z is None else mean + std * z, np.array(part["scale"]), np.array(part["shift"])
+    control: np.ndarray = value * scale + shift
+    for ends, side in zip(part["ends"], (-1, 1), strict=True):
+        for place, end in enumerate(ends):
+            if end is not None and side * np.float32(value[place]) >= side * np.float32(
+                (end - shift[place]) / scale[place]
+            ):
+                control[place] = end
+    return control
+
+
+def _binary(part: Part, logits: np.ndarray, _: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+    """The position of each switch."""
+    on = logits > 0 if z is None else np.array([_phi(one) for one in z]) < 1 / (1 + np.exp(-logits))
+    low, high = (np.array(ends) for ends in part["ends"])
+    return np.where(on, high, low)
+
+
+def _categorical(part: Part, logits: np.ndarray, _: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+    """A discrete action, as its value or as a row."""
+    index = int(logits.argmax())
+    if z is not None:
+        total = np.exp(logits - logits.max()).cumsum()
+        index = min(int((total <= _phi(z[0]) * total[-1]).sum()), len(total) - 1)
+    return np.array([part["values"][index]]) if part["values"] else np.eye(len(logits))[index]
+
+
+def _phi(z: float) -> float:
+    """The probability that a standard normal number is less."""
+    return 0.5 * math.erfc(-z / math.sqrt(2))
+
+
+KINDS: dict[str, Callable[[Part, np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]] = {
+    "gaussian": _continuous,
+    "clipped": _continuous,
+    "binary": _binary,
+    "categorical": _categorical,
+}
 
 
 def _checked(observation: Mapping[str, Any], one: Mapping[str, Any]) -> np.ndarray:
@@ -157,9 +209,7 @@ class NumpyNetworks:
             if one["choices"]:
                 found[f"selection_{level}"] = _selection(logits, one)
             if mean.shape[1]:
-                varying = mean.astype(np.float64) * weights["scale"] + weights["shift"]
-                constant = np.tile(weights["constant"], (len(varying), 1))
-                found[f"control_{level}"] = np.concatenate([varying, constant], axis=1)[:, weights["order"]]
+                found[f"control_{level}"] = mean
             if level < depth:
                 raw = self._network(self._about["terminations"][level], f"end_{level}", vector, step, images)[:, 0]
                 bound = np.float32(self._about["termination_bound"])
@@ -283,7 +333,9 @@ def _difference(about: Mapping[str, Any], name: str, value: np.ndarray, original
     if name.startswith("selection"):
         value, original = np.exp(value), np.exp(original)
     unit = np.ones(original.shape)
-    if name.startswith("control"):
+    if name.startswith("control_"):
+        unit = np.maximum(1.0, np.abs(original))
+    if name == "controls":
         varying = about["varying"]
         distance = np.abs(original[..., varying] - np.array(about["shift"]))
         unit[..., varying] = np.maximum(np.maximum(1.0, about["scale"]), distance)

@@ -14,10 +14,8 @@ Arrays = dict[str, np.ndarray]
 
 def weights_and_networks(hierarchy: Hierarchy) -> tuple[Arrays, dict[str, Any]]:
     """Every array by name; ``callers``, ``terminations`` and whether ``numpy`` can evaluate all of them."""
-    encoder, scaling = hierarchy.encoder, hierarchy.scaling
+    encoder = hierarchy.encoder
     arrays: Arrays = {"mean": encoder.mean.numpy(), "deviation": encoder.std.numpy()}
-    arrays |= {"scale": scaling.scale.numpy(), "shift": scaling.shift.numpy()}
-    arrays |= {"constant": scaling.constant.numpy(), "order": scaling.order.numpy()}
     levels = hierarchy.option_levels()
     networks = {f"caller_{number}": one.network for number, one in enumerate(hierarchy.callers())}
     networks |= {f"end_{number}": one.termination for number, one in enumerate(levels)}

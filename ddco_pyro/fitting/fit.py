@@ -23,6 +23,7 @@ from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy
 from ddco_pyro.fitting.records import read_metrics, refit
 from ddco_pyro.inference import Posterior, log_likelihood, posterior, segment
 from ddco_pyro.inference.decomposition import Decomposition, decompose
+from ddco_pyro.model.control_parts import ControlPart
 from ddco_pyro.model.encoding import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
@@ -189,7 +190,9 @@ def _read_model(spec: Spec, path: Path) -> Hierarchy:
     tensors = whole | tensors  # models of before had every dimension in them
     others = sorted(set(range(size)) - set(tensors["scaling.varying"].tolist()))
     constant = dict(zip(others, tensors["scaling.constant"].tolist(), strict=True))
-    hierarchy = build_hierarchy(spec, Dimensions(shapes, size, int(metadata["steps"]), constant))
+    kinds = json.loads(metadata["control"]) if "control" in metadata else None  # models of before are Gaussian
+    parts = None if kinds is None else tuple(ControlPart.of(part) for part in kinds)
+    hierarchy = build_hierarchy(spec, Dimensions(shapes, size, int(metadata["steps"]), constant, parts=parts))
     hierarchy.load_state_dict(tensors)
     return hierarchy
 

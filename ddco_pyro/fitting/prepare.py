@@ -15,6 +15,7 @@ from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError, e
 from ddco_pyro.data.memory import Work, refuse_too_much
 from ddco_pyro.fitting.clusters import POOLED
 from ddco_pyro.fitting.widths import nearest_widths
+from ddco_pyro.model.control_parts import ControlPart, control_parts
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import ShapeError
@@ -30,6 +31,7 @@ class Dimensions:
     :param constant: the control dimensions that are constant in all demonstrations, and their values: they are no part
         of the model.
     :param control: what each control dimension does in the demonstrations; empty where that is not known.
+    :param parts: how a fitted model has the control; None where that is still to be decided.
     """
 
     shapes: Shapes
@@ -37,6 +39,7 @@ class Dimensions:
     steps: int
     constant: Mapping[int, float] = field(default_factory=dict)
     control: tuple[ControlDimension, ...] = field(default=(), compare=False)
+    parts: tuple[ControlPart, ...] | None = None
 
     @classmethod
     def of(cls, demonstrations: Demonstrations) -> Dimensions:
@@ -74,7 +77,7 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
         )
     _refuse_giants(spec, dimensions)
     try:
-        return Hierarchy(spec, dimensions.shapes, dimensions.control_size, dimensions.steps, dimensions.constant)
+        return _hierarchy(spec, dimensions)
     except ShapeError as error:
         raise SpecError(str(error)) from error
 
@@ -115,8 +118,15 @@ def _refuse_giants(spec: Spec, dimensions: Dimensions) -> None:
 def _counted(spec: Spec, dimensions: Dimensions) -> int:
     """The number of parameters of the spec's networks, which are made without their numbers."""
     with torch.device("meta"):
-        size = dimensions.shapes, dimensions.control_size, dimensions.steps, dimensions.constant
-        return parameters(Hierarchy(spec, *size))
+        return parameters(_hierarchy(spec, dimensions))
+
+
+def _hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
+    parts = dimensions.parts
+    if parts is None and dimensions.control:
+        parts = control_parts(spec.control, dimensions.control)
+    size = dimensions.shapes, dimensions.control_size, dimensions.steps, dimensions.constant
+    return Hierarchy(spec, *size, parts)
 
 
 def parameters(network: nn.Module) -> int:

@@ -22,7 +22,7 @@ from ddco_pyro.fitting.metrics import evaluate, supervisor
 from ddco_pyro.fitting.prepare import Dimensions, baseline_spec, build_hierarchy, demonstrations, parameters, parts
 from ddco_pyro.fitting.training import Trainer, TrainingError
 from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_engines
-from ddco_pyro.model.encoding import encode, refuse_overflow
+from ddco_pyro.model.encoding import encode, refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, dump_spec
 
@@ -88,6 +88,7 @@ def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, cloc
     metrics |= {
         "engine_check": trained.check._asdict(),
         "demonstrations": trained.demonstrations | held_out | supervisor(demos),
+        "measure": hierarchy.scaling.measure,
         "control_dimensions": [dimension.as_data() for dimension in dimensions.control],
         "parameters": parameters(hierarchy),
         "training": trained.training,
@@ -181,7 +182,7 @@ def _train(
         torch.manual_seed(spec.seed)
         first = make()
         if held_out is not None:
-            refuse_overflow(held_out, first.encoder, first.scaling)
+            refuse_unusable(held_out, first.encoder, first.scaling)
         batches = [encode(part, first.encoder, first.scaling) for part in parts]
         few = batches[0].select(torch.arange(min(len(batches[0]), TRAJECTORIES)), STEPS)
         with torch.no_grad():
@@ -208,7 +209,12 @@ def _train(
 
 def _write_model(folder: Path, hierarchy: Hierarchy, dimensions: Dimensions) -> None:
     shapes = json.dumps({key: list(shape) for key, shape in hierarchy.encoder.shapes.items()})
-    metadata = {"shapes": shapes, "control_size": str(dimensions.control_size), "steps": str(dimensions.steps)}
+    metadata = {
+        "shapes": shapes,
+        "control_size": str(dimensions.control_size),
+        "steps": str(dimensions.steps),
+        "control": json.dumps([part.as_data() for part in hierarchy.scaling.parts]),
+    }
     write_tensors(folder / "model.safetensors", hierarchy.state_dict(), metadata)
 
 

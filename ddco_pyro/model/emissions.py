@@ -15,8 +15,12 @@ import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
+from torch.nn.functional import logsigmoid, one_hot, pad
+from torch.special import ndtr
 
 from ddco_pyro.model.tables import NEVER
+
+LOG_2PI = math.log(2 * math.pi)
 
 
 class Steps(Protocol):
@@ -56,17 +60,45 @@ class Emission(Steps, Protocol):
         """Mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i) of two callers, [...] nats."""
         ...
 
+    @property
+    def numbers(self) -> Tensor:
+        """What the network gave for each caller, [..., K, size]."""
+        ...
+
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
         """The same of changed tensors."""
         ...
 
 
+class Kind:
+    """What all kinds share: tensors as fields, of which those over time are the first ones."""
+
+    over_time: ClassVar[int] = 1
+    """Number of fields of shape [N, T, K, ...]; the others are the same at every step."""
+
+    @property
+    def numbers(self) -> Tensor:
+        """What the network gave for each caller, [..., K, size]."""
+        numbers: Tensor = getattr(self, fields(self)[0].name)  # type: ignore[arg-type]
+        return numbers
+
+    def steps(self) -> list[Self]:
+        """The same at each step."""
+        names = [field.name for field in fields(self)[: self.over_time]]  # type: ignore[arg-type]
+        unbound = zip(*(getattr(self, name).unbind(1) for name in names), strict=True)
+        return [replace(self, **dict(zip(names, tensors, strict=True))) for tensors in unbound]  # type: ignore[type-var]
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """The same of changed tensors."""
+        return replace(self, **{field.name: change(getattr(self, field.name)) for field in fields(self)})  # type: ignore
+
+
 @dataclass(frozen=True)
-class Gaussian:
-    """a ~ N(μ, σ²), each dimension by itself (§4.2).
+class Gaussian(Kind):
+    """A free continuous control, a ~ N(μ, σ²), each dimension by itself (§4.2).
 
     :param mean: μ, [..., K, A] in scaled units.
-    :param std: σ, [A] in scaled units.
+    :param std: σ, [A], or [K, A] where each caller has its own, in scaled units.
     :param log_scale: logarithms of the control's units, [A].
     """
 
@@ -82,13 +114,15 @@ class Gaussian:
     def by_dimension(self, actions: Tensor) -> Tensor:
         """log N(a_d; μ_d, σ_d²), [..., K, A]."""
         error = (actions.unsqueeze(-2) - self.mean) / self.std
-        return -0.5 * (error.square() + math.log(2 * math.pi)) - self.std.log() - self.log_scale
+        return -0.5 * (error.square() + LOG_2PI) - self.std.log() - self.log_scale
 
     def log_density(self, actions: Tensor) -> Tensor:
         """log N(a; μ, σ²), [..., K]."""
-        error = actions.unsqueeze(-2) - self.mean
-        constant = self.std.log().sum(-1) + 0.5 * math.log(2 * math.pi) * len(self.std) + self.log_scale.sum(-1)
-        return error.square() @ (-0.5 / self.std.square()).to(error.dtype) - constant
+        error, precision = actions.unsqueeze(-2) - self.mean, (-0.5 / self.std.square()).to(self.mean.dtype)
+        constant = self.std.log().sum(-1) + 0.5 * LOG_2PI * self.std.shape[-1] + self.log_scale.sum(-1)
+        if precision.dim() == 1:
+            return error.square() @ precision - constant
+        return (error.square() * precision).sum(-1) - constant.to(self.mean.dtype)
 
     @property
     def mode(self) -> Tensor:
@@ -100,17 +134,211 @@ class Gaussian:
         return self.mean + self.std * noise.unsqueeze(-2)
 
     def divergence(self, i: int, j: int) -> Tensor:
-        """½ Σ (μ_i - μ_j)² / σ²: both callers have the same σ."""
-        apart = (self.mean[..., i, :] - self.mean[..., j, :]) / self.std
-        return 0.5 * apart.double().square().sum(-1)
+        """Mean of both divergences; ½ Σ (μ_i - μ_j)² / σ² where callers share σ."""
+        mean, std = self.mean.double(), self.std.double()
+        apart = (mean[..., i, :] - mean[..., j, :]).square()
+        one, two = (std, std) if std.dim() == 1 else (std[i], std[j])
+        one, two = one.square(), two.square()
+        return 0.25 * ((one + apart) / two + (two + apart) / one - 2).sum(-1)
 
-    def steps(self) -> list[Gaussian]:
+
+@dataclass(frozen=True)
+class Clipped(Kind):
+    """A continuous control with bounds that it reaches: a = min(max(z, low), high) of z ~ N(μ, σ²), a censored normal.
+
+    Within its bounds it has the normal's density; on a bound, or beyond, the probability of what lies there, Φ. That is
+    a mass, whatever the units: densities and masses are different measures.
+
+    :param mean: μ, [..., K, A] in scaled units; ``std`` and ``log_scale`` as those of :class:`Gaussian`.
+    :param low: the lower bound of each dimension, -inf where it has none, [A] in scaled units; ``high`` likewise.
+    """
+
+    mean: Tensor
+    std: Tensor
+    log_scale: Tensor
+    low: Tensor
+    high: Tensor
+
+    @property
+    def shape(self) -> torch.Size:
+        """[..., K, A]."""
+        return self.mean.shape
+
+    def by_dimension(self, actions: Tensor) -> Tensor:
+        """log N(a_d; μ_d, σ_d²) within the bounds, log Φ of what lies beyond on one of them, float64 [..., K, A]."""
+        actions, mean, std = actions.double().unsqueeze(-2), self.mean.double(), self.std.double()
+        inside = -0.5 * (((actions - mean) / std).square() + LOG_2PI) - std.log() - self.log_scale
+        below, above = actions <= self.low, actions >= self.high
+        if not bool((below | above).any()):
+            return inside
+        at = (below | above).expand(inside.shape).nonzero(as_tuple=True)  # elsewhere no Φ is asked for
+        low, high, mean, std = (values.expand(inside.shape)[at] for values in (self.low, self.high, mean, std))
+        beyond = torch.where(below.expand(inside.shape)[at], low - mean, mean - high) / std
+        return inside.index_put(at, log_ndtr(beyond))
+
+    def log_density(self, actions: Tensor) -> Tensor:
+        """log π(a | s), float64 [..., K]."""
+        return self.by_dimension(actions).sum(-1)
+
+    @property
+    def mode(self) -> Tensor:
+        """μ within the bounds: the control without noise."""
+        return self.mean.clamp(self.low, self.high)
+
+    def draw(self, noise: Tensor) -> Tensor:
+        """μ + σ·z within the bounds."""
+        return (self.mean + self.std * noise.unsqueeze(-2)).clamp(self.low, self.high)
+
+    def divergence(self, i: int, j: int) -> Tensor:
+        """Mean of both divergences of the normals before they are clipped: an upper bound of those after."""
+        return Gaussian(self.mean, self.std, self.log_scale).divergence(i, j)
+
+
+@dataclass(frozen=True)
+class Binary(Kind):
+    """Switches, each of them on (1) with probability logistic(y), off (0) otherwise.
+
+    :param logits: y, [..., K, A].
+    """
+
+    logits: Tensor
+
+    @property
+    def shape(self) -> torch.Size:
+        """[..., K, A]."""
+        return self.logits.shape
+
+    def by_dimension(self, actions: Tensor) -> Tensor:
+        """Logarithms of the probabilities of the switches' positions, [..., K, A]; -inf for anything but 0 and 1."""
+        actions = actions.unsqueeze(-2)
+        position = logsigmoid(torch.where(actions > 0.5, self.logits, -self.logits))
+        return torch.where((actions == 0) | (actions == 1), position, NEVER)
+
+    def log_density(self, actions: Tensor) -> Tensor:
+        """log π(a | s), [..., K]."""
+        return self.by_dimension(actions).sum(-1)
+
+    @property
+    def mode(self) -> Tensor:
+        """The more likely position."""
+        return (self.logits > 0).to(self.logits.dtype)
+
+    def draw(self, noise: Tensor) -> Tensor:
+        """On where Φ(z) is less than the probability of it."""
+        return (ndtr(noise).unsqueeze(-2) < self.logits.sigmoid()).to(self.logits.dtype)
+
+    def divergence(self, i: int, j: int) -> Tensor:
+        """Mean of both divergences, ½ Σ (p_i - p_j)(y_i - y_j)."""
+        one, two = self.logits[..., i, :].double(), self.logits[..., j, :].double()
+        return 0.5 * ((one.sigmoid() - two.sigmoid()) * (one - two)).sum(-1)
+
+
+@dataclass(frozen=True)
+class Categorical(Kind):
+    """One of C discrete actions, as its index (A = 1) or, where A = C, as a row with a single 1.
+
+    :param logits: [..., K, C].
+    :param rows: whether actions are rows; a tensor with one truth value.
+    """
+
+    logits: Tensor
+    rows: Tensor
+
+    @property
+    def shape(self) -> torch.Size:
+        """[..., K, A]."""
+        return torch.Size([*self.logits.shape[:-1], self.logits.shape[-1] if bool(self.rows) else 1])
+
+    def by_dimension(self, actions: Tensor) -> Tensor:
+        """log softmax(logits)[a], [..., K, A]: in the first dimension, 0 in the others; -inf for no such action."""
+        classes = self.logits.shape[-1]
+        index = actions.argmax(-1, keepdim=True) if bool(self.rows) else actions.clamp(0, classes - 1).long()
+        meant = one_hot(index.squeeze(-1), classes) if bool(self.rows) else index
+        possible = (actions == meant).all(-1, keepdim=True).unsqueeze(-2)
+        log_probs = self.logits.log_softmax(-1)
+        chosen = log_probs.gather(-1, index.unsqueeze(-2).expand(*log_probs.shape[:-1], 1))
+        return pad(torch.where(possible, chosen, NEVER), (0, self.shape[-1] - 1))
+
+    def log_density(self, actions: Tensor) -> Tensor:
+        """log π(a | s), [..., K]."""
+        return self.by_dimension(actions)[..., 0]
+
+    @property
+    def mode(self) -> Tensor:
+        """The most likely action."""
+        return self._action(self.logits.argmax(-1))
+
+    def draw(self, noise: Tensor) -> Tensor:
+        """The first action up to which the probabilities sum to more than Φ(z) of the first number."""
+        total = self.logits.double().softmax(-1).cumsum(-1)
+        uniform = ndtr(noise[..., :1].double()).unsqueeze(-2)
+        return self._action((total <= uniform * total[..., -1:]).sum(-1).clamp(max=total.shape[-1] - 1))
+
+    def divergence(self, i: int, j: int) -> Tensor:
+        """Mean of both divergences."""
+        one, two = (self.logits[..., caller, :].double().log_softmax(-1) for caller in (i, j))
+        return 0.5 * ((one.exp() - two.exp()) * (one - two)).sum(-1)
+
+    def _action(self, index: Tensor) -> Tensor:
+        actions = one_hot(index, self.logits.shape[-1]) if bool(self.rows) else index.unsqueeze(-1)
+        return actions.to(self.logits.dtype)
+
+
+@dataclass(frozen=True)
+class Product:
+    """Groups of dimensions, each of its own kind, independent given the caller.
+
+    :param groups: the dimensions of each group, and their emission.
+    """
+
+    groups: tuple[tuple[tuple[int, ...], Emission], ...]
+
+    @property
+    def shape(self) -> torch.Size:
+        """[..., K, A]."""
+        size = sum(len(dimensions) for dimensions, _ in self.groups)
+        return torch.Size([*self.groups[0][1].shape[:-1], size])
+
+    def by_dimension(self, actions: Tensor) -> Tensor:
+        """log π(a_d | s) of each caller and dimension, [..., K, A]."""
+        return self._joined([emission.by_dimension(actions[..., dims]) for dims, emission in self.groups])
+
+    def log_density(self, actions: Tensor) -> Tensor:
+        """log π(a | s), [..., K]."""
+        return sum_of([emission.log_density(actions[..., dims]) for dims, emission in self.groups])
+
+    @property
+    def numbers(self) -> Tensor:
+        """What the network gave for each caller, group after group."""
+        return torch.cat([emission.numbers for _, emission in self.groups], dim=-1)
+
+    @property
+    def mode(self) -> Tensor:
+        """The most likely control of each group."""
+        return self._joined([emission.mode for _, emission in self.groups])
+
+    def draw(self, noise: Tensor) -> Tensor:
+        """The controls that standard normal numbers stand for, each group's own."""
+        return self._joined([emission.draw(noise[..., dims]) for dims, emission in self.groups])
+
+    def divergence(self, i: int, j: int) -> Tensor:
+        """The sum of the groups' divergences."""
+        return sum_of([emission.divergence(i, j) for _, emission in self.groups])
+
+    def steps(self) -> list[Product]:
         """The same at each step."""
-        return [replace(self, mean=mean) for mean in self.mean.unbind(1)]
+        each = zip(*(emission.steps() for _, emission in self.groups), strict=True)
+        names = [dimensions for dimensions, _ in self.groups]
+        return [Product(tuple(zip(names, emissions, strict=True))) for emissions in each]
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> Gaussian:
+    def map(self, change: Callable[[Tensor], Tensor]) -> Product:
         """The same of changed tensors."""
-        return Gaussian(*(change(getattr(self, field.name)) for field in fields(self)))
+        return Product(tuple((dimensions, emission.map(change)) for dimensions, emission in self.groups))
+
+    def _joined(self, values: Sequence[Tensor]) -> Tensor:
+        """The groups' values [..., K, A_g] in the order of the dimensions."""
+        order = torch.tensor([dimension for dimensions, _ in self.groups for dimension in dimensions]).argsort()
+        return torch.cat(list(values), dim=-1)[..., order]
 
 
 @dataclass(frozen=True)
@@ -202,6 +430,27 @@ class Acting(TorchDistribution):
             )
             acting = torch.where((choice > 0).unsqueeze(-1), option, acting)
         return acting
+
+
+def sum_of(values: Sequence[Tensor]) -> Tensor:
+    """The sum of one or more tensors."""
+    total = values[0]
+    for value in values[1:]:
+        total = total + value
+    return total
+
+
+TAIL = -30.0
+"""Below, log Φ is computed by its asymptotic series: torch's own loses its gradient to rounding from -1e8 on."""
+
+
+def log_ndtr(values: Tensor) -> Tensor:
+    """log Φ(x) in float64, with a gradient that is finite however small x is; float32 gives NaN in training."""
+    x = values.double()
+    tail = x.clamp(max=TAIL)
+    r = tail.square().reciprocal()
+    series = -0.5 * tail.square() - (-tail).log() - 0.5 * LOG_2PI + (-r * (1 - 3 * r * (1 - 5 * r))).log1p()
+    return torch.where(x < TAIL, series, torch.special.log_ndtr(x.clamp(min=TAIL)))
 
 
 def _of_caller(values: Tensor, caller: Tensor) -> Tensor:

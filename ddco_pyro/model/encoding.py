@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.model.controls import ControlScaling, refuse_impossible
 from ddco_pyro.model.networks import Inputs, InputShape
-from ddco_pyro.spec import ControlSpec, ObservationSpec
+from ddco_pyro.spec import ObservationSpec
 
 Shapes = Mapping[str, tuple[int, ...]]
 IMAGE_DIMENSIONS = 3
@@ -107,66 +107,6 @@ class ObservationEncoder(nn.Module):
         return Inputs(vector, images, torch.arange(vector.shape[1]))
 
 
-class ControlScaling(nn.Module):
-    """The A' of A control dimensions that vary, in units of their own spread, z = (a - shift) / scale, and back.
-
-    Nothing but this knows of the others: they are constant, no part of the model, and put back into what it emits.
-
-    :param size: A.
-    :param constant: the constant dimensions and their values, in the control's own units.
-    """
-
-    shift: Tensor
-    scale: Tensor
-    varying: Tensor
-    constant: Tensor
-    order: Tensor
-
-    def __init__(self, spec: ControlSpec, size: int, constant: Mapping[int, float] = MappingProxyType({})) -> None:
-        super().__init__()
-        self.standardize = spec.scale == "standardize"
-        varying = [dimension for dimension in range(size) if dimension not in constant]
-        declared = spec.scale if isinstance(spec.scale, tuple) else (1.0,) * size
-        self.register_buffer("shift", torch.zeros(len(varying), dtype=torch.float64))
-        self.register_buffer("scale", torch.tensor([declared[one] for one in varying], dtype=torch.float64))
-        self.register_buffer("varying", torch.tensor(varying, dtype=torch.int64))
-        self.register_buffer("constant", torch.tensor([constant[one] for one in sorted(constant)], dtype=torch.float64))
-        self.register_buffer("order", torch.tensor([*varying, *sorted(constant)]).argsort(), persistent=False)
-
-    @property
-    def size(self) -> int:
-        """A, the number of control dimensions, constant ones among them."""
-        return len(self.order)
-
-    def fit(self, demonstrations: Demonstrations) -> None:
-        """Where the spec says ``standardize``: take mean and spread of these demonstrations' controls."""
-        if self.standardize:
-            rows = np.concatenate([demo.actions[:, self.varying.numpy()] for demo in demonstrations])
-            spread = rows.std(0)
-            self.shift.copy_(torch.as_tensor(rows.mean(0)))
-            self.scale.copy_(torch.as_tensor(np.where(spread > 1e-9, spread, 1.0)))
-
-    @property
-    def log_scale(self) -> Tensor:
-        """log scale [A']: a log-density in the control's own units is that in scaled units less its sum."""
-        return self.scale.log()
-
-    def scaled(self, actions: np.ndarray) -> np.ndarray:
-        """[T, A] in the control's own units to [T, A'] in scaled ones."""
-        found: np.ndarray = (actions[:, self.varying.numpy()] - self.shift.numpy()) / self.scale.numpy()
-        return found
-
-    def emitted(self, actions: Tensor) -> Tensor:
-        """[..., A'] scaled to [..., A] in the control's own units, the constant dimensions put back."""
-        varying = actions.double() * self.scale + self.shift
-        return torch.cat([varying, self.constant.expand(*varying.shape[:-1], -1)], dim=-1)[..., self.order]
-
-    def unscaled(self, actions: Tensor) -> np.ndarray:
-        """The same as an array."""
-        found: np.ndarray = self.emitted(actions).numpy()
-        return found
-
-
 LARGEST_SCALED = 1e12
 """No feature or control may be larger, once it is scaled: float32 has to hold the square of what networks make of it,
 divided by that of a small σ, and ends at 3e38."""
@@ -177,17 +117,19 @@ def encode(demonstrations: Demonstrations, encoder: ObservationEncoder, scaling:
 
     :raises DemonstrationsError: a number is too large for networks.
     """
-    refuse_overflow(demonstrations, encoder, scaling)
+    refuse_unusable(demonstrations, encoder, scaling)
     inputs = encoder.inputs(demo.observations for demo in demonstrations)
     actions = _pad([scaling.scaled(demo.actions) for demo in demonstrations]).float()
     return Batch(inputs, actions, torch.tensor([len(demo) for demo in demonstrations]))
 
 
-def refuse_overflow(demonstrations: Demonstrations, encoder: ObservationEncoder, scaling: ControlScaling) -> None:
-    """See that networks can take every feature and control.
+def refuse_unusable(demonstrations: Demonstrations, encoder: ObservationEncoder, scaling: ControlScaling) -> None:
+    """See that networks can take every feature, and the emissions every control.
 
-    :raises DemonstrationsError: a number is larger than :data:`LARGEST_SCALED` once it is scaled.
+    :raises DemonstrationsError: a number is larger than :data:`LARGEST_SCALED` once it is scaled, or a control has a
+        value that it cannot have.
     """
+    refuse_impossible(demonstrations, scaling)
     places = np.repeat([f"obs/{spec.key}" for spec in encoder.specs], encoder.sizes)
     for demo in demonstrations:
         features = (encoder.features(demo.observations) - encoder.mean.numpy()) / encoder.std.numpy()

@@ -5,7 +5,6 @@ A baseline is a hierarchy without option levels whose meta-policy emits control.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
@@ -13,19 +12,16 @@ from types import MappingProxyType
 from typing import Literal
 
 import torch
-from torch import Tensor, nn
-from torch.nn.functional import softplus
+from torch import nn
 
-from ddco_pyro.model.emissions import Gaussian
-from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch, ControlScaling, ObservationEncoder, Shapes
+from ddco_pyro.model.control_parts import ControlPart, all_gaussian
+from ddco_pyro.model.controls import ControlScaling, ControlStd
+from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch, ObservationEncoder, Shapes
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
 from ddco_pyro.model.networks.activations import training_bytes
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import Tables
-from ddco_pyro.spec import ControlSpec, LearnedStd, LevelSpec, NetworkSpec, Spec, SpecError
-
-INITIAL_STD = 0.5
-"""A learned standard deviation starts here, in scaled units."""
+from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec, SpecError
 
 BYTES_AT_ONCE = 256 * 10**6
 """Most bytes that networks take for the trajectories that go through them together, one trajectory at least."""
@@ -36,7 +32,7 @@ Emits = Literal["options", "control"]
 class Caller(nn.Module):
     """K policies over the options of the level below, the physical control, or both (§4.2).
 
-    One network gives the log-probabilities y_0 (control), y_1, ..., y_k and the mean control μ of each.
+    One network gives the log-probabilities y_0 (control), y_1, ..., y_k and the numbers of the control of each.
     """
 
     def __init__(
@@ -46,7 +42,7 @@ class Caller(nn.Module):
         options: int,
         shape: InputShape,
         control: ControlSpec,
-        control_size: int,
+        scaling: ControlScaling,
         copies: int,
     ) -> None:
         super().__init__()
@@ -54,42 +50,16 @@ class Caller(nn.Module):
         self.emits_control = "control" in emits
         self.emits_options = "options" in emits and options > 0
         logits = options + self.emits_control if self.emits_options else 0
-        self.sizes = (logits, control_size if self.emits_control else 0)
+        self.sizes = (logits, scaling.numbers if self.emits_control else 0)
         self.network = build(network, shape, sum(self.sizes), copies)
-        self.std = ControlStd(control, control_size)
+        self.std = ControlStd(control, scaling, copies)
 
-    def forward(self, inputs: Inputs, log_scale: Tensor) -> CallerOutputs:
-        """What the callers say at every step of the inputs.
-
-        :param log_scale: logarithms of the control's units, [A].
-        """
+    def forward(self, inputs: Inputs, scaling: ControlScaling) -> CallerOutputs:
+        """What the callers say at every step of the inputs."""
         said = self.network(inputs)
-        logits, mean = said.split(self.sizes, dim=-1) if all(self.sizes) else (said, said)
-        emission = Gaussian(mean, self.std(), log_scale) if self.emits_control else None
+        logits, numbers = said.split(self.sizes, dim=-1) if all(self.sizes) else (said, said)
+        emission = scaling.emission(numbers, self.std()) if self.emits_control else None
         return CallerOutputs(self.options, logits if self.emits_options else None, emission)
-
-
-class ControlStd(nn.Module):
-    """The standard deviation σ of the Gaussian control, [A] in scaled units: fixed, or learned above a floor.
-
-    The options of a level share it: otherwise one of them collects the steps where the control hardly varies (a
-    saturated actuator), whatever the skill (see docs/decisions.md).
-    """
-
-    fixed: Tensor
-
-    def __init__(self, spec: ControlSpec, size: int) -> None:
-        super().__init__()
-        self.floor = spec.std.floor if isinstance(spec.std, LearnedStd) else None
-        if isinstance(spec.std, LearnedStd):
-            start = math.log(math.expm1(max(INITIAL_STD - spec.std.floor, 1e-3)))
-            self.raw = nn.Parameter(torch.full((size,), start))
-        else:
-            self.register_buffer("fixed", torch.full((size,), float(spec.std)), persistent=False)
-
-    def forward(self) -> Tensor:
-        """σ [A]."""
-        return self.fixed if self.floor is None else self.floor + softplus(self.raw)
 
 
 class Level(nn.Module):
@@ -102,14 +72,12 @@ class Level(nn.Module):
         options_below: int,
         shape: InputShape,
         control: ControlSpec,
-        control_size: int,
+        scaling: ControlScaling,
     ) -> None:
         super().__init__()
         self.count = spec.count
         with _named(f"{place}.policy"):
-            self.policy = Caller(
-                spec.policy, spec.policy.emits, options_below, shape, control, control_size, spec.count
-            )
+            self.policy = Caller(spec.policy, spec.policy.emits, options_below, shape, control, scaling, spec.count)
         with _named(f"{place}.termination"):
             self.termination = build(spec.termination, shape, 1, spec.count)
 
@@ -132,6 +100,7 @@ class Hierarchy(nn.Module):
     :param control_size: A, the number of control dimensions.
     :param steps: the longest demonstration, for per-timestep networks.
     :param constant: the control dimensions that are no part of the model, and the values that are emitted for them.
+    :param parts: how the other control dimensions are modelled; by default all of them are Gaussian.
     :raises ShapeError: where a network cannot read these observations.
     :raises SpecError: where a user's network does not take its options.
     """
@@ -143,21 +112,23 @@ class Hierarchy(nn.Module):
         control_size: int,
         steps: int,
         constant: Mapping[int, float] = MappingProxyType({}),
+        parts: tuple[ControlPart, ...] | None = None,
     ) -> None:
         super().__init__()
         self.steps = steps
         self.encoder = ObservationEncoder(spec.observations, shapes)
-        self.scaling = ControlScaling(spec.control, control_size, constant)
+        varying = [dimension for dimension in range(control_size) if dimension not in constant]
+        parts = all_gaussian(varying) if parts is None else parts
+        self.scaling = scaling = ControlScaling(spec.control, control_size, dict(constant), parts)
         self.input_shape = shape = self.encoder.shape(steps)
-        size = len(self.scaling.varying)
         levels, below = [], 0
         for number, level in enumerate(spec.hierarchy.levels if spec.hierarchy else ()):
-            levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, spec.control, size))
+            levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, spec.control, scaling))
             below = level.count
         self.levels = nn.ModuleList(levels)
         network, emits = _meta_policy(spec)
         with _named("hierarchy.meta_policy" if levels else "baseline.policy"):
-            self.meta_policy = Caller(network, emits, below, shape, spec.control, size, copies=1)
+            self.meta_policy = Caller(network, emits, below, shape, spec.control, scaling, copies=1)
 
     @property
     def depth(self) -> int:
@@ -195,9 +166,9 @@ class Hierarchy(nn.Module):
 
         :param discovering: d gives levels 1 to d alone under a uniform meta-policy (layer-wise training, SM 2.3).
         """
-        levels, log_scale = self.option_levels()[:discovering], self.scaling.log_scale
-        callers = [level.policy(inputs, log_scale) for level in levels]
-        top = _uniform(inputs, levels[-1].count) if discovering else self.meta_policy(inputs, log_scale)
+        levels = self.option_levels()[:discovering]
+        callers = [level.policy(inputs, self.scaling) for level in levels]
+        top = _uniform(inputs, levels[-1].count) if discovering else self.meta_policy(inputs, self.scaling)
         return Outputs((*callers, top), tuple(level.termination(inputs).squeeze(-1) for level in levels))
 
     def tabulate(self, batch: Batch, discovering: int | None = None) -> Tables:

@@ -53,6 +53,9 @@ class LearnedStd(Model):
     """Always true; for a fixed standard deviation give a number instead of this mapping."""
     floor: Positive = 0.01
     """Lower bound, in scaled units."""
+    per_option: bool = False
+    """Whether each option has its own. With ``gaussian`` controls that sit on a bound, one option may collect those
+    steps, whatever the skill; ``clipped`` and ``binary`` ones are safe."""
 
 
 Std = Annotated[
@@ -71,15 +74,57 @@ Scale = Annotated[
     ),
 ]
 
+Kind = Literal["auto", "gaussian", "clipped", "binary", "categorical"]
+
+
+class PartSpec(Model):
+    """Dimensions of the control that have a distribution of their own."""
+
+    name: Text
+    """What the dimensions are called."""
+    dims: Annotated[Items[Annotated[int, Field(ge=0)]], Field(min_length=1)]
+    """Which dimensions of the control, counted from 0."""
+    kind: Kind = "auto"
+    """As ``control.kind``."""
+    std: Std | None = None
+    """As ``control.std``, which null stands for."""
+    scale: Scale | None = None
+    """As ``control.scale``, which null stands for; a list has a number for each of these dimensions."""
+    bounds: Annotated[Items[float], Field(min_length=2, max_length=2)] | None = None
+    """``clipped`` alone: the lower and the upper bound, in the control's own units; null: the extremes on which the
+    demonstrations sit."""
+
 
 class ControlSpec(Model):
-    """The distribution of the control, a_t ~ N(π(s_t), σ²)."""
+    """The distribution of the control that a caller emits."""
 
+    kind: Kind = "auto"
+    """``gaussian``: free; ``clipped``: a Gaussian with bounds that it reaches; ``binary``: a switch between two values;
+    ``categorical``: discrete actions, as integers or rows with a single 1; ``auto``: decided for each dimension from
+    the demonstrations, and shown by ``check``."""
     std: Std = 0.1
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``."""
     scale: Scale = "standardize"
     """``standardize`` (by the training demonstrations), ``none``, or one positive number for each control dimension,
     by which it is divided."""
+    parts: Items[PartSpec] = ()
+    """Groups of dimensions with a distribution of their own; what is in none of them is as above."""
+
+    @model_validator(mode="after")
+    def _disjoint(self) -> ControlSpec:
+        dimensions: dict[int, str] = {}
+        for number, part in enumerate(self.parts):
+            if part.name in [other.name for other in self.parts[:number]]:
+                raise invalid((f"parts.{number}.name", f"{part.name!r} is the name of another part too"))
+            for dimension in part.dims:
+                if dimension in dimensions:
+                    where = f"control dimension {dimension} is in {dimensions[dimension]!r} already"
+                    raise invalid((f"parts.{number}.dims", where))
+                dimensions[dimension] = part.name
+            if part.bounds is not None and (part.kind != "clipped" or part.bounds[0] >= part.bounds[1]):
+                problem = "are for kind: clipped" if part.kind != "clipped" else "must be a lower and a higher number"
+                raise invalid((f"parts.{number}.bounds", problem))
+        return self
 
 
 class OptimizerSpec(Model):

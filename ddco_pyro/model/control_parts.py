@@ -1,0 +1,148 @@
+"""What kind of distribution each dimension of the control has, decided from the demonstrations or declared."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from ddco_pyro.data.control_dimensions import MOST_DISTINCT, ControlDimension, number
+from ddco_pyro.spec import ControlSpec, PartSpec, SpecError
+
+KINDS = ("gaussian", "clipped", "binary", "categorical")
+
+
+@dataclass(frozen=True)
+class ControlPart:
+    """Dimensions of the control whose distribution is of one kind.
+
+    :param dims: which dimensions of the control, in its own numbering; constant ones are in no part.
+    :param kind: ``gaussian``, ``clipped``, ``binary`` or ``categorical``.
+    :param low: of each dimension, in the control's own units: a ``clipped`` one's lower bound (-inf for none), the
+        lower of a ``binary`` one's two values; ``high`` likewise. Empty for other kinds.
+    :param values: the actions that a ``categorical`` part's single dimension takes; empty where actions are rows.
+    :param why: what decided on the kind.
+    """
+
+    name: str
+    dims: tuple[int, ...]
+    kind: str
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
+    values: tuple[float, ...] = ()
+    why: str = ""
+
+    @property
+    def continuous(self) -> bool:
+        """Whether its distribution has a σ."""
+        return self.kind in ("gaussian", "clipped")
+
+    @property
+    def size(self) -> int:
+        """Numbers that a network gives for it."""
+        return len(self.values) or len(self.dims)
+
+    def as_data(self) -> dict[str, Any]:
+        """The same as plain data."""
+        return asdict(self)
+
+    @classmethod
+    def of(cls, data: dict[str, Any]) -> ControlPart:
+        """That of plain data."""
+        lists = {key: tuple(value) for key, value in data.items() if isinstance(value, list)}
+        return cls(**{**data, **lists})
+
+
+def all_gaussian(varying: Sequence[int]) -> tuple[ControlPart, ...]:
+    """One Gaussian part of these dimensions: what is modelled where no demonstrations are known yet."""
+    return (ControlPart("gaussian", tuple(varying), "gaussian"),)
+
+
+def control_parts(spec: ControlSpec, dimensions: Sequence[ControlDimension]) -> tuple[ControlPart, ...]:
+    """The parts of a control of which demonstrations show these dimensions: the spec's, then the others by kind.
+
+    :raises SpecError: the spec asks for what does not fit the demonstrations.
+    """
+    varying = {one.number: one for one in dimensions if not one.constant}
+    named = []
+    for place, part in enumerate(spec.parts):
+        unknown = [dimension for dimension in part.dims if dimension >= len(dimensions)]
+        if unknown:
+            raise SpecError(
+                f"control.parts.{place}.dims: there is no control dimension {unknown[0]}; the control has "
+                f"{len(dimensions)}, counted from 0"
+            )
+        own = [varying.pop(dimension) for dimension in part.dims if dimension in varying]
+        named += list(_parts(part.kind, own, f"control.parts.{place}", part))
+    return (*named, *_parts(spec.kind, list(varying.values()), "control", None))
+
+
+def _parts(
+    kind: str, dimensions: Sequence[ControlDimension], place: str, spec: PartSpec | None
+) -> Iterator[ControlPart]:
+    """One part for each kind among the dimensions."""
+    if kind == "categorical" and dimensions:
+        yield _categorical(dimensions, place, spec.name if spec else kind)
+        return
+    alone = len(dimensions) == 1
+    decided = {one.number: _decided(one, alone) if kind == "auto" else (kind, "as declared") for one in dimensions}
+    kinds = [each for each in KINDS if each in {kind for kind, _ in decided.values()}]
+    for each in kinds:
+        own = [one for one in dimensions if decided[one.number][0] == each]
+        name = each if spec is None else spec.name if len(kinds) == 1 else f"{spec.name} {each}"
+        if each == "categorical":
+            yield _categorical(own, place, name)
+        else:
+            ends = [_ends(one, each, place, spec) for one in own]
+            low, high = zip(*ends, strict=True) if each in ("clipped", "binary") else ((), ())
+            why = "; ".join(dict.fromkeys(decided[one.number][1] for one in own))
+            yield ControlPart(name, tuple(one.number for one in own), each, low, high, why=why)
+
+
+def _decided(dimension: ControlDimension, alone: bool) -> tuple[str, str]:
+    """The kind of a dimension, and why.
+
+    :param alone: whether it is the only one.
+    """
+    if dimension.values:
+        return "binary", f"takes two values, {number(dimension.minimum)} and {number(dimension.maximum)}"
+    if alone and dimension.whole:
+        return "categorical", f"takes {len(dimension.distinct)} whole numbers and is the only dimension"
+    if dimension.extremes:
+        share = max(share for _, _, share in dimension.extremes)
+        return "clipped", f"sits on an extreme in up to {100 * share:.0f} % of the steps"
+    return "gaussian", "varies freely"
+
+
+def _ends(one: ControlDimension, kind: str, place: str, spec: PartSpec | None) -> tuple[float, float]:
+    if kind == "binary" and len(one.values) != 2:
+        raise SpecError(f"{place}.kind: control dimension {one.number} takes more than two values; it is no switch")
+    if kind != "clipped":
+        return one.minimum, one.maximum
+    if spec is not None and spec.bounds is not None:
+        low, high = spec.bounds
+        if one.minimum < low or one.maximum > high:
+            raise SpecError(
+                f"{place}.bounds: control dimension {one.number} goes from {number(one.minimum)} to "
+                f"{number(one.maximum)} in the demonstrations, beyond these bounds"
+            )
+        return low, high
+    often = {name: value for name, value, _ in one.extremes} or {"minimum": one.minimum, "maximum": one.maximum}
+    return often.get("minimum", -math.inf), often.get("maximum", math.inf)
+
+
+def _categorical(dimensions: Sequence[ControlDimension], place: str, name: str) -> ControlPart:
+    dims = tuple(one.number for one in dimensions)
+    if len(dims) == 1:
+        values = dimensions[0].distinct
+        if not values:
+            raise SpecError(f"{place}.kind: control dimension {dims[0]} takes more than {MOST_DISTINCT} values")
+        return ControlPart(name, dims, "categorical", values=values, why=f"{len(values)} discrete actions")
+    wrong = [one.number for one in dimensions if one.values != (0.0, 1.0)]
+    if wrong:
+        raise SpecError(
+            f"{place}.kind: control dimension {wrong[0]} is not 0 or 1: discrete actions are one dimension, or rows "
+            "with a single 1"
+        )
+    return ControlPart(name, dims, "categorical", why=f"{len(dims)} discrete actions, as rows")

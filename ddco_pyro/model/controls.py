@@ -1,0 +1,251 @@
+"""How each dimension of the control is modelled, what the model sees of it, and what it emits for it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from ddco_pyro.data.control_dimensions import number
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.model.control_parts import ControlPart
+from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Emission, Gaussian, Product
+from ddco_pyro.spec import ControlSpec, LearnedStd
+
+INITIAL_STD = 0.5
+"""A learned standard deviation starts here, in scaled units."""
+
+
+class ControlScaling(nn.Module):
+    """The A' of A control dimensions that vary, as the model sees them, and back.
+
+    Continuous ones are in units of their own spread, z = (a - shift) / scale; switches are 0 and 1, discrete actions
+    their index. Constant ones are no part of the model and put back into what it emits; bounds and switches' values are
+    emitted exactly.
+
+    :param size: A.
+    :param constant: the constant dimensions and their values, in the control's own units.
+    :param parts: how the others are modelled.
+    """
+
+    shift: Tensor
+    scale: Tensor
+    varying: Tensor
+    constant: Tensor
+    order: Tensor
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self, spec: ControlSpec, size: int, constant: dict[int, float], parts: tuple[ControlPart, ...]
+    ) -> None:
+        super().__init__()
+        self.parts = parts
+        varying = [dimension for dimension in range(size) if dimension not in constant]
+        self.groups = [tuple(varying.index(dimension) for dimension in part.dims) for part in parts]
+        shift, scale, standardized = _declared(spec, size, varying, parts)
+        self.standardized = np.array(standardized, dtype=bool)
+        self.register_buffer("shift", torch.tensor(shift, dtype=torch.float64))
+        self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
+        self.register_buffer("varying", torch.tensor(varying, dtype=torch.int64))
+        self.register_buffer("constant", torch.tensor([constant[d] for d in sorted(constant)], dtype=torch.float64))
+        self.register_buffer("order", torch.tensor([*varying, *sorted(constant)]).argsort(), persistent=False)
+        for name, end in (("low", -math.inf), ("high", math.inf)):
+            values = torch.full((len(varying),), end, dtype=torch.float64)
+            for dims, part in zip(self.groups, parts, strict=True):
+                if part.low:
+                    values[list(dims)] = torch.tensor(getattr(part, name), dtype=torch.float64)
+            self.register_buffer(name, values, persistent=False)
+
+    @property
+    def size(self) -> int:
+        """A, the number of control dimensions, constant ones among them."""
+        return len(self.order)
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers a network gives for the control of a caller."""
+        return sum(part.size for part in self.parts)
+
+    @property
+    def continuous(self) -> list[int]:
+        """The dimensions, of A', that have a σ: part after part."""
+        both = zip(self.groups, self.parts, strict=True)
+        return [dimension for dims, part in both if part.continuous for dimension in dims]
+
+    @property
+    def measure(self) -> dict[str, Any]:
+        """What a log-likelihood is about: densities, masses on bounds, probabilities. Others cannot be compared."""
+        measure: dict[str, Any] = {}
+        for part in self.parts:
+            for place, dimension in enumerate(part.dims):
+                ends = [part.low[place], part.high[place]] if part.low else []
+                about = [end if math.isfinite(end) else None for end in ends] or list(part.values)
+                measure[str(dimension)] = [part.kind, *about]
+        return measure
+
+    def fit(self, demonstrations: Demonstrations) -> None:
+        """Where the spec says ``standardize``: take mean and spread of these demonstrations' controls."""
+        if self.standardized.any():
+            rows = np.concatenate([demo.actions[:, self.varying.numpy()] for demo in demonstrations])
+            spread = rows.std(0)
+            shift, scale = rows.mean(0), np.where(spread > 1e-9, spread, 1.0)
+            self.shift.copy_(torch.as_tensor(np.where(self.standardized, shift, self.shift.numpy())))
+            self.scale.copy_(torch.as_tensor(np.where(self.standardized, scale, self.scale.numpy())))
+
+    @property
+    def log_scale(self) -> Tensor:
+        """log scale [A'], 0 where nothing is continuous: what a log-density in the control's own units is less by."""
+        logs = torch.zeros_like(self.scale)
+        logs[self.continuous] = self.scale[self.continuous].log()
+        return logs
+
+    def scaled(self, actions: np.ndarray) -> np.ndarray:
+        """[T, A] in the control's own units to [T, A'] as the model sees them; NaN for an unknown discrete action."""
+        scaled: np.ndarray = (actions[:, self.varying.numpy()] - self.shift.numpy()) / self.scale.numpy()
+        for dims, part in zip(self.groups, self.parts, strict=True):
+            if part.values:
+                given, values = actions[:, part.dims[0]], np.array(part.values)
+                index = np.searchsorted(values, given).clip(max=len(values) - 1)
+                scaled[:, dims[0]] = np.where(values[index] == given, index, np.nan)
+        return scaled
+
+    def impossible(self, demonstration: Demonstration) -> str:
+        """What is wrong with a demonstration that has a control of probability 0; nothing where none has."""
+        scaled = self.scaled(demonstration.actions)
+        for dims, part in zip(self.groups, self.parts, strict=True):
+            if not part.continuous:
+                own = scaled[:, list(dims)]
+                allowed = ~np.isnan(own) if part.values else (own == 0) | (own == 1)
+                if part.kind == "categorical" and not part.values:
+                    allowed &= own.sum(1, keepdims=True) == 1
+                if not allowed.all():
+                    step, place = np.argwhere(~allowed)[0]
+                    value = demonstration.actions[step, part.dims[place]]
+                    return (
+                        f"{demonstration.name}: control dimension {part.dims[place]} is {number(value)} at step "
+                        f"{step}, which {part.name} ({part.kind}) cannot be; declare another kind in control.parts"
+                    )
+        return ""
+
+    def emitted(self, scaled: Tensor) -> Tensor:
+        """[..., A'] as the model sees them to [..., A] in the control's own units, the constant dimensions put back."""
+        values = scaled.double() * self.scale + self.shift
+        low, high = self.ends()
+        values = torch.where(scaled.float() <= low, self.low, values)
+        values = torch.where(scaled.float() >= high, self.high, values)
+        for dims, part in zip(self.groups, self.parts, strict=True):
+            if part.values:
+                actions = torch.tensor(part.values, dtype=torch.float64)[scaled[..., dims[0]].long()]
+                values = torch.where(torch.arange(values.shape[-1]) == dims[0], actions.unsqueeze(-1), values)
+        return torch.cat([values, self.constant.expand(*values.shape[:-1], -1)], dim=-1)[..., self.order]
+
+    def unscaled(self, scaled: Tensor) -> np.ndarray:
+        """The same as an array."""
+        controls: np.ndarray = self.emitted(scaled).numpy()
+        return controls
+
+    def ends(self) -> tuple[Tensor, Tensor]:
+        """Bounds as the model sees them, float32 [A'], infinite where there are none."""
+        return ((self.low - self.shift) / self.scale).float(), ((self.high - self.shift) / self.scale).float()
+
+    def emission(self, numbers: Tensor, std: Tensor) -> Emission:
+        """The emission that a network's numbers [..., K, size] stand for.
+
+        :param std: σ of the continuous dimensions, part after part, [C] or [K, C].
+        """
+        low, high = self.ends()
+        groups: list[tuple[tuple[int, ...], Emission]] = []
+        sizes, at = [part.size for part in self.parts], 0
+        for dims, part, own in zip(self.groups, self.parts, numbers.split(sizes, dim=-1), strict=True):
+            if part.continuous:
+                deviation, at = std[..., at : at + part.size], at + part.size
+                gaussian = (own, deviation, self.log_scale[list(dims)])
+                bounds = (low[list(dims)], high[list(dims)])
+                groups.append((dims, Gaussian(*gaussian) if part.kind == "gaussian" else Clipped(*gaussian, *bounds)))
+            elif part.kind == "binary":
+                groups.append((dims, Binary(own)))
+            else:
+                groups.append((dims, Categorical(own, torch.tensor(not part.values))))
+        in_order = [dimension for dims, _ in groups for dimension in dims] == list(range(len(self.varying)))
+        return groups[0][1] if len(groups) == 1 and in_order else Product(tuple(groups))
+
+
+def _declared(
+    spec: ControlSpec, size: int, varying: Sequence[int], parts: Sequence[ControlPart]
+) -> tuple[list[float], list[float], list[bool]]:
+    """Shift, scale, and whether both are taken from demonstrations, of each dimension that varies."""
+    own = {part.name: part.scale for part in spec.parts if part.scale is not None}
+    shift, scale, standardized = [0.0] * len(varying), [1.0] * len(varying), [False] * len(varying)
+    for part in parts:
+        for place, dimension in enumerate(part.dims):
+            at = varying.index(dimension)
+            if part.kind == "binary":
+                shift[at], scale[at] = part.low[place], part.high[place] - part.low[place]
+            elif part.continuous:
+                named = next((one for one in spec.parts if dimension in one.dims and one.name in own), None)
+                declared = own[named.name] if named else spec.scale
+                standardized[at] = declared == "standardize"
+                if isinstance(declared, tuple):
+                    scale[at] = declared[named.dims.index(dimension) if named else dimension]
+    return shift, scale, standardized
+
+
+class ControlStd(nn.Module):
+    """The standard deviations σ of the continuous control dimensions, in scaled units: fixed, or learned above a floor.
+
+    The options of a level share a σ unless ``per_option`` says otherwise: one of them could collect the steps where a
+    Gaussian control hardly varies (an actuator on its bound), whatever the skill (see docs/decisions.md).
+    """
+
+    fixed: Tensor
+    floor: Tensor
+
+    def __init__(self, spec: ControlSpec, scaling: ControlScaling, copies: int) -> None:
+        super().__init__()
+        stds = [_std_of(spec, dimension) for dimension in scaling.varying[scaling.continuous].tolist()]
+        fixed = [0.0 if isinstance(std, LearnedStd) else float(std) for std in stds]
+        learned = [place for place, std in enumerate(stds) if isinstance(std, LearnedStd)]
+        self.own = [place for place in learned if getattr(stds[place], "per_option", False)]
+        self.shared = [place for place in learned if place not in self.own]
+        floors = [std.floor if isinstance(std, LearnedStd) else 0.0 for std in stds]
+        self.register_buffer("fixed", torch.tensor(fixed), persistent=False)
+        self.register_buffer("floor", torch.tensor(floors), persistent=False)
+        start = torch.tensor([math.log(math.expm1(max(INITIAL_STD - floor, 1e-3))) for floor in floors])
+        if self.shared:
+            self.raw = nn.Parameter(start[self.shared].clone())
+        if self.own:
+            self.raw_own = nn.Parameter(start[self.own].repeat(copies, 1))
+
+    def forward(self) -> Tensor:
+        """σ [C], or [K, C] where a dimension has one for each option."""
+        std = self.fixed
+        if self.shared:
+            std = std.index_put((torch.tensor(self.shared),), self.floor[self.shared] + softplus(self.raw))
+        if self.own:
+            own = self.floor[self.own] + softplus(self.raw_own)
+            columns = list(std.expand(len(own), -1).unbind(-1))
+            for place, column in zip(self.own, own.unbind(-1), strict=True):
+                columns[place] = column
+            std = torch.stack(columns, dim=-1)
+        return std
+
+
+def _std_of(spec: ControlSpec, dimension: int) -> float | LearnedStd:
+    named = next((part for part in spec.parts if dimension in part.dims), None)
+    return spec.std if named is None or named.std is None else named.std
+
+
+def refuse_impossible(demonstrations: Demonstrations, scaling: ControlScaling) -> None:
+    """See that every control of these demonstrations can be emitted.
+
+    :raises DemonstrationsError: a switch or a discrete action has a value that it does not have in the model.
+    """
+    for demonstration in demonstrations:
+        if problem := scaling.impossible(demonstration):
+            raise DemonstrationsError(problem)
