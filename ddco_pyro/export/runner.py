@@ -115,7 +115,7 @@ class Runner:
         return int((total <= generator.random() * total[-1]).sum())
 
     def _control(self, outputs: Outputs, generator: np.random.Generator) -> np.ndarray:
-        """The most likely control, or a sample, of the lowest level whose choice is an option, else of the meta-policy."""
+        """The most likely control, or a sample, of the lowest level with an option, else of the meta-policy."""
         level, actor = next(((d, h - 1) for d, h in enumerate(self.choices) if h > 0), (len(self.choices), 0))
         numbers, first = outputs[f"control_{level}"][actor].astype(np.float64), 0
         sampled = self.about["control"] == "sample"
