@@ -256,15 +256,6 @@ def test_looking_does_not_take_more_than_a_block(tmp_path: Path) -> None:
     assert found.peak - base.peak < 150e6  # of 480 MB
 
 
-def test_a_page_of_very_many_segments_shows_the_first(toy_run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = toy_like(tmp_path / "demos.hdf5", 9, 50)
-    monkeypatch.setattr("ddco_pyro.segmenting.page.MOST_BOXES", 1)
-    assert call("segment", toy_run.folder, path, "--html", tmp_path / "a.html").status == 0
-    text = (tmp_path / "a.html").read_text()
-    assert text.count('class="demonstration"') == 1
-    assert "The first 1 of 9 demonstrations" in text
-
-
 @pytest.mark.slow
 def test_eight_gigabytes_are_looked_at(eight: Path, tmp_path: Path) -> None:
     ended = measured("inspect", eight)

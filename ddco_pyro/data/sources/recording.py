@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import h5py
@@ -94,6 +95,17 @@ def of_dataset(dataset: h5py.Dataset, where: str) -> Column:
             yield block
 
     return Column(dataset.shape, dataset.dtype, blocks)
+
+
+def damaged(path: Path, where: str, error: BaseException) -> DemonstrationsError:
+    """What a library says of a file that it cannot read, as one line; what is such a line already stays as it is.
+
+    :param where: the part of it; may be empty.
+    """
+    if isinstance(error, DemonstrationsError):
+        return error
+    text = " ".join(str(error).split()) or type(error).__name__
+    return DemonstrationsError(f"{path}: {where + ': ' if where else ''}cannot be read, or is damaged: {text}")
 
 
 def block_steps(shape: tuple[int, ...], dtype: np.dtype) -> int:
