@@ -123,6 +123,7 @@ class Inspection:
     :param frequency: control steps in a second, Hz, where the file says it.
     :param control: what each dimension of the control does.
     :param excluded: names of demonstrations that were not looked at.
+    :param unreadable: names of demonstrations that could not be read.
     """
 
     path: Path
@@ -134,6 +135,7 @@ class Inspection:
     problems: list[str] = field(default_factory=list)
     control: tuple[ControlDimension, ...] = ()
     excluded: tuple[str, ...] = ()
+    unreadable: tuple[str, ...] = ()
 
     @property
     def notes(self) -> list[str]:
@@ -203,6 +205,7 @@ def _inspect(path: Path, source: Source, exclude: tuple[str, ...]) -> Inspection
     lengths: dict[str, int] = {}
     fields: dict[str, Field] = {}
     problems: list[str] = []
+    unreadable: list[str] = []
     control = ControlStatistics()
     for name in (name for name in source.names if name not in exclude):
         try:
@@ -213,11 +216,13 @@ def _inspect(path: Path, source: Source, exclude: tuple[str, ...]) -> Inspection
                 problems += _add(fields, place, watched, name, lengths[name])
         except DemonstrationsError as error:
             problems.append(str(error))
+            unreadable.append(name)
     problems += problems_of_masks(source.masks, source.names)
     masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in source.masks.items()}
     found = Inspection(
-        path, source.format, lengths, fields, masks, source.frequency, problems, control.dimensions(), exclude
-    )
+        path, source.format, lengths, fields, masks, source.frequency, problems, control.dimensions(), exclude,
+        tuple(unreadable),
+    )  # fmt: skip
     found.problems.extend(_problems(found))
     return found
 
