@@ -19,7 +19,8 @@ from provenance import Record
 
 from ddco_pyro.acting.lockstep import Played, play
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import read_tensors, write_tensors, write_text
+from ddco_pyro.data.files import write_text
+from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.fitting.fit import log_likelihoods
 from ddco_pyro.fitting.prepare import Dimensions, baseline_spec, build_hierarchy, dimensions
 from ddco_pyro.fitting.training import Trainer

@@ -20,7 +20,8 @@ from selecting import data_at
 
 import ddco_pyro
 from ddco_pyro.cli import console
-from ddco_pyro.data.files import Damaged, read_tensors, write_tensors
+from ddco_pyro.data.files import Damaged
+from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.prepare import demonstrations

@@ -14,7 +14,7 @@ import pytest
 import toy_task
 
 import ddco_pyro
-from ddco_pyro.data.files import read_tensors, write_tensors
+from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.fitting.fit import Fit, RunError
 from ddco_pyro.fitting.rollouts import policies, roll_out
 from ddco_pyro.simulation.episodes import run_episode, run_episodes

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from ddco_pyro.data.files import NotWritable, read_tensors, whole_file, whole_folder, write_tensors, write_text
+from ddco_pyro.data.files import NotWritable, whole_file, whole_folder, write_text
+from ddco_pyro.data.tensors import read_tensors, write_tensors
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])

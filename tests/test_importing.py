@@ -50,6 +50,17 @@ def test_a_file_of_robomimics_is_read_as_it_is() -> None:
     assert inspect(ROBOMIMIC).frequency == 20
 
 
+def test_a_file_of_robomimics_that_is_written_again_says_the_same(out: Path) -> None:
+    demos = Demonstrations.read(ROBOMIMIC)
+    demos.write(out)
+    again = Demonstrations.read(out)
+    assert (again.masks, again.attributes) == (demos.masks, demos.attributes)
+    assert inspect(out).frequency == 20
+    with h5py.File(out) as file, h5py.File(ROBOMIMIC) as source:
+        for name in ("env_args", "total"):
+            assert file["data"].attrs[name] == source["data"].attrs[name]
+
+
 def test_robomimic_in_this_layout(out: Path) -> None:
     found = import_demonstrations(ROBOMIMIC, out)
     assert found.names == tuple(f"demo_{number}" for number in range(6))
@@ -322,11 +333,13 @@ def test_broken_demonstrations_are_refused_or_left_out(tmp_path: Path, out: Path
     with h5py.File(source, "r+") as file:
         file["data/demo_1/actions"][0, 0] = np.nan
         del file["data/demo_3/obs/pose"]
-    with pytest.raises(DemonstrationsError, match=r"demo_1: actions has NaN or .*; or leave such ones out with --skip"):
+    with pytest.raises(
+        DemonstrationsError, match=r"demo_1: actions is nan at step 0, index \[0\]; .*; or leave .*--skip"
+    ):
         import_demonstrations(source, out)
     ended = call("import", source, "--out", out, "--skip-broken")
     assert (ended.status, ended.out) == (0, f"{out}: 3 demonstrations\n")
-    assert "left out demo_1: demo_1: actions has NaN or infinite values" in ended.err
+    assert "left out demo_1: demo_1: actions is nan at step 0, index [0]; repair it" in ended.err
     assert "left out demo_3: demo_3: obs/pose is missing, which demo_0 has" in ended.err
     demos = Demonstrations.read(out)
     assert (demos.names, demos.masks) == (("demo_0", "demo_2", "demo_4"), {"valid": ("demo_2",)})

@@ -9,9 +9,10 @@ import pytest
 import torch
 from sklearn.metrics import adjusted_rand_score
 
-from ddco_pyro.fitting.clusters import POOLED, Clusters
+from ddco_pyro.fitting.clusters import Clusters
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.networks.conv import POOLED
 
 LENGTHS = (7, 4, 6)
 PLACES = np.array([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])

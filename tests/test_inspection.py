@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import h5py
@@ -11,7 +12,7 @@ import pytest
 from command_line import call
 from random_demonstrations import demonstrations
 
-from ddco_pyro.data.demonstrations import DemonstrationsError
+from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.data.inspection import inspect
 
 
@@ -70,7 +71,7 @@ def test_what_a_fit_would_refuse_is_said(path: Path) -> None:
     assert found.problems == [
         "demo_3: obs/goal has 2 steps, but actions has 6",
         "demo_4: actions is missing; there is: labels/phase, obs/camera, obs/fixed, obs/goal, obs/pose",
-        "mask/valid: there is no demonstration 'demo_9'",
+        "mask/valid: there is no demonstration 'demo_9' (did you mean 'demo_4'?)",
         "obs/goal cannot be used in 1 of 4 demonstrations",
         "obs/pose has 1 NaN and 1 infinite values, the first in demo_1 at step 2; 2 of 4 demonstrations are affected",
     ]
@@ -98,6 +99,23 @@ def test_values_that_cannot_be_used_have_a_place(path: Path, block: int, monkeyp
     ]
     assert "1 NaN, 0 infinite; 4 beyond ±1e+30" in call("inspect", path).out
     assert inspect(path, exclude=["demo_3", "demo_4"]).problems == []
+
+
+def test_what_reading_refuses_is_a_problem_and_is_not_imported(path: Path, tmp_path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["data/demo_1"].attrs["num_samples"] = 9
+        steps = len(file["data/demo_2/actions"])
+        del file["data/demo_2/obs/goal"]
+        file["data/demo_2/obs/goal"] = np.ones((steps, 7))
+    short = "demo_1: actions has 4 steps, but num_samples is 9"
+    other = "demo_2: obs/goal has shape (7,) at each step, but (2,) in"
+    first, second, *_ = inspect(path).problems
+    assert (first, second[: len(other)]) == (short, other)
+    for exclude, message in (((), short), (("demo_1",), other)):
+        with pytest.raises(DemonstrationsError, match=re.escape(message)):
+            Demonstrations.read(path, exclude=exclude)
+    ended = call("import", path, "--out", tmp_path / "out.hdf5", "--skip-broken")
+    assert (ended.out, ended.err.count("left out")) == (f"{tmp_path / 'out.hdf5'}: 3 demonstrations\n", 2)
 
 
 def test_demonstrations_that_are_left_out_do_not_count(path: Path) -> None:

@@ -20,8 +20,8 @@ import yaml
 from killing import Kept, Killed, until_done, whole
 from random_demonstrations import demonstrations
 
-from ddco_pyro.data.files import read_tensors
 from ddco_pyro.data.importing import import_demonstrations
+from ddco_pyro.data.tensors import read_tensors
 
 
 def same_hdf5(one: Path, other: Path) -> None:

@@ -5,7 +5,6 @@ from dataclasses import replace
 from html.parser import HTMLParser
 
 import h5py
-import imageio.v3 as imageio
 import numpy as np
 import pytest
 import toy_task
@@ -20,7 +19,8 @@ from ddco_pyro.report.plot_rows import order
 from ddco_pyro.report.plot_timing import shares, terminations
 from ddco_pyro.report.plot_trajectories import movement, position_key, view
 from ddco_pyro.selection.scoring import Unwatched
-from ddco_pyro.simulation.episodes import paired_difference, summarize
+from ddco_pyro.simulation.episodes import Episode, paired_difference, summarize
+from ddco_pyro.simulation.film import write_film
 from ddco_pyro.spec import parse_spec
 
 LINEAR = {"network": "linear"}
@@ -85,7 +85,7 @@ def deep(tmp_path_factory):
     frames = np.random.default_rng(0).integers(0, 255, (5, 48, 64, 3), dtype=np.uint8)
     (found.folder / "videos").mkdir()
     for name in ("flat-1000", "ddco-1000", "ddco-1001"):
-        imageio.imwrite(found.folder / "videos" / f"{name}.mp4", frames, plugin="FFMPEG", fps=3, macro_block_size=1)
+        write_film(found.folder / "videos" / f"{name}.mp4", Episode(1000, demos[0], {}, np.zeros((4, 0), int), frames))
     (found.folder / "rollouts.csv").write_text("method,seed,success\nddco,1000,1.0\nddco,1001,0.0\nflat,1000,\n")
     return found, write_report(found, demos).read_text()
 

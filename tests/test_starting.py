@@ -135,7 +135,7 @@ def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path, ke
     spec = load_spec(written)
     assert spec.demonstrations.exclude == ("demo_2", "demo_9")
     assert [one.key for one in spec.observations] == ["pose"]
-    assert "# NaN, infinite or huge values; where: ddco-pyro inspect" in text
+    assert "# NaN, infinite or huge values, or damaged; where: ddco-pyro inspect" in text
     assert text.startswith("# A starting spec for 8 demonstrations of 3 to 6 steps.")
     ended = call("fit", written, "--out", tmp_path / "run", "--set", "training.epochs=1")
     assert ended.status == 0, ended.err
@@ -146,6 +146,17 @@ def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path, ke
     assert ended.status == 0, ended.err
     rows = [line.split(",")[0] for line in (tmp_path / "segments.csv").read_text().splitlines()[1:]]
     assert set(rows) == {f"demo_{number}" for number in range(10)} - {"demo_2", "demo_9"}
+
+
+def test_demonstrations_that_cannot_be_read_are_left_out(path: Path, tmp_path: Path) -> None:
+    demonstrations(7).write(path)
+    with h5py.File(path, "r+") as file:
+        del file["data/demo_1/actions"]
+        file["data/demo_3"].attrs["num_samples"] = 99
+    spec = load_spec(write(tmp_path, text := starting_spec(inspect(path), path)))
+    assert spec.demonstrations.exclude == ("demo_1", "demo_3")
+    assert text.startswith("# A starting spec for 5 demonstrations")
+    assert call("check", tmp_path / "written.yaml").status == 0
 
 
 def test_of_many_broken_demonstrations_the_key_is_left_out(path: Path) -> None:

@@ -1,8 +1,4 @@
-"""Demonstrations in memory and in HDF5 files of robomimic's layout.
-
-A file holds groups ``data/<name>`` with ``actions`` [T, A], ``obs/<key>`` [T, ...] and, if it likes, ``labels/<name>``
-[T]; beside them, if it likes, ``mask/<name>``: lists of names of demonstrations.
-"""
+"""Demonstrations in memory, checked; read from and written to HDF5 files of robomimic's layout."""
 
 from __future__ import annotations
 
@@ -11,27 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, overload
 
-import h5py
 import numpy as np
 
-from ddco_pyro.data.files import whole_file
-from ddco_pyro.data.hdf5 import (
-    Attribute,
-    DemonstrationsError,
-    array_at,
-    attributes_of,
-    dataset_at,
-    datasets,
-    member,
-    names_in_mask,
-    natural,
-    opened,
-    written,
-)
+from ddco_pyro.data.checks import check, check_alike, check_values, problems_of_masks, unknown
+from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import PROGRAM, Extent, refuse_too_much
 from ddco_pyro.data.sources.recording import Recording, of_array
-from ddco_pyro.data.values import LARGEST, usable
-from ddco_pyro.errors import nearest
+from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,47 +39,42 @@ class Demonstration:
             raise DemonstrationsError(
                 f"{self.name!r} cannot be the name of a demonstration; it must not be empty or have a /"
             )
-        actions = _numbers(self.actions, self.name, "actions")
-        if actions.ndim != 2 or actions.shape[1] == 0:
-            raise DemonstrationsError(
-                f"{self.name}: actions has shape {actions.shape}, it has to be [steps, dimensions]"
-            )
-        if len(actions) == 0:
-            raise DemonstrationsError(f"{self.name}: actions has no steps; remove this demonstration")
-        observations = {key: _numbers(one, self.name, f"obs/{key}") for key, one in self.observations.items()}
-        labels = {key: _integers(one, f"{self.name}: labels/{key}") for key, one in self.labels.items()}
-        for where, array in [
-            *((f"obs/{key}", one) for key, one in observations.items()),
-            *((f"labels/{key}", one) for key, one in labels.items()),
-        ]:
-            if array.shape[:1] != (len(actions),):
-                steps = f"{len(array)} steps" if array.ndim else "no steps"
-                raise DemonstrationsError(f"{self.name}: {where} has {steps}, but actions has {len(actions)}")
-        object.__setattr__(self, "actions", actions.astype(np.float64))
+        recording = self.recording()
+        check(recording)
+        check_values(recording, f"repair it, or leave {self.name} out (demonstrations.exclude)")
+        observations = {key: _numbers(values) for key, values in self.observations.items()}
+        labels = {key: _integers(values, f"{self.name}: labels/{key}") for key, values in self.labels.items()}
+        object.__setattr__(self, "actions", np.asarray(self.actions).astype(np.float64))
         object.__setattr__(self, "observations", observations)
         object.__setattr__(self, "labels", labels)
+
+    @classmethod
+    def of(cls, recording: Recording) -> Demonstration:
+        """A recording, read.
+
+        :raises DemonstrationsError: its file is damaged, or it cannot be used.
+        """
+        observations, labels = (
+            {key: column.array() for key, column in columns.items()}
+            for columns in (recording.observations, recording.labels)
+        )
+        return cls(recording.name, observations, recording.actions.array(), labels, recording.attributes)
+
+    def recording(self) -> Recording:
+        """The same as a recording, to be written."""
+        observations, labels = (
+            {key: of_array(values) for key, values in arrays.items()} for arrays in (self.observations, self.labels)
+        )
+        return Recording(self.name, observations, of_array(self.actions), labels, self.attributes)
 
     def __len__(self) -> int:
         return len(self.actions)
 
 
-def _numbers(array: Any, name: str, place: str) -> np.ndarray:
-    """Numbers as float64, or as they are if uint8; everything finite and at most ``values.LARGEST``."""
-    array, where = np.asarray(array), f"{name}: {place}"
-    if array.dtype == np.uint8:
-        return array
-    if array.dtype.kind not in "fiub":
-        raise DemonstrationsError(f"{where} holds {array.dtype}, it has to hold real numbers")
-    good = usable(array)
-    if not good.all():
-        place = np.argwhere(~good)[0].tolist()
-        value = float(array[tuple(place)])
-        at = f" at step {place[0]}, index {place[1:]}" if place else ""
-        limit = f", and at most {LARGEST:g} can be used" if np.isfinite(value) else ""
-        raise DemonstrationsError(
-            f"{where} is {value:g}{at}{limit}; repair it, or leave {name} out (demonstrations.exclude)"
-        )
-    return array.astype(np.float64)
+def _numbers(values: Any) -> np.ndarray:
+    """As float64, or as they are if uint8."""
+    array = np.asarray(values)
+    return array if array.dtype == np.uint8 else array.astype(np.float64)
 
 
 def _integers(array: Any, where: str) -> np.ndarray:
@@ -128,12 +105,11 @@ class Demonstrations(Sequence[Demonstration]):
         if len(set(self.names)) < len(self):
             twice = next(name for name in self.names if self.names.count(name) > 1)
             raise DemonstrationsError(f"{twice}: there are two demonstrations of this name; rename one")
+        first = self.demonstrations[0].recording()
         for demo in self.demonstrations[1:]:
-            _check_alike(self.demonstrations[0], demo)
-        for mask, names in self.masks.items():
-            unknown = sorted(set(names) - set(self.names))
-            if unknown:
-                raise DemonstrationsError(f"mask/{mask}: {_unknown(unknown[0], self.names)}")
+            check_alike(demo.recording(), first)
+        for problem in problems_of_masks(self.masks, self.names):
+            raise DemonstrationsError(problem)
 
     @classmethod
     def read(
@@ -151,21 +127,18 @@ class Demonstrations(Sequence[Demonstration]):
         :raises DemonstrationsError: the file cannot be read, does not hold what was asked for, or holds more than fits
             into memory.
         """
-        with opened(path) as file:
-            needed = PROGRAM + _extent(file, observations, labels, exclude).size
+        with open_robomimic(Path(path)) as source:
+            needed = PROGRAM + _extent(source, observations, labels, exclude).size
             refuse_too_much(needed, "reading it", "read only some observations, or scale pictures down")
-            return cls(*_read(file, observations, labels, exclude))
+            read = tuple(Demonstration.of(one) for one in _recordings(source, observations, labels, exclude))
+            masks = {mask: tuple(one for one in names if one not in exclude) for mask, names in source.masks.items()}
+            return cls(read, masks, source.attributes)
 
     def write(self, path: str | Path) -> None:
         """Write an HDF5 file, whole or not at all."""
-        with whole_file(Path(path)) as temporary, written(temporary) as file:
-            file.attrs.update(self.attributes)
-            data = file.create_group("data")
-            data.attrs["total"] = sum(self.lengths)
+        with robomimic_file(Path(path), self.attributes, self.masks) as data:
             for demo in self:
-                _write(data.create_group(demo.name), demo)
-            for name, members in self.masks.items():
-                file.create_dataset(f"mask/{name}", data=np.array([name.encode() for name in members], dtype=np.bytes_))
+                write_recording(data, demo.recording())
 
     def __len__(self) -> int:
         return len(self.demonstrations)
@@ -209,7 +182,7 @@ class Demonstrations(Sequence[Demonstration]):
         chosen = tuple(names)
         for name in chosen:
             if name not in by_name:
-                raise DemonstrationsError(_unknown(name, self.names))
+                raise DemonstrationsError(unknown(name, self.names))
         return Demonstrations(tuple(by_name[name] for name in chosen), attributes=self.attributes)
 
     def split(self, valid_fraction: float, seed: int) -> tuple[Demonstrations, Demonstrations]:
@@ -243,125 +216,28 @@ class Demonstrations(Sequence[Demonstration]):
         return tuple(self.names[index] for index in sorted(drawn))
 
 
-def _check_alike(first: Demonstration, other: Demonstration) -> None:
-    if other.actions.shape[1:] != first.actions.shape[1:]:
-        raise DemonstrationsError(_differ(other, "actions", other.actions, first, first.actions))
-    if set(other.observations) != set(first.observations) or set(other.labels) != set(first.labels):
-        keys = sorted(set(other.observations) ^ set(first.observations) | set(other.labels) ^ set(first.labels))
-        raise DemonstrationsError(f"{other.name}: {', '.join(keys)} is only in one of {first.name} and {other.name}")
-    for key, array in other.observations.items():
-        if array.shape[1:] != first.observations[key].shape[1:]:
-            raise DemonstrationsError(_differ(other, f"obs/{key}", array, first, first.observations[key]))
-
-
-def _differ(other: Demonstration, where: str, array: np.ndarray, first: Demonstration, expected: np.ndarray) -> str:
-    return (
-        f"{other.name}: {where} has shape {array.shape[1:]} at each step, but {expected.shape[1:]} in {first.name}; "
-        "all demonstrations need the same"
-    )
-
-
-def _unknown(name: str, names: Sequence[str]) -> str:
-    return f"there is no demonstration {name!r}{nearest(name, names)}"
-
-
-# --- HDF5 -------------------------------------------------------------------------------------------------------------
-
-
 def extent(path: str | Path, observations: Sequence[str], exclude: Sequence[str] = ()) -> Extent:
     """How much there is of these observations and of the controls, by the file's headers alone.
 
     :raises DemonstrationsError: the file cannot be read or does not hold them.
     """
-    with opened(path) as file:
-        return _extent(file, observations, (), exclude)
+    with open_robomimic(Path(path)) as source:
+        return _extent(source, observations, (), exclude)
 
 
 def _extent(
-    file: h5py.File, observations: Sequence[str] | None, labels: Sequence[str], exclude: Sequence[str]
+    source: Robomimic, observations: Sequence[str] | None, labels: Sequence[str], exclude: Sequence[str]
 ) -> Extent:
-    return Extent.of(
-        {
-            "actions": dataset_at(group, "actions", f"{name}: "),
-            **_datasets(group, "obs", observations, name),
-            **_datasets(group, "labels", labels, name),
-        }
-        for name, group in _groups(file, exclude)
-    )
+    return Extent.of(dict(one.columns()) for one in _recordings(source, observations, labels, exclude))
 
 
-def _datasets(group: h5py.Group, folder: str, keys: Sequence[str] | None, name: str) -> dict[str, h5py.Dataset]:
-    """The datasets ``keys`` of a folder of a demonstration, by their place; all of them if None."""
-    if keys is not None and not keys:
-        return {}
-    members = member(group, folder, h5py.Group, f"{name}: ")
-    names = datasets(members) if keys is None else keys
-    return {f"{folder}/{key}": dataset_at(members, key, f"{name}: {folder}/") for key in names}
-
-
-def _groups(file: h5py.File, exclude: Sequence[str]) -> list[tuple[str, h5py.Group]]:
-    """The demonstrations of a file with their names, in order, without those that are left out."""
-    data = member(file, "data", h5py.Group, "")
-    names = sorted((name for name in data if isinstance(data.get(name), h5py.Group)), key=natural)
-    if not names:
-        raise DemonstrationsError("the group 'data' holds no demonstrations; at least one is needed")
+def _recordings(
+    source: Robomimic, observations: Sequence[str] | None, labels: Sequence[str], exclude: Sequence[str]
+) -> Iterator[Recording]:
+    """The demonstrations of a file, in order, without those that are left out."""
     for name in exclude:
-        if name not in names:
-            raise DemonstrationsError(f"demonstrations.exclude: {_unknown(name, names)}")
-    if len(set(exclude)) == len(names):
+        if name not in source.names:
+            raise DemonstrationsError(f"demonstrations.exclude: {unknown(name, source.names)}")
+    if set(exclude) == set(source.names):
         raise DemonstrationsError("demonstrations.exclude: leaves every demonstration out; keep some")
-    return [(name, data[name]) for name in names if name not in exclude]
-
-
-def _read(
-    file: h5py.File, observations: Sequence[str] | None, labels: Sequence[str], exclude: Sequence[str]
-) -> tuple[tuple[Demonstration, ...], dict[str, tuple[str, ...]], dict[str, Attribute]]:
-    demonstrations = tuple(_read_one(group, name, observations, labels) for name, group in _groups(file, exclude))
-    masks = member(file, "mask", h5py.Group, "") if "mask" in file else {}
-    members = {mask: names_in_mask(masks, mask) for mask in masks}
-    kept = {mask: tuple(name for name in names if name not in exclude) for mask, names in members.items()}
-    return demonstrations, kept, attributes_of(file)
-
-
-def _read_one(group: h5py.Group, name: str, observations: Sequence[str] | None, labels: Sequence[str]) -> Demonstration:
-    actions = array_at(group, "actions", f"{name}: ")
-    attributes = attributes_of(group)
-    claimed = attributes.pop("num_samples", len(actions))
-    if claimed != len(actions):
-        raise DemonstrationsError(f"{name}: actions has {len(actions)} steps, but num_samples is {claimed}")
-    return Demonstration(
-        name=name,
-        observations=_arrays(group, "obs", observations, name),
-        actions=actions,
-        labels=_arrays(group, "labels", labels, name),
-        attributes=attributes,
-    )
-
-
-def _arrays(group: h5py.Group, folder: str, keys: Sequence[str] | None, name: str) -> dict[str, np.ndarray]:
-    """The arrays ``keys`` of a folder of a demonstration; all of them if None."""
-    if keys is not None and not keys:
-        return {}
-    members = member(group, folder, h5py.Group, f"{name}: ")
-    return {key: array_at(members, key, f"{name}: {folder}/") for key in (datasets(members) if keys is None else keys)}
-
-
-def _write(group: h5py.Group, demo: Demonstration) -> None:
-    group.attrs.update(demo.attributes)
-    group.attrs["num_samples"] = len(demo)
-    group.create_dataset("actions", data=demo.actions)
-    for key, array in demo.observations.items():
-        group.create_dataset(f"obs/{key}", data=array)
-    for key, array in demo.labels.items():
-        group.create_dataset(f"labels/{key}", data=array)
-
-
-def recording_of(demo: Demonstration) -> Recording:
-    """A demonstration as a recording, to be written by itself."""
-    return Recording(
-        demo.name,
-        {key: of_array(array) for key, array in demo.observations.items()},
-        of_array(demo.actions),
-        {key: of_array(array) for key, array in demo.labels.items()},
-        demo.attributes,
-    )
+    return (source.recording(name, observations, labels) for name in source.names if name not in exclude)

@@ -1,9 +1,8 @@
-"""Reading HDF5 files of which nothing is believed: what is missing, damaged or claims too much is one clear line."""
+"""Reading and writing HDF5: what is missing or damaged in a file is one clear line."""
 
 from __future__ import annotations
 
 import io
-import math
 import re
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -17,9 +16,6 @@ from ddco_pyro.errors import BadInput, Failed, nearest
 
 Attribute = float | int | str | bool
 
-LARGEST_INFLATION = 1100  # deflate, the strongest of HDF5's usual filters, stores at most 1032 bytes in one
-LARGEST_STEP = 64 * 2**20  # bytes; a picture of 4096 x 4096 in four colours
-LARGEST_CHUNK = 256 * 2**20  # bytes; HDF5 unpacks whole chunks, whatever is asked for
 # What h5py raises for a damaged file.
 DAMAGE = (OSError, RuntimeError, ValueError, TypeError, KeyError, MemoryError)
 
@@ -134,61 +130,21 @@ def datasets(group: h5py.Group) -> list[str]:
     return sorted(found)
 
 
-def array_at(group: h5py.Group, key: str, where: str) -> np.ndarray:
-    """The whole array at ``key``.
-
-    :raises DemonstrationsError: it is missing, no array, damaged, or claims more than the file holds.
-    """
-    dataset = dataset_at(group, key, where)
-    try:
-        return np.asarray(dataset[()])
-    except DAMAGE as error:
-        raise DemonstrationsError(f"{where}{key} cannot be read ({error}); the file may be damaged") from error
-
-
 def dataset_at(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
-    """The dataset at ``key``, which holds as much as it claims and can be read step by step; nothing of it is read.
+    """The dataset at ``key``; nothing of it is read.
 
-    :raises DemonstrationsError: it is missing, no array, claims more than the file holds, or has giant steps or chunks.
+    :raises DemonstrationsError: it is missing, no array, or claims more than the file holds: HDF5 would fill in zeros.
     """
     dataset = member(group, key, h5py.Dataset, where)
     if dataset.shape is None or dataset.ndim == 0:
         raise DemonstrationsError(f"{where}{key} has no steps; it has to be an array")
-    _refuse_claims(dataset, f"{where}{key}")
-    _refuse_giants(dataset, f"{where}{key}")
+    stored = dataset.id.get_storage_size()
+    packed = dataset.is_virtual or (stored and dataset.id.get_create_plist().get_nfilters())
+    if dataset.nbytes > stored and not packed:
+        raise DemonstrationsError(
+            f"{where}{key} claims {dataset.nbytes} bytes, but the file holds {stored}; write it again"
+        )
     return dataset
-
-
-def _refuse_claims(dataset: h5py.Dataset, name: str) -> None:
-    """A damaged header can claim any size, and HDF5 would fill what is not in the file with zeros."""
-    stored, files = dataset.id.get_storage_size(), "file holds"
-    packed = dataset.id.get_create_plist().get_nfilters() > 0
-    if dataset.is_virtual:
-        folder = Path(dataset.file.filename).parent
-        names = {one.file_name for one in dataset.virtual_sources()}
-        sources = [Path(dataset.file.filename) if one == "." else folder / one for one in names]
-        stored, files, packed = sum(one.stat().st_size for one in sources if one.is_file()), "files hold", True
-    if dataset.nbytes > (LARGEST_INFLATION if packed else 1) * stored:
-        raise DemonstrationsError(f"{name} claims {dataset.nbytes} bytes, but the {files} {stored}; write it again")
-
-
-def _refuse_giants(dataset: h5py.Dataset, name: str) -> None:
-    """What is read is read in blocks of at least a step, and of at least a chunk."""
-    step, chunk = (math.prod(shape) * dataset.dtype.itemsize for shape in (dataset.shape[1:], dataset.chunks or ()))
-    if step > LARGEST_STEP:
-        raise DemonstrationsError(
-            f"{name} takes {_megabytes(step)} at each step, and at most {LARGEST_STEP // 10**6} can be read; "
-            "write less in a step"
-        )
-    if chunk > LARGEST_CHUNK:
-        raise DemonstrationsError(
-            f"{name} is stored in chunks of {_megabytes(chunk)}, and at most {LARGEST_CHUNK // 10**6} can be read; "
-            "write smaller chunks"
-        )
-
-
-def _megabytes(size: int) -> str:
-    return f"{size / 10**6:.0f} MB"
 
 
 def member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
@@ -205,20 +161,6 @@ def member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
             f"{where}{key} has to be a {kind.__name__.lower()}, not a {type(found).__name__.lower()}"
         )
     return found
-
-
-def names_in_mask(masks: h5py.Group, mask: str) -> tuple[str, ...]:
-    """The names of demonstrations that a mask (robomimic: a filter key) lists.
-
-    :raises DemonstrationsError: it is no list of names, or one that no memory can hold.
-    """
-    size = dataset_at(masks, mask, "mask/").nbytes
-    if size > LARGEST_STEP:
-        raise DemonstrationsError(
-            f"mask/{mask} takes {_megabytes(size)}, and no list of names is that long; write it again"
-        )
-    names = array_at(masks, mask, "mask/").ravel().tolist()
-    return tuple(name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names)
 
 
 def attributes_of(owner: h5py.HLObject) -> dict[str, Attribute]:

@@ -11,16 +11,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ddco_pyro.data.checks import check, check_alike, check_values
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, opened
 from ddco_pyro.data.resumable import Parts, discard, parts_of
 from ddco_pyro.data.sources import Column, Format, Recording, Source, open_source
-from ddco_pyro.data.values import LARGEST, usable
+from ddco_pyro.data.sources.robomimic import FREQUENCY
+from ddco_pyro.data.values import NUMBERS
 from ddco_pyro.errors import BadInput, nearest
 
-FREQUENCY = "control_frequency"
 IDENTITY = "imported"
-KEPT = ("env_args",)
-"""Attributes of robomimic's group ``data`` that its own tools look for there."""
+"""Attribute of a file: what decided its contents."""
 
 OnRecording = Callable[[int, int], None]
 
@@ -78,9 +78,7 @@ def import_demonstrations(
             if not parts.done:
                 raise DemonstrationsError(f"{source}: none of its demonstrations can be used")
             done = tuple(parts.done)
-            parts.finish(
-                _attributes(opened_source, source, identity), _masks(opened_source, done), _kept(opened_source)
-            )
+            parts.finish(_attributes(opened_source, source, identity), _masks(opened_source, done))
     return Imported(out, done, left_out)
 
 
@@ -92,9 +90,10 @@ def _keep(source: Source, choice: Choice, parts: Parts, on_recording: OnRecordin
     for number, name in enumerate(names):
         try:
             recording = _chosen(source.recording(name), choice)
-            _check(recording, first or recording)
+            check(recording)
+            check_alike(recording, first or recording)
             if name not in parts.done:
-                _check_values(recording)
+                check_values(recording)
                 parts.add(recording)
             first = first or recording
         except DemonstrationsError as error:
@@ -143,14 +142,9 @@ def _masks(source: Source, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def _attributes(source: Source, path: str | Path, identity: str) -> dict[str, Attribute]:
-    own = {name: value for name, value in source.attributes.items() if name not in (*KEPT, "total", IDENTITY)}
     frequency = {FREQUENCY: source.frequency} if source.frequency else {}
     said = {"source": Path(path).name, "source_format": source.format, IDENTITY: _digest(identity)}
-    return {**own, **frequency, **said}
-
-
-def _kept(source: Source) -> dict[str, Attribute]:
-    return {name: source.attributes[name] for name in KEPT if name in source.attributes}
+    return {**source.attributes, **frequency, **said}
 
 
 def _chosen(recording: Recording, choice: Choice) -> Recording:
@@ -162,7 +156,7 @@ def _chosen(recording: Recording, choice: Choice) -> Recording:
                 f"{recording.name}: there is no observation {key!r}{nearest(key, known)}; there is: {', '.join(known)}"
             )
     wanted = choice.observations or tuple(
-        key for key, one in known.items() if one.dtype.kind in "fiub" and (choice.videos or not one.video)
+        key for key, one in known.items() if one.dtype.kind in NUMBERS and (choice.videos or not one.video)
     )
     if not wanted:
         raise DemonstrationsError(f"{recording.name}: has no observation that can be used")
@@ -184,35 +178,3 @@ def _scaled(column: Column, size: tuple[int, int] | None) -> Column:
 def _resized(frame: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     found: np.ndarray = cv2.resize(frame, size[::-1], interpolation=cv2.INTER_AREA)
     return found.reshape(*size, frame.shape[-1])
-
-
-def _check(recording: Recording, first: Recording) -> None:
-    """What :class:`ddco_pyro.data.demonstrations.Demonstrations` asks for, of shapes alone."""
-    name, steps = recording.name, recording.actions.shape[0]
-    if len(recording.actions.shape) != 2 or not recording.actions.shape[1]:
-        raise DemonstrationsError(
-            f"{name}: actions has shape {recording.actions.shape}, it has to be [steps, dimensions]"
-        )
-    if steps == 0:
-        raise DemonstrationsError(f"{name}: actions has no steps")
-    theirs = dict(first.columns())
-    for place, column in recording.columns():
-        if column.dtype.kind not in "fiub":
-            raise DemonstrationsError(f"{name}: {place} holds {column.dtype}, it has to hold real numbers")
-        if column.shape[:1] != (steps,):
-            raise DemonstrationsError(f"{name}: {place} has {column.shape[0]} steps, but actions has {steps}")
-        if place not in theirs or theirs[place].shape[1:] != column.shape[1:]:
-            raise DemonstrationsError(
-                f"{name}: {place} is not as in {first.name}: shape {column.shape[1:]} at each step"
-            )
-    if set(theirs) - {place for place, _ in recording.columns()}:
-        missing = sorted(set(theirs) - {place for place, _ in recording.columns()})
-        raise DemonstrationsError(f"{name}: {', '.join(missing)} is missing, which {first.name} has")
-
-
-def _check_values(recording: Recording) -> None:
-    for place, column in recording.columns():
-        if not all(bool(usable(block).all()) for block in column.blocks()):
-            raise DemonstrationsError(
-                f"{recording.name}: {place} has NaN or infinite values, or some beyond ±{LARGEST:g}; repair them first"
-            )

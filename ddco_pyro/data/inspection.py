@@ -9,13 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from ddco_pyro.data.checks import check_shape, check_steps, problems_of_masks
 from ddco_pyro.data.control_dimensions import ControlDimension, ControlStatistics, notes
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.sources import Column, Format, Source, open_source
-from ddco_pyro.data.values import LARGEST, usable
-
-NUMBERS = "fiub"
-"""Kinds of numpy types that are real numbers."""
+from ddco_pyro.data.values import LARGEST, NUMBERS, usable
 
 
 @dataclass
@@ -125,6 +123,7 @@ class Inspection:
     :param frequency: control steps in a second, Hz, where the file says it.
     :param control: what each dimension of the control does.
     :param excluded: names of demonstrations that were not looked at.
+    :param unreadable: names of demonstrations that could not be read.
     """
 
     path: Path
@@ -136,6 +135,7 @@ class Inspection:
     problems: list[str] = field(default_factory=list)
     control: tuple[ControlDimension, ...] = ()
     excluded: tuple[str, ...] = ()
+    unreadable: tuple[str, ...] = ()
 
     @property
     def notes(self) -> list[str]:
@@ -205,6 +205,7 @@ def _inspect(path: Path, source: Source, exclude: tuple[str, ...]) -> Inspection
     lengths: dict[str, int] = {}
     fields: dict[str, Field] = {}
     problems: list[str] = []
+    unreadable: list[str] = []
     control = ControlStatistics()
     for name in (name for name in source.names if name not in exclude):
         try:
@@ -212,17 +213,16 @@ def _inspect(path: Path, source: Source, exclude: tuple[str, ...]) -> Inspection
             lengths[name] = recording.actions.shape[0] if recording.actions.shape else 0
             for place, column in recording.columns():
                 watched = _watched(column, control) if place == "actions" else column
-                _add(fields, place, watched, name, lengths[name], problems)
+                problems += _add(fields, place, watched, name, lengths[name])
         except DemonstrationsError as error:
             problems.append(str(error))
-    for mask, names in source.masks.items():
-        unknown = [name for name in names if name not in source.names]
-        if unknown:
-            problems.append(f"mask/{mask}: there is no demonstration {unknown[0]!r}")
+            unreadable.append(name)
+    problems += problems_of_masks(source.masks, source.names)
     masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in source.masks.items()}
     found = Inspection(
-        path, source.format, lengths, fields, masks, source.frequency, problems, control.dimensions(), exclude
-    )
+        path, source.format, lengths, fields, masks, source.frequency, problems, control.dimensions(), exclude,
+        tuple(unreadable),
+    )  # fmt: skip
     found.problems.extend(_problems(found))
     return found
 
@@ -239,21 +239,17 @@ def _watched(column: Column, control: ControlStatistics) -> Column:
     return replace(column, blocks=blocks)
 
 
-def _add(fields: dict[str, Field], place: str, column: Column, name: str, steps: int, problems: list[str]) -> None:
-    if column.shape[:1] != (steps,):
-        had = column.shape[0] if column.shape else "no"
-        problems.append(f"{name}: {place} has {had} steps, but actions has {steps}")
-        return
-    known = fields.get(place)
-    if known is None:
-        none = np.zeros(0)
-        known = fields[place] = Field(place, tuple(column.shape[1:]), str(column.dtype), none, none)
-    if known.shape != tuple(column.shape[1:]):
-        problems.append(
-            f"{name}: {place} has shape {list(column.shape[1:])} at each step, but {list(known.shape)} elsewhere"
-        )
-        return
+def _add(fields: dict[str, Field], place: str, column: Column, name: str, steps: int) -> list[str]:
+    """Take in an array of a demonstration; what is wrong with its shape, so that it could not be."""
+    none, shape = np.zeros(0), tuple(column.shape[1:])
+    try:
+        check_steps(name, place, column, steps)
+        known = fields.setdefault(place, Field(place, shape, str(column.dtype), none, none))
+        check_shape(f"{name}: {place}", column, known.shape, "the first")
+    except DemonstrationsError as error:
+        return [str(error)]
     known.add(column, name)
+    return []
 
 
 def _problems(found: Inspection) -> list[str]:

@@ -11,12 +11,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from ddco_pyro.data.files import leftovers, only_one, whole_file, write_text
 from ddco_pyro.data.hdf5 import Attribute, attributes_of, natural, opened, written
-from ddco_pyro.data.sources.recording import Column, Recording
+from ddco_pyro.data.sources.recording import Recording
+from ddco_pyro.data.sources.robomimic import robomimic_file, write_recording
 
 PART_BYTES = 64 * 2**20
 """A part is closed when it holds about so much, or so many recordings as its maker allows."""
@@ -55,7 +55,7 @@ class Parts:
         part = self.folder / f"{len(self._files()):06d}.hdf5"
         with whole_file(part) as temporary, written(temporary) as file:
             for recording in self._open:
-                write_recording(file.create_group(recording.name, track_order=True), recording)
+                write_recording(file, recording)
         self.done += [recording.name for recording in self._open]
         self._open, self._bytes = [], 0
 
@@ -67,27 +67,14 @@ class Parts:
                 found += [attributes_of(file[name]) for name in sorted(file, key=natural)]
         return found
 
-    def finish(
-        self, attributes: Mapping[str, Attribute], masks: Mapping[str, Sequence[str]], data: Mapping[str, Attribute]
-    ) -> None:
-        """Put the file together and remove the parts.
-
-        :param attributes: of the file.
-        :param data: of its group ``data``.
-        """
+    def finish(self, attributes: Mapping[str, Attribute], masks: Mapping[str, Sequence[str]]) -> None:
+        """Put the file together."""
         self.close()
-        with whole_file(self.path) as temporary, written(temporary) as file:
-            file.attrs.update(attributes)
-            group = file.create_group("data")
-            total = 0
+        with robomimic_file(self.path, attributes, masks) as data:
             for part in self._files():
                 with opened(part) as source:
                     for name in sorted(source, key=natural):
-                        source.copy(source[name], group, name)
-                        total += len(group[name]["actions"])
-            group.attrs.update({**data, "total": total})
-            for name, members in masks.items():
-                file.create_dataset(f"mask/{name}", data=np.array([one.encode() for one in members], dtype=np.bytes_))
+                        source.copy(source[name], data, name)
 
 
 def _names(part: Path) -> list[str]:
@@ -135,21 +122,3 @@ def discard(path: Path) -> None:
 
 def _folder(path: Path) -> Path:
     return path.with_name(f".{path.name}.parts")
-
-
-def write_recording(group: h5py.Group, recording: Recording) -> None:
-    """Write a recording into a group, block by block."""
-    group.attrs.update(recording.attributes)
-    group.attrs["num_samples"] = recording.actions.shape[0]
-    for place, column in recording.columns():
-        write_column(group, place, column)
-
-
-def write_column(group: h5py.Group, place: str, column: Column) -> None:
-    """Write an array block by block; pictures are compressed."""
-    settings = {"chunks": (1, *column.shape[1:]), "compression": "gzip", "compression_opts": 1} if column.image else {}
-    dataset = group.create_dataset(place, column.shape, column.dtype, **settings)
-    at = 0
-    for block in column.blocks():
-        dataset[at : at + len(block)] = block
-        at += len(block)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ddco_pyro.data.control_dimensions import all_constant
-from ddco_pyro.data.hdf5 import DemonstrationsError
+from ddco_pyro.data.hdf5 import DemonstrationsError, natural
 from ddco_pyro.data.inspection import Field, Inspection, inspect
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.spec.reading import read_yaml
@@ -41,12 +41,12 @@ PATIENCE = 50
 def starting_spec(found: Inspection, path: str | Path) -> str:
     """The text of a spec for what was found, commented, with ``path`` as its file.
 
-    Demonstrations with values that cannot be used are left out where they are few; else the observations with such
-    values are. What was left out is said in a comment.
+    Demonstrations that cannot be read are left out, and those with values that cannot be used where they are few; else
+    the observations with such values are. What was left out is said in a comment.
 
     :raises DemonstrationsError: nothing can be fitted to it; the line says why.
     """
-    excluded = _few_affected(found)
+    excluded = sorted({*found.unreadable, *_few_affected(found)}, key=natural)
     if excluded:
         found = inspect(found.path, exclude=excluded)
     if len(found.lengths) < LEAST:
@@ -90,7 +90,7 @@ def _lines(found: Inspection, path: str) -> Iterator[str]:
     yield f"  path: {_text(path)}"
     if found.excluded:
         names = ", ".join(map(_text, found.excluded))
-        yield f"  exclude: [{names}]   # NaN, infinite or huge values; where: ddco-pyro inspect"
+        yield f"  exclude: [{names}]   # NaN, infinite or huge values, or damaged; where: ddco-pyro inspect"
     yield from _validation(found)
     yield from _labels(found)
     yield from _observations(found)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+NUMBERS = "fiub"
+"""Kinds of numpy types that are real numbers."""
+
 LARGEST = 1e30
 """No number may be larger: networks are float32, which ends at 3e38, and variances are float64, which ends at 1e308."""
 

@@ -13,9 +13,7 @@ from sklearn.cluster import KMeans
 from torch import Tensor
 
 from ddco_pyro.model.encoding import Batch
-
-POOLED = 8
-"""Images are clustered by their POOLED × POOLED block means."""
+from ddco_pyro.model.networks.conv import POOLED
 
 
 class Clusters:
@@ -65,7 +63,7 @@ def _observations(batch: Batch) -> np.ndarray:
 
 
 def _block_means(frames: Tensor) -> Tensor:
-    """uint8 [T, H, W, C] to [T, C · POOLED²], in [0, 1]."""
+    """uint8 [T, H, W, C] to [T, C · POOLED²], in [0, 1]: as many numbers as a convolutional network keeps of a map."""
     pooled = [
         torch.nn.functional.adaptive_avg_pool2d(block.permute(0, 3, 1, 2).float() / 255, POOLED).flatten(1)
         for block in frames.split(FRAMES_AT_ONCE)

@@ -16,7 +16,7 @@ from torch import Tensor
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import read_tensors
+from ddco_pyro.data.tensors import read_tensors
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting import analysis
 from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy

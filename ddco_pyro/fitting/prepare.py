@@ -13,12 +13,12 @@ from torch import nn
 from ddco_pyro.data.control_dimensions import ControlDimension, all_constant, control_dimensions
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError, extent
 from ddco_pyro.data.memory import Work, refuse_too_much
-from ddco_pyro.fitting.clusters import POOLED
 from ddco_pyro.fitting.widths import nearest_widths
 from ddco_pyro.model.control_parts import ControlPart, control_parts
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import ShapeError
+from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.simulation.collect import OnDemonstration, collect
 from ddco_pyro.simulation.task import find_task
 from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code

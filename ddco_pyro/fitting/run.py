@@ -16,7 +16,8 @@ from typing import Any, Protocol
 import torch
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import leftovers, only_one, write_tensors, write_text
+from ddco_pyro.data.files import leftovers, only_one, write_text
+from ddco_pyro.data.tensors import write_tensors
 from ddco_pyro.fitting.fit import Fit, RunError, is_finished, load, model_name
 from ddco_pyro.fitting.metrics import evaluate, supervisor
 from ddco_pyro.fitting.prepare import Dimensions, baseline_spec, build_hierarchy, demonstrations, parameters, parts

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ddco_pyro.data.files import read_tensors, write_tensors
+from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.clusters import Clusters
 from ddco_pyro.fitting.convergence import StageEnd, share, summary

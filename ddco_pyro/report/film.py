@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import imageio.v3 as imageio
 import numpy as np
 from matplotlib.figure import Figure
 
+from ddco_pyro.data.sources.video import frames
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.pictures import blank, data_uri, hide_frame
 from ddco_pyro.fitting.records import read_successes
@@ -52,10 +52,10 @@ def films(folder: Path, first: str) -> list[Film]:
 
 def draw_strip(path: Path) -> Figure:
     """Frames of a film, evenly over time, in rows."""
-    frames = imageio.imread(path, plugin="FFMPEG")
-    chosen = frames[np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MOST_FRAMES)).round().astype(int))]
+    film = np.stack(list(frames(path)))
+    chosen = film[np.unique(np.linspace(0, len(film) - 1, min(len(film), MOST_FRAMES)).round().astype(int))]
     rows = -(-len(chosen) // COLUMNS)
-    height, width = frames.shape[1:3]
+    height, width = film.shape[1:3]
     figure = blank(rows * 9.6 / COLUMNS * height / width)
     figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0, hspace=0)  # type: ignore[union-attr, call-arg]
     panels = figure.subplots(rows, COLUMNS, squeeze=False)

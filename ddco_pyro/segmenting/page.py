@@ -14,22 +14,17 @@ from ddco_pyro.fitting.analysis import agreement
 from ddco_pyro.segmenting import Segmented, Segments
 from ddco_pyro.segmenting.timeline import duration, option_name, timelines
 
-MOST_BOXES = 100_000
-"""Segments that a page shows, about: more are slow in any browser, and take much memory to write."""
-
 
 def write_page(path: Path, found: Segmented, run: str, file: str) -> None:
     """Write the page, whole or not at all; whatever comes from files is escaped."""
-    shown = timelines(found, MOST_BOXES)
     page = {
         "run": run,
         "file": file,
         "levels": [_level(name, count, found) for name, count in found.counts.items()],
         "truth": found.truth,
-        "demonstrations": shown,
-        "all": len(found),
+        "demonstrations": timelines(found),
         "held_out": sum(one.held_out for one in found.segments),
-        "longest": duration(max(len(one) for one in found.segments[: len(shown)]), found.frequency),
+        "longest": duration(max(len(one) for one in found.segments), found.frequency),
     }
     write_text(path, render("segmenting/page.html.j2", page))
 

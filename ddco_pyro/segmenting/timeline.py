@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -59,7 +60,7 @@ def anchor(name: str) -> str:
     return "segments-" + quote(name, safe="").replace("%", ".")
 
 
-def timelines(found: Segmented, most_boxes: int) -> list[Timeline]:
+def timelines(found: Segmented, most_boxes: float = math.inf) -> list[Timeline]:
     """The first demonstrations on one scale: about ``most_boxes`` segments in all, one demonstration at least."""
     shown = list(_first(found, most_boxes))
     longest = max(len(one) for one in shown)
@@ -72,7 +73,7 @@ def timelines(found: Segmented, most_boxes: int) -> list[Timeline]:
     ]  # fmt: skip
 
 
-def _first(found: Segmented, most_boxes: int) -> Iterator[Segments]:
+def _first(found: Segmented, most_boxes: float) -> Iterator[Segments]:
     boxes = 0
     for one in found.segments:
         if boxes >= most_boxes:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ddco_pyro.data.demonstrations import DemonstrationsError, recording_of
+from ddco_pyro.data.demonstrations import DemonstrationsError
 from ddco_pyro.data.resumable import Parts, parts_of
 from ddco_pyro.simulation.episodes import run_episodes, summarize
 from ddco_pyro.simulation.task import Task, find_task
@@ -62,11 +62,11 @@ def collect(
             return path
         seeds = range(spec.seed + len(parts.done), spec.seed + spec.count)
         for episode in run_episodes(task_name, spec.supervisor, seeds):
-            parts.add(recording_of(episode.record))
+            parts.add(episode.record.recording())
             if on_demonstration:
                 on_demonstration(len(parts.done), spec.count)
         attributes = {"task": task.name, "policy": spec.supervisor, "supervisor": json.dumps(_summary(task, parts))}
-        parts.finish(attributes, {}, {})
+        parts.finish(attributes, {})
     return path
 
 

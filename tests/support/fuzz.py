@@ -147,13 +147,6 @@ def _huge(file: h5py.File, choose: random.Random) -> None:
                         compression=choose.choice([None, "gzip"]))  # fmt: skip
 
 
-def _bomb(file: h5py.File, choose: random.Random) -> None:
-    """Zeros that take little room in the file, and very much in memory."""
-    place = f"data/demo_0/obs/bomb{choose.randrange(9)}"
-    if place not in file and "data/demo_0/obs" in file:
-        file.create_dataset(place, shape=(4, 10**8), chunks=(1, 10**7), dtype="u1", compression="gzip", fillvalue=0)
-
-
 def _loop(file: h5py.File, choose: random.Random) -> None:
     place = _anything(file, choose)
     group = file.get(place, file)
@@ -180,7 +173,7 @@ def _rename(file: h5py.File, choose: random.Random) -> None:
 DTYPES = ("i1", "f2", "c16", "?", "u8")
 
 EDITS: tuple[Edit, ...] = (
-    _remove, _remove, _huge, _bomb, _loop, _attribute, _attribute, _rename,
+    _remove, _remove, _huge, _loop, _attribute, _attribute, _rename,
     _replace(lambda choose: np.full((choose.randint(0, 5), 2), choose.choice([np.nan, np.inf, 1e308, 0.0]))),
     _replace(lambda choose: np.zeros((choose.randint(0, 5),) * choose.randint(0, 4), choose.choice(DTYPES))),
     _replace(lambda choose: np.zeros(4, dtype=[("a", "f8"), ("b", "S3")])),

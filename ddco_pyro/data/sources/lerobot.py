@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
-from ddco_pyro.data.sources.recording import Column, Format, Recording, of_array
+from ddco_pyro.data.sources.recording import Column, Format, Recording, damaged, of_array
 from ddco_pyro.data.sources.video import video_column
 
 try:
@@ -97,7 +97,7 @@ class LeRobot:
             labels = {"subtask": rows.vectors(SUBTASK, ())} if SUBTASK in rows.present else {}
             actions = rows.vectors("action", self.features["action"]["shape"])
         except _DAMAGE as error:
-            raise _damaged(self.folder, name, error) from error
+            raise damaged(self.folder, name, error) from error
         return Recording(name, observations, actions, labels, self._facts(index))
 
     def _facts(self, index: int) -> dict[str, Attribute]:
@@ -156,7 +156,7 @@ class _Rows:
                 for batch in self._batches(key, IMAGES_AT_ONCE):
                     yield np.stack([self._picture(one["bytes"], size) for one in batch.column(0).to_pylist()])
             except _DAMAGE as error:
-                raise _damaged(self.path, f"{self.name}: {key}", error) from error
+                raise damaged(self.path, f"{self.name}: {key}", error) from error
 
         return Column((len(self), *size, 3), np.dtype(np.uint8), blocks)
 
@@ -204,7 +204,7 @@ def _episodes(folder: Path) -> dict[int, dict[str, Any]]:
             rows = parquet.read_table(path, columns=[one for one in names if not one.startswith("stats/")]).to_pylist()
             found |= {int(row["episode_index"]): row for row in rows}
         except _DAMAGE as error:
-            raise _damaged(path, "", error) from error
+            raise damaged(path, "", error) from error
     return dict(sorted(found.items()))
 
 
@@ -214,17 +214,8 @@ def _json(path: Path) -> dict[str, Any]:
         if not isinstance(found.get("features"), dict):
             raise DemonstrationsError(f"{path}: says nothing of features; is it LeRobot's?")
     except (OSError, ValueError, AttributeError, RecursionError) as error:
-        if isinstance(error, DemonstrationsError):
-            raise
-        raise _damaged(path, "", error) from error
+        raise damaged(path, "", error) from error
     return found
-
-
-def _damaged(path: Path, where: str, error: Exception) -> DemonstrationsError:
-    if isinstance(error, DemonstrationsError):
-        return error
-    text = " ".join(str(error).split()) or type(error).__name__
-    return DemonstrationsError(f"{path}: {where + ': ' if where else ''}cannot be read, or is damaged: {text}")
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError
-from ddco_pyro.data.sources.recording import Column, Format, Recording, of_array
+from ddco_pyro.data.sources.recording import Column, Format, Recording, damaged, of_array
 
 BARE = "observation"
 """Key of observations that are one array without a name."""
@@ -44,7 +44,7 @@ class Minari:
             (episode,) = self._storage.get_episodes([index])
             (facts,) = self._storage.get_episode_metadata([index])
         except (*DAMAGE, AssertionError) as error:
-            raise _damaged(self.folder, name, error) from error
+            raise damaged(self.folder, name, error) from error
         actions, steps = episode["actions"], len(episode["rewards"])
         if not isinstance(actions, np.ndarray) or actions.dtype.kind != "f":
             what = actions.dtype if isinstance(actions, np.ndarray) else "several arrays"
@@ -73,11 +73,6 @@ def _leaves(observations: Any, key: str) -> Iterator[tuple[str, np.ndarray]]:
         yield key or BARE, observations if observations.ndim > 1 else observations[:, None]
 
 
-def _damaged(folder: Path, where: str, error: BaseException) -> DemonstrationsError:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return DemonstrationsError(f"{folder}: {where + ': ' if where else ''}cannot be read, or is damaged: {text}")
-
-
 @contextmanager
 def open_minari(path: Path) -> Iterator[Minari]:
     """Open a dataset's folder, its folder ``data``, or the ``main_data.hdf5`` in there.
@@ -96,8 +91,6 @@ def open_minari(path: Path) -> Iterator[Minari]:
         if len(spaces) < 2:  # Minari would make the environment to ask for them, which runs the data's code
             raise DemonstrationsError(f"{folder}: metadata.json does not say its observation and action spaces")
         storage = MinariStorage.read(folder)
-    except DemonstrationsError:
-        raise
     except (*DAMAGE, AssertionError, ImportError, AttributeError, RecursionError) as error:
-        raise _damaged(folder, "", error) from error
+        raise damaged(folder, "", error) from error
     yield Minari(folder, storage)

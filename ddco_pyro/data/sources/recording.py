@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import h5py
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError
+from ddco_pyro.data.memory import refuse_too_much
 
 Format = Literal["robomimic", "minari", "lerobot"]
 
@@ -67,30 +71,43 @@ class Recording:
         yield from ((f"labels/{key}", column) for key, column in self.labels.items())
 
 
-def of_array(array: np.ndarray) -> Column:
+def of_array(values: ArrayLike) -> Column:
     """A column that is in memory already."""
+    array = np.asarray(values)
     return Column(array.shape, array.dtype, lambda: iter([array]))
 
 
-def of_dataset(dataset: h5py.Dataset, where: str, steps: int | None = None) -> Column:
-    """A dataset of an open file, or its first ``steps`` steps.
+def of_dataset(dataset: h5py.Dataset, where: str) -> Column:
+    """A dataset of an open file; reading it raises :class:`DemonstrationsError` where the file is damaged.
 
-    Reading it raises :class:`DemonstrationsError` where the file is damaged.
+    :raises DemonstrationsError: a step of it, or a chunk, which HDF5 reads whole, takes more memory than is allowed.
     """
-    length = len(dataset) if steps is None else min(steps, len(dataset))
-    at_once = block_steps(dataset.shape[1:], dataset.dtype)
+    length, at_once = len(dataset), block_steps(dataset.shape[1:], dataset.dtype)
+    least = dataset.dtype.itemsize * max(math.prod(dataset.shape[1:]), math.prod(dataset.chunks or ()))
+    refuse_too_much(least, f"{where}: to read one step", "store it in smaller steps or chunks")
 
     def blocks() -> Iterator[np.ndarray]:
         for start in range(0, length, at_once):
             try:
-                block = np.asarray(dataset[start : min(start + at_once, length)])
+                block = np.asarray(dataset[start : start + at_once])
             except DAMAGE as error:
                 raise DemonstrationsError(f"{where} cannot be read ({error}); the file may be damaged") from error
             yield block
 
-    return Column((length, *dataset.shape[1:]), dataset.dtype, blocks)
+    return Column(dataset.shape, dataset.dtype, blocks)
+
+
+def damaged(path: Path, where: str, error: BaseException) -> DemonstrationsError:
+    """What a library says of a file that it cannot read, as one line; what is such a line already stays as it is.
+
+    :param where: the part of it; may be empty.
+    """
+    if isinstance(error, DemonstrationsError):
+        return error
+    text = " ".join(str(error).split()) or type(error).__name__
+    return DemonstrationsError(f"{path}: {where + ': ' if where else ''}cannot be read, or is damaged: {text}")
 
 
 def block_steps(shape: tuple[int, ...], dtype: np.dtype) -> int:
     """Steps in a block of an array whose steps have this shape."""
-    return max(1, BLOCK_BYTES // max(1, int(np.prod(shape, dtype=np.int64)) * dtype.itemsize))
+    return max(1, BLOCK_BYTES // max(1, math.prod(shape) * dtype.itemsize))

@@ -1,0 +1,67 @@
+"""Named tensors with metadata in safetensors files that know whether they are damaged."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from ddco_pyro.data.files import Damaged, whole_file
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Write named tensors and text metadata as safetensors, whole or not at all; equal contents give equal bytes.
+
+    A checksum of both is written with them.
+    """
+    checked = {**metadata, CHECKSUM: _digest(tensors, metadata)}
+    content = save({name: value.contiguous() for name, value in tensors.items()}, checked)
+    with whole_file(path) as temporary:
+        temporary.write_bytes(_metadata_in_order(content))
+
+
+def _metadata_in_order(content: bytes) -> bytes:
+    """The library writes metadata in random order. The header is JSON after its own length, padded to 8 bytes."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:end])
+    header["__metadata__"] = dict(sorted(header.get("__metadata__", {}).items()))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + content[end:]
+
+
+CHECKSUM = "sha256"
+
+
+def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+    """SHA-256 of names, types, shapes, bytes and metadata."""
+    found = hashlib.sha256(json.dumps(sorted(metadata.items())).encode())
+    for name in sorted(tensors):
+        value = tensors[name].detach().cpu().contiguous()
+        found.update(json.dumps([name, str(value.dtype), list(value.shape)]).encode())
+        found.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())
+    return found.hexdigest()
+
+
+def read_tensors(path: Path, remedy: str = "write it again") -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Named tensors and metadata of a safetensors file; what was written without a checksum is believed.
+
+    :param remedy: what to do where it is damaged.
+    :raises Damaged: it cannot be read, or does not hold what was written.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            metadata = dict(file.metadata() or {})
+    except (SafetensorError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        raise Damaged(path, " ".join(str(error).split()), remedy) from error
+    known = metadata.pop(CHECKSUM, None)
+    if known is not None and known != _digest(tensors, metadata):
+        raise Damaged(path, "its contents are not what was written", remedy)
+    return tensors, metadata
