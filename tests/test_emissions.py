@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pyro
 import pytest
 import torch
 from hierarchies import make_batch, make_hierarchy
+from oracle import brute_force
 from pyro.infer import Predictive
+from scipy import stats
 
-from ddco_pyro.inference import enumeration, total_log_likelihood
+from ddco_pyro.inference import enumeration, log_likelihood, total_log_likelihood
+from ddco_pyro.inference.check import compare_engines
 from ddco_pyro.model.ahmm import ahmm
-from ddco_pyro.model.emissions import Acting
+from ddco_pyro.model.emissions import Acting, Binary, Categorical, Clipped, Gaussian, Product
+from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import complete
 
 DRAWS = 4000
@@ -90,3 +96,203 @@ def test_who_cannot_be_does_not_act():
     steps = tuple(emission.steps()[0] for emission in outputs.emissions)
     choices = (torch.ones(len(batch), dtype=torch.int64), torch.zeros(len(batch), dtype=torch.int64))
     assert (Acting(steps, choices).log_prob(batch.actions[:, 0]) == -torch.inf).all()
+
+
+# --- kinds ------------------------------------------------------------------------------------------------------------
+
+STD = torch.tensor([0.4, 1.3], dtype=torch.float64)
+SCALE = torch.tensor([2.0, 0.5], dtype=torch.float64)
+INF = float("inf")
+LOW, HIGH = torch.tensor([-1.0, -INF]), torch.tensor([1.0, 0.5])
+
+
+def numbers(*shape, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def clipped(mean, std=STD):
+    return Clipped(mean, std, SCALE.log(), LOW, HIGH)
+
+
+def test_a_clipped_density_sums_to_one_with_its_masses():
+    """Between the bounds by the trapezoidal rule in the control's own units, plus the masses on both bounds."""
+    mean = torch.tensor([[-1.4, 0.2], [0.3, 0.6], [2.0, -0.5]], dtype=torch.float64)
+    for dimension, (low, high) in enumerate(((-1.0, 1.0), (-12.0, 0.5))):
+        grid = torch.linspace(low, high, 200_001, dtype=torch.float64)
+        inside = grid[1:-1]
+        for emission in (clipped(mean), clipped(mean, torch.stack([STD, 2 * STD, 0.5 * STD]))):
+            actions = torch.zeros(len(inside), 2, dtype=torch.float64)
+            actions[:, dimension] = inside
+            batch = emission.map(lambda tensor: tensor)  # the same for every action
+            spread = Clipped(mean.expand(len(inside), 3, 2), batch.std, batch.log_scale, LOW, HIGH)
+            density = spread.by_dimension(actions)[..., dimension].exp()
+            total = density.sum(0) * (grid[1] - grid[0]) * SCALE[dimension]
+            for end in (low, high):
+                if torch.isfinite((LOW if end == low else HIGH)[dimension]):
+                    on_bound = torch.zeros(2, dtype=torch.float64)
+                    on_bound[dimension] = end
+                    total = total + emission.by_dimension(on_bound)[..., dimension].exp()
+            torch.testing.assert_close(total, torch.ones(3, dtype=torch.float64), rtol=0, atol=2e-4)
+
+
+def test_a_clipped_density_is_scipys():
+    mean, actions = (
+        numbers(5, 3, 2),
+        torch.tensor([[-1.0, 0.5], [1.0, 0.1], [0.2, 0.5], [0.3, -3.0], [1.0, 0.5]]).double(),
+    )
+    found = clipped(mean).by_dimension(actions)
+    for n, k, d in itertools.product(range(5), range(3), range(2)):
+        a, m, s = float(actions[n, d]), float(mean[n, k, d]), float(STD[d])
+        if a <= float(LOW[d]):
+            expected = stats.norm.logcdf((a - m) / s)
+        elif a >= float(HIGH[d]):
+            expected = stats.norm.logsf((a - m) / s)
+        else:
+            expected = stats.norm.logpdf(a * float(SCALE[d]), m * float(SCALE[d]), s * float(SCALE[d]))
+        assert float(found[n, k, d]) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("far", [0.0, 1.0, 1e2, 1e4, 1e8, 1e12])
+@pytest.mark.parametrize("std", [1.0, 0.01, 1e-6])
+def test_far_from_a_bound_value_and_gradient_stay_finite(far, std):
+    mean = torch.full((1, 1, 1), -far, dtype=torch.float64).requires_grad_()
+    deviation = torch.tensor([std], dtype=torch.float64).requires_grad_()
+    zero = torch.zeros(1)
+    emission = Clipped(mean, deviation, zero, torch.tensor([-INF]), torch.tensor([1.0]))
+    value = emission.log_density(torch.ones(1, 1)).sum()
+    gradients = torch.autograd.grad(value, [mean, deviation])
+    assert torch.isfinite(value)
+    assert all(torch.isfinite(gradient).all() for gradient in gradients)
+    z = (1.0 + far) / std  # the derivative of log Φ(-z) tends to z
+    if z > 100:
+        assert float(gradients[0]) == pytest.approx(z / std, rel=2e-4)
+
+
+KINDS = {
+    "gaussian": lambda: Gaussian(numbers(2, 3, 2, 2), STD, SCALE.log()),
+    "gaussian, own σ": lambda: Gaussian(numbers(2, 3, 2, 2), torch.stack([STD, 2 * STD]), SCALE.log()),
+    "clipped": lambda: clipped(numbers(2, 3, 2, 2)),
+    "clipped, own σ": lambda: clipped(numbers(2, 3, 2, 2), torch.stack([STD, 2 * STD])),
+    "binary": lambda: Binary(numbers(2, 3, 2, 2)),
+    "categorical": lambda: Categorical(numbers(2, 3, 2, 4), torch.tensor(False)),
+    "rows": lambda: Categorical(numbers(2, 3, 2, 4), torch.tensor(True)),
+    "product": lambda: Product((((2, 0), clipped(numbers(2, 3, 2, 2))), ((1,), Binary(numbers(2, 3, 2, 1, seed=1))))),
+}
+
+
+def actions_of(kind):
+    """Controls [2, 3, A] that the kind can emit, some of them on bounds."""
+    generator = torch.Generator().manual_seed(3)
+    switches = torch.randint(0, 2, (2, 3, 2), generator=generator).double()
+    reals = numbers(2, 3, 2, seed=4).clamp(LOW, HIGH)
+    index = torch.randint(0, 4, (2, 3), generator=generator)
+    return {
+        "binary": switches,
+        "categorical": index.unsqueeze(-1).double(),
+        "rows": torch.nn.functional.one_hot(index, 4).double(),
+        "product": torch.stack([reals[..., 1], switches[..., 0], reals[..., 0]], dim=-1),
+    }.get(kind, reals if "clipped" in kind else numbers(2, 3, 2, seed=4))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients_are_finite_differences(kind):
+    emission, actions = KINDS[kind](), actions_of(kind)
+    leaves = []
+
+    def leaf(tensor):
+        if tensor.dtype != torch.float64 or not torch.isfinite(tensor).all():
+            return tensor
+        leaves.append(tensor.clone().requires_grad_())
+        return leaves[-1]
+
+    emission.map(leaf)
+    originals = list(leaves)
+
+    def density(*values):
+        given = iter(values)
+        whole = emission.map(
+            lambda tensor: next(given) if tensor.dtype == torch.float64 and torch.isfinite(tensor).all() else tensor
+        )
+        return whole.log_density(actions)
+
+    assert torch.autograd.gradcheck(density, originals)
+    torch.testing.assert_close(emission.by_dimension(actions).sum(-1), emission.log_density(actions))
+
+
+@pytest.mark.parametrize("kind", ["binary", "categorical", "rows"])
+def test_probabilities_sum_to_one_and_other_values_have_none(kind):
+    emission = KINDS[kind]()
+    size = emission.shape[-1]
+    every = {
+        "binary": torch.cartesian_prod(torch.arange(2.0), torch.arange(2.0)),
+        "categorical": torch.arange(4.0).unsqueeze(1),
+        "rows": torch.eye(4),
+    }[kind].double()
+    total = sum(emission.log_density(action.expand(2, 3, size)).exp() for action in every)
+    torch.testing.assert_close(total, torch.ones_like(total))
+    for other in (torch.full((2, 3, size), 0.5), torch.full((2, 3, size), -1.0), torch.full((2, 3, size), 7.0)):
+        assert (emission.log_density(other.double()) == -INF).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_draws_have_the_density_and_stay_possible(kind):
+    """The mean log-density of draws is minus the entropy that the density has, found with draws from other noise."""
+    emission = KINDS[kind]()
+    torch.manual_seed(0)
+    means = []
+    for _ in range(2):
+        noise = torch.randn(4000, *emission.shape[:-2], emission.shape[-1], dtype=torch.float64)
+        drawn = torch.stack([emission.draw(one) for one in noise])[..., 0, :]  # of the first caller
+        means.append(torch.stack([emission.log_density(one)[..., 0] for one in drawn]))
+    assert all(torch.isfinite(mean).all() for mean in means)
+    error = (means[0].var(0) / 2000).sqrt()
+    assert ((means[0].mean(0) - means[1].mean(0)).abs() < 5 * error + 1e-9).all()
+    if kind in ("binary", "categorical", "rows"):
+        probability = emission.log_density(emission.mode[..., 0, :])[..., 0].exp()
+        share = (drawn == emission.mode[..., 0, :]).all(-1).double().mean(0)
+        assert (share - probability).abs().max() < 5 * (0.25 / 4000) ** 0.5
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "gaussian, own σ", "binary", "categorical", "product"])
+def test_divergences_are_those_of_torch(kind):
+    emission = KINDS[kind]()
+    if kind == "product":  # the clipped part counts as the normal before it is clipped
+        normal = Gaussian(emission.groups[0][1].mean, STD, SCALE.log()).divergence(0, 1)
+        torch.testing.assert_close(emission.divergence(0, 1), normal + emission.groups[1][1].divergence(0, 1))
+        return
+    distributions = torch.distributions
+    if kind.startswith("gaussian"):
+        std = emission.std.expand(2, 2)
+        p, q = (distributions.Normal(emission.mean[..., k, :], std[k]) for k in (0, 1))
+    elif kind == "binary":
+        p, q = (distributions.Bernoulli(logits=emission.logits[..., k, :]) for k in (0, 1))
+    else:
+        p, q = (distributions.Categorical(logits=emission.logits[..., k, :]) for k in (0, 1))
+    both = 0.5 * (distributions.kl_divergence(p, q) + distributions.kl_divergence(q, p))
+    torch.testing.assert_close(emission.divergence(0, 1), both if kind == "categorical" else both.sum(-1))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("depth", [1, 2, 3])
+def test_every_kind_at_every_depth_has_one_likelihood(kind, depth):
+    """Brute force, Pyro's enumeration of the program and the compiled pass."""
+    steps, actions = 3 if depth < 3 else 2, actions_of(kind)
+    generator = torch.Generator().manual_seed(depth)
+
+    def draw(*shape):
+        return torch.randn(2, steps, *shape, generator=generator, dtype=torch.float64)
+
+    emission = KINDS[kind]().map(lambda t: t[:, :steps] if t.dim() == 4 else t)
+    callers = [CallerOutputs(0, None, emission)]
+    callers += [CallerOutputs(2, draw(2 if level < depth - 1 else 1, 2), None) for level in range(depth)]
+    outputs = Outputs(tuple(callers), tuple(draw(2) for _ in range(depth)))
+    lengths, actions = torch.tensor([steps, 1]), actions[:, :steps]
+    tables = outputs.tables(actions)
+    truth = [brute_force(tables, n, int(length)).log_likelihood for n, length in enumerate(lengths)]
+    torch.testing.assert_close(log_likelihood(tables, lengths), torch.tensor(truth, dtype=torch.float64))
+    by_program = enumeration.program_log_likelihood(tables, lengths, outputs.emissions, actions)
+    assert float(by_program) == pytest.approx(sum(truth), rel=1e-9)
+    check = compare_engines(outputs, actions, lengths)
+    assert check.value < 1e-12
+    assert check.gradient < 1e-10

@@ -9,6 +9,7 @@ from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood
+from ddco_pyro.model.control_parts import all_gaussian
 from ddco_pyro.model.encoding import ControlScaling, ObservationEncoder, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import ControlSpec, ObservationSpec, parse_spec
@@ -107,7 +108,7 @@ def test_images_alone_have_no_features():
 
 def batch():
     encoder = fitted(ObservationSpec(key="pose"), ObservationSpec(key="camera"))
-    scaling = ControlScaling(ControlSpec(scale="none"), 3)
+    scaling = ControlScaling(ControlSpec(scale="none"), 3, {}, all_gaussian(range(3)))
     return encode(DEMOS, encoder, scaling)
 
 
@@ -144,7 +145,7 @@ ACTIONS = np.concatenate([demo.actions for demo in DEMOS])
 
 
 def scaling(scale):
-    found = ControlScaling(ControlSpec(scale=scale), 3)
+    found = ControlScaling(ControlSpec(scale=scale), 3, {}, all_gaussian(range(3)))
     found.fit(DEMOS)
     return found
 

@@ -39,7 +39,9 @@ def random_outputs(counts, emits, number=2, steps=4, seed=0, sharp=1.0, dtype=to
 
 def leaves(outputs):
     """What a gradient can be taken of."""
-    return [tensor for tensor in outputs.tensors() if tensor.requires_grad]
+    tensors = []
+    outputs.map(lambda tensor: tensors.append(tensor) or tensor)
+    return [tensor for tensor in tensors if tensor.requires_grad]
 
 
 def log_likelihood(outputs, actions, lengths):

@@ -208,7 +208,7 @@ class ControlStd(nn.Module):
 
     def __init__(self, spec: ControlSpec, scaling: ControlScaling, copies: int) -> None:
         super().__init__()
-        stds = [_std_of(spec, dimension) for dimension in scaling.varying[scaling.continuous].tolist()]
+        stds = [_std_of(spec, dimension) for part in scaling.parts if part.continuous for dimension in part.dims]
         fixed = [0.0 if isinstance(std, LearnedStd) else float(std) for std in stds]
         learned = [place for place, std in enumerate(stds) if isinstance(std, LearnedStd)]
         self.own = [place for place in learned if getattr(stds[place], "per_option", False)]

@@ -77,10 +77,10 @@ class Outputs:
         return Tables(tuple(table for table in selection if table is not None), self.termination, control)
 
     def tensors(self) -> list[Tensor]:
-        """Everything that the networks say."""
-        said: list[Tensor] = []
-        self.map(lambda tensor: said.append(tensor) or tensor)  # type: ignore[func-returns-value]
-        return said
+        """Everything that the networks say, each [N, T, ...]."""
+        logits = [caller.logits for caller in self.callers if caller.logits is not None]
+        numbers = [emission.numbers for emission in self.emissions if emission is not None]
+        return [*logits, *numbers, *self.termination_logits]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Outputs:
         """The same of changed tensors."""
