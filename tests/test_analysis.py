@@ -63,7 +63,7 @@ def act(decision, n, t, i):
 
 def test_divergences_are_mean_kullback_leibler_divergences_in_both_directions(hybrid):
     decision, u = hybrid
-    (found,) = divergences(Outputs((decision, decision), ()), Posterior((u,), (u,), (u,)))
+    (found,) = divergences([(Outputs((decision, decision), ()), Posterior((u,), (u,), (u,)))])
     assert [one["options"] for one in found] == [[1, 2], [1, 3], [2, 3]]
     kl = torch.distributions.kl_divergence
     for one in found:
@@ -83,15 +83,15 @@ def test_divergences_of_policies_that_emit_one_kind_of_thing(hybrid):
     same = Posterior((u,), (u,), (u,))
     apart = (decision.mean[:, :, 0] - decision.mean[:, :, 1]) / decision.std
     weight = u[..., 1] + u[..., 2]
-    (found,) = divergences(Outputs((Decision(0, None, decision.mean, decision.std), decision), ()), same)
+    (found,) = divergences([(Outputs((Decision(0, None, decision.mean, decision.std), decision), ()), same)])
     assert found[0]["divergence"] == pytest.approx(float((weight * apart.square().sum(-1) / 2).sum() / weight.sum()))
     options = decision.logits[..., 1:]
-    (found,) = divergences(Outputs((Decision(2, options, None, decision.std), decision), ()), same)
+    (found,) = divergences([(Outputs((Decision(2, options, None, decision.std), decision), ()), same)])
     p, q = (options[:, :, i].log_softmax(-1) for i in (0, 1))
     both = ((p.exp() - q.exp()) * (p - q)).sum(-1) / 2
     assert found[0]["divergence"] == pytest.approx(float((weight * both).sum() / weight.sum()))
     never = torch.zeros_like(u)
-    (found,) = divergences(Outputs((decision, decision), ()), Posterior((never,), (never,), (never,)))
+    (found,) = divergences([(Outputs((decision, decision), ()), Posterior((never,), (never,), (never,)))])
     assert found[0]["divergence"] is None
 
 

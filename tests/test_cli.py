@@ -323,7 +323,7 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
     longer = with_set("compare_with=[]", "training.epochs=240", "training.patience=null")
     folder = tmp_path / "cut"
     interrupt = "os.kill(os.getpid(), signal.SIGINT)"
-    status, err = struck(["fit", spec, "--out", folder, *longer], HERE, "Fitting.epoch", 100, interrupt)
+    status, err = struck(["fit", spec, "--out", folder, *longer], HERE, "EpochEnded", 100, interrupt)
     assert status == 1
     assert not (folder / "model.safetensors").exists()
     said, _, command = err.splitlines()[-1].partition("; continue with: ddco-pyro ")

@@ -37,7 +37,7 @@ def rolled(toy_run: Fit, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rolled")
     shutil.copytree(toy_run.folder, folder / "run")
     demonstrations(toy_run.spec).write(folder / "demos.hdf5")
-    roll_out(ddco_pyro.load(folder / "run"), 2, 0, lambda name: None, jobs=1)
+    roll_out(ddco_pyro.load(folder / "run"), 2, jobs=1)
     return folder
 
 

@@ -18,7 +18,7 @@ def paired_rollouts(fits: Sequence[Fit], order: Sequence[str]) -> list[dict[str,
 
     Runs of other tasks, or without rollouts, are left out. ``p_value`` is McNemar's exact one.
     """
-    by_name = {str(fit.folder): fit for fit in fits}
+    by_name = {str(fit): fit for fit in fits}
     known = {name: own for name in order if (own := _outcomes(by_name[name]))}
     if len(known) < 2:
         return []
@@ -37,7 +37,9 @@ def _pair(first: str, ours: Outcomes, second: str, theirs: Outcomes) -> dict[str
 
 def _outcomes(fit: Fit) -> Outcomes:
     """What ``rollout`` wrote: for a baseline into the folder of the run that it belongs to."""
-    above = fit.folder.resolve().parent
-    places = [fit.folder, above.parent] if above.name == "baselines" else [fit.folder]
-    known = next((found for place in places if (found := read_successes(place))), {})
-    return {seed: value for (method, seed), value in known.items() if method == fit.name}
+    folder, name = fit.run_folder, fit.name
+    run = folder.resolve().parent.parent
+    beside = folder.resolve().parent == run / "baselines"
+    known = next((found for place in ([folder, run] if beside else [folder]) if (found := read_successes(place))), {})
+    names = {name, folder.resolve().name} if beside else {name}
+    return {seed: value for (method, seed), value in known.items() if method in names}

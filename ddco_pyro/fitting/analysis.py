@@ -4,7 +4,7 @@ ground truth.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import Any
@@ -57,22 +57,32 @@ def as_rows(use: Sequence[Sequence[OptionUse]]) -> list[list[dict[str, float | i
     return [[asdict(one) for one in level] for level in use]
 
 
-def divergences(outputs: Outputs, posterior: Posterior) -> list[list[dict[str, Any]]]:
+def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[dict[str, Any]]]:
     """How differently each two ``options`` of each level (lowest first) act, as ``divergence`` in nats per step.
 
     That is the mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i), averaged over steps with weights u_t(i) + u_t(j): over the
     time that one of the two is active; None where neither ever is. Two options of divergence 0 are the same skill
     under two numbers.
+
+    :param pieces: what the networks say of some demonstrations, and the posterior given those; gone through once.
     """
-    return [_pairs(own, u) for own, u in zip(outputs.decisions[:-1], posterior.u, strict=True)]
+    levels: list[dict[tuple[int, int], Tensor]] = []
+    for outputs, posterior in pieces:
+        levels = levels or [{} for _ in posterior.u]
+        for level, own, u in zip(levels, outputs.decisions[:-1], posterior.u, strict=True):
+            for pair in combinations(range(u.shape[-1] - 1), 2):
+                level[pair] = level.get(pair, 0.0) + _divergence(own, *pair, u)
+    return [
+        [
+            {"options": [i + 1, j + 1], "divergence": float(total / weight) if weight > 0 else None}
+            for (i, j), (total, weight) in level.items()
+        ]
+        for level in levels
+    ]
 
 
-def _pairs(own: Decision, u: Tensor) -> list[dict[str, Any]]:
-    options = range(u.shape[-1] - 1)
-    return [{"options": [i + 1, j + 1], "divergence": _divergence(own, i, j, u)} for i, j in combinations(options, 2)]
-
-
-def _divergence(own: Decision, i: int, j: int, u: Tensor) -> float | None:
+def _divergence(own: Decision, i: int, j: int, u: Tensor) -> Tensor:
+    """Weighted sum over the steps, and the sum of the weights, [2]."""
     steps = torch.zeros(u.shape[:2], dtype=torch.float64)
     control = torch.ones_like(steps)  # mean probability of emitting the control
     if own.selection is not None:
@@ -84,7 +94,7 @@ def _divergence(own: Decision, i: int, j: int, u: Tensor) -> float | None:
         apart = (own.mean[:, :, i] - own.mean[:, :, j]) / own.std
         steps += control * 0.5 * apart.double().square().sum(-1)
     weight = u[..., i + 1] + u[..., j + 1]
-    return float((weight * steps).sum() / weight.sum()) if float(weight.sum()) > 0 else None
+    return torch.stack([(weight * steps).sum(), weight.sum()])
 
 
 def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> float:
