@@ -50,7 +50,8 @@ def spec_with(folder: Path, place: str, value: float, scaled: bool = True) -> Pa
 def test_numbers_that_nothing_can_hold(tmp_path: Path, name: str, key: str, value: float) -> None:
     """Trained with or held out; their variance is infinite, or float32 cannot hold them."""
     spec = spec_with(tmp_path, f"data/{name}/{key}", value)
-    for command in (["check", spec], ["fit", spec, "--out", tmp_path / "run"]):
+    check = [["check", spec]] if key == "actions" else []  # which reads no observations
+    for command in (*check, ["fit", spec, "--out", tmp_path / "run"]):
         ended = call(*command)
         assert (ended.status, ended.out) == (2, "")
         assert ended.err == (

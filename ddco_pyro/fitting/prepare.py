@@ -276,10 +276,10 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
     for kind, names, there in (("obs", keys, first.observations), ("labels", labels, first.labels)):
         for name in names:
             if name not in there:
-                raise DemonstrationsError(
-                    f"there is no {kind}/{name}{nearest(name, there)}; there is: {', '.join(there)}"
-                )
-    demos.select(exclude)  # there are those that are left out
+                known = ", ".join(there) or "nothing"
+                raise DemonstrationsError(f"there is no {kind}/{name}{nearest(name, there)}; there is: {known}")
+    if exclude:
+        demos.select(exclude)  # or one of them is not there
     kept = tuple(
         replace(
             demo,
