@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import importlib
+import json
 import math
 from collections import Counter
 from pathlib import Path
@@ -118,9 +119,17 @@ def test_several_baselines_of_a_kind(commanded: Path, tmp_path: Path) -> None:
         assert list(one.metrics["comparison"]) == list(one.baselines) == ["flat", "flat_2"]
         networks = [beside.spec.baseline.policy.network for beside in one.baselines.values()]
         assert networks == ["linear", "mlp"]
+    outcomes = {"ddco": (1, 1), "flat": (0, 1), "flat_2": (0, 0)}
+    rows = [f"{name},{seed},{value}" for name, values in outcomes.items() for seed, value in enumerate(values)]
+    (tmp_path / "run" / "rollouts.csv").write_text("\n".join(["method,seed,success", *rows]))
     assert call("report", tmp_path / "run").status == 0
     both = [tmp_path / "run" / "baselines" / name for name in ("flat", "flat_2")]
     assert call("compare", tmp_path / "run", *both, "--out", tmp_path / "compared").status == 0
+    pairs = json.loads((tmp_path / "compared" / "compare.json").read_text())["rollouts"]
+    successes = {
+        Path(pair[name]).name: pair[rate] for pair in pairs for name, rate in (("run", "rate"), ("other", "other_rate"))
+    }
+    assert {name: rate["successes"] for name, rate in successes.items()} == {"run": 2, "flat": 1, "flat_2": 0}
 
 
 # --- in pieces --------------------------------------------------------------------------------------------------------

@@ -37,9 +37,11 @@ def _pair(first: str, ours: Outcomes, second: str, theirs: Outcomes) -> dict[str
 
 def _outcomes(fit: Fit) -> Outcomes:
     """What ``rollout`` wrote: for a baseline into the folder of the run that it belongs to."""
-    folder, name = fit.run_folder, fit.name
-    run = folder.resolve().parent.parent
-    beside = folder.resolve().parent == run / "baselines"
-    known = next((found for place in ([folder, run] if beside else [folder]) if (found := read_successes(place))), {})
-    names = {name, folder.resolve().name} if beside else {name}
-    return {seed: value for (method, seed), value in known.items() if method in names}
+    folder = fit.run_folder.resolve()
+    run = folder.parent.parent
+    tables = [(folder, fit.name), *([(run, folder.name)] if folder.parent == run / "baselines" else [])]
+    for place, name in tables:
+        own = {seed: value for (method, seed), value in read_successes(place).items() if method == name}
+        if own:
+            return own
+    return {}

@@ -104,6 +104,8 @@ class Progress:
 class Trainer:
     """Trains a spec's hierarchy on ``train``, stopping and choosing among restarts by ``tune``.
 
+    ``first`` is the hierarchy before any training.
+
     :param checkpoint: where the state is kept at the end of epochs; None for a training too short to be continued.
     :raises DemonstrationsError: a number is too large for networks.
     """
@@ -123,8 +125,7 @@ class Trainer:
         self._saved_at = -np.inf  # the first epoch is saved
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(spec.seed)
-            self.first = build_hierarchy(spec, dimensions)
-        """A hierarchy before any training; its encoder and scaling are those of all restarts."""
+            self.first = build_hierarchy(spec, dimensions)  # its encoder and scaling are those of all restarts
         self.first.encoder.fit(train)
         self.first.scaling.fit(train)
         self.names = train.names
