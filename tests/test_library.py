@@ -255,6 +255,8 @@ def test_a_spec_that_does_not_fit_is_refused_before_anything_is_written(commande
     spec = with_overrides(load_spec(commanded / "spec.yaml"), {"control.scale": [1.0, 2.0, 3.0]})
     with pytest.raises(SpecError, match=r"control\.scale: has 3 numbers, but the control has 2 dimensions"):
         ddco_pyro.fit(spec, out=tmp_path / "run")
+    with pytest.raises(SpecError, match=r"control\.scale: has 3 numbers"):
+        ddco_pyro.fit(spec, two_skills(), out=tmp_path / "run")
     with pytest.raises(BadInput, match=r"nowhere\.hdf5: there is no such file"):
         ddco_pyro.fit(spec, tmp_path / "nowhere.hdf5", out=tmp_path / "run")
     assert not any(tmp_path.iterdir())

@@ -53,8 +53,6 @@ class _Bar:
         self._start = self._said = 0.0
 
     def __enter__(self) -> Self:
-        if self.console.is_terminal:
-            self._progress.start()
         return self
 
     def __exit__(
@@ -66,6 +64,8 @@ class _Bar:
     def begin(self, label: str, total: int | None) -> None:
         """Begin to count up to ``total``; None where nobody knows how far it goes."""
         self.end()
+        if self.console.is_terminal:
+            self._progress.start()  # once: what is refused before leaves the terminal alone
         self._label, self._total, self._done = label, total, 0
         self._start = self._said = time.monotonic()
         self._task = self._progress.add_task(label, total=total, note="")

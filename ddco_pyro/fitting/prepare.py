@@ -293,11 +293,11 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
     return replace(demos, demonstrations=kept, masks=masks)
 
 
-def digest(demos: Demonstrations, observations: Sequence[str] | None = None) -> str:
-    """SHA-256 of names, controls and observations (all of them, or those named)."""
+def digest(demos: Demonstrations) -> str:
+    """SHA-256 of names, controls and observations."""
     found = hashlib.sha256()
     for demo in demos:
-        keys = sorted(demo.observations) if observations is None else observations
+        keys = sorted(demo.observations)
         found.update(json.dumps([demo.name, *demo.actions.shape, *keys]).encode())
         for array in (demo.actions, *(demo.observations[key] for key in keys)):
             found.update(np.ascontiguousarray(array).tobytes())

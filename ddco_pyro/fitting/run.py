@@ -74,26 +74,26 @@ def fit(
     :raises TrainingError: training stopped; nothing that was written before is lost.
     """
     spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else Path(out)
-    if demonstrations is None or isinstance(demonstrations, str | Path):
-        named = {} if demonstrations is None else {"demonstrations.path": str(demonstrations)}
-        return fit_run(with_overrides(spec, named), None, folder, on_event)
-    if folder is not None:
-        file = folder / "demonstrations.hdf5"
-        spec = with_overrides(spec, {"demonstrations.path": str(file)})
-        claim(folder, spec)
-        if file.exists() and digest(Demonstrations.read(file)) != digest(demonstrations):
-            raise RunError(f"{folder}: holds a run of other demonstrations; choose another folder or remove it")
-        demonstrations.write(file)
-    return fit_run(spec, seen(spec, demonstrations), folder, on_event)
+    if isinstance(demonstrations, Demonstrations):
+        path = {"demonstrations.path": str(folder / "demonstrations.hdf5")} if folder else {}
+        return fit_run(with_overrides(spec, path), seen(spec, demonstrations), folder, on_event, keep=demonstrations)
+    path = {} if demonstrations is None else {"demonstrations.path": str(demonstrations)}
+    return fit_run(with_overrides(spec, path), None, folder, on_event)
 
 
 def fit_run(
-    spec: Spec, demos: Demonstrations | None, folder: Path | None, on_event: OnEvent = ignore, resume: bool = True
+    spec: Spec,
+    demos: Demonstrations | None,
+    folder: Path | None,
+    on_event: OnEvent = ignore,
+    resume: bool = True,
+    keep: Demonstrations | None = None,
 ) -> Fit:
     """:func:`fit`, with everything that can be refused refused before anything is collected, trained or written.
 
     :param demos: as the spec sees them; None for those that it names, which are read once.
     :param resume: whether the folder may hold all of this run already.
+    :param keep: demonstrations that the run is to have a copy of, in the file that the spec names.
     """
     clock = _Clock()
     with clock("demonstrations"):
@@ -103,6 +103,8 @@ def fit_run(
         return _fit(spec, demos or read_demonstrations(spec, on_event), None, on_event, clock)
     claim(folder, spec, resume)
     with only_one(folder):
+        if keep is not None:
+            _keep(keep, Path(str(spec.demonstrations.path)))
         if is_finished(folder):
             return replace(load(folder, allow_code=True), given=demos)  # it is this very spec, which the caller has
         for part in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
@@ -111,6 +113,14 @@ def fit_run(
         with clock("demonstrations"):
             demos = demos or read_demonstrations(spec, on_event)
         return _fit(spec, demos, folder, on_event, clock)
+
+
+def _keep(demos: Demonstrations, path: Path) -> None:
+    """:raises RunError: other demonstrations are kept there."""
+    if not path.exists():
+        demos.write(path)
+    elif digest(Demonstrations.read(path)) != digest(demos):
+        raise RunError(f"{path.parent}: holds a run of other demonstrations; choose another folder or remove it")
 
 
 def _fit(
