@@ -48,7 +48,7 @@ with Progress() as watch:
 # %%
 runs = [five, *five.baselines.values(), two, hybrid, deep]
 found = compare([run.folder for run in runs])
-write(found, None, RUNS / "comparison")
+write(found, RUNS / "comparison")
 Markdown((RUNS / "comparison" / "compare.md").read_text())
 
 # %%
