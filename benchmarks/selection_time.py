@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ddco_pyro.data.files import write_text
+from ddco_pyro.events import Event, FoldScored
 from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.fitting.run import claim
 from ddco_pyro.selection import Workers, folds, grid, scoring, select
@@ -62,21 +63,16 @@ def speed_up() -> dict[str, Any]:
     return found | {"speed_up": per_fold[1] / per_fold[2], "load_after": os.getloadavg()[0]}
 
 
-class Clock(scoring.Unwatched):
+class Clock:
     """When each fold was done."""
 
     def __init__(self) -> None:
         self.ends: list[float] = []
 
-    def selecting(self, total: int, kept: int) -> None:
-        """Nothing."""
-
-    def scored(self, candidate: str, fold: int, failed: str) -> None:
-        """A fold is done."""
-        self.ends.append(time.monotonic())
-
-    def given_up(self, candidate: str, folds: int) -> None:
-        """Nothing."""
+    def __call__(self, event: Event) -> None:
+        """A fold is done, or something else has happened."""
+        if isinstance(event, FoldScored):
+            self.ends.append(time.monotonic())
 
 
 def main() -> None:

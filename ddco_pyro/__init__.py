@@ -10,9 +10,10 @@ if TYPE_CHECKING:
     from ddco_pyro.acting.controller import Controller
     from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
     from ddco_pyro.fitting.fit import Fit, load
+    from ddco_pyro.fitting.run import fit
     from ddco_pyro.spec import Spec, load_spec
 
-__all__ = ["Controller", "Demonstration", "Demonstrations", "Fit", "Spec", "inference", "load", "load_spec"]
+__all__ = ["Controller", "Demonstration", "Demonstrations", "Fit", "Spec", "fit", "inference", "load", "load_spec"]
 
 _MODULES = {
     "Controller": "acting.controller",
@@ -20,6 +21,7 @@ _MODULES = {
     "Demonstrations": "data.demonstrations",
     "Fit": "fitting.fit",
     "Spec": "spec",
+    "fit": "fitting.run",
     "load": "fitting.fit",
     "load_spec": "spec",
 }

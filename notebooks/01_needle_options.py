@@ -26,7 +26,7 @@ from IPython.display import Image, Markdown
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
 from ddco_pyro import load_spec
-from ddco_pyro.cli.console import Fitting
+from ddco_pyro.cli.console import Progress
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.fitting.run import fit
@@ -41,8 +41,8 @@ SMALLER = os.environ.get("NOTEBOOK_SMALLER", "").split()  # a test makes the fit
 
 # %%
 spec = load_spec("../specs/needle.yaml", SMALLER)
-with Fitting() as progress:
-    needle = fit(spec, RUNS / "needle", progress)
+with Progress() as progress:
+    needle = fit(spec, None, RUNS / "needle", progress)
 demos = demonstrations(spec)
 write_report(needle, demos)
 figures = needle.folder / "figures"

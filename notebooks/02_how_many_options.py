@@ -27,7 +27,7 @@ from IPython.display import Image, Markdown
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
 from ddco_pyro import load_spec
-from ddco_pyro.cli.console import Selecting
+from ddco_pyro.cli.console import Progress
 from ddco_pyro.selection import Workers, select
 
 RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))
@@ -43,7 +43,7 @@ GRID = ["selection.folds=5", "selection.grid.hierarchy.levels.0.count=[1, 2, 3, 
 spec = load_spec("../specs/needle.yaml", [*LINEAR, *GRID, "compare_with=[]", *SMALLER])
 
 # %%
-with Selecting() as progress:
+with Progress() as progress:
     found = select(spec, RUNS / "how-many", progress, Workers(1))
 
 # %%

@@ -26,7 +26,7 @@ from IPython.display import Image, Markdown
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
 from ddco_pyro import load_spec
-from ddco_pyro.cli.console import Fitting
+from ddco_pyro.cli.console import Progress
 from ddco_pyro.comparison import compare, write
 from ddco_pyro.fitting.run import fit
 
@@ -34,12 +34,12 @@ RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))
 SMALLER = os.environ.get("NOTEBOOK_SMALLER", "").split()  # a test makes the fits smaller
 
 # %%
-with Fitting() as progress:
-    five = fit(load_spec("../specs/needle.yaml", SMALLER), RUNS / "needle", progress)
+with Progress() as watch:
+    five = fit(load_spec("../specs/needle.yaml", SMALLER), None, RUNS / "needle", watch)
     two = fit(load_spec("../specs/needle.yaml", ["hierarchy.levels.0.count=2", "compare_with=[]", *SMALLER]),
-              RUNS / "two-options", progress)  # fmt: skip
-    hybrid = fit(load_spec("../specs/needle_hybrid.yaml", ["compare_with=[]", *SMALLER]), RUNS / "hybrid", progress)
-    deep = fit(load_spec("../specs/needle_3level.yaml", ["compare_with=[]", *SMALLER]), RUNS / "3-levels", progress)
+              None, RUNS / "two-options", watch)  # fmt: skip
+    hybrid = fit(load_spec("../specs/needle_hybrid.yaml", ["compare_with=[]", *SMALLER]), None, RUNS / "hybrid", watch)
+    deep = fit(load_spec("../specs/needle_3level.yaml", ["compare_with=[]", *SMALLER]), None, RUNS / "3-levels", watch)
 
 # %% [markdown]
 # At the command line: `ddco-pyro compare runs/needle runs/needle/baselines/flat ...`. The columns are those of arviz's

@@ -28,7 +28,7 @@ from IPython.display import Image, Markdown
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
 from ddco_pyro import Demonstrations, load_spec
-from ddco_pyro.cli.console import Fitting
+from ddco_pyro.cli.console import Progress
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.report import write_report
@@ -74,8 +74,8 @@ RUNS.mkdir(parents=True, exist_ok=True)
 spec = load_spec(RUNS / "mine.yaml", [one for one in SMALLER if not one.startswith("demonstrations.")])
 
 # %%
-with Fitting() as progress:
-    mine = fit(spec, RUNS / "mine", progress)
+with Progress() as progress:
+    mine = fit(spec, None, RUNS / "mine", progress)
 write_report(mine, demos)
 Markdown(words.verdict(mine.metrics))
 

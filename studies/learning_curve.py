@@ -24,11 +24,10 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing.pictures import blank, keep, style
 from ddco_pyro.fitting.analysis import paired
-from ddco_pyro.fitting.fit import log_likelihoods
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.prepare import Dimensions, baseline_spec, demonstrations
 from ddco_pyro.fitting.run import train
 from ddco_pyro.selection.folds import Folds, divide
-from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 
 OUT = Path("docs/results")
@@ -62,7 +61,7 @@ def run(own: argparse.Namespace, made_by: Record, fold: int, folds: Folds, count
     others, held_out = folds.split(fold)
     order = np.random.default_rng([spec.seed, fold]).permutation(len(others))[:count]
     used = Demonstrations(tuple(others[int(row)] for row in order))
-    hierarchy = train(spec, folds.dimensions, used, Unwatched()).hierarchy
+    hierarchy = train(spec, folds.dimensions, used).hierarchy
     found = {
         "fold": fold,
         "count": count,
@@ -70,7 +69,7 @@ def run(own: argparse.Namespace, made_by: Record, fold: int, folds: Folds, count
         "changes": own.set,
         "made_by": made_by,
         "steps": held_out.lengths,
-        "log_likelihood": log_likelihoods(hierarchy, held_out).tolist(),
+        "log_likelihood": Fit(spec, hierarchy).log_likelihood(held_out).tolist(),
         "cpu_seconds": time.process_time() - start,
     }
     write_text(path, json.dumps(found) + "\n")

@@ -18,7 +18,6 @@ from provenance import record, sentence, text
 
 from ddco_pyro.data.files import write_text
 from ddco_pyro.fitting.run import fit
-from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import load_spec
 
 INITIALIZATIONS = ("random", "vq", "vq_controls")
@@ -30,7 +29,7 @@ def run(initialize: str, seed: int, overrides: list[str]) -> dict[str, Any]:
     changes = [*overrides, f"training.initialize={initialize}", f"seed={seed}", "compare_with=[]"]
     spec = load_spec("specs/metaworld_pick_place.yaml", changes)
     with tempfile.TemporaryDirectory() as folder:
-        metrics = fit(spec, Path(folder) / "run", Unwatched()).metrics
+        metrics = fit(spec, out=Path(folder) / "run").metrics
     return {
         "initialize": initialize,
         "seed": seed,

@@ -16,7 +16,6 @@ from matplotlib.ticker import MaxNLocator
 
 from ddco_pyro.drawing.pictures import STYLE, keep
 from ddco_pyro.fitting.fit import load
-from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.report.activity import Activity, activity
 from ddco_pyro.report.plot_rows import order
 from ddco_pyro.report.plot_trajectories import panel
@@ -53,7 +52,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     fit = load(parser.parse_args().run)
-    demos = demonstrations(fit.spec)
+    demos = fit.demonstrations
     with matplotlib.rc_context({**STYLE, **LARGE, "figure.constrained_layout.use": False}):
         figure = draw(activity(fit, demos), [demo.observations[KEY][:, :3] for demo in demos])
         keep(figure, OUT, "Gripper positions coloured by option, and the options of every demonstration over time", "")

@@ -24,7 +24,6 @@ from scipy import stats
 from ddco_pyro.data.files import whole_file, write_text
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit
-from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.simulation.episodes import rate
 from ddco_pyro.spec import load_spec
 
@@ -44,7 +43,7 @@ def run_seed(seed: int, arguments: argparse.Namespace, made_by: Record) -> None:
     if seed > 0:
         overrides.append("rollout.policies=[]")  # scripted policies know no training seed
     folder = arguments.runs / made_by["code"][:12] / f"seed-{seed}"
-    fitted = fit(load_spec("specs/needle.yaml", overrides), folder, Unwatched())
+    fitted = fit(load_spec("specs/needle.yaml", overrides), out=folder)
     rolled = roll_out(fitted, arguments.episodes, 0, lambda name: None, jobs=1)
     metrics = fitted.metrics
     likelihood = {name: one["log_likelihood_per_step"] for name, one in metrics["comparison"].items()}

@@ -21,10 +21,9 @@ from ddco_pyro.acting.lockstep import Played, play
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
-from ddco_pyro.fitting.fit import log_likelihoods
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.prepare import Dimensions, baseline_spec, build_hierarchy, dimensions
-from ddco_pyro.fitting.training import Trainer
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.fitting.run import train
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.simulation.task import Task
@@ -141,25 +140,15 @@ def held_out(folder: Path, spec: Spec, development: bool = False) -> Demonstrati
 
 def fit(spec: Spec, demos: Demonstrations, checkpoint: Path) -> tuple[Hierarchy, float]:
     """The fitted hierarchy, and the seconds that it took."""
-    train, tune = demos.split(spec.training.tune_fraction, spec.seed)
-
-    def make() -> Hierarchy:
-        hierarchy = build_hierarchy(spec, Dimensions.of(demos))
-        hierarchy.encoder.fit(train)
-        hierarchy.scaling.fit(train)
-        return hierarchy
-
-    first = make()
-    batches = [encode(part, first.encoder, first.scaling) for part in (train, tune)]
     start = time.perf_counter()
-    hierarchy = Trainer(spec, make, batches[0], batches[1], checkpoint, list(train.names), lambda row: None).run()
+    hierarchy = train(spec, Dimensions.of(demos), demos, checkpoint=checkpoint).hierarchy
     checkpoint.unlink(missing_ok=True)
     return hierarchy, time.perf_counter() - start
 
 
-def per_step(hierarchy: Hierarchy, demos: Demonstrations) -> float:
+def per_step(fit: Fit, demos: Demonstrations) -> float:
     """Log-likelihood per step, nats, at the spec's σ."""
-    return float(log_likelihoods(hierarchy, demos).sum() / sum(demos.lengths))
+    return float(fit.log_likelihood(demos).sum() / sum(demos.lengths))
 
 
 def fitted(cell: Cell, folder: Path, made_by: Record) -> Hierarchy:
@@ -173,15 +162,16 @@ def fitted(cell: Cell, folder: Path, made_by: Record) -> Hierarchy:
         hierarchy.load_state_dict(read_tensors(path)[0])
         return hierarchy.eval()
     hierarchy, seconds = fit(spec, demos, path.with_suffix(".checkpoint"))
-    likelihood = {"train": per_step(hierarchy, demos), "held_out": per_step(hierarchy, held_out(folder, spec))}
-    found = {
+    found = Fit(spec, hierarchy)
+    likelihood = {"train": per_step(found, demos), "held_out": per_step(found, held_out(folder, spec))}
+    numbers = {
         "parameters": sum(one.numel() for one in hierarchy.parameters()),
         "std": spec.control.std,
         "seconds": seconds,
         "made_by": made_by,
         "log_likelihood_per_step": likelihood,
     }
-    write_text(folder / "fits" / f"{cell.fit}.json", json.dumps(found, indent=1) + "\n")
+    write_text(folder / "fits" / f"{cell.fit}.json", json.dumps(numbers, indent=1) + "\n")
     write_tensors(path, hierarchy.state_dict(), {})
     return hierarchy
 

@@ -60,7 +60,7 @@ def segments(options: int, seed: int, arguments: argparse.Namespace) -> tuple[De
     cell = Cell("DDCO MLP", options, arguments.demonstrations, seed)
     spec = spec_of(cell)
     demos = held_out(arguments.runs, spec)
-    (found,) = Fit(arguments.runs, spec, fitted(cell, arguments.runs, arguments.made_by)).segment(demos)
+    (found,) = Fit(spec, fitted(cell, arguments.runs, arguments.made_by)).segment(demos)
     return demos, found[found >= 0]
 
 

@@ -51,6 +51,7 @@ from pushing_results import grouped, write
 
 from ddco_pyro.acting.lockstep import play
 from ddco_pyro.data.files import write_text
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec
 
@@ -108,7 +109,7 @@ def candidate(name: str, rate: float, seed: int, folder: Path) -> tuple[Cell, Sp
 def try_rate(name: str, rate: float, seed: int, folder: Path) -> dict[str, Any]:
     """Held-out likelihood with a learning rate."""
     _, spec, hierarchy = candidate(name, rate, seed, folder)
-    value = per_step(hierarchy, held_out(folder, spec, development=True))
+    value = per_step(Fit(spec, hierarchy), held_out(folder, spec, development=True))
     return {"method": name, "rate": rate, "seed": seed, "held_out": value}
 
 

@@ -24,7 +24,6 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.fitting.run import claim
 from ddco_pyro.selection import Workers, select
-from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import Spec, parse_spec
 
 OUT = Path("docs/results")
@@ -34,19 +33,6 @@ LASTING = 0.8  # probability that a skill goes on at the next step
 HINT_NOISE = 0.15  # of a circle of radius 1, on which each skill has its place
 PLACE = 0.4  # spread of where a skill is applied, less than that of the hints: clusters start from the hints
 CONTROL_NOISE = 0.3
-
-
-class Watcher(Unwatched):
-    """Says nothing."""
-
-    def selecting(self, total: int, kept: int) -> None:
-        """Nothing."""
-
-    def scored(self, candidate: str, fold: int, failed: str) -> None:
-        """Nothing."""
-
-    def given_up(self, candidate: str, folds: int) -> None:
-        """Nothing."""
 
 
 def plant(options: int, seed: int, count: int = 60) -> Demonstrations:
@@ -110,7 +96,7 @@ def draw(options: int, seed: int, folds: int, most: int, jobs: int, made_by: Rec
         plant(options, seed).write(path)
         spec = planted_spec(path, folds, most, seed)
         claim(Path(folder) / "run", spec)
-        found = select(spec, Path(folder) / "run", Watcher(), Workers(jobs)).choice
+        found = select(spec, Path(folder) / "run", workers=Workers(jobs)).choice
     assert found.best is not None
     assert found.chosen is not None
     return {

@@ -30,10 +30,9 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing.pictures import FAINT, INK, blank, keep, style
 from ddco_pyro.fitting.analysis import agreement, divergences, option_use
 from ddco_pyro.fitting.diagnostics import DOMINATING_SHARE, HIGH_FITTING_SHARE, SMALLEST_DIVERGENCE
-from ddco_pyro.fitting.fit import Fit, log_likelihoods
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.prepare import Dimensions, demonstrations, parts
 from ddco_pyro.fitting.run import train
-from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import Spec, load_spec
 
 OUT = Path("docs/results")
@@ -82,8 +81,8 @@ def run(name: str, initialize: str, layerwise: bool, seed: int, changes: list[st
     start = time.process_time()
     spec = spec_of(name, initialize, layerwise, seed, changes)
     demos, divided = divide(spec)
-    hierarchy = train(spec, Dimensions.of(demos), divided["train"], Unwatched()).hierarchy
-    found = measure(Fit(path.parent, spec, hierarchy), demos, divided)
+    hierarchy = train(spec, Dimensions.of(demos), divided["train"]).hierarchy
+    found = measure(Fit(spec, hierarchy), demos, divided)
     found |= {"spec": name, "setting": name_of(initialize, layerwise), "seed": seed, "changes": changes}
     found |= {"made_by": made_by}
     write_text(path, json.dumps(found | {"cpu_seconds": time.process_time() - start}) + "\n")
@@ -99,10 +98,10 @@ def measure(fit: Fit, demos: Demonstrations, divided: dict[str, Demonstrations])
     assert selection is not None  # the meta-policy emits options
     steps = torch.arange(selection.shape[1]) < torch.tensor(demos.lengths)[:, None]
     control, *options = [one.share for one in option_use(posterior)[0]]
-    apart = [one["divergence"] for one in divergences(outputs, posterior)[0]]
+    apart = [one["divergence"] for one in divergences([(outputs, posterior)])[0]]
     segments = fit.segment(demos)[0]
     return {
-        **{part: float(log_likelihoods(fit.hierarchy, own).sum() / sum(own.lengths)) for part, own in divided.items()},
+        **{part: float(fit.log_likelihood(own).sum() / sum(own.lengths)) for part, own in divided.items()},
         "selects_option": float(1 - selection[:, :, 0, 0].exp()[steps].mean()),
         "control": control,
         "largest": max(options) / sum(options),

@@ -18,7 +18,6 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.fitting.run import fit
-from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import load_spec
 
 TUNED = Path("specs/metaworld_pick_place.yaml")
@@ -28,7 +27,7 @@ OUT = Path("docs/results")
 def valid(spec: Path, seed: int) -> float:
     """Held-out nats per step of one fit."""
     with tempfile.TemporaryDirectory() as folder:
-        metrics = fit(load_spec(spec, [f"seed={seed}", "compare_with=[]"]), Path(folder) / "run", Unwatched()).metrics
+        metrics = fit(load_spec(spec, [f"seed={seed}", "compare_with=[]"]), out=Path(folder) / "run").metrics
     return float(metrics["log_likelihood_per_step"]["valid"])
 
 

@@ -40,22 +40,16 @@ def cache(tmp_path_factory):
 
 
 class Watched:
-    """What a fit told its watcher."""
+    """What a fit told whoever watches it."""
 
     def __init__(self):
-        self.demonstrations, self.models, self.rows = [], [], []
+        self.events = []
 
-    def collected(self, done, total):
-        self.demonstrations.append((done, total))
+    def __call__(self, event):
+        self.events.append(event)
 
-    def training(self, name, epochs):
-        self.models.append((name, epochs))
-
-    def epoch(self, row):
-        self.rows.append(row)
-
-    def trained(self, name):
-        self.models.append(name)
+    def of(self, *kinds):
+        return [event for event in self.events if isinstance(event, kinds)]
 
 
 @pytest.fixture(scope="session")
@@ -71,4 +65,4 @@ def watched():
 @pytest.fixture(scope="session")
 def toy_run(cache, tmp_path_factory, toy_spec, watched):
     """A fit of the toy task with both baselines beside it; nobody changes its folder."""
-    return fit(toy_spec, tmp_path_factory.mktemp("runs") / "toy", watched)
+    return fit(toy_spec, out=tmp_path_factory.mktemp("runs") / "toy", on_event=watched)

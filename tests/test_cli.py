@@ -323,7 +323,7 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
     longer = with_set("compare_with=[]", "training.epochs=240", "training.patience=null")
     folder = tmp_path / "cut"
     interrupt = "os.kill(os.getpid(), signal.SIGINT)"
-    status, err = struck(["fit", spec, "--out", folder, *longer], HERE, "Fitting.epoch", 100, interrupt)
+    status, err = struck(["fit", spec, "--out", folder, *longer], HERE, "EpochEnded", 100, interrupt)
     assert status == 1
     assert not (folder / "model.safetensors").exists()
     said, _, command = err.splitlines()[-1].partition("; continue with: ddco-pyro ")
@@ -337,22 +337,26 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
 
 
 LIGHT = """
-import sys
+import runpy, sys
 sys.argv = {arguments!r}
-from ddco_pyro.cli.app import main
+import ddco_pyro
 try:
-    main()
+    if "{module}" == "ddco_pyro.cli":
+        runpy.run_module("ddco_pyro.cli", run_name="__main__")
+    else:
+        from ddco_pyro.cli.app import main
+        main()
 finally:
     print(sorted(name for name in ("h5py", "pyro", "sklearn", "torch") if name in sys.modules))
 """
 
 
-@pytest.mark.parametrize(
-    "arguments", [["ddco-pyro", "--help"], ["ddco-pyro", "check", "--schema"], ["ddco-pyro", "check", "nowhere.yaml"]]
-)
-def test_help_and_refusals_load_nothing_heavy(arguments):
+@pytest.mark.parametrize("arguments", [["--help"], ["fit", "--help"], ["check", "--schema"], ["check", "nowhere.yaml"]])
+@pytest.mark.parametrize("module", ["ddco_pyro.cli", "ddco_pyro.cli.app"])
+def test_help_and_refusals_load_nothing_heavy(module, arguments):
     """Loading torch, pyro and scikit-learn takes seconds."""
-    ended = subprocess.run([sys.executable, "-c", LIGHT.format(arguments=arguments)], capture_output=True, text=True)
+    program = LIGHT.format(module=module, arguments=["ddco-pyro", *arguments])
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert ended.stdout.splitlines()[-1] == "[]"
 
 

@@ -12,6 +12,7 @@ import toy_task
 from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.events import DemonstrationsDone
 from ddco_pyro.simulation.collect import cache_folder, cache_path, collect
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import DemonstrationsSpec
@@ -28,11 +29,11 @@ def own_cache(tmp_path, monkeypatch):
 
 def test_the_same_demonstrations_are_collected_once(own_cache):
     told = []
-    path = collect(TASK, SPEC, on_demonstration=lambda *progress: told.append(progress))
+    path = collect(TASK, SPEC, on_event=told.append)
     assert own_cache in path.parents
-    assert told == [(1, 5), (2, 5), (3, 5), (4, 5), (5, 5)]
+    assert told == [DemonstrationsDone(done, 5) for done in range(1, 6)]
     before = path.stat()
-    assert collect(TASK, SPEC, on_demonstration=lambda *progress: told.append(progress)) == path
+    assert collect(TASK, SPEC, on_event=told.append) == path
     assert (path.stat().st_mtime_ns, path.stat().st_ino, len(told)) == (before.st_mtime_ns, before.st_ino, 5)
 
 

@@ -23,7 +23,6 @@ from ddco_pyro.fitting.prepare import demonstrations, parts
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.report import write_report
-from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import with_overrides
 
 SHORT = {"training.epochs": 1, "compare_with": []}
@@ -40,7 +39,7 @@ def other(toy_spec, cache, tmp_path_factory):
 
     def make(name="other", **changes):
         paths = {key.replace("__", "."): value for key, value in changes.items()}
-        return fit(with_overrides(toy_spec, SHORT | paths), tmp_path_factory.mktemp("runs") / name, Unwatched())
+        return fit(with_overrides(toy_spec, SHORT | paths), out=tmp_path_factory.mktemp("runs") / name)
 
     return make
 
@@ -225,7 +224,7 @@ def rolled(toy_run, other, tmp_path_factory):
     first = load(shutil.copytree(toy_run.folder, tmp_path_factory.mktemp("rolled") / "first"))
     second = other("second", rollout__seed=1002, rollout__policies=[])
     for run, episodes in ((first, 6), (second, 7)):
-        roll_out(run, episodes, film=0, on_episode=lambda name: None, jobs=1)
+        roll_out(run, episodes, film=0, jobs=1)
     return first, second, other("third")
 
 

@@ -7,6 +7,16 @@ import itertools
 import pytest
 
 from ddco_pyro.cli import console
+from ddco_pyro.events import (
+    CandidateGivenUp,
+    DemonstrationsDone,
+    EpisodeEnded,
+    EpochEnded,
+    FoldScored,
+    SelectionBegan,
+    TrainingBegan,
+    TrainingEnded,
+)
 
 
 @pytest.fixture
@@ -17,9 +27,9 @@ def clock(monkeypatch):
 
 
 def test_plain_lines_come_now_and_then_and_at_the_end(clock, capsys):
-    with console.Collecting() as progress:
+    with console.Progress() as progress:
         for done in range(1, 8):
-            progress.collected(done, 7)
+            progress(DemonstrationsDone(done, 7))
     assert capsys.readouterr().err.splitlines() == [
         "collecting demonstrations: 3/7, at most 16 s left",
         "collecting demonstrations: 6/7, at most 4 s left",
@@ -28,12 +38,12 @@ def test_plain_lines_come_now_and_then_and_at_the_end(clock, capsys):
 
 
 def test_a_fit_that_stops_early_says_so(clock, capsys):
-    row = {"stage": "level-1", "train": 1.25, "tune": -0.5}
-    with console.Fitting() as progress:
-        progress.training("ddco", 100)
+    row = EpochEnded(0, "level-1", 1, 1.25, -0.5)
+    with console.Progress() as progress:
+        progress(TrainingBegan("ddco", 100))
         for _ in range(3):
-            progress.epoch(row)
-        progress.trained("ddco")
+            progress(row)
+        progress(TrainingEnded("ddco"))
     assert capsys.readouterr().err.splitlines() == [
         "training ddco: 3/100, at most 388 s left  level-1: training 1.250, tuning -0.500 nats/step",
         "training ddco: done after 3, 16 s",
@@ -41,11 +51,11 @@ def test_a_fit_that_stops_early_says_so(clock, capsys):
 
 
 def test_where_nobody_knows_how_far_it_goes_there_is_no_time_left(clock, capsys):
-    with console.Fitting() as progress:
-        progress.training("ddco", None)
+    with console.Progress() as progress:
+        progress(TrainingBegan("ddco", None))
         for _ in range(3):
-            progress.epoch({"stage": "level-1", "train": 1.25, "tune": -0.5})
-        progress.trained("ddco")
+            progress(EpochEnded(0, "level-1", 1, 1.25, -0.5))
+        progress(TrainingEnded("ddco"))
     assert capsys.readouterr().err.splitlines() == [
         "training ddco: 3  level-1: training 1.250, tuning -0.500 nats/step",
         "training ddco: done after 3, 16 s",
@@ -53,8 +63,8 @@ def test_where_nobody_knows_how_far_it_goes_there_is_no_time_left(clock, capsys)
 
 
 def test_markup_in_names_is_text(clock, capsys):
-    with console.Rolling(1) as progress:
-        progress.episode("[bold]own[/bold]")
+    with console.Progress() as progress:
+        progress(EpisodeEnded("[bold]own[/bold]", 1))
     assert "[bold]own[/bold]" in capsys.readouterr().err
 
 
@@ -91,12 +101,12 @@ def test_nothing_is_cut_where_there_is_no_terminal(capsys):
 
 
 def test_a_selection_says_what_was_kept_failed_and_given_up(clock, capsys):
-    with console.Selecting() as progress:
-        progress.selecting(total=9, kept=2)
-        progress.scored("count = 1", 0, "")
-        progress.scored("count = 2", 0, "it diverged")
-        progress.given_up("count = 3", 4)
-        progress.scored("count = 1", 1, "")
+    with console.Progress() as progress:
+        progress(SelectionBegan(total=9, kept=2))
+        progress(FoldScored("count = 1", 0, ""))
+        progress(FoldScored("count = 2", 0, "it diverged"))
+        progress(CandidateGivenUp("count = 3", 4))
+        progress(FoldScored("count = 1", 1, ""))
     lines = capsys.readouterr().err.splitlines()
     assert all(line.startswith("cross-validation (2 of 9 kept from before): ") for line in lines)
     said = [line.partition("before): ")[2] for line in lines]

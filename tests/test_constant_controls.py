@@ -25,7 +25,6 @@ from ddco_pyro.export import TOLERANCE, export, runner
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.selection import folds as dividing
-from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import Spec, parse_spec, with_overrides
 
 STILL = {1: 0.1, 3: -7.0}
@@ -83,14 +82,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def whole(folder: Path) -> Fit:
     """Fitted to all four dimensions."""
     make_demonstrations().write(folder / "whole.hdf5")
-    return fit(spec_for(folder / "whole.hdf5"), folder / "whole", Unwatched())
+    return fit(spec_for(folder / "whole.hdf5"), out=folder / "whole")
 
 
 @pytest.fixture(scope="module")
 def reduced(folder: Path) -> Fit:
     """Fitted to those that vary."""
     with_controls(make_demonstrations(), columns=FREE).write(folder / "reduced.hdf5")
-    return fit(spec_for(folder / "reduced.hdf5"), folder / "reduced", Unwatched())
+    return fit(spec_for(folder / "reduced.hdf5"), out=folder / "reduced")
 
 
 # --- the likelihood ---------------------------------------------------------------------------------------------------
@@ -178,7 +177,7 @@ def test_many_at_once_emit_them(whole: Fit, reduced: Fit, control: str) -> None:
 
 @pytest.mark.parametrize("control", ["mean", "sample"])
 def test_exported_controllers_emit_them(whole: Fit, tmp_path: Path, control: str) -> None:
-    changed = Fit(whole.folder, with_overrides(whole.spec, {"rollout.control": control}), whole.hierarchy)
+    changed = Fit(with_overrides(whole.spec, {"rollout.control": control}), whole.hierarchy)
     differences = export(changed, tmp_path, onnx=True)
     assert set(differences) == {"numpy", "torch", "onnx"}
     assert all(difference < TOLERANCE for difference, _ in differences.values())
@@ -211,7 +210,7 @@ def test_what_changes_in_held_out_demonstrations_alone_stays_in(folder: Path, tm
     changed[4, 3] = 0.0
     path = tmp_path / "demos.hdf5"
     with_controls(demos, {"demo_7": changed}).write(path)
-    found = fit(spec_for(path, compare_with=[]), tmp_path / "run", Unwatched())
+    found = fit(spec_for(path, compare_with=[]), out=tmp_path / "run")
     assert found.hierarchy.scaling.varying.tolist() == [0, 2, 3]
     held_out = found.metrics["log_likelihood_by_dimension"]["valid"]["by_dimension"]
     assert np.isfinite(held_out[3])
@@ -235,7 +234,7 @@ def test_runs_that_score_other_dimensions_are_not_compared(whole: Fit, tmp_path:
     path = tmp_path / "demos.hdf5"
     with_controls(demos, {"demo_2": changed}).write(path)
     runs = [
-        fit(spec_for(path, compare_with=[], demonstrations=own | {"path": str(path)}), tmp_path / name, Unwatched())
+        fit(spec_for(path, compare_with=[], demonstrations=own | {"path": str(path)}), out=tmp_path / name)
         for name, own in (("all", {}), ("without", {"exclude": ["demo_2"]}))
     ]
     message = (

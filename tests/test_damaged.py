@@ -38,7 +38,7 @@ def rolled(toy_run: Fit, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rolled")
     shutil.copytree(toy_run.folder, folder / "run")
     demonstrations(toy_run.spec).write(folder / "demos.hdf5")
-    roll_out(ddco_pyro.load(folder / "run"), 2, 0, lambda name: None, jobs=1)
+    roll_out(ddco_pyro.load(folder / "run"), 2, jobs=1)
     return folder
 
 
@@ -226,6 +226,29 @@ def test_a_damaged_history(run: Path, content: bytes) -> None:
     for name in ("history.csv", "metrics.json"):
         (run / name).unlink()
     assert call(*ended.err.partition("fit again: ddco-pyro ")[2].split()).status == 0
+
+
+UNFINISHED = {
+    "truncated": (lambda text: text[:-20], "is no JSON: EOF while parsing"),
+    "{}": (lambda text: "{}", "models: missing; it has to be given"),
+    "an outcome less": (
+        lambda text: json.dumps(json.loads(text) | {"seeds": [1000, 1001, 1002]}),
+        "outcomes: supervisor has 2, but there are 3 seeds",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", UNFINISHED)
+def test_damaged_unfinished_rollouts(run: Path, monkeypatch: pytest.MonkeyPatch, damage: str) -> None:
+    outcomes = {"supervisor": [{"success": 1.0}, {"success": 0.0}]}
+    whole = json.dumps({"models": "0", "seeds": [1000, 1001], "outcomes": outcomes})
+    path, (change, what) = run / "rollouts.unfinished.json", UNFINISHED[damage]
+    path.write_text(change(whole))
+    monkeypatch.chdir(run.parent)
+    refused(run, COMMANDS["rollout"], path, what)
+    path.write_text(whole)  # of other models: not taken, and put away at the end
+    assert call(*(one.replace("RUN", str(run)) for one in COMMANDS["rollout"])).status == 0
+    assert not path.exists()
 
 
 # --- tensors ----------------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.events import DemonstrationsDone
 from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy, check_networks, demonstrations, dimensions
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 
@@ -101,8 +102,8 @@ def test_demonstrations_are_read_from_the_file(path):
 def test_demonstrations_are_collected_where_there_is_no_file_yet(tmp_path):
     path, told = tmp_path / "later.hdf5", []
     given = spec(demonstrations={"path": str(path), "count": 3, "labels": "phase"})
-    found = demonstrations(given, lambda *progress: told.append(progress))
-    assert (found.names, told[-1]) == (("demo_0", "demo_1", "demo_2"), (3, 3))
+    found = demonstrations(given, told.append)
+    assert (found.names, told[-1]) == (("demo_0", "demo_1", "demo_2"), DemonstrationsDone(3, 3))
     assert (set(found[0].observations), set(found[0].labels)) == ({"offsets"}, {"phase"})
     assert path.exists()
 

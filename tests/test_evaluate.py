@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 from collections import Counter
+from dataclasses import replace
 from unittest import mock
 
 import numpy as np
@@ -15,7 +16,8 @@ import toy_task
 
 import ddco_pyro
 from ddco_pyro.data.tensors import read_tensors, write_tensors
-from ddco_pyro.fitting.fit import Fit, RunError
+from ddco_pyro.events import EpisodeEnded
+from ddco_pyro.fitting.fit import RunError
 from ddco_pyro.fitting.rollouts import policies, roll_out
 from ddco_pyro.simulation.episodes import run_episode, run_episodes
 from ddco_pyro.spec import with_overrides
@@ -30,7 +32,7 @@ def rolled(toy_run, tmp_path_factory):
     told = []
     run = ddco_pyro.load(shutil.copytree(toy_run.folder, tmp_path_factory.mktemp("rolled") / "run"))
     before = run.metrics
-    results = roll_out(run, EPISODES, film=2, on_episode=told.append, jobs=1)
+    results = roll_out(run, EPISODES, film=2, on_event=told.append, jobs=1)
     return run, results, told, before
 
 
@@ -62,7 +64,7 @@ def test_the_table_is_what_the_episodes_gave(rolled, rows):
 
 def test_progress_is_told_for_every_episode(rolled):
     *_, told, _ = rolled
-    assert Counter(told) == dict.fromkeys(METHODS, EPISODES)
+    assert told == [EpisodeEnded(name, len(METHODS) * EPISODES) for name in METHODS for _ in range(EPISODES)]
 
 
 def test_metrics_can_be_computed_again_from_the_table(rolled, rows):
@@ -95,14 +97,14 @@ def test_the_first_episodes_of_each_method_are_filmed(rolled):
 def test_rolling_out_again_gives_the_same(rolled, toy_run, tmp_path):
     run, results, *_ = rolled
     again = ddco_pyro.load(shutil.copytree(toy_run.folder, tmp_path / "again"))
-    roll_out(again, EPISODES, film=0, on_episode=lambda name: None, jobs=2)
+    roll_out(again, EPISODES, film=0, jobs=2)
     assert (again.folder / "rollouts.csv").read_bytes() == (run.folder / "rollouts.csv").read_bytes()
     assert again.metrics["rollouts"] == results
     assert not (again.folder / "videos").exists()
 
 
 def changed(run, **changes):
-    return Fit(run.folder, with_overrides(run.spec, changes), run.hierarchy)
+    return replace(run, spec=with_overrides(run.spec, changes))
 
 
 def test_an_unknown_scripted_policy_is_refused(toy_run):
@@ -160,7 +162,7 @@ def test_others_are(copied, change, episodes, film, resume):
         copied = changed(copied, **{"rollout.policies": ["supervisor"]})
     results = roll_out(copied, episodes, film, told.append, jobs=1, resume=resume)
     methods = METHODS[1:] if change == "method" else METHODS
-    assert Counter(told) == dict.fromkeys(methods, episodes)
+    assert Counter(event.method for event in told) == dict.fromkeys(methods, episodes)
     assert (list(results["methods"]), results["episodes"]) == (methods, episodes)
 
 
@@ -168,13 +170,13 @@ def interrupted(run, after, **options):
     """Roll out as above, and be interrupted in the middle of a method."""
     told = []
 
-    def on_episode(name):
-        told.append(name)
+    def on_event(event):
+        told.append(event)
         if len(told) == after:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        roll_out(run, EPISODES, 2, on_episode, jobs=1, **options)
+        roll_out(run, EPISODES, 2, on_event, jobs=1, **options)
 
 
 @pytest.fixture
@@ -195,7 +197,7 @@ def test_what_was_interrupted_goes_on_with_the_next_method(rolled, fresh, monkey
     monkeypatch.setattr("ddco_pyro.fitting.rollouts.run_episodes", counted)
     assert roll_out(fresh, EPISODES, 2, told.append, jobs=1) == results
     assert len(begun) == len(METHODS) - 2
-    assert Counter(told) == dict.fromkeys(METHODS, EPISODES)
+    assert told == [EpisodeEnded(name, len(METHODS) * EPISODES) for name in METHODS for _ in range(EPISODES)]
     assert (fresh.folder / "rollouts.csv").read_bytes() == (run.folder / "rollouts.csv").read_bytes()
     assert {path.name for path in fresh.folder.iterdir()} == {path.name for path in run.folder.iterdir()}
 
@@ -215,5 +217,5 @@ def test_what_was_interrupted_is_not_mixed_with_anything_else(fresh, change):
         raise KeyboardInterrupt
 
     with mock.patch("ddco_pyro.fitting.rollouts.run_episodes", stop), pytest.raises(KeyboardInterrupt):
-        roll_out(ddco_pyro.load(fresh.folder), episodes, film, lambda name: None, jobs=1)
+        roll_out(ddco_pyro.load(fresh.folder), episodes, film, jobs=1)
     assert begun == [METHODS[0]]

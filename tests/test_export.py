@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -52,7 +51,7 @@ def make(network="mlp", counts=(3,), emits=("options",), camera=False, steps=7, 
     hierarchy.encoder.mean[3:6] = 0  # of the differences: it goes to and fro
     hierarchy.scaling.scale.copy_(torch.tensor([10.0, 0.3]))
     hierarchy.scaling.shift.copy_(torch.tensor([-4.0, 1.0]))
-    return Fit(Path("run"), spec, hierarchy.eval())
+    return Fit(spec, hierarchy.eval())
 
 
 FITS = {

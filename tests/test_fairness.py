@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 import shutil
@@ -111,9 +112,9 @@ def test_flat_equal_is_a_run_of_its_own(fitted, tmp_path):
 
 
 def test_flat_equal_is_rolled_out_and_compared(fitted, tmp_path):
-    copy = ddco_pyro.load(shutil.copytree(fitted[0].folder, tmp_path / "run"))
-    assert set(roll_out(copy, 2, 0, lambda name: None, jobs=1)["methods"]) >= {"ddco", *BASELINES}
-    found = compare([copy.folder, *(copy.folder / "baselines" / name for name in BASELINES)])
+    copied = ddco_pyro.load(shutil.copytree(fitted[0].folder, tmp_path / "run"))
+    assert set(roll_out(copied, 2, jobs=1)["methods"]) >= {"ddco", *BASELINES}
+    found = compare([copied.folder, *(copied.folder / "baselines" / name for name in BASELINES)])
     assert {row.model for row in found.rows} == {"ddco", *BASELINES}
     assert len(found.rollouts) == 3
 
@@ -156,7 +157,7 @@ def test_stages_that_needed_more_are_named_on_the_console(fitted):
 
 
 def test_earlier_stages_are_named_where_the_last_one_has_converged(fitted):
-    metrics = {key: fitted[0].metrics[key] for key in ("model", "training")} | {"comparison": {}}
+    metrics = copy.deepcopy(fitted[0].metrics) | {"comparison": {}}
     metrics["training"]["stages"][1] |= {"converged": True}
     metrics["training"]["stages"][2] |= {"epochs": 0}
     metrics["training"]["stages"][3] |= {"converged": True}

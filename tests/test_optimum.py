@@ -12,7 +12,6 @@ from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.fitting.run import fit
-from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import parse_spec
 
 STD = 0.4  # of the control, in units of its spread
@@ -46,7 +45,7 @@ def flat(tmp_path_factory):
             "training": {"epochs": 500, "patience": None, "optimizer": {"lr": 0.01}},
         }
     )
-    found = fit(spec, folder / "run", Unwatched())
+    found = fit(spec, out=folder / "run")
     return found, demos.split(spec.training.tune_fraction, spec.seed)[0]
 
 
@@ -118,7 +117,7 @@ def options(tmp_path_factory):
     for epochs in (1, 400):
         training = {"initialize": "vq_controls", "layerwise": False, "epochs": epochs, "patience": None}
         spec = parse_spec(data | {"training": training | {"optimizer": {"lr": 0.01}}})
-        found[epochs] = fit(spec, folder / str(epochs), Unwatched())
+        found[epochs] = fit(spec, out=folder / str(epochs))
     return found, demos.split(spec.training.tune_fraction, spec.seed)[0]
 
 

@@ -11,6 +11,7 @@ import toy_task
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing import words
+from ddco_pyro.fitting.fit import load
 from ddco_pyro.fitting.prepare import demonstrations, parts
 from ddco_pyro.fitting.run import fit, write_metrics
 from ddco_pyro.report import film, tables, write_report
@@ -18,7 +19,6 @@ from ddco_pyro.report.activity import Activity, LevelActivity, activity, bins
 from ddco_pyro.report.plot_rows import order
 from ddco_pyro.report.plot_timing import shares, terminations
 from ddco_pyro.report.plot_trajectories import movement, position_key, view
-from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.simulation.episodes import Episode, paired_difference, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.spec import parse_spec
@@ -50,7 +50,7 @@ def run(folder, demos, **changes):
         "compare_with": [{"kind": "flat", "policy": LINEAR}],
     }
     spec = parse_spec({key: value for key, value in (data | changes).items() if value is not None})
-    found = fit(spec, folder / changes.get("name", "run"), Unwatched())
+    found = fit(spec, out=folder / changes.get("name", "run"))
     return found, demonstrations(spec)
 
 
@@ -87,6 +87,7 @@ def deep(tmp_path_factory):
     for name in ("flat-1000", "ddco-1000", "ddco-1001"):
         write_film(found.folder / "videos" / f"{name}.mp4", Episode(1000, demos[0], {}, np.zeros((4, 0), int), frames))
     (found.folder / "rollouts.csv").write_text("method,seed,success\nddco,1000,1.0\nddco,1001,0.0\nflat,1000,\n")
+    found = load(found.folder)
     return found, write_report(found, demos).read_text()
 
 
@@ -255,8 +256,7 @@ def test_a_long_list_is_folded_and_long_timelines_are_cut(labelled, monkeypatch)
 def test_runs_of_before_have_no_list(labelled, tmp_path):
     found, _, demos = labelled
     before = {key: value for key, value in found.metrics.items() if key != "demonstrations_by_likelihood"}
-    copy = replace(found, folder=shutil.copytree(found.folder, tmp_path / "before"))
-    write_metrics(copy.folder, before)
+    copy = replace(found, folder=shutil.copytree(found.folder, tmp_path / "before"), metrics=before)
     page = write_report(copy, demos).read_text()
     assert ids(page) == ["likelihood", "dimensions", "learning", "options", "warnings", "particulars"]
     assert 'href="#segments' not in page
@@ -353,7 +353,7 @@ def test_names_are_escaped(tmp_path):
             "training": {"epochs": 1, "initialize": "random"},
         }
     )
-    page = write_report(fit(spec, folder, Unwatched()), demonstrations(spec)).read_text()
+    page = write_report(fit(spec, out=folder), demonstrations(spec)).read_text()
     assert "<b>" not in page
     assert "<i>" not in page
     assert "<img>" not in page

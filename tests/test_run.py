@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -17,10 +18,10 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import Damaged
+from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan, TrainingEnded
 from ddco_pyro.fitting.fit import RunError
 from ddco_pyro.fitting.prepare import Dimensions, demonstrations
 from ddco_pyro.fitting.run import claim, fit, train
-from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import dump_spec, load_spec, with_overrides
 
 
@@ -40,14 +41,14 @@ def copied(toy_run, tmp_path):
     return shutil.copytree(toy_run.folder, tmp_path / "run")
 
 
-class Interrupting(Unwatched):
+class Interrupting:
     """Ctrl-C at the end of some epoch."""
 
     def __init__(self, epochs):
         self.left = epochs
 
-    def epoch(self, row):
-        self.left -= 1
+    def __call__(self, event):
+        self.left -= isinstance(event, EpochEnded)
         if self.left == 0:
             raise KeyboardInterrupt
 
@@ -70,16 +71,18 @@ def test_the_spec_in_the_folder_is_the_whole_spec(toy_run, toy_spec):
 
 def test_the_history_has_every_epoch(toy_run, watched):
     rows = list(csv.DictReader((toy_run.folder / "history.csv").open()))
-    told = [row for row in watched.rows if row["stage"] != "policy"]
+    told = [asdict(row) for row in watched.of(EpochEnded) if row.stage != "policy"]
     assert [{**row, "restart": str(row["restart"]), "epoch": str(row["epoch"])} for row in told] == [
         {**row, "train": float(row["train"]), "tune": float(row["tune"])} for row in rows
     ]
     assert [row["stage"] for row in rows] == ["vq-1"] * 6 + ["level-1"] * 6 + ["meta-policy"] * 6 + ["joint"] * 6
 
 
-def test_the_watcher_is_told_what_goes_on(toy_run, watched):
-    assert watched.models == [("ddco", 24), "ddco", ("flat", 24), "flat", ("per_timestep", 24), "per_timestep"]
-    assert watched.demonstrations in ([(n, 12) for n in range(1, 13)], [])  # nothing where they are in the cache
+def test_whoever_watches_is_told_what_goes_on(toy_run, watched):
+    models = [(TrainingBegan(name, 24), TrainingEnded(name)) for name in ("ddco", "flat", "per_timestep")]
+    assert watched.of(TrainingBegan, TrainingEnded) == [event for pair in models for event in pair]
+    collected = [DemonstrationsDone(n, 12) for n in range(1, 13)]
+    assert watched.of(DemonstrationsDone) in (collected, [])  # nothing where they are in the cache
 
 
 FIRST_ELIMINATION = """
@@ -221,7 +224,7 @@ def test_planted_skills_are_found(planted, tmp_path, toy_spec):
         "observations": ["side", "place"],
     }
     spec = with_overrides(toy_spec, given | {"compare_with": [], "training.epochs": 240} | LINEAR)
-    found = fit(spec, tmp_path / "run", Unwatched())
+    found = fit(spec, out=tmp_path / "run")
     assert found.metrics["agreement"]["valid"] == [pytest.approx(1)]
     assert "supervisor" not in found.metrics["demonstrations"]
 
@@ -234,10 +237,10 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(toy_run, toy_spec, tmp_pat
     """In the first stage, at its end, in later ones, in a baseline."""
     folder = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        fit(toy_spec, folder, Interrupting(epochs))
+        fit(toy_spec, out=folder, on_event=Interrupting(epochs))
     with pytest.raises(RunError, match=r"run: an unfinished run: fit it again to continue it"):
         ddco_pyro.load(folder)
-    fit(toy_spec, folder, Unwatched())
+    fit(toy_spec, out=folder)
     for name in ("model.safetensors", "history.csv", "baselines/flat/model.safetensors", "spec.yaml"):
         assert (folder / name).read_bytes() == (toy_run.folder / name).read_bytes()
     for name in ("metrics.json", "baselines/flat/metrics.json"):
@@ -253,24 +256,24 @@ def test_the_engines_are_compared_on_a_model_that_the_seed_decides(toy_spec, dem
     for seed in (1, 2):
         torch.manual_seed(seed)
         before = torch.get_rng_state()
-        checks.append(train(spec, Dimensions.of(demos), demos, Unwatched()).check)
+        checks.append(train(spec, Dimensions.of(demos), demos).check)
         assert torch.equal(torch.get_rng_state(), before)
     assert checks[0] == checks[1]
-    assert checks[0] != train(with_overrides(spec, {"seed": 1}), Dimensions.of(demos), demos, Unwatched()).check
+    assert checks[0] != train(with_overrides(spec, {"seed": 1}), Dimensions.of(demos), demos).check
 
 
 def test_a_finished_run_is_left_as_it_is(copied, toy_spec):
     metrics = copied / "metrics.json"
     metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"note": "kept"}))
     before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in copied.rglob("*") if path.is_file()}
-    assert fit(toy_spec, copied, Interrupting(1)).metrics["note"] == "kept"
+    assert fit(toy_spec, out=copied, on_event=Interrupting(1)).metrics["note"] == "kept"
     assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in before} == before
 
 
 def test_a_run_of_another_spec_is_refused(copied, toy_spec):
     other = with_overrides(toy_spec, {"seed": 1})
     with pytest.raises(RunError, match=r"run: holds a run of another spec; choose another --out or remove it$"):
-        fit(other, copied, Unwatched())
+        fit(other, out=copied)
     assert load_spec(copied / "spec.yaml") == toy_spec
 
 

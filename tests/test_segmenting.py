@@ -27,7 +27,6 @@ from ddco_pyro.fitting.run import fit
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
 from ddco_pyro.segmenting.lerobot import annotate
 from ddco_pyro.segmenting.lerobot_forms import FORMS
-from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import parse_spec
 
 LEROBOT = Path(__file__).parent / "fixtures" / "lerobot"
@@ -60,7 +59,7 @@ def look(run: Path, demos: Path) -> Segmented:
 
 @pytest.mark.parametrize("at_once", [8192, 1])
 def test_they_are_the_fits_own(toy_run, toy_spec, file, at_once, monkeypatch):
-    monkeypatch.setattr("ddco_pyro.segmenting.STEPS_AT_ONCE", at_once)
+    monkeypatch.setattr("ddco_pyro.model.hierarchy.STEPS_AT_ONCE", at_once)
     demos = demonstrations(toy_spec)
     (path,) = toy_run.segment(demos)
     (u,) = toy_run.posterior(demos).u
@@ -250,7 +249,7 @@ def lerobot_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lerobot")
     import_demonstrations(LEROBOT, folder / "demos.hdf5")
     spec = parse_spec(yaml.safe_load(SPEC.replace("PATH", str(folder / "demos.hdf5"))))
-    return fit(spec, folder / "run", Unwatched())
+    return fit(spec, out=folder / "run")
 
 
 def files(folder):

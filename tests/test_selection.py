@@ -17,13 +17,12 @@ from selecting import Told, data_at, kept, score, spec_at, two_skills
 
 import ddco_pyro
 from ddco_pyro.errors import Failed
-from ddco_pyro.fitting.fit import log_likelihoods
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.prepare import Dimensions
 from ddco_pyro.fitting.run import train
 from ddco_pyro.selection import SelectionFailed, Workers, check, final_spec, parallel, scoring, select
 from ddco_pyro.selection.folds import FoldError
 from ddco_pyro.selection.parallel import BackendError
-from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.spec import SpecError, with_overrides
 
 ONE = Workers(1)
@@ -46,8 +45,8 @@ def test_a_score_is_that_of_a_fit_without_the_fold(finished):
     for row in made.choice.rows:
         names = made.folds.held_out[2]
         rest = demos.select([name for name in demos.names if name not in names])
-        trained = train(row.candidate.spec, Dimensions.of(demos), rest, Unwatched())
-        expected = log_likelihoods(trained.hierarchy, demos.select(names))
+        trained = train(row.candidate.spec, Dimensions.of(demos), rest)
+        expected = Fit(row.candidate.spec, trained.hierarchy).log_likelihood(demos.select(names))
         np.testing.assert_array_equal(scores[row.candidate.number, 2]["log_likelihood"], expected)
 
 
@@ -55,9 +54,9 @@ def test_restarts_are_chosen_inside_the_training_part(tmp_path, monkeypatch):
     spec = spec_at(tmp_path, grid={"training.restarts": [2]}, folds=3)
     seen = []
 
-    def spied(spec, dimensions, demos, watcher, checkpoint=None, held_out=None):
+    def spied(spec, dimensions, demos, held_out):
         seen.append(set(demos.names))
-        return train(spec, dimensions, demos, watcher, checkpoint, held_out)
+        return train(spec, dimensions, demos, held_out=held_out)
 
     monkeypatch.setattr(scoring, "train", spied)
     made = select(spec, tmp_path / "run", Told(), ONE)
@@ -230,7 +229,7 @@ def test_a_killed_selection_goes_on_and_gives_the_same(tmp_path):
     arguments = ["select", spec, "--out"]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     cut = tmp_path / "cut"
-    status, _ = struck([*arguments, cut, "--jobs", "2"], tmp_path, "Selecting.scored", 2, KILL)
+    status, _ = struck([*arguments, cut, "--jobs", "2"], tmp_path, "FoldScored", 2, KILL)
     assert status == -signal.SIGKILL
     done = {path: path.read_bytes() for path in (cut / "folds").glob("*.json")}
     assert len(done) == 2

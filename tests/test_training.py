@@ -165,9 +165,9 @@ def test_frozen_levels_stay_as_they_were_discovered(tmp_path):
     trainer = make_trainer(spec, random_demonstrations(), tmp_path)
 
     def keep(row):
-        snapshots[row["stage"]] = {name: t.clone() for name, t in trainer._saved["best"].items()}
+        snapshots[row.stage] = {name: t.clone() for name, t in trainer._saved["best"].items()}
 
-    trainer.on_epoch = keep
+    trainer.on_event = keep
     final = trainer.run().state_dict()
     lower = [name for name in final if name.startswith("levels.")]
     meta = [name for name in final if name.startswith("meta_policy.network")]

@@ -8,12 +8,24 @@ from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from rich import progress as rich_progress
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
 from ddco_pyro.data.control_dimensions import notes
+from ddco_pyro.events import (
+    CandidateGivenUp,
+    DemonstrationsDone,
+    EpisodeEnded,
+    EpochEnded,
+    Event,
+    FoldScored,
+    SelectionBegan,
+    TrainingBegan,
+    TrainingEnded,
+)
 from ddco_pyro.fitting.convergence import effort
 
 if TYPE_CHECKING:
@@ -32,7 +44,7 @@ class _Bar:
     def __init__(self) -> None:
         self.console = Console(stderr=True)
         columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
-        self._progress = Progress(
+        self._progress = rich_progress.Progress(
             *columns, TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=self.console
         )
         self._task: TaskID | None = None
@@ -41,8 +53,6 @@ class _Bar:
         self._start = self._said = 0.0
 
     def __enter__(self) -> Self:
-        if self.console.is_terminal:
-            self._progress.start()
         return self
 
     def __exit__(
@@ -54,6 +64,8 @@ class _Bar:
     def begin(self, label: str, total: int | None) -> None:
         """Begin to count up to ``total``; None where nobody knows how far it goes."""
         self.end()
+        if self.console.is_terminal:
+            self._progress.start()  # once: what is refused before leaves the terminal alone
         self._label, self._total, self._done = label, total, 0
         self._start = self._said = time.monotonic()
         self._task = self._progress.add_task(label, total=total, note="")
@@ -87,69 +99,47 @@ class _Bar:
         self.console.print(f"{self._label}: {text}", markup=False, highlight=False, soft_wrap=True)
 
 
-class Collecting(_Bar):
-    """Shows how many demonstrations have been collected, or whatever else is done with them one by one."""
+class Progress(_Bar):
+    """Shows events as they happen.
+
+    :param label: what is done with demonstrations one by one.
+    """
 
     def __init__(self, label: str = "collecting demonstrations") -> None:
         super().__init__()
         self._what = label
 
-    def collected(self, done: int, total: int) -> None:
-        """So many of the demonstrations have been collected."""
+    def __call__(self, event: Event) -> None:
+        """Show an event."""
+        match event:
+            case DemonstrationsDone(done, total):
+                self._begun(self._what, total)
+                self.advance(done)
+            case TrainingBegan(model, epochs):
+                self.begin(f"training {model}", epochs)
+            case EpochEnded():
+                note = f"{event.stage}: training {event.train:.3f}, tuning {event.tune:.3f} nats/step"
+                self.advance(self._done + 1, note)
+            case TrainingEnded():
+                self.end()
+            case SelectionBegan(total, kept):
+                note = f" ({kept} of {total} kept from before)" if kept else ""
+                self.begin(f"cross-validation{note}", total - kept)
+            case FoldScored(candidate, fold, failed):
+                if failed:
+                    self._say(f"{candidate}, fold {fold} failed: {failed}")
+                self.advance(self._done + 1, f"{candidate}, fold {fold}")
+            case CandidateGivenUp(candidate, folds):
+                self._say(f"{candidate}: stopped early, {folds} folds less")
+                self.advance(self._done + folds)
+            case EpisodeEnded(method, total):
+                self._begun("rolling out", total)
+                self.advance(self._done + 1, method)
+
+    def _begun(self, label: str, total: int) -> None:
+        """Begin to count, unless that was begun already."""
         if self._task is None:
-            self.begin(self._what, total)
-        self.advance(done)
-
-
-class Fitting(Collecting):
-    """Shows how a fit goes on (a :class:`ddco_pyro.fitting.run.Watcher`)."""
-
-    def training(self, name: str, epochs: int | None) -> None:
-        """A model begins to be trained, for at most so many epochs in all; None for no limit."""
-        self.begin(f"training {name}", epochs)
-
-    def epoch(self, row: Mapping[str, Any]) -> None:
-        """An epoch has ended; its row of the history."""
-        note = f"{row['stage']}: training {row['train']:.3f}, tuning {row['tune']:.3f} nats/step"
-        self.advance(self._done + 1, note)
-
-    def trained(self, name: str) -> None:
-        """A model has been trained."""
-        self.end()
-
-
-class Selecting(Fitting):
-    """Shows how a cross-validation goes on (a :class:`ddco_pyro.selection.Watcher`), and the fit that follows."""
-
-    def selecting(self, total: int, kept: int) -> None:
-        """So many (candidate, fold) are to be scored in all, of which some were kept from before."""
-        note = f" ({kept} of {total} kept from before)" if kept else ""
-        self.begin(f"cross-validation{note}", total - kept)
-
-    def scored(self, candidate: str, fold: int, failed: str) -> None:
-        """One has been scored, or has failed."""
-        if failed:
-            self._say(f"{candidate}, fold {fold} failed: {failed}")
-        self.advance(self._done + 1, f"{candidate}, fold {fold}")
-
-    def given_up(self, candidate: str, folds: int) -> None:
-        """A candidate has been stopped early: so many of its folds need not be scored."""
-        self._say(f"{candidate}: stopped early, {folds} folds less")
-        self.advance(self._done + folds)
-
-
-class Rolling(_Bar):
-    """Shows how many episodes have been rolled out."""
-
-    def __init__(self, total: int) -> None:
-        super().__init__()
-        self._episodes = total
-
-    def episode(self, name: str) -> None:
-        """An episode of the method so named has ended."""
-        if self._task is None:
-            self.begin("rolling out", self._episodes)
-        self.advance(self._done + 1, name)
+            self.begin(label, total)
 
 
 def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Sequence[tuple[Spec, Hierarchy]]) -> None:

@@ -7,6 +7,10 @@ from typing import Annotated
 
 import typer
 
+SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="The spec, a YAML file.", show_default=False)]
+Overrides = Annotated[
+    list[str], typer.Option("--set", metavar="KEY=VALUE", help="Another value for a key of the spec; repeatable.")
+]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a finished fit.", show_default=False)]
 AllowCode = Annotated[
     bool,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,6 +13,7 @@ from ddco_pyro.errors import BadInput
 
 if TYPE_CHECKING:
     from ddco_pyro.data.sources import Source
+    from ddco_pyro.events import OnEvent
     from ddco_pyro.fitting.fit import Fit
     from ddco_pyro.segmenting import Segmented
 
@@ -72,13 +72,13 @@ def segment(
     from ddco_pyro.segmenting.tables import write_csv, write_parquet
 
     fit = load(run, allow_code)
-    with open_source(demos) as source, console.Collecting("segmenting") as progress:
+    with open_source(demos) as source, console.Progress("segmenting") as progress:
         if labelled and source.format != "robomimic":
             raise BadInput(f"{demos}: labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot")
         if lerobot:
-            found = _annotate(fit, source, lerobot, (level, lerobot_format.value), progress.collected)
+            found = _annotate(fit, source, lerobot, (level, lerobot_format.value), progress)
         else:
-            found = segments(fit, source, progress.collected)
+            found = segments(fit, source, progress)
     if csv:
         write_csv(csv, found)
         print(csv)
@@ -105,9 +105,7 @@ def _labelled(demos: Path, out: Path | None, in_place: bool) -> Path | None:
     return demos if in_place else out
 
 
-def _annotate(
-    fit: Fit, source: Source, out: Path, how: tuple[str | None, str], on_demonstration: Callable[[int, int], None]
-) -> Segmented:
+def _annotate(fit: Fit, source: Source, out: Path, how: tuple[str | None, str], on_event: OnEvent) -> Segmented:
     """The segments of a LeRobot dataset, after a copy with a level's options as subtasks was written.
 
     :param how: the level, the lowest where it is None, and the format.
@@ -127,7 +125,7 @@ def _annotate(
         raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(counts)})")
     chosen = level or next(iter(counts), "")
     check_target(source, out, subtask_names(chosen, counts.get(chosen, 0)), form)
-    found = segments(fit, source, on_demonstration)
+    found = segments(fit, source, on_event)
     annotate(source, out, found, chosen, form)
     print(out)
     return found

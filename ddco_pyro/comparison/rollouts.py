@@ -18,7 +18,7 @@ def paired_rollouts(fits: Sequence[Fit], order: Sequence[str]) -> list[dict[str,
 
     Runs of other tasks, or without rollouts, are left out. ``p_value`` is McNemar's exact one.
     """
-    by_name = {str(fit.folder): fit for fit in fits}
+    by_name = {str(fit): fit for fit in fits}
     known = {name: own for name in order if (own := _outcomes(by_name[name]))}
     if len(known) < 2:
         return []
@@ -37,7 +37,11 @@ def _pair(first: str, ours: Outcomes, second: str, theirs: Outcomes) -> dict[str
 
 def _outcomes(fit: Fit) -> Outcomes:
     """What ``rollout`` wrote: for a baseline into the folder of the run that it belongs to."""
-    above = fit.folder.resolve().parent
-    places = [fit.folder, above.parent] if above.name == "baselines" else [fit.folder]
-    known = next((found for place in places if (found := read_successes(place))), {})
-    return {seed: value for (method, seed), value in known.items() if method == fit.name}
+    folder = fit.run_folder.resolve()
+    run = folder.parent.parent
+    tables = [(folder, fit.name), *([(run, folder.name)] if folder.parent == run / "baselines" else [])]
+    for place, name in tables:
+        own = {seed: value for (method, seed), value in read_successes(place).items() if method == name}
+        if own:
+            return own
+    return {}

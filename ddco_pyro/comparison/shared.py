@@ -10,7 +10,7 @@ import numpy as np
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.prepare import demonstrations, parts
+from ddco_pyro.fitting.prepare import parts
 
 
 class NotShared(BadInput):
@@ -43,22 +43,20 @@ def held_out(fits: Sequence[Fit]) -> list[Held]:
 
 def _own(fit: Fit) -> Demonstrations:
     """What a run held out."""
-    found = parts(fit.spec, demonstrations(fit.spec))
+    found = parts(fit.spec, fit.demonstrations)
     if "valid" not in found:
-        raise NotShared(
-            f"{fit.folder}: held nothing out (demonstrations.valid_fraction: 0); there is nothing to compare"
-        )
+        raise NotShared(f"{fit}: held nothing out (demonstrations.valid_fraction: 0); there is nothing to compare")
     return found["valid"]
 
 
 def _check_same(first: Fit, ours: Demonstrations, second: Fit, theirs: Demonstrations) -> None:
     """Held-out demonstrations have the same names, controls, and observations where both runs see them."""
-    lead = f"{first.folder} and {second.folder} were not held out on the same data"
+    lead = f"{first} and {second} were not held out on the same data"
     only = sorted(set(ours.names) ^ set(theirs.names))
     if only:
         where = first if only[0] in ours.names else second
         remedy = "fit both with the same demonstrations, valid_fraction and seed"
-        raise NotShared(f"{lead}: {only[0]} was held out by {where.folder} alone; {remedy}")
+        raise NotShared(f"{lead}: {only[0]} was held out by {where} alone; {remedy}")
     for mine, yours in zip(ours, theirs.select(ours.names), strict=True):
         different = _different(mine, yours)
         if different:
@@ -72,8 +70,8 @@ def _check_dimensions(first: Fit, second: Fit) -> None:
         dimension = min(ours ^ theirs)
         scored, left = (first, second) if dimension in ours else (second, first)
         raise NotShared(
-            f"{first.folder} and {second.folder} score different things: control dimension {dimension} is in the "
-            f"likelihood of {scored.folder} and not in that of {left.folder}; fit both to the same demonstrations, "
+            f"{first} and {second} score different things: control dimension {dimension} is in the "
+            f"likelihood of {scored} and not in that of {left}; fit both to the same demonstrations, "
             "with the same version"
         )
 
@@ -90,5 +88,5 @@ def _held(fit: Fit, demos: Demonstrations) -> Held:
     values = fit.log_likelihood(demos)
     for name, value in zip(demos.names, values, strict=True):
         if not fit.was_held_out(name, float(value)):
-            raise NotShared(f"{fit.folder}: {name} has changed since this run was fitted to it; fit it again")
-    return Held(str(fit.folder), fit, demos.names, demos.lengths, values)
+            raise NotShared(f"{fit}: {name} has changed since this run was fitted to it; fit it again")
+    return Held(str(fit), fit, demos.names, demos.lengths, values)

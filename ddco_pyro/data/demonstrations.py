@@ -90,6 +90,13 @@ def _integers(array: Any, where: str) -> np.ndarray:
 class Demonstrations(Sequence[Demonstration]):
     """Demonstrations that go together: the same observations, of the same shapes, and controls of the same size.
 
+    >>> demos = ddco_pyro.Demonstrations.read("mine.hdf5")
+    >>> len(demos), demos.names[0], demos.observation_shapes, demos.control_size
+    (6, 'demo_0', {'place': (2,)}, 2)
+    >>> train, valid = demos.split(0.5, seed=0)
+    >>> len(train), len(valid)
+    (3, 3)
+
     :param masks: name to names of demonstrations, such as ``{"valid": ("demo_3", "demo_7")}``.
     :param attributes: what is known of all of them.
     :raises DemonstrationsError: none at all, a name given twice, they do not go together, a mask names an unknown one.

@@ -57,39 +57,43 @@ def as_rows(use: Sequence[Sequence[OptionUse]]) -> list[list[dict[str, float | i
     return [[asdict(one) for one in level] for level in use]
 
 
-def divergences(parts: Iterable[tuple[Outputs, Posterior]]) -> list[list[dict[str, Any]]]:
+def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[dict[str, Any]]]:
     """How differently each two ``options`` of each level (lowest first) act, as ``divergence`` in nats per step.
 
     That is the mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i), averaged over steps with weights u_t(i) + u_t(j): over the
     time that one of the two is active; None where neither ever is. Two options of divergence 0 are the same skill
     under two numbers.
 
-    :param parts: what the networks say of some demonstrations, and the posterior of the same.
+    :param pieces: what the networks say of some demonstrations, and the posterior given those; gone through once.
     """
-    sums: dict[tuple[int, int, int], Tensor] = {}
-    for outputs, posterior in parts:
-        for level, (own, u) in enumerate(zip(outputs.callers[:-1], posterior.u, strict=True)):
-            for i, j in combinations(range(u.shape[-1] - 1), 2):
-                weight = u[..., i + 1] + u[..., j + 1]
-                own_sums = torch.stack([(weight * _divergence(own, i, j)).sum(), weight.sum()])
-                sums[level, i, j] = sums.get((level, i, j), 0.0) + own_sums
-    levels: list[list[dict[str, Any]]] = [[] for _ in outputs.callers[:-1]]
-    for (level, i, j), (total, weight) in sums.items():
-        divergence = float(total / weight) if float(weight) > 0 else None
-        levels[level].append({"options": [i + 1, j + 1], "divergence": divergence})
-    return levels
+    levels: list[dict[tuple[int, int], Tensor]] = []
+    for outputs, posterior in pieces:
+        levels = levels or [{} for _ in posterior.u]
+        for level, own, u in zip(levels, outputs.callers[:-1], posterior.u, strict=True):
+            for pair in combinations(range(u.shape[-1] - 1), 2):
+                level[pair] = level.get(pair, 0.0) + _divergence(own, *pair, u)
+    return [
+        [
+            {"options": [i + 1, j + 1], "divergence": float(total / weight) if weight > 0 else None}
+            for (i, j), (total, weight) in level.items()
+        ]
+        for level in levels
+    ]
 
 
-def _divergence(own: CallerOutputs, i: int, j: int) -> Tensor:
-    """That of two callers at each step, [N, T]."""
-    steps = torch.zeros((), dtype=torch.float64)
-    control = torch.ones((), dtype=torch.float64)  # mean probability of emitting the control
+def _divergence(own: CallerOutputs, i: int, j: int, u: Tensor) -> Tensor:
+    """Weighted sum over the steps, and the sum of the weights, [2]."""
+    steps = torch.zeros(u.shape[:2], dtype=torch.float64)
+    control = torch.ones_like(steps)  # mean probability of emitting the control
     if own.selection is not None:
         p, q = (own.selection[:, :, option].double() for option in (i, j))
         both = torch.isfinite(p) & torch.isfinite(q)  # callers of a level emit the same kinds of choices
         steps = torch.where(both, 0.5 * (p.exp() - q.exp()) * (p - q), 0.0).sum(-1)
         control = 0.5 * (p[..., 0].exp() + q[..., 0].exp())
-    return steps if own.emission is None else steps + control * own.emission.divergence(i, j)
+    if own.emission is not None:
+        steps = steps + control * own.emission.divergence(i, j)
+    weight = u[..., i + 1] + u[..., j + 1]
+    return torch.stack([(weight * steps).sum(), weight.sum()])
 
 
 def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> float:

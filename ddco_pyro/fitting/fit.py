@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,19 +15,15 @@ from torch import Tensor
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor
-from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.tensors import read_tensors
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting import analysis
-from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy
+from ddco_pyro.fitting.inferred import Inferred, infer
+from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy, demonstrations, named_baselines
 from ddco_pyro.fitting.records import read_metrics, refit
-from ddco_pyro.inference import Posterior, log_likelihood, posterior, segment
-from ddco_pyro.inference.decomposition import Decomposition, decompose
+from ddco_pyro.inference import Posterior
 from ddco_pyro.model.control_parts import ControlPart
-from ddco_pyro.model.encoding import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.outputs import Outputs
-from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import Spec, load_spec, user_code
 
 TOLERANCE = 1e-4
@@ -38,22 +34,35 @@ class RunError(BadInput):
     """A folder is not the run it was taken for."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
-    """A fitted model and the folder it lives in. ``metrics`` is ``metrics.json``."""
+    """A fitted model.
 
-    folder: Path
+    :param metrics: its numbers, the contents of ``metrics.json``.
+    :param folder: its run folder; None where it was not written.
+    :param given: the demonstrations that it was fitted to; None for those that the spec names.
+    :param beside: the baselines that were trained beside it, by name; None for those in its folder.
+    """
+
     spec: Spec
     hierarchy: Hierarchy
+    metrics: dict[str, Any] = field(default_factory=dict, repr=False)
+    folder: Path | None = None
+    given: Demonstrations | None = field(default=None, repr=False)
+    beside: Mapping[str, Fit] | None = field(default=None, repr=False)
+
+    def __str__(self) -> str:
+        return str(self.folder or "this fit")
 
     @property
-    def metrics(self) -> dict[str, Any]:
-        """The contents of ``metrics.json``.
+    def run_folder(self) -> Path:
+        """The folder, for what is read from it or written into it.
 
-        :raises Damaged: it lacks something that a reader needs.
+        :raises RunError: there is none.
         """
-        hierarchy = self.spec.hierarchy
-        return read_metrics(self.folder, [level.count for level in hierarchy.levels] if hierarchy else [])
+        if self.folder is None:
+            raise RunError("this fit has no run folder; fit with out=FOLDER, which this needs")
+        return self.folder
 
     @property
     def name(self) -> str:
@@ -61,59 +70,68 @@ class Fit:
         return model_name(self.spec)
 
     @cached_property
-    def baselines(self) -> dict[str, Fit]:
+    def demonstrations(self) -> Demonstrations:
+        """The demonstrations that it was fitted to, training and held out; those of a run are read when asked for."""
+        return demonstrations(self.spec) if self.given is None else self.given
+
+    @cached_property
+    def baselines(self) -> Mapping[str, Fit]:
         """The baselines that were trained beside it, by name."""
-        folders = [self.folder / "baselines" / baseline.kind for baseline in self.spec.compare_with]
+        if self.beside is not None or self.folder is None:
+            return self.beside or {}
+        folders = [self.folder / "baselines" / name for name in named_baselines(self.spec)]
         allow_code = bool(user_code(self.spec))  # theirs is named in this spec too
         return {folder.name: load(folder, allow_code) for folder in folders if is_finished(folder)}
 
     @cached_property
     def held_out(self) -> dict[str, float]:
         """log p(ξ) of each demonstration that was held out, by name, as it was then."""
-        return {one["name"]: one["log_likelihood"] for one in self.metrics["valid"]}
+        return {row["name"]: row["log_likelihood"] for row in self.metrics["valid"]}
 
     def was_held_out(self, name: str, log_likelihood: float) -> bool:
         """Whether a demonstration is one of those that were held out: the same name, and as likely as it was then."""
         return bool(np.isclose(self.held_out.get(name, np.nan), log_likelihood, rtol=TOLERANCE, atol=TOLERANCE))
 
-    def log_likelihood(self, demos: Demonstrations) -> np.ndarray:
-        """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units."""
-        return log_likelihoods(self.hierarchy, demos)
+    def infer(self, demos: Iterable[Demonstration]) -> Iterator[Inferred]:
+        """What the model says of demonstrations, in pieces that fit into memory, in their order.
 
-    def decompose(self, demos: Demonstrations) -> Decomposition:
-        """What each control dimension and choosing options add to log p(ξ) of each demonstration."""
-        with torch.no_grad():
-            return Decomposition.joined(
-                decompose(self.hierarchy(batch.inputs), batch) for batch in _batches(self.hierarchy, demos)
-            )
+        >>> for piece in fit.infer(demos):
+        ...     print(piece.log_likelihood.shape, piece.posterior.u[0].shape, piece.path.choices[0].shape)
+        (6,) torch.Size([6, 10, 3]) torch.Size([6, 10])
 
-    def posterior(self, demos: Demonstrations) -> Posterior:
-        """u, v and w of §4.1 for every level."""
-        parts = [posterior(*part) for part in _tables(self.hierarchy, demos)]
-        u, v, w = (
-            tuple(_stacked(level, 0.0) for level in zip(*tables, strict=True)) for tables in zip(*parts, strict=True)
+        :param demos: :class:`~ddco_pyro.Demonstrations`, or single ones that are read while this goes on.
+        :raises DemonstrationsError: there are none, or a number is too large for networks.
+        """
+        return infer(self.hierarchy, demos)
+
+    def log_likelihood(self, demos: Iterable[Demonstration]) -> np.ndarray:
+        """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units.
+
+        >>> fit.log_likelihood(demos).shape
+        (6,)
+        """
+        return np.concatenate([piece.log_likelihood for piece in self.infer(demos)])
+
+    def posterior(self, demos: Iterable[Demonstration]) -> Posterior:
+        """u, v and w of §4.1 for every level, each [N, T, 1 + k] with control as choice 0.
+
+        >>> (u,) = fit.posterior(demos).u
+        >>> u.shape, float(u[0, 0].sum().round(decimals=6))
+        (torch.Size([6, 10, 3]), 1.0)
+        """
+        parts = [piece.posterior for piece in self.infer(demos)]
+        return Posterior(
+            *(tuple(_stacked(level, 0.0) for level in zip(*kind, strict=True)) for kind in zip(*parts, strict=True))
         )
-        return Posterior(u, v, w)
 
-    def divergences(self, demos: Demonstrations, posterior: Posterior) -> list[list[dict[str, Any]]]:
-        """How differently each two options of a level act (:func:`ddco_pyro.fitting.analysis.divergences`)."""
-        with torch.no_grad():
-            return analysis.divergences(self._with_posterior(demos, posterior))
+    def segment(self, demos: Iterable[Demonstration]) -> tuple[np.ndarray, ...]:
+        """Choices of the most likely path, a [N, T] for each level, lowest first; -1 past a demonstration's end.
 
-    def _with_posterior(self, demos: Demonstrations, posterior: Posterior) -> Iterator[tuple[Outputs, Posterior]]:
-        """What the networks say of the demonstrations, some at a time, and the same steps of the posterior."""
-        for rows, batch in encode(demos, self.hierarchy.encoder, self.hierarchy.scaling).pieces(
-            self.hierarchy.steps_at_once
-        ):
-            steps = batch.inputs.batch[1]
-            yield (
-                self.hierarchy(batch.inputs),
-                Posterior(*(tuple(u[rows, :steps] for u in table) for table in posterior)),
-            )
-
-    def segment(self, demos: Demonstrations) -> tuple[np.ndarray, ...]:
-        """Choices of the most likely path, a [N, T] for each level, lowest first; -1 past a demonstration's end."""
-        parts = [segment(*part) for part in _tables(self.hierarchy, demos)]
+        >>> (options,) = fit.segment(demos)
+        >>> options.shape, sorted(set(options[options >= 0].tolist()) - {1, 2})
+        ((6, 10), [])
+        """
+        parts = [piece.path.choices for piece in self.infer(demos)]
         return tuple(_stacked(level, -1).numpy() for level in zip(*parts, strict=True))
 
     def controller(self, seed: int = 0) -> Controller:
@@ -131,25 +149,6 @@ def _stacked(parts: Sequence[Tensor], padding: float) -> Tensor:
     return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=padding)
 
 
-def log_likelihoods(hierarchy: Hierarchy, demos: Demonstrations) -> np.ndarray:
-    """log p(ξ) of each demonstration under a trained hierarchy, nats, [N]."""
-    found: np.ndarray = torch.cat([log_likelihood(*part) for part in _tables(hierarchy, demos)]).numpy()
-    return found
-
-
-def _tables(hierarchy: Hierarchy, demos: Demonstrations) -> Iterator[tuple[Tables, Tensor]]:
-    """Tables and lengths of the demonstrations, some at a time."""
-    with torch.no_grad():
-        for batch in _batches(hierarchy, demos):
-            yield hierarchy.tabulate(batch), batch.lengths
-
-
-def _batches(hierarchy: Hierarchy, demos: Demonstrations) -> Iterator[Batch]:
-    """The demonstrations as the networks see them, some at a time."""
-    for _, batch in encode(demos, hierarchy.encoder, hierarchy.scaling).pieces(hierarchy.steps_at_once):
-        yield batch
-
-
 def model_name(spec: Spec) -> str:
     """``ddco``, or the kind of the baseline."""
     return spec.baseline.kind if spec.baseline else "ddco"
@@ -157,6 +156,10 @@ def model_name(spec: Spec) -> str:
 
 def load(folder: str | Path, allow_code: bool = False) -> Fit:
     """The fit in a run folder.
+
+    >>> again = ddco_pyro.load("runs/mine")
+    >>> again.metrics == fit.metrics, (again.log_likelihood(demos) == fit.log_likelihood(demos)).all()
+    (True, np.True_)
 
     :param allow_code: import the user code (``module:name``) that its spec names; nothing else in a run is ever
         executed.
@@ -173,13 +176,13 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
         raise RunError(f"{folder}: {what} (it has no {missing[0]})")
     spec = load_spec(folder / "spec.yaml", allow_code=allow_code)
     try:
-        found = Fit(folder, spec, _read_model(spec, folder / "model.safetensors").eval())
+        hierarchy = _read_model(spec, folder / "model.safetensors").eval()
     except BadInput:
         raise
     except (KeyError, ValueError, RuntimeError) as error:
         raise RunError(f"{folder / 'model.safetensors'}: is of another spec than spec.yaml; {refit(folder)}") from error
-    _ = found.metrics  # whoever loads a run is told that they are damaged, before any work
-    return found
+    counts = [level.count for level in spec.hierarchy.levels] if spec.hierarchy else []
+    return Fit(spec, hierarchy, read_metrics(folder, counts), folder)
 
 
 def _read_model(spec: Spec, path: Path) -> Hierarchy:

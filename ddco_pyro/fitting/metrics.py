@@ -3,33 +3,63 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting import analysis
 from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.inferred import Inferred
+from ddco_pyro.inference import Posterior
+from ddco_pyro.inference.decomposition import Decomposition
+from ddco_pyro.model.outputs import Outputs
 
 
 class NotFinite(Failed):
     """A log-likelihood that is no number to report."""
 
 
-def _log_likelihood(found: Fit, demos: Demonstrations) -> np.ndarray:
+@dataclass(frozen=True)
+class _Part:
+    """What a model says of a part of the demonstrations.
+
+    :param values: log p(ξ) of each, nats, [N].
+    :param each: that in parts.
+    :param segments: the most likely options of all their steps, for each level.
+    """
+
+    values: np.ndarray
+    each: Decomposition
+    segments: list[np.ndarray]
+
+    @classmethod
+    def of(cls, fit: Fit, demos: Demonstrations) -> _Part:
+        values, parts, paths = [], [], []
+        for piece in fit.infer(demos):
+            values.append(_finite(fit, piece))
+            parts.append(piece.decomposition)
+            paths.append(piece.path.choices)
+        segments = [np.concatenate([h[h >= 0].numpy() for h in level]) for level in zip(*paths, strict=True)]
+        return cls(np.concatenate(values), Decomposition.joined(parts), segments)
+
+
+def _finite(fit: Fit, piece: Inferred) -> np.ndarray:
     """log p(ξ) of each demonstration, nats, [N].
 
     :raises NotFinite: one is NaN or infinite.
     """
-    values = found.log_likelihood(demos)
-    for name, value in zip(demos.names, values, strict=True):
+    for name, value in zip(piece.names, piece.log_likelihood, strict=True):
         if not np.isfinite(value):
             raise NotFinite(
-                f"{found.folder}: the log-likelihood of {name} under the fitted model is {value}; look at its values "
+                f"{fit}: the log-likelihood of {name} under the fitted model is {value}; look at its values "
                 "(ddco-pyro inspect), lower training.optimizer.lr, or leave it out (demonstrations.exclude)"
             )
-    return values
+    return piece.log_likelihood
 
 
 def evaluate(found: Fit, parts: dict[str, Demonstrations], demos: Demonstrations) -> dict[str, Any]:
@@ -39,35 +69,52 @@ def evaluate(found: Fit, parts: dict[str, Demonstrations], demos: Demonstrations
 
     :raises NotFinite: a log-likelihood is NaN or infinite.
     """
-    methods = {found.name: found, **found.baselines}
-    by_method = {name: {part: _log_likelihood(fit, parts[part]) for part in parts} for name, fit in methods.items()}
+    ours = {name: _Part.of(found, part) for name, part in parts.items()}
+    by_method = {found.name: {name: part.values for name, part in ours.items()}}
+    for method, fit in found.baselines.items():
+        by_method[method] = {
+            name: np.concatenate([_finite(fit, piece) for piece in fit.infer(part)]) for name, part in parts.items()
+        }
     values = by_method[found.name]
     per_step = {name: float(v.sum() / sum(parts[name].lengths)) for name, v in values.items()}
     metrics: dict[str, Any] = {
         "model": found.name,
         "log_likelihood_per_step": {"train": per_step["train"], "valid": per_step.get("valid")},
         "log_likelihood_by_dimension": {
-            name: _by_dimension(found, parts[name]) if name in parts else None for name in ("train", "valid")
+            name: _by_dimension(found, ours[name].each, parts[name]) if name in parts else None
+            for name in ("train", "valid")
         },
         "valid": _each(parts["valid"], values["valid"]) if "valid" in parts else [],
         "demonstrations_by_likelihood": _worst_first(found.name, parts, by_method),
         "comparison": {
             name: {
-                "log_likelihood_per_step": one.metrics["log_likelihood_per_step"],
+                "log_likelihood_per_step": fit.metrics["log_likelihood_per_step"],
                 "difference": _difference(values["valid"], by_method[name]["valid"], parts["valid"]),
-                "parameters": one.metrics["parameters"],
-                "training": one.metrics["training"],
+                "parameters": fit.metrics["parameters"],
+                "training": fit.metrics["training"],
             }
-            for name, one in found.baselines.items()
+            for name, fit in found.baselines.items()
         },
     }
     if found.hierarchy.depth:
-        posterior = found.posterior(demos)
-        metrics["options"] = analysis.as_rows(analysis.option_use(posterior))
-        metrics["divergences"] = found.divergences(demos, posterior)
+        metrics |= _options(found, demos)
         if found.spec.demonstrations.labels:
-            metrics["agreement"] = _agreement(found, parts)
+            metrics["agreement"] = _agreement(found.spec.demonstrations.labels, ours, parts)
     return metrics
+
+
+def _options(found: Fit, demos: Demonstrations) -> dict[str, Any]:
+    """How options are used, and how differently they act."""
+    sums: list[Posterior] = []
+
+    def pieces() -> Iterator[tuple[Outputs, Posterior]]:
+        for piece in found.infer(demos):
+            sums.append(Posterior(*(tuple(h.sum(1, keepdim=True) for h in kind) for kind in piece.posterior)))
+            yield piece.outputs, piece.posterior
+
+    divergences = analysis.divergences(pieces())
+    whole = Posterior(*(tuple(map(torch.cat, zip(*kind, strict=True))) for kind in zip(*sums, strict=True)))
+    return {"options": analysis.as_rows(analysis.option_use(whole)), "divergences": divergences}
 
 
 def _each(demos: Demonstrations, values: np.ndarray) -> list[dict[str, Any]]:
@@ -98,11 +145,10 @@ def _worst_first(
     return sorted(rows, key=lambda row: row["log_likelihood_per_step"][ours])
 
 
-def _by_dimension(found: Fit, demos: Demonstrations) -> dict[str, Any]:
+def _by_dimension(found: Fit, each: Decomposition, demos: Demonstrations) -> dict[str, Any]:
     """What each control dimension (None for constant ones, which are no part of the model) and choosing options add to
     the log-likelihood per step.
     """
-    each = found.decompose(demos)
     scaling, steps = found.hierarchy.scaling, sum(demos.lengths)
     values: list[float | None] = [None] * scaling.size
     for dimension, value in zip(scaling.varying.tolist(), each.dimensions.sum(0).tolist(), strict=True):
@@ -114,18 +160,12 @@ def _difference(ours: np.ndarray, theirs: np.ndarray, valid: Demonstrations) -> 
     return analysis.paired(ours, theirs, np.array(valid.lengths, dtype=float))
 
 
-def _agreement(found: Fit, parts: dict[str, Demonstrations]) -> dict[str, Any]:
+def _agreement(label: str, ours: dict[str, _Part], parts: dict[str, Demonstrations]) -> dict[str, Any]:
     """NMI of each level's segments with the ground-truth labels."""
-    label = found.spec.demonstrations.labels
-    assert label is not None  # asked only where there are labels
     scores: dict[str, Any] = {"labels": label}
     for name, part in parts.items():
         truth = [demo.labels[label] for demo in part]
-        levels = found.segment(part)
-        scores[name] = [
-            analysis.agreement([row[: len(demo)] for row, demo in zip(level, part, strict=True)], truth)
-            for level in levels
-        ]
+        scores[name] = [analysis.agreement([level], truth) for level in ours[name].segments]
     return scores
 
 

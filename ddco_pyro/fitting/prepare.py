@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import h5py
+import numpy as np
 import torch
 from torch import nn
 
 from ddco_pyro.data.control_dimensions import ControlDimension, all_constant, control_dimensions
-from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError, extent
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, extent
+from ddco_pyro.data.hdf5 import dataset_at, member, opened
 from ddco_pyro.data.memory import Work, refuse_too_much
+from ddco_pyro.errors import nearest
+from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.widths import nearest_widths
 from ddco_pyro.model.control_parts import ControlPart, control_parts
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import ShapeError
 from ddco_pyro.model.networks.conv import POOLED
-from ddco_pyro.simulation.collect import OnDemonstration, collect
+from ddco_pyro.simulation.collect import collect
 from ddco_pyro.simulation.task import find_task
 from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code
 
@@ -160,12 +167,22 @@ def baselines(spec: Spec, dimensions: Dimensions) -> list[tuple[Spec, Hierarchy]
     return found
 
 
+def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
+    """The baselines trained beside, by name: their kind, numbered from the second of one kind on."""
+    names: dict[str, BaselineSpec] = {}
+    for baseline in spec.compare_with:
+        before = sum(other.kind == baseline.kind for other in names.values())
+        names[f"{baseline.kind}_{before + 1}" if before else baseline.kind] = baseline
+    return names
+
+
 def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) -> Spec:
     """The spec of a baseline trained beside: the same but for the model.
 
     :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
     """
-    alone = spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": ()})
+    grid = spec.selection.model_copy(update={"grid": {}})  # it is about the hierarchy
+    alone = spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": (), "selection": grid})
     if baseline.kind != "flat_equal":
         return alone
 
@@ -178,14 +195,18 @@ def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) ->
     return resized(nearest_widths(baseline.policy.hidden, target, lambda hidden: _counted(resized(hidden), dimensions)))
 
 
-def dimensions(spec: Spec) -> Dimensions:
+def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
     """The dimensions of what the spec names, without collecting anything: from its file, or else from its task.
 
     A task that does not say how long its episodes are counts as having one step.
+
+    :param demos: the demonstrations, where they have been read; of a file no observation is read otherwise.
     """
-    path = spec.demonstrations.path
-    if spec.demonstrated_task is None or (path is not None and Path(path).exists()):
-        return Dimensions.of(demonstrations(spec))
+    if demos is None and in_file(spec):
+        demos = outline(spec)
+    if demos is not None:
+        return Dimensions.of(demos)
+    assert spec.demonstrated_task is not None  # or they would be in a file
     task = find_task(spec.demonstrated_task)
     environment = task.load(spec.demonstrations.seed)
     try:
@@ -203,35 +224,113 @@ def parts(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
     return {"train": train, "valid": valid}
 
 
-def demonstrations(spec: Spec, on_demonstration: OnDemonstration | None = None) -> Demonstrations:
+def in_file(spec: Spec) -> bool:
+    """Whether the demonstrations are read from the file that the spec names; else they are a task's."""
+    path = spec.demonstrations.path
+    return spec.demonstrated_task is None or (path is not None and Path(path).exists())
+
+
+def known_demonstrations(spec: Spec) -> Demonstrations | None:
+    """:func:`demonstrations` where nothing has to be collected for them, else None."""
+    return demonstrations(spec) if in_file(spec) else None
+
+
+def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
     """The spec's demonstrations: read from its file, collected from its task's supervisor where there is none.
 
     :raises DemonstrationsError: the file is missing or wrong, lacks an observation or label that the spec names, or a
         fit to it would take more memory than is allowed.
     """
     own = spec.demonstrations
-    path = Path(own.path) if own.path else None
-    if spec.demonstrated_task is not None and (path is None or not path.exists()):
-        path = collect(spec.demonstrated_task, own, path, on_demonstration)
-    assert path is not None  # a spec has a task or a file
-    if not path.exists():
-        raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
-    _refuse_what_is_larger_than_memory(spec, path)
-    labels = (own.labels,) if own.labels else ()
-    return Demonstrations.read(path, [one.key for one in spec.observations], labels, own.exclude)
+    if in_file(spec):
+        path = Path(str(own.path))
+    else:
+        path = collect(str(spec.demonstrated_task), own, Path(own.path) if own.path else None, on_event)
+    _refuse_what_cannot_be_read(spec, path)
+    return Demonstrations.read(path, [one.key for one in spec.observations], _labels(spec), own.exclude)
+
+
+def outline(spec: Spec) -> Demonstrations:
+    """The demonstrations in the spec's file with their controls and labels, but with zeros for observations, of which
+    headers alone are read.
+
+    :raises DemonstrationsError: as :func:`demonstrations`, but for the values of observations.
+    """
+    path = Path(str(spec.demonstrations.path))
+    _refuse_what_cannot_be_read(spec, path)
+    controls = Demonstrations.read(path, [], _labels(spec), spec.demonstrations.exclude)
+    keys = [one.key for one in spec.observations]
+    with opened(path) as file:
+        return replace(
+            controls, demonstrations=tuple(_outlined(file[f"data/{one.name}"], one, keys) for one in controls)
+        )
+
+
+def _outlined(group: h5py.Group, demo: Demonstration, keys: Sequence[str]) -> Demonstration:
+    members = member(group, "obs", h5py.Group, f"{demo.name}: ")
+    headers = {key: dataset_at(members, key, f"{demo.name}: obs/") for key in keys}
+    kinds = {key: np.uint8 if header.dtype.kind in "fiub" else header.dtype for key, header in headers.items()}
+    zeros = {key: np.broadcast_to(np.zeros((), kinds[key]), header.shape) for key, header in headers.items()}
+    return replace(demo, observations=zeros)  # uint8 zeros are taken as they are: they need no memory
+
+
+def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
+    """What the spec names of demonstrations in memory: its observations and labels, without those that it excludes.
+
+    :raises DemonstrationsError: they lack one of them.
+    """
+    keys, labels, exclude = [one.key for one in spec.observations], _labels(spec), set(spec.demonstrations.exclude)
+    first = demos[0]
+    if (first.observations.keys(), first.labels.keys(), exclude) == ({*keys}, {*labels}, set()):
+        return demos
+    for kind, names, there in (("obs", keys, first.observations), ("labels", labels, first.labels)):
+        for name in names:
+            if name not in there:
+                known = ", ".join(there) or "nothing"
+                raise DemonstrationsError(f"there is no {kind}/{name}{nearest(name, there)}; there is: {known}")
+    if exclude:
+        demos.select(exclude)  # or one of them is not there
+    kept = tuple(
+        replace(
+            demo,
+            observations={key: demo.observations[key] for key in keys},
+            labels={name: demo.labels[name] for name in labels},
+        )
+        for demo in demos
+        if demo.name not in exclude
+    )
+    masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in demos.masks.items()}
+    return replace(demos, demonstrations=kept, masks=masks)
+
+
+def digest(demos: Demonstrations) -> str:
+    """SHA-256 of names, controls and observations."""
+    found = hashlib.sha256()
+    for demo in demos:
+        keys = sorted(demo.observations)
+        found.update(json.dumps([demo.name, *demo.actions.shape, *keys]).encode())
+        for array in (demo.actions, *(demo.observations[key] for key in keys)):
+            found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()
+
+
+def _labels(spec: Spec) -> tuple[str, ...]:
+    return (spec.demonstrations.labels,) if spec.demonstrations.labels else ()
 
 
 def _needed(spec: Spec) -> str:
     """What to do about a file that is not there."""
-    labels = [spec.demonstrations.labels] if spec.demonstrations.labels else []
-    read = ["actions", *(f"obs/{one.key}" for one in spec.observations), *(f"labels/{name}" for name in labels)]
+    read = ["actions", *(f"obs/{one.key}" for one in spec.observations), *(f"labels/{name}" for name in _labels(spec))]
     return (
         "put it there, or fit to another with --set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, "
         f"with {', '.join(read)} in each data/<demonstration>"
     )
 
 
-def _refuse_what_is_larger_than_memory(spec: Spec, path: Path) -> None:
+def _refuse_what_cannot_be_read(spec: Spec, path: Path) -> None:
+    """There is a file, and a fit to it takes no more memory than is allowed."""
+    if not path.exists():
+        raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
     remedy = (
         "leave observations out, make its demonstrations fewer, shorter or equally long, scale pictures down, or lower "
         "filters or hidden"

@@ -268,6 +268,21 @@ class Rollouts(Record):
     methods: dict[str, Method]
 
 
+class Unfinished(Record):
+    """Rollouts that were interrupted: the outcome of each seed's episode, for every method that was done."""
+
+    models: str
+    seeds: list[int]
+    outcomes: dict[str, list[dict[str, float]]]
+
+    @model_validator(mode="after")
+    def _an_outcome_for_each_seed(self) -> Unfinished:
+        for method, outcomes in self.outcomes.items():
+            if len(outcomes) != len(self.seeds):
+                raise invalid(("outcomes", f"{method} has {len(outcomes)}, but there are {len(self.seeds)} seeds"))
+        return self
+
+
 class Counts(Record):
     """Demonstrations, and how often their supervisor succeeded."""
 

@@ -6,18 +6,18 @@ import csv
 import hashlib
 import io
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ddco_pyro.data.files import write_text
+from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit, RunError
+from ddco_pyro.fitting.records import Unfinished, read_record
 from ddco_pyro.fitting.run import write_metrics
 from ddco_pyro.simulation.episodes import paired_difference, run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task
-
-OnEpisode = Callable[[str], None]
 
 Outcomes = dict[str, list[dict[str, float]]]
 """What came of each method's episodes, in the order of their seeds."""
@@ -29,7 +29,7 @@ def policies(fit: Fit) -> dict[str, Policy | str]:
     :raises RunError: the spec has no task, or names a scripted policy that the task lacks.
     """
     if fit.spec.task is None:
-        raise RunError(f"{fit.folder}: its spec has no task, so there is nothing to roll out in")
+        raise RunError(f"{fit}: its spec has no task, so there is nothing to roll out in")
     known = find_task(fit.spec.task).policies
     unknown = [name for name in fit.spec.rollout.policies if name not in known]
     if unknown:
@@ -41,7 +41,7 @@ def policies(fit: Fit) -> dict[str, Policy | str]:
 
 
 def roll_out(
-    fit: Fit, episodes: int, film: int, on_episode: OnEpisode, jobs: int = -1, resume: bool = False
+    fit: Fit, episodes: int, film: int = 0, on_event: OnEvent = ignore, jobs: int = -1, resume: bool = False
 ) -> dict[str, Any]:
     """Roll every method out from the same ``episodes`` initial states; fills ``rollouts.csv``, ``videos/`` and
     ``metrics.json``. Methods that were done when this was interrupted are not done again.
@@ -49,7 +49,10 @@ def roll_out(
     :param film: how many episodes of each method to film.
     :param resume: where the run holds all of these rollouts, leave them as they are.
     :returns: what ``metrics.json`` now has under ``rollouts``.
+    :raises RunError: there is no task, or the fit has no folder.
+    :raises Damaged: what an interrupted rollout has kept cannot be read.
     """
+    folder = fit.run_folder
     seeds = range(fit.spec.rollout.seed, fit.spec.rollout.seed + episodes)
     methods = policies(fit)
     held = fit.metrics.get("rollouts", {})
@@ -60,33 +63,34 @@ def roll_out(
     )
     if resume and whole and all(_filmed(fit, name, seeds[:film]) for name in methods):
         return dict(held)
-    rolled = _Unfinished(fit, seeds)
+    rolled, total = _Unfinished(folder, seeds), len(methods) * episodes
     for name, policy in methods.items():
         if name in rolled.outcomes and _filmed(fit, name, seeds[:film]):
             for _ in seeds:
-                on_episode(name)
+                on_event(EpisodeEnded(name, total))
             continue
         outcomes = []
         for episode in run_episodes(str(fit.spec.task), policy, seeds, film, jobs):
             outcomes.append(episode.outcome)
             if episode.frames:
                 write_film(_film(fit, name, episode.seed), episode)
-            on_episode(name)
+            on_event(EpisodeEnded(name, total))
         rolled.keep(name, outcomes)
     found = {name: rolled.outcomes[name] for name in methods}
-    write_text(fit.folder / "rollouts.csv", _table(found, seeds))
+    write_text(folder / "rollouts.csv", _table(found, seeds))
     results = {
         "seed": seeds.start,
         "episodes": episodes,
         "methods": _methods(find_task(str(fit.spec.task)), found, fit.name),
     }
-    write_metrics(fit.folder, fit.metrics | {"rollouts": results})
+    fit.metrics["rollouts"] = results
+    write_metrics(folder, fit.metrics)
     rolled.end()
     return results
 
 
 def _film(fit: Fit, name: str, seed: int) -> Path:
-    return fit.folder / "videos" / f"{name}-{seed}.mp4"
+    return fit.run_folder / "videos" / f"{name}-{seed}.mp4"
 
 
 def _filmed(fit: Fit, name: str, seeds: Sequence[int]) -> bool:
@@ -96,12 +100,15 @@ def _filmed(fit: Fit, name: str, seeds: Sequence[int]) -> bool:
 class _Unfinished:
     """``outcomes`` of the methods that have been rolled out so far, kept in a file until all have been."""
 
-    def __init__(self, fit: Fit, seeds: Sequence[int]) -> None:
-        self._path = fit.folder / "rollouts.unfinished.json"
-        models = b"".join(path.read_bytes() for path in sorted(fit.folder.rglob("model.safetensors")))
+    def __init__(self, folder: Path, seeds: Sequence[int]) -> None:
+        self._path = folder / "rollouts.unfinished.json"
+        models = b"".join(path.read_bytes() for path in sorted(folder.rglob("model.safetensors")))
         self._key = {"models": hashlib.sha256(models).hexdigest(), "seeds": list(seeds)}
-        kept = json.loads(self._path.read_text()) if self._path.exists() else {}
-        self.outcomes: Outcomes = kept["outcomes"] if kept | self._key == kept else {}
+        self.outcomes: Outcomes = {}
+        if self._path.exists():
+            kept = read_record(self._path, Unfinished, f"remove it and roll out again: ddco-pyro rollout {folder}")
+            if (kept.models, kept.seeds) == (self._key["models"], self._key["seeds"]):
+                self.outcomes = kept.outcomes
 
     def keep(self, name: str, outcomes: list[dict[str, float]]) -> None:
         """A method has been rolled out."""

@@ -9,95 +9,164 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import leftovers, only_one, write_text
 from ddco_pyro.data.tensors import write_tensors
+from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, ignore
 from ddco_pyro.fitting.fit import Fit, RunError, is_finished, load, model_name
 from ddco_pyro.fitting.metrics import evaluate, supervisor
-from ddco_pyro.fitting.prepare import Dimensions, baseline_spec, build_hierarchy, demonstrations, parameters, parts
+from ddco_pyro.fitting.prepare import (
+    Dimensions,
+    baseline_spec,
+    check_networks,
+    digest,
+    dimensions,
+    known_demonstrations,
+    named_baselines,
+    parameters,
+    parts,
+    seen,
+)
+from ddco_pyro.fitting.prepare import demonstrations as read_demonstrations
 from ddco_pyro.fitting.training import Trainer, TrainingError
 from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_engines
-from ddco_pyro.model.encoding import encode, refuse_unusable
+from ddco_pyro.model.encoding import refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import Spec, dump_spec
+from ddco_pyro.spec import Spec, dump_spec, load_spec, with_overrides
 
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
 
 
-class Watcher(Protocol):
-    """Is told how a fit goes on."""
+def fit(
+    spec: Spec | str | Path,
+    demonstrations: Demonstrations | str | Path | None = None,
+    out: str | Path | None = None,
+    on_event: OnEvent = ignore,
+) -> Fit:
+    """Fit a spec's hierarchy and its baselines to demonstrations, and evaluate them.
 
-    def collected(self, done: int, total: int) -> None:
-        """So many of the demonstrations have been collected."""
+    >>> import numpy as np
+    >>> random = np.random.default_rng(0)
+    >>> def demonstration(n):  # to the place, then away from it
+    ...     place = random.normal(size=(10, 2))
+    ...     return ddco_pyro.Demonstration(f"demo_{n}", {"place": place}, place * np.repeat([[-2.0], [2.0]], 5, 0))
+    >>> demos = ddco_pyro.Demonstrations(tuple(demonstration(n) for n in range(6)))
+    >>> fit = ddco_pyro.fit("mine.yaml", demos)
+    >>> fit.metrics["demonstrations"]
+    {'train': 4, 'tune': 1, 'valid': 1}
+    >>> ddco_pyro.fit("mine.yaml", demos, out="runs/mine").folder
+    PosixPath('runs/mine')
 
-    def training(self, name: str, epochs: int | None) -> None:
-        """A model begins to be trained, for at most so many epochs in all; None for no limit."""
-
-    def epoch(self, row: dict[str, Any]) -> None:
-        """An epoch has ended; its row of the history."""
-
-    def trained(self, name: str) -> None:
-        """A model has been trained."""
-
-
-def fit(spec: Spec, folder: Path, watcher: Watcher) -> Fit:
-    """Collect or read the demonstrations, train the spec's model and its baselines, evaluate, and fill the run folder.
-
-    A folder that holds part of this run is continued; one that holds all of it is left as it is.
-
+    :param spec: a spec, or its YAML file; one that names user code is given by ``load_spec(path, allow_code=True)``.
+    :param demonstrations: in memory, or the HDF5 file to use instead of ``demonstrations.path``; None for those that
+        the spec names.
+    :param out: the run folder, as ``ddco-pyro fit`` makes it, with demonstrations from memory kept in it; None to write
+        nothing. A folder that holds part of this run is continued; one that holds all of it is left as it is.
+    :param on_event: is told how it goes on.
+    :raises SpecError: something in the spec does not fit the demonstrations.
+    :raises DemonstrationsError: they cannot be used.
     :raises RunError: the folder holds something else.
     :raises TrainingError: training stopped; nothing that was written before is lost.
     """
-    claim(folder, spec)
+    spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else Path(out)
+    if isinstance(demonstrations, Demonstrations):
+        path = {"demonstrations.path": str(folder / "demonstrations.hdf5")} if folder else {}
+        return fit_run(with_overrides(spec, path), seen(spec, demonstrations), folder, on_event, keep=demonstrations)
+    path = {} if demonstrations is None else {"demonstrations.path": str(demonstrations)}
+    return fit_run(with_overrides(spec, path), None, folder, on_event)
+
+
+def fit_run(
+    spec: Spec,
+    demos: Demonstrations | None,
+    folder: Path | None,
+    on_event: OnEvent = ignore,
+    resume: bool = True,
+    keep: Demonstrations | None = None,
+) -> Fit:
+    """:func:`fit`, with everything that can be refused refused before anything is collected, trained or written.
+
+    :param demos: as the spec sees them; None for those that it names, which are read once.
+    :param resume: whether the folder may hold all of this run already.
+    :param keep: demonstrations that the run is to have a copy of, in the file that the spec names.
+    """
+    clock = _Clock()
+    with clock("demonstrations"):
+        demos = known_demonstrations(spec) if demos is None else demos
+        check_networks(spec, dimensions(spec, demos))
+    if folder is None:
+        return _fit(spec, demos or read_demonstrations(spec, on_event), None, on_event, clock)
+    claim(folder, spec, resume)
     with only_one(folder):
+        if keep is not None:
+            _keep(keep, Path(str(spec.demonstrations.path)))
         if is_finished(folder):
-            return load(folder, allow_code=True)  # it is this very spec, which the caller has
+            return replace(load(folder, allow_code=True), given=demos)  # it is this very spec, which the caller has
         for part in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
             for old in leftovers(part):
                 old.unlink()
-        clock = _Clock()
         with clock("demonstrations"):
-            demos = demonstrations(spec, watcher.collected)
-        return _fit(spec, folder, demos, watcher, clock)
+            demos = demos or read_demonstrations(spec, on_event)
+        return _fit(spec, demos, folder, on_event, clock)
 
 
-def _fit(spec: Spec, folder: Path, demos: Demonstrations, watcher: Watcher, clock: _Clock) -> Fit:
+def _keep(demos: Demonstrations, path: Path) -> None:
+    """:raises RunError: other demonstrations are kept there."""
+    if not path.exists():
+        demos.write(path)
+    elif digest(Demonstrations.read(path)) != digest(demos):
+        raise RunError(f"{path.parent}: holds a run of other demonstrations; choose another folder or remove it")
+
+
+def _fit(
+    spec: Spec, demos: Demonstrations, folder: Path | None, on_event: OnEvent, clock: _Clock, name: str | None = None
+) -> Fit:
+    """:param name: what the model is called in events."""
     split = parts(spec, demos)
     dimensions = Dimensions.of(demos)
     with clock("training"):
-        checkpoint = folder / "checkpoints" / "latest.safetensors"
-        trained = train(spec, dimensions, split["train"], watcher, checkpoint, split.get("valid"))
-    hierarchy = trained.hierarchy
-    _write_history(folder, trained.history)
-    _write_model(folder, hierarchy, dimensions)
-    found = Fit(folder, spec, hierarchy)
+        checkpoint = folder / "checkpoints" / "latest.safetensors" if folder else None
+        trained = train(spec, dimensions, split["train"], on_event, checkpoint, split.get("valid"), name)
+    if folder:
+        _write_history(folder, trained.history)
+        _write_model(folder, trained.hierarchy, dimensions)
     with clock("baselines"):
-        for baseline in spec.compare_with:
-            own, beside = folder / "baselines" / baseline.kind, baseline_spec(spec, baseline, dimensions)
-            claim(own, beside)
-            if not is_finished(own):
-                _fit(beside, own, demos, watcher, _Clock())
+        beside = {
+            name: _baseline(baseline_spec(spec, baseline, dimensions), demos, folder, on_event, name)
+            for name, baseline in named_baselines(spec).items()
+        }
+    fitted = Fit(spec, trained.hierarchy, {}, folder, demos, beside)
     with clock("evaluation"):
-        metrics = evaluate(found, split, demos)
-    held_out = {"valid": len(split.get("valid", ()))}
+        metrics = evaluate(fitted, split, demos)
     metrics |= {
         "engine_check": trained.check._asdict(),
-        "demonstrations": trained.demonstrations | held_out | supervisor(demos),
-        "measure": hierarchy.scaling.measure,
+        "demonstrations": trained.demonstrations | {"valid": len(split.get("valid", ()))} | supervisor(demos),
+        "measure": trained.hierarchy.scaling.measure,
         "control_dimensions": [dimension.as_data() for dimension in dimensions.control],
-        "parameters": parameters(hierarchy),
+        "parameters": parameters(trained.hierarchy),
         "training": trained.training,
         "seconds": clock.seconds,
         "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
     }
-    write_metrics(folder, metrics)
-    return found
+    if folder:
+        write_metrics(folder, metrics)
+    return replace(fitted, metrics=json.loads(json.dumps(metrics)))  # as they are read back
+
+
+def _baseline(spec: Spec, demos: Demonstrations, run: Path | None, on_event: OnEvent, name: str) -> Fit:
+    """A baseline trained beside, in a folder of its own where the run has one; nothing where it was done before."""
+    folder = run / "baselines" / name if run else None
+    if folder:
+        claim(folder, spec)
+        if is_finished(folder):
+            return load(folder, allow_code=True)
+    return _fit(spec, demos, folder, on_event, _Clock(), name)
 
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
@@ -147,65 +216,55 @@ def train(
     spec: Spec,
     dimensions: Dimensions,
     demos: Demonstrations,
-    watcher: Watcher,
+    on_event: OnEvent = ignore,
     checkpoint: Path | None = None,
     held_out: Demonstrations | None = None,
+    name: str | None = None,
 ) -> Trained:
     """Train the spec's model on these demonstrations, of which ``training.tune_fraction`` are used to tune.
 
     :param checkpoint: where training is kept to be continued; None for nowhere.
     :param held_out: demonstrations that will be evaluated; whether they can be is known before training.
+    :param name: what the model is called in events.
     :raises DemonstrationsError: a number is too large for networks.
     :raises TrainingError: a log-likelihood is not finite, or the engines disagree.
     """
-    kept, tune = demos.split(spec.training.tune_fraction, spec.seed)
+    name, budget = name or model_name(spec), spec.training
+    kept, tune = demos.split(budget.tune_fraction, spec.seed)
     with one_thread():
-        return _train(spec, dimensions, (kept, tune), watcher, checkpoint, held_out)
-
-
-def _train(
-    spec: Spec,
-    dimensions: Dimensions,
-    parts: tuple[Demonstrations, Demonstrations],
-    watcher: Watcher,
-    checkpoint: Path | None,
-    held_out: Demonstrations | None,
-) -> Trained:
-    kept, tune = parts
-
-    def make() -> Hierarchy:
-        hierarchy = build_hierarchy(spec, dimensions)
-        hierarchy.encoder.fit(kept)
-        hierarchy.scaling.fit(kept)
-        return hierarchy
-
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(spec.seed)
-        first = make()
+        trainer = Trainer(spec, dimensions, kept, tune, checkpoint, on_event)
         if held_out is not None:
-            refuse_unusable(held_out, first.encoder, first.scaling)
-        batches = [encode(part, first.encoder, first.scaling) for part in parts]
-        few = batches[0].select(torch.arange(min(len(batches[0]), TRAJECTORIES)), STEPS)
-        with torch.no_grad():
-            outputs = first(few.inputs)
-        if not all(bool(torch.isfinite(values).all()) for values in outputs.tensors()):
-            raise TrainingError(
-                "before any training a network gives values that are NaN or infinite; look at its code, or at the "
-                "ranges of the observations (ddco-pyro inspect)"
-            )
-        check = compare_engines(outputs, few.actions, few.lengths)
+            refuse_unusable(held_out, trainer.first.encoder, trainer.first.scaling)
+        check = _check_engines(trainer)
+        on_event(TrainingBegan(name, None if budget.epochs is None else budget.epochs * budget.restarts))
+        hierarchy = trainer.run()
+    on_event(TrainingEnded(name))
+    counts = {"train": len(kept), "tune": len(tune)}
+    return Trained(hierarchy, check, trainer.progress.history, counts, trainer.summary)
+
+
+def _check_engines(trainer: Trainer) -> EngineCheck:
+    """How far the engines are apart before any training.
+
+    :raises TrainingError: they disagree, or the networks give no numbers.
+    """
+    first, batch = trainer.first, trainer.train
+    few = batch.select(torch.arange(min(len(batch), TRAJECTORIES)), STEPS)
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        torch.manual_seed(trainer.spec.seed)
+        outputs = first(few.inputs)
+    if not all(bool(torch.isfinite(values).all()) for values in outputs.tensors()):
+        raise TrainingError(
+            "before any training a network gives values that are NaN or infinite; look at its code, or at the "
+            "ranges of the observations (ddco-pyro inspect)"
+        )
+    check = compare_engines(outputs, few.actions, few.lengths)
     if not check.agrees:
         raise TrainingError(
             f"the engines disagree (value {check.value:.1e}, gradient {check.gradient:.1e}): "
             "this is a defect; use inference.engine=enumerate and report it"
         )
-    training = spec.training
-    watcher.training(model_name(spec), None if training.epochs is None else training.epochs * training.restarts)
-    trainer = Trainer(spec, make, batches[0], batches[1], checkpoint, list(kept.names), watcher.epoch)
-    hierarchy = trainer.run()
-    watcher.trained(model_name(spec))
-    counts = {"train": len(kept), "tune": len(tune)}
-    return Trained(hierarchy, check, trainer.progress.history, counts, trainer.summary)
+    return check
 
 
 def _write_model(folder: Path, hierarchy: Hierarchy, dimensions: Dimensions) -> None:
@@ -248,4 +307,4 @@ class _Clock:
     def __call__(self, phase: str) -> Iterator[None]:
         start = time.perf_counter()
         yield
-        self.seconds[phase] = time.perf_counter() - start
+        self.seconds[phase] = self.seconds.get(phase, 0.0) + time.perf_counter() - start

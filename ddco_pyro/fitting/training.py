@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,12 +20,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.errors import Failed
+from ddco_pyro.events import EpochEnded, OnEvent, ignore
 from ddco_pyro.fitting.clusters import Clusters
 from ddco_pyro.fitting.convergence import StageEnd, share, summary
+from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.encoding import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import OptimizerSpec, Spec
 
@@ -99,33 +101,35 @@ class Progress:
     history: list[dict[str, Any]] = field(default_factory=list)
 
 
-OnEpoch = Callable[[dict[str, Any]], None]
-
-
 class Trainer:
-    """Trains a hierarchy on ``train``, stopping and choosing among restarts by ``tune``.
+    """Trains a spec's hierarchy on ``train``, stopping and choosing among restarts by ``tune``.
 
-    :param make: a freshly initialised hierarchy; called under a seed of its own for each restart.
+    ``first`` is the hierarchy before any training.
+
     :param checkpoint: where the state is kept at the end of epochs; None for a training too short to be continued.
-    :param names: names of the demonstrations in ``train``, for messages.
-    :param on_epoch: called with each new row of the history.
+    :raises DemonstrationsError: a number is too large for networks.
     """
 
     def __init__(
         self,
         spec: Spec,
-        make: Callable[[], Hierarchy],
-        train: Batch,
-        tune: Batch,
-        checkpoint: Path | None,
-        names: list[str],
-        on_epoch: OnEpoch,
+        dimensions: Dimensions,
+        train: Demonstrations,
+        tune: Demonstrations,
+        checkpoint: Path | None = None,
+        on_event: OnEvent = ignore,
     ) -> None:
-        self.spec, self.make, self.train, self.tune = spec, make, train, tune
-        self.checkpoint, self.names, self.on_epoch = checkpoint, names, on_epoch
+        self.spec, self.dimensions, self.checkpoint, self.on_event = spec, dimensions, checkpoint, on_event
         self.progress = Progress()
         self._saved: dict[str, State] = {}
         self._saved_at = -np.inf  # the first epoch is saved
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(spec.seed)
+            self.first = build_hierarchy(spec, dimensions)  # its encoder and scaling are those of all restarts
+        self.first.encoder.fit(train)
+        self.first.scaling.fit(train)
+        self.names = train.names
+        self.train, self.tune = (encode(part, self.first.encoder, self.first.scaling) for part in (train, tune))
 
     def run(self) -> Hierarchy:
         """The best restart's hierarchy, in evaluation mode.
@@ -154,7 +158,10 @@ class Trainer:
     def _fresh(self) -> Hierarchy:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self._seed(self.progress.restart))
-            return self.make().eval()
+            hierarchy = build_hierarchy(self.spec, self.dimensions)
+        hierarchy.encoder.load_state_dict(self.first.encoder.state_dict())
+        hierarchy.scaling.load_state_dict(self.first.scaling.state_dict())
+        return hierarchy.eval()
 
     def _seed(self, *where: int) -> int:
         return int(np.random.SeedSequence([self.spec.seed, *where]).generate_state(1)[0])
@@ -207,9 +214,9 @@ class Trainer:
             self._saved["best"] = _copy(model)
         else:
             now.stale += 1
-        row = {"restart": now.restart, "stage": stage.name, "epoch": now.epoch, "train": train, "tune": tune}
-        now.history.append(row)
-        self.on_epoch(row)
+        row = EpochEnded(now.restart, stage.name, now.epoch, train, tune)
+        now.history.append(asdict(row))
+        self.on_event(row)
 
     def _finish_restart(self, model: Hierarchy) -> None:
         now = self.progress

@@ -20,8 +20,9 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
     """Write ``report.html`` and ``figures/`` into the run folder; the path of the page.
 
     :param demos: the demonstrations the fit was made from.
+    :raises RunError: the fit has no folder.
     """
-    metrics = fit.metrics
+    path, metrics = fit.run_folder / "report.html", fit.metrics
     active = activity.activity(fit, demos) if fit.spec.hierarchy else None
     timelines = demonstration_list.timelines(fit, demos, active, metrics) if active else []
     with style():
@@ -38,6 +39,5 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             "demonstrations": demonstration_list.listed(metrics, {one.anchor for one in timelines}),
             "timelines": timelines,
         }
-    path = fit.folder / "report.html"
     write_text(path, render("report/report.html.j2", page))
     return path

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.inference import most_likely_path, posterior
-from ddco_pyro.model.encoding import encode
-from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.fitting.inferred import Inferred
 
 MOST_BINS = 60
 
@@ -51,30 +47,18 @@ class Activity:
 def activity(fit: Fit, demos: Demonstrations) -> Activity:
     """Posteriors, most likely paths and terminations of a fit with at least one level."""
     assert fit.spec.hierarchy is not None  # a baseline has no levels
-    specs, steps = fit.spec.hierarchy.levels, max(demos.lengths)
-    size = max(1, fit.hierarchy.steps_at_once // steps)
-    parts = [_chunk(fit.hierarchy, part, steps) for part in _chunks(demos, size)]
+    parts = [_arrays(piece, max(demos.lengths)) for piece in fit.infer(demos)]
     levels = []
-    for number, level in enumerate(specs):
+    for number, level in enumerate(fit.spec.hierarchy.levels):
         arrays = (np.concatenate([part[what][number] for part in parts]) for what in range(4))
         levels.append(LevelActivity(level.name, *arrays))
     return Activity(tuple(levels), np.array(demos.lengths))
 
 
-def _chunks(demos: Demonstrations, size: int) -> Iterator[Demonstrations]:
-    for start in range(0, len(demos), size):
-        yield demos.select(demos.names[start : start + size])
-
-
-def _chunk(hierarchy: Hierarchy, demos: Demonstrations, steps: int) -> tuple[list[np.ndarray], ...]:
-    with torch.no_grad():
-        batch = encode(demos, hierarchy.encoder, hierarchy.scaling)
-        outputs = hierarchy(batch.inputs)
-        tables = outputs.tables(batch.actions)
-        active = [_padded(one.float().numpy(), steps, 0.0) for one in posterior(tables, batch.lengths).u]
-        path = most_likely_path(tables, batch.lengths)
-        choices, ended = ([_padded(one.numpy(), steps, -1) for one in part] for part in path)
-        termination = [_padded(one[..., 1].exp().numpy(), steps, 0.0) for one in outputs.termination]
+def _arrays(piece: Inferred, steps: int) -> tuple[list[np.ndarray], ...]:
+    active = [_padded(u.float().numpy(), steps, 0.0) for u in piece.posterior.u]
+    choices, ended = ([_padded(level.numpy(), steps, -1) for level in part] for part in piece.path)
+    termination = [_padded(level[..., 1].exp().numpy(), steps, 0.0) for level in piece.outputs.termination]
     return active, choices, ended, termination
 
 

@@ -101,7 +101,7 @@ def header(fit: Fit, metrics: Mapping[str, Any]) -> Header:
     own = counts.get("supervisor", {}).get("success")
     if own and "successes" in own:
         facts["Supervisor’s own success"] = f"{words.rate(own, 'demonstrations')}, 95 % interval"
-    name = fit.folder.resolve().name
+    name = fit.run_folder.resolve().name
     return Header(words.method(fit.name), name, words.verdict(metrics), words.success(metrics), facts)
 
 
@@ -113,7 +113,7 @@ def likelihood(fit: Fit, metrics: Mapping[str, Any]) -> Figures:
         "Left: log-likelihood of each method. Right: the model’s minus each baseline’s on the same held-out "
         "demonstrations; diamond: mean with one standard error, dots: single demonstrations."
     )
-    picture = keep(plot_likelihood.draw(rows), fit.folder / "figures" / "likelihood.png", alt, caption)
+    picture = keep(plot_likelihood.draw(rows), fit.run_folder / "figures" / "likelihood.png", alt, caption)
     return Figures([picture], tables.likelihood(rows), words.about(row.name for row in rows))
 
 
@@ -129,14 +129,14 @@ def rollouts(fit: Fit, metrics: Mapping[str, Any]) -> Rollouts | None:
     if rates:
         alt = "; ".join(f"{words.method(name)}: {words.rate(one)}" for name, one in rates.items())
         caption = "Success rate of each method with its Wilson 95 % interval."
-        picture = keep(plot_success.draw(rates), fit.folder / "figures" / "success.png", f"Success. {alt}", caption)
+        picture = keep(plot_success.draw(rates), fit.run_folder / "figures" / "success.png", f"Success. {alt}", caption)
     against = tables.against(methods, metrics["model"])
     return Rollouts(found["episodes"], found["seed"], tables.measures(methods), against, picture)
 
 
 def learning(fit: Fit) -> Figures | None:
     """Learning curves of the model and its baselines."""
-    folders = {fit.name: fit.folder} | {name: one.folder for name, one in fit.baselines.items()}
+    folders = {fit.name: fit.run_folder} | {name: one.run_folder for name, one in fit.baselines.items()}
     paths = {name: folder / "history.csv" for name, folder in folders.items()}
     stages = plot_learning.stages({name: path for name, path in paths.items() if path.exists()})
     if not stages:
@@ -149,7 +149,8 @@ def learning(fit: Fit) -> Figures | None:
     names = list(dict.fromkeys(stage.name for stage in stages))
     kinds = dict.fromkeys(name.partition("-")[0] for name in names)
     text = " ".join([*(STAGES[kind] for kind in kinds if kind in STAGES), STAGE_NAMES.format(", ".join(names))])
-    return Figures([keep(plot_learning.draw(stages), fit.folder / "figures" / "learning.png", alt, caption)], text=text)
+    picture = keep(plot_learning.draw(stages), fit.run_folder / "figures" / "learning.png", alt, caption)
+    return Figures([picture], text=text)
 
 
 STAGES = {
@@ -196,7 +197,7 @@ def _posteriors(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mappi
     )
     if examples[0].labels is not None:
         caption += f" Boxes: ground-truth label “{fit.spec.demonstrations.labels}”."
-    path = fit.folder / "figures" / "posterior.png"
+    path = fit.run_folder / "figures" / "posterior.png"
     alt = f"Stacked probabilities of the options over time in {', '.join(names)}"
     return keep(plot_posterior.draw(found, examples), path, alt, caption)
 
@@ -212,7 +213,7 @@ def _rows(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str
     if known:
         caption += " Ground-truth labels in shades of grey."
     alt = f"Rows of colour: the most likely option at each step of {len(demos)} demonstrations"
-    return keep(plot_rows.draw(found, known or None), fit.folder / "figures" / "segments.png", alt, caption)
+    return keep(plot_rows.draw(found, known or None), fit.run_folder / "figures" / "segments.png", alt, caption)
 
 
 def _trajectories(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture | None:
@@ -229,7 +230,7 @@ def _trajectories(fit: Fit, demos: Demonstrations, found: Activity, metrics: Map
         "spread the most."
     )
     alt = f"Trajectories of {key} in three dimensions, coloured by option"
-    return keep(figure, fit.folder / "figures" / "trajectories.png", alt, caption)
+    return keep(figure, fit.run_folder / "figures" / "trajectories.png", alt, caption)
 
 
 def _timing(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture:
@@ -241,7 +242,7 @@ def _timing(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[s
     if len(found.levels) > 1:
         caption += " Above the lowest level an option can end only where the one below it ends."
     alt = f"Share of each option and termination probabilities over time, {len(demos)} demonstrations"
-    return keep(plot_timing.draw(found), fit.folder / "figures" / "timing.png", alt, caption)
+    return keep(plot_timing.draw(found), fit.run_folder / "figures" / "timing.png", alt, caption)
 
 
 def _labels(fit: Fit, demo: Demonstration) -> Any:
@@ -284,7 +285,7 @@ def degeneracies(spec: Spec, metrics: Mapping[str, Any]) -> list[tuple[str, str]
 
 def films(fit: Fit) -> Films | None:
     """Filmed rollouts, the model's first."""
-    found = film.films(fit.folder, first=fit.name)
+    found = film.films(fit.run_folder, first=fit.name)
     if not found:
         return None
     strip = None
@@ -295,9 +296,9 @@ def films(fit: Fit) -> Films | None:
             f"Frames of {words.method(one.method)}, seed {one.seed}{outcome}. The border has the colour of the lowest "
             "level’s option; h1 is its number."
         )
-        figure = film.draw_strip(fit.folder / one.link)
+        figure = film.draw_strip(fit.run_folder / one.link)
         strip = keep(
-            figure, fit.folder / "figures" / "film.png", f"Film strip of one rollout, seed {one.seed}", caption
+            figure, fit.run_folder / "figures" / "film.png", f"Film strip of one rollout, seed {one.seed}", caption
         )
     return Films(strip, found)
 

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.memory import INFERENCE, PROGRAM, Extent, refuse_too_much
 from ddco_pyro.data.sources import Recording, Source
 from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.inference import log_likelihood, most_likely_path, posterior
-from ddco_pyro.model.encoding import STEPS_AT_ONCE, encode
+from ddco_pyro.fitting.inferred import Inferred
 
 __all__ = ["LevelLabels", "Segmented", "Segments", "segments"]
 
@@ -79,9 +78,7 @@ class Segmented:
         return len(self.segments)
 
 
-def segments(
-    fit: Fit, source: Source, on_demonstration: Callable[[int, int], None] = lambda done, total: None
-) -> Segmented:
+def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
     """The options of a run over every demonstration of a source, some at a time; those that its spec leaves out of its
     own file are left out here.
 
@@ -90,13 +87,14 @@ def segments(
     """
     hierarchy = fit.spec.hierarchy
     if hierarchy is None:
-        raise BadInput(f"{fit.folder}: is a {fit.name} policy without options; name a run with a hierarchy")
+        raise BadInput(f"{fit}: is a {fit.name} policy without options; name a run with a hierarchy")
     counts = {level.name: level.count for level in hierarchy.levels}
     names = _names(source, fit)
+    labels: dict[str, dict[str, np.ndarray]] = {}
     found: list[Segments] = []
-    for group in _groups(source, names, fit):
-        found += _segment(fit, group, tuple(counts))
-        on_demonstration(len(found), len(names))
+    for piece in fit.infer(_demonstrations(source, names, fit, labels)):
+        found += _segments(fit, piece, tuple(counts), labels)
+        on_event(DemonstrationsDone(len(found), len(names)))
     return Segmented(tuple(found), counts, source.frequency, fit.spec.demonstrations.labels)
 
 
@@ -107,50 +105,44 @@ def _names(source: Source, fit: Fit) -> list[str]:
     return [name for name in source.names if not (same and name in known.exclude)]
 
 
-def _groups(source: Source, names: Sequence[str], fit: Fit) -> Iterator[list[Demonstration]]:
-    """Demonstrations of about so many steps together as the networks take at once."""
-    group: list[Demonstration] = []
-    before = 0
-    for name in names:
-        recording = source.recording(name)
-        at_once = _steps_at_once(recording, fit, before)
-        demo = _demonstration(recording, fit)
-        if group and (len(group) + 1) * max(len(demo), *map(len, group)) > at_once:
-            yield group
-            group = []
-        group.append(demo)
-        before += len(demo)
-    yield group
-
-
-GROUP_BYTES = 5e8
-"""Demonstrations are segmented together while they take no more than this."""
-
 FOUND = 40
 """Bytes that are kept of a segmented step for each level."""
 
 
-def _steps_at_once(recording: Recording, fit: Fit, before: int) -> int:
-    """How many steps like these can be segmented together.
+def _demonstrations(
+    source: Source, names: Sequence[str], fit: Fit, labels: dict[str, dict[str, np.ndarray]]
+) -> Iterator[Demonstration]:
+    """What the run's networks see of each recording; their ground-truth labels, which may differ, go into ``labels``.
 
-    :param before: steps that were segmented before: their options are in memory.
-    :raises DemonstrationsError: this demonstration alone takes more memory than is allowed.
+    :raises DemonstrationsError: one cannot be used, or alone takes more memory than is allowed.
     """
+    before = 0  # steps: their options are in memory
+    for name in names:
+        recording = source.recording(name)
+        _refuse_too_long(recording, fit, before)
+        labels[name] = {
+            key: column.array()
+            for key, column in recording.labels.items()
+            if column.dtype.kind in "iub" and len(column.shape) == 1
+        }
+        demo = _demonstration(recording, fit)
+        before += len(demo)
+        yield demo
+
+
+def _refuse_too_long(recording: Recording, fit: Fit, before: int) -> None:
     known = recording.observations
     seen = {f"obs/{key}": known[key] for key in fit.hierarchy.encoder.shapes if key in known}
     found = Extent.of([{"actions": recording.actions, **seen}])
     (steps,) = found.lengths
-    each = found.size / max(steps, 1) + found.step(
-        {f"obs/{one.key}" for one in fit.spec.observations if one.differences}
-    )
-    each += fit.hierarchy.step_bytes
-    needed = PROGRAM + steps * (each + INFERENCE) + FOUND * fit.hierarchy.depth * (before + steps)
+    differences = {f"obs/{one.key}" for one in fit.spec.observations if one.differences}
+    each = found.step(differences) + fit.hierarchy.step_bytes + INFERENCE
+    needed = PROGRAM + found.size + steps * each + FOUND * fit.hierarchy.depth * (before + steps)
     refuse_too_much(needed, f"{recording.name}: segmenting its {steps} steps", "divide it, or the file")
-    return int(min(STEPS_AT_ONCE, GROUP_BYTES / (each + INFERENCE)))
 
 
 def _demonstration(recording: Recording, fit: Fit) -> Demonstration:
-    """What the run's networks see of a recording, and its ground-truth labels.
+    """What the run's networks see of a recording.
 
     :raises DemonstrationsError: it lacks an observation, or one or its control has another shape than was fitted to.
     """
@@ -164,10 +156,7 @@ def _demonstration(recording: Recording, fit: Fit) -> Demonstration:
             )
         _check_shape(f"{recording.name}: obs/{key}", known[key].shape[1:], tuple(shape))
     _check_shape(f"{recording.name}: actions", recording.actions.shape[1:], (fit.hierarchy.scaling.size,))
-    labels = {
-        key: one.array() for key, one in recording.labels.items() if one.dtype.kind in "iub" and len(one.shape) == 1
-    }
-    return Demonstration(recording.name, {key: known[key].array() for key in shapes}, recording.actions.array(), labels)
+    return Demonstration(recording.name, {key: known[key].array() for key in shapes}, recording.actions.array())
 
 
 def _check_shape(where: str, found: tuple[int, ...], fitted: tuple[int, ...]) -> None:
@@ -175,19 +164,13 @@ def _check_shape(where: str, found: tuple[int, ...], fitted: tuple[int, ...]) ->
         raise DemonstrationsError(f"{where} has shape {found} at each step, the run was fitted to {fitted}")
 
 
-def _segment(fit: Fit, group: list[Demonstration], names: tuple[str, ...]) -> Iterator[Segments]:
-    alike = [Demonstration(demo.name, demo.observations, demo.actions) for demo in group]
-    hierarchy = fit.hierarchy
-    with torch.no_grad():
-        batch = encode(Demonstrations(tuple(alike)), hierarchy.encoder, hierarchy.scaling)
-        tables = hierarchy.tabulate(batch)
-        path = most_likely_path(tables, batch.lengths)
-        active = posterior(tables, batch.lengths).u
-        values = log_likelihood(tables, batch.lengths).tolist()
-    for row, demo in enumerate(group):
-        levels = {
-            name: LevelLabels.of(*(one[row, : len(demo)].numpy() for one in level))
-            for name, *level in zip(names, path.choices, path.terminations, active, strict=True)
+def _segments(
+    fit: Fit, piece: Inferred, levels: tuple[str, ...], labels: dict[str, dict[str, np.ndarray]]
+) -> Iterator[Segments]:
+    for row, (name, steps) in enumerate(zip(piece.names, piece.lengths, strict=True)):
+        each = {
+            level: LevelLabels.of(*(array[row, :steps].numpy() for array in arrays))
+            for level, *arrays in zip(levels, *piece.path, piece.posterior.u, strict=True)
         }
-        held_out = fit.was_held_out(demo.name, values[row])
-        yield Segments(demo.name, levels, values[row] / len(demo), held_out, dict(demo.labels))
+        value = float(piece.log_likelihood[row])
+        yield Segments(name, each, value / steps, fit.was_held_out(name, value), labels[name])

@@ -9,11 +9,12 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.errors import Failed
-from ddco_pyro.fitting.prepare import demonstrations, dimensions
+from ddco_pyro.events import CandidateGivenUp, FoldScored, OnEvent, SelectionBegan, ignore
+from ddco_pyro.fitting import prepare
 from ddco_pyro.selection import choice as choosing
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.selection import grid, parallel, plot, scoring, table
@@ -24,7 +25,7 @@ from ddco_pyro.selection.parallel import Workers
 from ddco_pyro.selection.scoring import Score
 from ddco_pyro.spec import Spec, with_overrides
 
-__all__ = ["Choice", "Selection", "SelectionFailed", "Workers", "check", "final_spec", "select"]
+__all__ = ["Choice", "Selection", "SelectionFailed", "Workers", "check", "final_spec", "known_demonstrations", "select"]
 
 
 HERE = Workers()
@@ -35,66 +36,68 @@ class SelectionFailed(Failed):
     """Nothing could be chosen."""
 
 
-class Watcher(Protocol):
-    """Is told how a selection goes on."""
-
-    def collected(self, done: int, total: int) -> None:
-        """So many of the demonstrations have been collected."""
-
-    def selecting(self, total: int, kept: int) -> None:
-        """So many (candidate, fold) are to be scored in all, of which some were kept from before."""
-
-    def scored(self, candidate: str, fold: int, failed: str) -> None:
-        """One has been scored, or has failed."""
-
-    def given_up(self, candidate: str, folds: int) -> None:
-        """A candidate has been stopped early: so many of its folds need not be scored."""
-
-
 @dataclass(frozen=True)
 class Selection:
-    """A finished cross-validation and the folder it lives in."""
+    """A finished cross-validation, the folder it lives in, and the demonstrations, with all that a candidate sees."""
 
     folder: Path
+    demos: Demonstrations
     choice: Choice
     folds: Folds
 
 
-def check(spec: Spec, workers: Workers = HERE) -> list[Candidate]:
+def known_demonstrations(spec: Spec) -> Demonstrations | None:
+    """The demonstrations, with all that a candidate sees, where nothing has to be collected for them; else None."""
+    return prepare.known_demonstrations(grid.wide(spec))
+
+
+def check(spec: Spec, workers: Workers = HERE, demos: Demonstrations | None = None) -> list[Candidate]:
     """The candidates, all of them valid, without collecting or training anything.
 
+    :param demos: :func:`known_demonstrations`, where they have been read.
     :raises SpecError: a candidate is not valid, or the grid is empty.
     :raises FoldError: there are fewer demonstrations than folds.
     :raises BackendError: the workers cannot be reached.
     """
-    found = grid.candidates(spec, dimensions(grid.wide(spec)))
-    own = spec.demonstrations
-    if own.path is None or not Path(own.path).exists():  # they will be collected
+    wide, own = grid.wide(spec), spec.demonstrations
+    demos = prepare.outline(wide) if demos is None and prepare.in_file(wide) else demos
+    found = grid.candidates(spec, prepare.dimensions(wide, demos))
+    if demos is None:  # they will be collected
         dividing.assign(own.count - len(set(own.exclude)), spec.selection.folds, spec.seed)
     else:
-        dividing.divide(demonstrations(grid.wide(spec)), spec.selection.folds, spec.seed)
+        dividing.divide(demos, spec.selection.folds, spec.seed)
     workers.check()
     return found
 
 
-def select(spec: Spec, folder: Path, watcher: Watcher, workers: Workers = HERE, stop_early: bool = False) -> Selection:
+def select(
+    spec: Spec,
+    folder: Path,
+    on_event: OnEvent = ignore,
+    workers: Workers = HERE,
+    stop_early: bool = False,
+    demos: Demonstrations | None = None,
+) -> Selection:
     """Score every candidate of the spec's grid in every fold, choose, and write table and figure into the folder.
 
     What the folder has already is not done again. Which folds are scored depends on nothing but the spec, the
     demonstrations and ``stop_early``; neither on the workers nor on interruptions.
 
+    :param demos: :func:`known_demonstrations`, where they have been read.
     :raises SelectionFailed: every candidate has failed in some fold.
     :raises Busy: another process is at work on the folder.
     """
     with only_one(folder):
-        return _select(spec, folder, watcher, workers, stop_early)
+        demos = demos or prepare.demonstrations(grid.wide(spec), on_event)
+        return _select(spec, folder, demos, on_event, workers, stop_early)
 
 
-def _select(spec: Spec, folder: Path, watcher: Watcher, workers: Workers, stop_early: bool) -> Selection:
-    demos = demonstrations(grid.wide(spec), watcher.collected)
+def _select(
+    spec: Spec, folder: Path, demos: Demonstrations, on_event: OnEvent, workers: Workers, stop_early: bool
+) -> Selection:
     folds = dividing.divide(demos, spec.selection.folds, spec.seed)
     dividing.keep(folds, folder / "folds.json")
-    work = _Work(folder, folds, grid.candidates(spec, folds.dimensions), watcher)
+    work = _Work(folder, folds, grid.candidates(spec, folds.dimensions), on_event)
     work.load()
     with parallel.pool(workers) as pool:
         for numbers in _rounds(len(folds.held_out), stop_early):
@@ -106,7 +109,7 @@ def _select(spec: Spec, folder: Path, watcher: Watcher, workers: Workers, stop_e
     if found.chosen is None:
         reasons = [reason for row in found.rows for reason in row.failed.values()]
         raise SelectionFailed(f"every candidate has failed in some fold; the first reason: {reasons[0]}")
-    return Selection(folder, found, folds)
+    return Selection(folder, demos, found, folds)
 
 
 def final_spec(spec: Spec, chosen: Candidate) -> Spec:
@@ -126,7 +129,7 @@ class _Work:
     folder: Path
     folds: Folds
     candidates: Sequence[Candidate]
-    watcher: Watcher
+    on_event: OnEvent
     done: dict[tuple[int, int], Score] = field(default_factory=dict)
     stopped: set[int] = field(default_factory=set)
 
@@ -137,7 +140,7 @@ class _Work:
                 found = scoring.kept(self.folder, candidate.number, fold)
                 if found is not None:
                     self.done[candidate.number, fold] = found
-        self.watcher.selecting(len(self.candidates) * len(self.folds.held_out), len(self.done))
+        self.on_event(SelectionBegan(len(self.candidates) * len(self.folds.held_out), len(self.done)))
 
     def score(self, pool: parallel.Parallel, folds: Sequence[int]) -> None:
         """Score what is missing in some folds, and keep each score as soon as it is there."""
@@ -152,7 +155,7 @@ class _Work:
         for found in parallel.scores(pool, self.folds, missing):
             scoring.keep(self.folder, found)
             self.done[found.candidate, found.fold] = found
-            self.watcher.scored(self.candidates[found.candidate].name, found.fold, found.failed)
+            self.on_event(FoldScored(self.candidates[found.candidate].name, found.fold, found.failed))
 
     def give_up(self, last: int) -> None:
         """Give up the candidates that are hopeless by their folds 0 to ``last``; later scores of theirs do not count,
@@ -163,7 +166,7 @@ class _Work:
         for number in sorted(choosing.hopeless(running, seen)):
             later = [(number, fold) for fold in range(last + 1, len(self.folds.held_out))]
             missing = [key for key in later if self.done.pop(key, None) is None]
-            self.watcher.given_up(self.candidates[number].name, len(missing))
+            self.on_event(CandidateGivenUp(self.candidates[number].name, len(missing)))
             self.stopped.add(number)
 
     def scores(self) -> list[Score]:

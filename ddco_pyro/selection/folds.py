@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +12,7 @@ from sklearn.model_selection import KFold
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.prepare import Dimensions
+from ddco_pyro.fitting.prepare import Dimensions, digest
 from ddco_pyro.fitting.records import Record, read_record
 
 
@@ -82,14 +80,3 @@ def keep(folds: Folds, path: Path) -> None:
 class _Kept(Record):
     demonstrations: str
     folds: list[list[str]]
-
-
-def digest(demos: Demonstrations, observations: Sequence[str] | None = None) -> str:
-    """SHA-256 of names, controls and observations (all of them, or those named)."""
-    found = hashlib.sha256()
-    for demo in demos:
-        keys = sorted(demo.observations) if observations is None else observations
-        found.update(json.dumps([demo.name, *demo.actions.shape, *keys]).encode())
-        for array in (demo.actions, *(demo.observations[key] for key in keys)):
-            found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()

@@ -7,15 +7,14 @@ import math
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from ddco_pyro.data.files import Damaged, write_text
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.fitting.fit import log_likelihoods
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.records import read_record
-from ddco_pyro.fitting.run import Watcher, one_thread, train
+from ddco_pyro.fitting.run import one_thread, train
 from ddco_pyro.selection.folds import Folds
 from ddco_pyro.selection.grid import Candidate
 
@@ -47,22 +46,6 @@ class Score:
         return math.fsum(self.log_likelihood)
 
 
-class Unwatched(Watcher):
-    """Nobody watches a single fold: the selection as a whole is watched."""
-
-    def collected(self, done: int, total: int) -> None:
-        """Nothing."""
-
-    def training(self, name: str, epochs: int | None) -> None:
-        """Nothing."""
-
-    def epoch(self, row: dict[str, Any]) -> None:
-        """Nothing."""
-
-    def trained(self, name: str) -> None:
-        """Nothing."""
-
-
 def score(folds: Folds, candidate: Candidate, fold: int) -> Score:
     """Train the candidate without the fold's demonstrations, and score it on them; on one thread, so that the numbers
     are the same in any process.
@@ -75,8 +58,8 @@ def score(folds: Folds, candidate: Candidate, fold: int) -> Score:
     empty = Score(candidate.number, fold, held_out.names, held_out.lengths)
     try:
         with threadpool_limits(1), one_thread():
-            trained = train(candidate.spec, folds.dimensions, training, Unwatched(), held_out=held_out)
-            values = tuple(float(value) for value in log_likelihoods(trained.hierarchy, held_out))
+            trained = train(candidate.spec, folds.dimensions, training, held_out=held_out)
+            values = tuple(Fit(candidate.spec, trained.hierarchy).log_likelihood(held_out).tolist())
     except (BadInput, Failed) as error:
         found = replace(empty, failed=str(error))
     except Exception as error:  # whatever it is, the other folds go on and the user is told

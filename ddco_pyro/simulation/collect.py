@@ -5,18 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from ddco_pyro.data.demonstrations import DemonstrationsError
 from ddco_pyro.data.resumable import Parts, parts_of
+from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.simulation.episodes import run_episodes, summarize
 from ddco_pyro.simulation.task import Task, find_task
 from ddco_pyro.spec import DemonstrationsSpec
-
-OnDemonstration = Callable[[int, int], None]
-"""Called with (how many are done, how many there will be)."""
 
 
 def cache_folder() -> Path:
@@ -39,9 +36,7 @@ def _identity(task: Task, name: str, spec: DemonstrationsSpec) -> str:
     return digest.hexdigest()
 
 
-def collect(
-    task_name: str, spec: DemonstrationsSpec, path: Path | None = None, on_demonstration: OnDemonstration | None = None
-) -> Path:
+def collect(task_name: str, spec: DemonstrationsSpec, path: Path | None = None, on_event: OnEvent = ignore) -> Path:
     """Record ``spec.count`` demonstrations, unless the file is there already; the path of the file.
 
     Each is kept as soon as it is recorded: after an interruption the next call goes on with those that are missing.
@@ -63,8 +58,7 @@ def collect(
         seeds = range(spec.seed + len(parts.done), spec.seed + spec.count)
         for episode in run_episodes(task_name, spec.supervisor, seeds):
             parts.add(episode.record.recording())
-            if on_demonstration:
-                on_demonstration(len(parts.done), spec.count)
+            on_event(DemonstrationsDone(len(parts.done), spec.count))
         attributes = {"task": task.name, "policy": spec.supervisor, "supervisor": json.dumps(_summary(task, parts))}
         parts.finish(attributes, {})
     return path

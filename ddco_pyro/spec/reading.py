@@ -44,6 +44,10 @@ def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool 
 
     Nothing that it names is imported here.
 
+    >>> spec = ddco_pyro.load_spec("mine.yaml", ["hierarchy.levels.0.count=3"])
+    >>> spec.hierarchy.levels[0].count, spec.training.batch_size
+    (3, 16)
+
     :param allow_code: whether it may name user code (``module:name``), which is imported where the spec is used.
     :raises SpecError: the file cannot be read, is not YAML, is not a valid spec, or names code that is not allowed; one
         line for each problem.

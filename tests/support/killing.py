@@ -46,29 +46,29 @@ import os, signal
 from ddco_pyro.cli import console
 from ddco_pyro.cli.app import main
 
-left, go_on = {after}, console.{watcher}
+left, go_on = {after}, console.Progress.__call__
 
-def strike(*arguments):
+def strike(progress, event):
     global left
-    left -= 1
+    left -= type(event).__name__ == "{event}"
     if left == 0:
         {strike}
-    go_on(*arguments)
+    go_on(progress, event)
 
-console.{watcher} = strike
+console.Progress.__call__ = strike
 main()
 """
 
 
-def struck(arguments: Sequence[object], folder: Path, watcher: str, after: int, strike: str) -> tuple[int, str]:
+def struck(arguments: Sequence[object], folder: Path, event: str, after: int, strike: str) -> tuple[int, str]:
     """Run a command that is struck by a signal at a moment of its own, whatever else the machine does.
 
-    :param watcher: the method of :mod:`ddco_pyro.cli.console` whose call is the moment, such as ``Fitting.epoch``.
-    :param after: which of its calls.
+    :param event: the kind of event (:mod:`ddco_pyro.events`) that is the moment, such as ``EpochEnded``.
+    :param after: which of them.
     :param strike: Python that sends the signal.
     :returns: its exit status, and what it printed to stderr.
     """
-    program = STRIKES_ITSELF.format(watcher=watcher, after=after, strike=strike)
+    program = STRIKES_ITSELF.format(event=event, after=after, strike=strike)
     with tempfile.TemporaryFile("w+") as err:  # not a pipe: orphans would keep it open
         process = subprocess.Popen(
             [sys.executable, "-c", program, *map(str, arguments)],

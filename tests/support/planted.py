@@ -6,6 +6,7 @@ import torch
 from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.events import ignore
 from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy
 from ddco_pyro.fitting.training import Trainer
 from ddco_pyro.inference import log_likelihood, segment
@@ -36,19 +37,9 @@ def make_spec(counts=(2,), seed=0, control=None, **training):
     )
 
 
-def make_trainer(spec, demos, path, on_epoch=lambda row: None):
+def make_trainer(spec, demos, path, on_event=ignore):
     train, tune = demos.split(0.2, 0)
-    dimensions = Dimensions.of(demos)
-
-    def make():
-        hierarchy = build_hierarchy(spec, dimensions)
-        hierarchy.encoder.fit(train)
-        hierarchy.scaling.fit(train)
-        return hierarchy
-
-    first = make()
-    batches = [encode(part, first.encoder, first.scaling) for part in (train, tune)]
-    return Trainer(spec, make, batches[0], batches[1], path / "latest.safetensors", list(train.names), on_epoch)
+    return Trainer(spec, Dimensions.of(demos), train, tune, path / "latest.safetensors", on_event)
 
 
 def plant(truth, number, steps, seed):

@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import json
+from dataclasses import astuple
 
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.events import CandidateGivenUp, FoldScored, SelectionBegan
 from ddco_pyro.selection.grid import Candidate
-from ddco_pyro.selection.scoring import Score, Unwatched
+from ddco_pyro.selection.scoring import Score
 from ddco_pyro.spec import parse_spec
 
 
-class Told(Unwatched):
-    """What a selection told its watcher."""
+class Told:
+    """What a selection told whoever watches it."""
 
     def __init__(self):
         self.begun, self.pairs, self.stopped = [], [], []
 
-    def selecting(self, total, kept):
-        self.begun.append((total, kept))
-
-    def scored(self, candidate, fold, failed):
-        self.pairs.append((candidate, fold, failed))
-
-    def given_up(self, candidate, folds):
-        self.stopped.append((candidate, folds))
+    def __call__(self, event):
+        kinds = {SelectionBegan: self.begun, FoldScored: self.pairs, CandidateGivenUp: self.stopped}
+        kinds.get(type(event), []).append(astuple(event))
 
 
 def two_skills(count=12, steps=8, seed=0):

@@ -13,7 +13,6 @@ from ddco_pyro.acting.lockstep import play
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.prepare import check_networks, dimensions
 from ddco_pyro.fitting.run import fit
-from ddco_pyro.selection.scoring import Unwatched
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import Spec, load_spec
 
@@ -41,7 +40,7 @@ def test_all_specs_are_here() -> None:
 
 @pytest.mark.parametrize("path", SPECS, ids=lambda path: path.stem)
 def test_specs_fit_and_act(path: Path, demonstrations: Path, tmp_path: Path) -> None:
-    found = fit(short(path, demonstrations), tmp_path / "run", Unwatched())
+    found = fit(short(path, demonstrations), out=tmp_path / "run")
     assert found.metrics["engine_check"]["value"] < 1e-6
     brief = replace(pushing.limited, load=lambda seed: pushing.load_single(seed))
     (episode,) = play(brief, found.hierarchy, found.spec.rollout, [0], keep=("tip",))

@@ -1,4 +1,4 @@
-"""What comes in: ``inspect``, ``init`` and ``import``."""
+"""What comes in: ``collect``, ``inspect``, ``init`` and ``import``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from typing import Annotated
 
 import typer
 
+from ddco_pyro.cli.options import AllowCode, Overrides, SpecPath
 from ddco_pyro.errors import BadInput
+from ddco_pyro.spec import SpecError, load_spec
 
 
 class FormatName(StrEnum):
@@ -28,6 +30,25 @@ SourcePath = Annotated[
 FormatOption = Annotated[
     FormatName | None, typer.Option("--format", help="What wrote it; recognised unless given.", show_default=False)
 ]
+
+
+def collect(
+    spec: SpecPath,
+    out: Annotated[Path | None, typer.Option(help="The HDF5 file; by default in the cache, by content.")] = None,
+    overrides: Overrides = [],  # noqa: B006
+    allow_code: AllowCode = False,
+) -> None:
+    """Record demonstrations of the task's supervisor, unless they are there already."""
+    found = load_spec(spec, overrides, allow_code)
+    if found.demonstrated_task is None:
+        raise SpecError(f"{spec}: names no task, so there is no supervisor to record")
+    from ddco_pyro.cli import console
+    from ddco_pyro.simulation.collect import collect as record
+
+    own = found.demonstrations.path
+    with console.Progress() as progress:
+        path = record(found.demonstrated_task, found.demonstrations, out or (Path(own) if own else None), progress)
+    print(path)
 
 
 def inspect(
@@ -95,11 +116,14 @@ def import_(
     """Write somebody else's demonstrations into this project's layout; goes on where it was interrupted."""
     from ddco_pyro.cli import console
     from ddco_pyro.data.importing import Choice, import_demonstrations
+    from ddco_pyro.events import DemonstrationsDone
 
     size = (image_size, image_size) if image_size else None
     choice = Choice(tuple(observations), mask, videos, size, skip_broken)
-    with console.Collecting("importing") as progress:
-        found = import_demonstrations(source, out, form.value if form else None, choice, progress.collected)
+    with console.Progress("importing") as progress:
+        found = import_demonstrations(
+            source, out, form.value if form else None, choice, lambda *done: progress(DemonstrationsDone(*done))
+        )
     for name, reason in found.left_out.items():
         print(f"left out {name}: {reason}", file=sys.stderr)
     print(f"{out}: {len(found.names)} demonstrations")

@@ -1,0 +1,5 @@
+"""``python -m ddco_pyro.cli``."""
+
+from ddco_pyro.cli.app import main
+
+main()

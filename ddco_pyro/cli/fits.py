@@ -1,0 +1,153 @@
+"""From a spec to a fit: ``check``, ``fit`` and ``select``."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ddco_pyro.cli.options import AllowCode, Overrides, SpecPath
+from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
+
+if TYPE_CHECKING:
+    from ddco_pyro.fitting.fit import Fit
+
+
+class Backend(StrEnum):
+    """Where folds are trained."""
+
+    LOKY = "loky"
+    DASK = "dask"
+
+
+def check(
+    spec: Annotated[Path | None, typer.Argument(metavar="[SPEC]", help="The spec, a YAML file.")] = None,
+    overrides: Overrides = [],  # noqa: B006 (typer reads the default, nobody changes it)
+    schema: Annotated[bool, typer.Option("--schema", help="Print the JSON Schema of specs instead.")] = False,
+    allow_code: AllowCode = False,
+) -> None:
+    """Print the spec with all defaults, the shapes it works on, and the parameters of each network."""
+    if schema:
+        print(json.dumps(spec_schema(), indent=2))
+        return
+    if spec is None:
+        raise SpecError("name a spec, such as: ddco-pyro check specs/needle.yaml")
+    found = load_spec(spec, overrides, allow_code)
+    from ddco_pyro.cli import console
+    from ddco_pyro.fitting.prepare import baselines, check_networks, dimensions
+
+    size = dimensions(found)
+    hierarchy = check_networks(found, size)
+    print(dump_spec(found), end="")
+    console.dimensions(found, size, hierarchy, baselines(found, size))
+    console.control(size)
+
+
+def fit(
+    spec: SpecPath,
+    out: Annotated[Path | None, typer.Option(help="The run folder; by default runs/SPEC-TIME.")] = None,
+    overrides: Overrides = [],  # noqa: B006
+    resume: Annotated[bool, typer.Option("--resume", help="Where --out holds this run whole, show it again.")] = False,
+    allow_code: AllowCode = False,
+) -> None:
+    """Fit the spec's hierarchy and its baselines; write the run folder with its report.
+
+    An unfinished run of this very spec in --out is continued.
+    """
+    found = load_spec(spec, overrides, allow_code)
+    from ddco_pyro.cli import console
+    from ddco_pyro.fitting.run import fit_run
+    from ddco_pyro.report import write_report
+
+    folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
+    with (
+        _continued(f"fit {folder / 'spec.yaml'} --out {folder} --resume{_allowed(found)}", folder),
+        console.Progress() as progress,
+    ):
+        fitted = fit_run(found, None, folder, progress, resume)
+    console.log_likelihoods(fitted.metrics)
+    _warn(fitted)
+    print(f"report: {write_report(fitted, fitted.demonstrations)}")
+    if found.hierarchy and found.demonstrations.path:
+        file = shlex.quote(found.demonstrations.path)
+        print(f"next: ddco-pyro segment {shlex.quote(str(folder))} {file} --html segments.html{_allowed(found)}")
+
+
+def select(
+    spec: SpecPath,
+    out: Annotated[Path | None, typer.Option(help="The folder; by default runs/SPEC-select-TIME.")] = None,
+    overrides: Overrides = [],  # noqa: B006
+    folds: Annotated[int | None, typer.Option(help="Number of folds; by default the spec's selection.folds.")] = None,
+    jobs: Annotated[int, typer.Option(help="Processes that train folds; -1 is one for each core.")] = -1,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the unfinished selection in --out.")] = False,
+    stop_early: Annotated[bool, typer.Option("--stop-early", help="Give hopeless candidates up.")] = False,
+    backend: Annotated[Backend, typer.Option(help="Where folds are trained: loky (here) or dask.")] = Backend.LOKY,
+    scheduler: Annotated[str | None, typer.Option(help="Address of the dask scheduler, tcp://HOST:PORT.")] = None,
+    allow_code: AllowCode = False,
+) -> None:
+    """Choose among the candidates of the spec's grid by cross-validation; then fit what was chosen to all the data.
+
+    With --stop-early, after each fold from the third on, a candidate is given up where the paired t-test over the folds
+    so far puts it below the best so far (one-sided, p < 0.001), or where a fold of it has failed.
+    """
+    number = [] if folds is None else [f"selection.folds={folds}"]
+    found = load_spec(spec, [*overrides, *number], allow_code)
+    if (backend is Backend.DASK) != (scheduler is not None):
+        raise SpecError("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
+    from ddco_pyro import selection
+    from ddco_pyro.cli import console
+    from ddco_pyro.fitting.prepare import seen
+    from ddco_pyro.fitting.run import claim, fit_run
+    from ddco_pyro.report import write_report
+    from ddco_pyro.selection.table import HEAD, cells
+
+    workers = selection.Workers(jobs, scheduler)
+    demos = selection.known_demonstrations(found)
+    selection.check(found, workers, demos)  # before anything is collected, trained or written
+    folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"
+    claim(folder, found, resume)
+    early = " --stop-early" * stop_early
+    again = f"select {folder / 'spec.yaml'} --out {folder} --resume{early}{_allowed(found)}"
+    with _continued(again, folder), console.Progress() as progress:
+        made = selection.select(found, folder, progress, workers, stop_early, demos)
+        progress.end()
+        assert made.choice.chosen is not None  # or it would have failed
+        final = selection.final_spec(found, made.choice.chosen.candidate)
+        fitted = fit_run(final, seen(final, made.demos), folder / "fit", progress)
+    console.selection(made.choice, HEAD, [cells(row, made.choice) for row in made.choice.rows])
+    _warn(fitted)
+    print(f"selection: {folder / 'selection.json'}")
+    print(f"report: {write_report(fitted, fitted.demonstrations)}")
+
+
+@contextmanager
+def _continued(command: str, folder: Path) -> Iterator[None]:
+    """Ctrl-C ends with 1 and the command that continues, where there is something to continue."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not (folder / "spec.yaml").exists():
+            raise
+        print(f"interrupted; continue with: ddco-pyro {command}", file=sys.stderr)
+        raise typer.Exit(1) from None
+
+
+def _warn(fitted: Fit) -> None:
+    """Signs of too short a training, and of a degenerate solution."""
+    from ddco_pyro.cli import console
+    from ddco_pyro.report import degeneracies, unconverged
+
+    console.warnings([*unconverged(fitted.metrics), *degeneracies(fitted.spec, fitted.metrics)])
+
+
+def _allowed(spec: Spec) -> str:
+    """What has to be said again so that the user code of this spec is imported again."""
+    return " --allow-code" if user_code(spec) else ""

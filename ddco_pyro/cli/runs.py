@@ -1,0 +1,72 @@
+"""What is done with finished runs: ``compare``, ``rollout`` and ``report``."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ddco_pyro.cli.options import AllowCode, RunPath
+
+FILMED = 3
+"""Episodes of each method that ``rollout --video`` films."""
+
+Jobs = Annotated[int, typer.Option(help="Processes that run episodes; -1 is one for each core.")]
+
+
+def compare(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN RUN...", help="Run folders; a run's baselines are some too.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="The folder to write to; by default runs/compare-TIME.")] = None,
+    allow_code: AllowCode = False,
+) -> None:
+    """Compare runs on the demonstrations that all of them held out, and on rollouts from the same initial states."""
+    from ddco_pyro import comparison
+    from ddco_pyro.cli import console
+    from ddco_pyro.comparison import page
+
+    found = comparison.compare(runs, allow_code)
+    console.comparison(page.HEAD, [page.cells(row) for row in found.rows])
+    if found.rollouts:
+        console.comparison(page.ROLLOUT_HEAD, page.rollout_cells(found))
+    print(page.verdict(found))
+    print(f"comparison: {comparison.write(found, out or Path('runs') / time.strftime('compare-%Y%m%d-%H%M%S'))}")
+
+
+def rollout(
+    run: RunPath,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each method; by default the spec's.")] = None,
+    video: Annotated[bool, typer.Option("--video", help="Film the first episodes of each method.")] = False,
+    jobs: Jobs = -1,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Where RUN holds these very rollouts, show them again.")
+    ] = False,
+    allow_code: AllowCode = False,
+) -> None:
+    """Roll the model, its baselines and the spec's scripted policies out from the same initial states.
+
+    An unfinished rollout of as many episodes is continued.
+    """
+    from ddco_pyro.cli import console
+    from ddco_pyro.fitting.fit import load
+    from ddco_pyro.fitting.rollouts import roll_out
+    from ddco_pyro.report import write_report
+
+    fitted = load(run, allow_code)
+    number = episodes or fitted.spec.rollout.episodes
+    with console.Progress() as progress:
+        results = roll_out(fitted, number, FILMED if video else 0, progress, jobs, resume)
+    console.successes(results)
+    print(f"report: {write_report(fitted, fitted.demonstrations)}")
+
+
+def report(run: RunPath, allow_code: AllowCode = False) -> None:
+    """Write the report of a run again."""
+    from ddco_pyro.fitting.fit import load
+    from ddco_pyro.report import write_report
+
+    fitted = load(run, allow_code)
+    print(f"report: {write_report(fitted, fitted.demonstrations)}")

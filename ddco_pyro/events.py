@@ -1,0 +1,90 @@
+"""What long work tells whoever watches it: one event at a time, to one callback."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class DemonstrationsDone:
+    """So many of the demonstrations have been collected, imported or segmented."""
+
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
+class TrainingBegan:
+    """A model begins to be trained, for at most so many epochs in all; None for no limit."""
+
+    model: str
+    epochs: int | None
+
+
+@dataclass(frozen=True)
+class EpochEnded:
+    """A row of the history: log-likelihood per step, nats, of the training and the tuning demonstrations."""
+
+    restart: int
+    stage: str
+    epoch: int
+    train: float
+    tune: float
+
+
+@dataclass(frozen=True)
+class TrainingEnded:
+    """A model has been trained."""
+
+    model: str
+
+
+@dataclass(frozen=True)
+class SelectionBegan:
+    """So many (candidate, fold) are to be scored in all, of which some were kept from before."""
+
+    total: int
+    kept: int
+
+
+@dataclass(frozen=True)
+class FoldScored:
+    """A fold of a candidate has been scored, or has failed: why, else empty."""
+
+    candidate: str
+    fold: int
+    failed: str
+
+
+@dataclass(frozen=True)
+class CandidateGivenUp:
+    """A candidate has been stopped early: so many of its folds need not be scored."""
+
+    candidate: str
+    folds: int
+
+
+@dataclass(frozen=True)
+class EpisodeEnded:
+    """One of ``total`` episodes, of the method so named, has ended."""
+
+    method: str
+    total: int
+
+
+Event = (
+    DemonstrationsDone
+    | TrainingBegan
+    | EpochEnded
+    | TrainingEnded
+    | SelectionBegan
+    | FoldScored
+    | CandidateGivenUp
+    | EpisodeEnded
+)
+OnEvent = Callable[[Event], None]
+
+
+def ignore(event: Event) -> None:
+    """Nobody watches."""

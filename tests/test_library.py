@@ -1,0 +1,293 @@
+"""The library calls: the same fit as the command's, in memory or in a folder; what is read, and in which pieces."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import json
+import math
+from collections import Counter
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from command_line import call
+from selecting import DATA, data_at, two_skills
+
+import ddco_pyro
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.errors import BadInput
+from ddco_pyro.fitting.fit import RunError
+from ddco_pyro.fitting.rollouts import roll_out
+from ddco_pyro.report import write_report
+from ddco_pyro.spec import SpecError, load_spec, parse_spec, with_overrides
+
+FLAT = {"kind": "flat", "policy": {"network": "linear"}}
+
+
+def spec_for(path: Path, **changes: object) -> dict[str, object]:
+    data = {key: value for key, value in DATA.items() if key != "selection"}
+    return {**data, "demonstrations": {"path": str(path)}, "compare_with": [FLAT], **changes}
+
+
+@pytest.fixture(scope="module")
+def commanded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the command makes of a file: ``spec.yaml``, ``demos.hdf5`` and ``run``."""
+    folder = tmp_path_factory.mktemp("commanded")
+    two_skills().write(folder / "demos.hdf5")
+    (folder / "spec.yaml").write_text(yaml.safe_dump(spec_for(folder / "demos.hdf5")))
+    assert call("fit", folder / "spec.yaml", "--out", folder / "run").status == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def in_memory(commanded: Path) -> ddco_pyro.Fit:
+    return ddco_pyro.fit(commanded / "spec.yaml", two_skills())
+
+
+# --- a fit without a folder -------------------------------------------------------------------------------------------
+
+
+def numbers(fit: ddco_pyro.Fit) -> dict[str, object]:
+    return {key: value for key, value in fit.metrics.items() if key != "seconds"}
+
+
+def test_the_fit_in_memory_is_the_commands(in_memory: ddco_pyro.Fit, commanded: Path) -> None:
+    loaded, demos = ddco_pyro.load(commanded / "run"), two_skills()
+    assert (in_memory.folder, loaded.folder) == (None, commanded / "run")
+    assert numbers(in_memory) == numbers(loaded)
+    assert numbers(in_memory.baselines["flat"]) == numbers(loaded.baselines["flat"])
+    np.testing.assert_array_equal(in_memory.log_likelihood(demos), loaded.log_likelihood(demos))
+    assert in_memory.demonstrations.names == loaded.demonstrations.names == demos.names
+
+
+def test_nothing_is_written_unless_it_is_asked_for(commanded: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    spec = with_overrides(load_spec(commanded / "spec.yaml"), {"training.epochs": 1})
+    assert ddco_pyro.fit(spec, commanded / "demos.hdf5").folder is None
+    assert not any(tmp_path.iterdir())
+
+
+def test_what_needs_a_folder_says_so(in_memory: ddco_pyro.Fit) -> None:
+    line = r"^this fit has no run folder; fit with out=FOLDER, which this needs$"
+    for ask in (lambda: write_report(in_memory, two_skills()), lambda: roll_out(in_memory, 1)):
+        with pytest.raises(RunError, match=line):
+            ask()
+
+
+def test_demonstrations_from_memory_are_kept_with_the_run(commanded: Path, tmp_path: Path) -> None:
+    spec, folder = load_spec(commanded / "spec.yaml"), tmp_path / "run"
+    fit = ddco_pyro.fit(spec, two_skills(), out=folder)
+    assert (folder / "model.safetensors").read_bytes() == (commanded / "run" / "model.safetensors").read_bytes()
+    assert numbers(ddco_pyro.load(folder)) == numbers(fit)
+    assert call("report", folder).status == 0
+    assert call("compare", folder, commanded / "run", "--out", tmp_path / "compared").status == 0
+    before = (folder / "metrics.json").read_bytes()
+    assert ddco_pyro.fit(spec, two_skills(), out=folder).metrics == fit.metrics
+    assert (folder / "metrics.json").read_bytes() == before
+    with pytest.raises(RunError, match=r"run: holds a run of other demonstrations; choose another folder or remove it"):
+        ddco_pyro.fit(spec, two_skills(seed=1), out=folder)
+
+
+def test_the_spec_says_what_is_seen_of_demonstrations_from_memory(in_memory: ddco_pyro.Fit) -> None:
+    """Another observation, and a demonstration that is left out."""
+    records = [*two_skills(), Demonstration("other", two_skills()[0].observations, two_skills()[0].actions)]
+    more = [Demonstration(d.name, {**d.observations, "noise": np.ones((len(d), 3))}, d.actions) for d in records]
+    spec = with_overrides(in_memory.spec, {"demonstrations.exclude": ["other"]})
+    fit = ddco_pyro.fit(spec, Demonstrations(tuple(more)))
+    assert numbers(fit) == numbers(in_memory)
+    assert numbers(ddco_pyro.fit(in_memory.spec, Demonstrations(tuple(more[:-1])))) == numbers(in_memory)
+    with pytest.raises(DemonstrationsError, match=r"there is no demonstration 'another'"):
+        ddco_pyro.fit(with_overrides(spec, {"demonstrations.exclude": ["another"]}), Demonstrations(tuple(more)))
+    with pytest.raises(
+        DemonstrationsError, match=r"there is no obs/plac .did you mean 'place'..; there is: place, turn"
+    ):
+        ddco_pyro.fit(with_overrides(in_memory.spec, {"observations": ["plac"]}), two_skills())
+    with pytest.raises(DemonstrationsError, match=r"there is no labels/phase; there is: nothing"):
+        ddco_pyro.fit(with_overrides(in_memory.spec, {"demonstrations.labels": "phase"}), two_skills())
+
+
+def test_several_baselines_of_a_kind(commanded: Path, tmp_path: Path) -> None:
+    wide = {"kind": "flat", "policy": {"network": "mlp", "hidden": [4]}}
+    grid = {"grid": {"hierarchy.levels.0.count": [1, 2]}}  # which baselines have nothing to do with
+    data = spec_for(commanded / "demos.hdf5", compare_with=[FLAT, wide], selection=grid)
+    fit = ddco_pyro.fit(parse_spec(data), out=tmp_path / "run")
+    loaded = ddco_pyro.load(tmp_path / "run")
+    for one in (fit, loaded):
+        assert list(one.metrics["comparison"]) == list(one.baselines) == ["flat", "flat_2"]
+        networks = [beside.spec.baseline.policy.network for beside in one.baselines.values()]
+        assert networks == ["linear", "mlp"]
+    outcomes = {"ddco": (1, 1), "flat": (0, 1), "flat_2": (0, 0)}
+    rows = [f"{name},{seed},{value}" for name, values in outcomes.items() for seed, value in enumerate(values)]
+    (tmp_path / "run" / "rollouts.csv").write_text("\n".join(["method,seed,success", *rows]))
+    assert call("report", tmp_path / "run").status == 0
+    both = [tmp_path / "run" / "baselines" / name for name in ("flat", "flat_2")]
+    assert call("compare", tmp_path / "run", *both, "--out", tmp_path / "compared").status == 0
+    pairs = json.loads((tmp_path / "compared" / "compare.json").read_text())["rollouts"]
+    successes = {
+        Path(pair[name]).name: pair[rate] for pair in pairs for name, rate in (("run", "rate"), ("other", "other_rate"))
+    }
+    assert {name: rate["successes"] for name, rate in successes.items()} == {"run": 2, "flat": 1, "flat_2": 0}
+
+
+# --- in pieces --------------------------------------------------------------------------------------------------------
+
+
+def test_pieces_say_what_the_whole_says(in_memory: ddco_pyro.Fit, monkeypatch: pytest.MonkeyPatch) -> None:
+    demos = two_skills()
+    (whole,) = in_memory.infer(demos)
+    monkeypatch.setattr("ddco_pyro.model.hierarchy.STEPS_AT_ONCE", 40)
+    pieces = list(in_memory.infer(demos))
+    assert [name for piece in pieces for name in piece.names] == list(demos.names)
+    assert len(pieces) > 2
+    assert all(len(piece.names) * max(piece.lengths) <= 40 for piece in pieces)
+    row = 0
+    for piece in pieces:
+        for own, steps in enumerate(piece.lengths):
+            assert piece.log_likelihood[own] == pytest.approx(whole.log_likelihood[row], rel=1e-6)
+            for kind in ("posterior", "path"):
+                ours, theirs = (getattr(one, kind)[0][0][at, :steps] for one, at in ((piece, own), (whole, row)))
+                np.testing.assert_allclose(ours, theirs, atol=1e-5)
+            total = piece.decomposition.dimensions[own].sum() + piece.decomposition.options[own]
+            assert float(total) == pytest.approx(piece.log_likelihood[own], rel=1e-6)
+            row += 1
+    assert in_memory.posterior(demos).u[0].shape == whole.posterior.u[0].shape
+    np.testing.assert_array_equal(in_memory.segment(demos)[0], whole.path.choices[0])
+
+
+def test_demonstrations_are_taken_as_they_are_needed(in_memory: ddco_pyro.Fit, monkeypatch) -> None:
+    monkeypatch.setattr("ddco_pyro.model.hierarchy.STEPS_AT_ONCE", 1)
+    taken = []
+    pieces = in_memory.infer(taken.append(demo.name) or demo for demo in two_skills())
+    for number, _ in enumerate(pieces, start=1):
+        assert len(taken) <= number + 1
+
+
+def test_evaluation_does_not_depend_on_the_pieces(in_memory: ddco_pyro.Fit, monkeypatch) -> None:
+    from ddco_pyro.fitting.metrics import evaluate
+    from ddco_pyro.fitting.prepare import parts
+
+    demos = two_skills()
+    monkeypatch.setattr("ddco_pyro.model.hierarchy.STEPS_AT_ONCE", 1)
+    again = evaluate(in_memory, parts(in_memory.spec, demos), demos)
+    for key in ("options", "divergences", "valid", "log_likelihood_by_dimension"):
+        assert len(str(again[key])) > 10
+        compare(again[key], in_memory.metrics[key])
+
+
+def compare(ours: object, theirs: object) -> None:
+    assert type(ours) is type(theirs)
+    if isinstance(ours, dict):
+        assert ours.keys() == theirs.keys()
+    if isinstance(ours, dict | list):
+        for key in ours if isinstance(ours, dict) else range(len(ours)):
+            compare(ours[key], theirs[key])
+    else:
+        assert ours == (pytest.approx(theirs, rel=1e-5, abs=1e-6) if isinstance(ours, float) else theirs)
+
+
+# --- what is read -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> Counter:
+    """How much of each dataset has been read, in parts of its size."""
+    counted: Counter = Counter()
+    read = h5py.Dataset.__getitem__
+
+    def counting(dataset, *arguments, **named):
+        values = read(dataset, *arguments, **named)
+        counted[dataset.name] += np.size(values) / max(1, math.prod(dataset.shape))
+        return values
+
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", counting)
+    return counted
+
+
+def everything(path: Path) -> set[str]:
+    names = set()
+    with h5py.File(path) as file:
+        file.visititems(lambda name, one: names.add(f"/{name}") if isinstance(one, h5py.Dataset) else None)
+    return names
+
+
+def test_a_fit_reads_its_demonstrations_once(commanded: Path, tmp_path: Path, reads: Counter) -> None:
+    assert call("fit", commanded / "spec.yaml", "--out", tmp_path / "run").status == 0
+    assert reads == dict.fromkeys(everything(commanded / "demos.hdf5"), 1.0)
+    assert (tmp_path / "run" / "report.html").exists()
+
+
+def test_a_selection_reads_its_demonstrations_once(tmp_path: Path, reads: Counter) -> None:
+    data = data_at(tmp_path) | {"selection": {"folds": 2, "grid": {"observations": [["turn"], ["place", "turn"]]}}}
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(data | {"observations": ["turn"]}))
+    assert call("select", tmp_path / "spec.yaml", "--out", tmp_path / "select", "--jobs", "1").status == 0
+    assert reads == dict.fromkeys(everything(tmp_path / "demos.hdf5"), 1.0)
+    assert (tmp_path / "select" / "fit" / "report.html").exists()
+
+
+def test_check_reads_no_observations(commanded: Path, reads: Counter) -> None:
+    """The controls are read: which are constant, or take two values, is part of what it says."""
+    assert call("check", commanded / "spec.yaml").status == 0
+    assert reads == {name: 1.0 for name in everything(commanded / "demos.hdf5") if name.endswith("/actions")}
+
+
+def test_check_sees_what_headers_say(tmp_path: Path) -> None:
+    path, spec = tmp_path / "demos.hdf5", tmp_path / "spec.yaml"
+    spec.write_text(yaml.safe_dump(spec_for(path)))
+    changes = {
+        "demo_3: obs/place has shape (3,) at each step, but (2,) in demo_0": np.zeros((8, 3)),
+        "demo_3: obs/place has 5 steps, but actions has 8": np.zeros((5, 2)),
+        "demo_3: obs/place holds |S1, it has to hold real numbers": np.full((8, 2), b"a"),
+    }
+    for said, values in changes.items():
+        two_skills().write(path)
+        with h5py.File(path, "r+") as file:
+            del file["data/demo_3/obs/place"]
+            file["data/demo_3/obs/place"] = values
+        ended = call("check", spec)
+        assert (ended.status, ended.err.count("\n")) == (2, 1)
+        assert ended.err.startswith(f"ddco-pyro: {path}: {said}")
+
+
+def test_a_spec_that_does_not_fit_is_refused_before_anything_is_written(commanded: Path, tmp_path: Path) -> None:
+    spec = with_overrides(load_spec(commanded / "spec.yaml"), {"control.scale": [1.0, 2.0, 3.0]})
+    with pytest.raises(SpecError, match=r"control\.scale: has 3 numbers, but the control has 2 dimensions"):
+        ddco_pyro.fit(spec, out=tmp_path / "run")
+    with pytest.raises(SpecError, match=r"control\.scale: has 3 numbers"):
+        ddco_pyro.fit(spec, two_skills(), out=tmp_path / "run")
+    with pytest.raises(BadInput, match=r"nowhere\.hdf5: there is no such file"):
+        ddco_pyro.fit(spec, tmp_path / "nowhere.hdf5", out=tmp_path / "run")
+    assert not any(tmp_path.iterdir())
+
+
+# --- examples ---------------------------------------------------------------------------------------------------------
+
+MINE = """
+demonstrations: {path: mine.hdf5}
+observations: [place]
+control: {std: 0.5}
+hierarchy:
+  levels: [{count: 2, policy: {network: linear}, termination: {network: linear}}]
+  meta_policy: {network: linear}
+training: {epochs: 12, optimizer: {lr: 0.05}}
+"""
+
+
+def test_the_examples_of_the_public_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.yaml").write_text(MINE)
+    random = np.random.default_rng(0)
+    places = [random.normal(size=(10, 2)) for _ in range(6)]
+    turn = np.repeat([[-2.0], [2.0]], 5, 0)
+    demos = Demonstrations(tuple(Demonstration(f"demo_{n}", {"place": x}, turn * x) for n, x in enumerate(places)))
+    demos.write("mine.hdf5")
+    names = {"ddco_pyro": ddco_pyro, "demos": demos, "fit": ddco_pyro.fit("mine.yaml", demos, out="runs/mine")}
+    shown = []
+    for module in ("fitting.run", "fitting.fit", "data.demonstrations", "spec.reading"):
+        found = importlib.import_module(f"ddco_pyro.{module}")
+        for example in doctest.DocTestFinder().find(found, extraglobs=names):
+            shown += [example.name.rpartition(".")[2]] if example.examples else []
+            assert doctest.DocTestRunner().run(example).failed == 0
+    assert {"fit", "load", "infer", "log_likelihood", "segment", "Demonstrations", "load_spec"} <= {*shown}
