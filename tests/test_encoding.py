@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy import stats
 
+from ddco_pyro.data.control_parts import all_gaussian
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.model.control_parts import all_gaussian
 from ddco_pyro.model.encoding import ControlScaling, ObservationEncoder, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import ControlSpec, ObservationSpec, parse_spec

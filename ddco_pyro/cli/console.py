@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ddco_pyro.data.control_dimensions import notes
+from ddco_pyro.data.control_parts import described
 from ddco_pyro.events import (
     CandidateGivenUp,
     DemonstrationsDone,
@@ -166,9 +167,9 @@ def _baseline(spec: Spec) -> str:
     return f"{spec.baseline.kind}, {f'hidden: {hidden}' if hidden else spec.baseline.policy.network}"
 
 
-def control(size: Dimensions) -> None:
-    """What is odd about dimensions of the control, a line each."""
-    for note in notes(size.control):
+def control(size: Dimensions, hierarchy: Hierarchy) -> None:
+    """What is odd about dimensions of the control, and how each is modelled, a line each."""
+    for note in (*notes(size.control), *(described(hierarchy.scaling.parts) if size.control else ())):
         Console().print(Text(note), soft_wrap=True)
 
 

@@ -48,7 +48,7 @@ def check(
     hierarchy = check_networks(found, size)
     print(dump_spec(found), end="")
     console.dimensions(found, size, hierarchy, baselines(found, size))
-    console.control(size)
+    console.control(size, hierarchy)
 
 
 def fit(

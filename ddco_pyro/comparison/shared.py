@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ddco_pyro.data.control_parts import difference
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import Fit
@@ -64,7 +65,7 @@ def _check_same(first: Fit, ours: Demonstrations, second: Fit, theirs: Demonstra
 
 
 def _check_dimensions(first: Fit, second: Fit) -> None:
-    """Both likelihoods are densities of the same control dimensions: constant ones are no part of a model."""
+    """Both likelihoods are of the same control dimensions (constant ones are no part of a model), in one measure."""
     ours, theirs = (set(one.hierarchy.scaling.varying.tolist()) for one in (first, second))
     if ours != theirs:
         dimension = min(ours ^ theirs)
@@ -73,6 +74,11 @@ def _check_dimensions(first: Fit, second: Fit) -> None:
             f"{first} and {second} score different things: control dimension {dimension} is in the "
             f"likelihood of {scored} and not in that of {left}; fit both to the same demonstrations, "
             "with the same version"
+        )
+    if different := difference(first.hierarchy.scaling.measure, second.hierarchy.scaling.measure):
+        raise NotShared(
+            f"{first.folder} and {second.folder} measure different things: {different}; densities and probabilities "
+            "cannot be ranked, so fit both with the same control.kind"
         )
 
 

@@ -72,8 +72,8 @@ class ControlDimension:
         return ""
 
     def as_data(self) -> dict[str, Any]:
-        """The same as plain data."""
-        return asdict(self)
+        """The same as plain data, without the distinct values."""
+        return {key: value for key, value in asdict(self).items() if key != "distinct"}
 
 
 def number(value: float) -> str:

@@ -11,9 +11,11 @@ import numpy as np
 
 from ddco_pyro.data.checks import check_shape, check_steps, problems_of_masks
 from ddco_pyro.data.control_dimensions import ControlDimension, ControlStatistics, notes
+from ddco_pyro.data.control_parts import control_parts, described
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.sources import Column, Format, Source, open_source
 from ddco_pyro.data.values import LARGEST, NUMBERS, usable
+from ddco_pyro.spec import ControlSpec
 
 
 @dataclass
@@ -140,7 +142,8 @@ class Inspection:
     @property
     def notes(self) -> list[str]:
         """What is odd about dimensions of the control, one line each."""
-        return notes(self.control)
+        auto = control_parts(ControlSpec(), self.control) if self.control else ()
+        return [*notes(self.control), *(f"{line}, by control.kind: auto" for line in described(auto))]
 
     @property
     def affected(self) -> list[str]:

@@ -95,8 +95,9 @@ def _lines(found: Inspection, path: str) -> Iterator[str]:
     yield from _labels(found)
     yield from _observations(found)
     yield "control:"
-    yield "  std: {learn: true, floor: 0.01}   # in units of each dimension's own spread"
+    yield "  kind: auto                        # decided from the demonstrations; so it is:"
     yield from (f"  # {note}" for note in found.notes)
+    yield "  std: {learn: true, floor: 0.01}   # in units of each dimension's own spread"
     yield "hierarchy:"
     yield "  levels:"
     yield "    - name: option"

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor
+from ddco_pyro.data.control_parts import ControlPart
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.tensors import read_tensors
 from ddco_pyro.errors import BadInput
@@ -22,7 +23,6 @@ from ddco_pyro.fitting.inferred import Inferred, infer
 from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy, demonstrations, named_baselines
 from ddco_pyro.fitting.records import read_metrics, refit
 from ddco_pyro.inference import Posterior
-from ddco_pyro.model.control_parts import ControlPart
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, user_code
 

@@ -15,13 +15,13 @@ import torch
 from torch import nn
 
 from ddco_pyro.data.control_dimensions import ControlDimension, all_constant, control_dimensions
+from ddco_pyro.data.control_parts import ControlPart, control_parts
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, extent
 from ddco_pyro.data.hdf5 import dataset_at, member, opened
 from ddco_pyro.data.memory import Work, refuse_too_much
 from ddco_pyro.errors import nearest
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.widths import nearest_widths
-from ddco_pyro.model.control_parts import ControlPart, control_parts
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import ShapeError

@@ -14,7 +14,7 @@ from typing import Literal
 import torch
 from torch import nn
 
-from ddco_pyro.model.control_parts import ControlPart, all_gaussian
+from ddco_pyro.data.control_parts import ControlPart, all_gaussian
 from ddco_pyro.model.controls import ControlScaling, ControlStd
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch, ObservationEncoder, Shapes
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build

@@ -31,23 +31,32 @@ def section(metrics: Mapping[str, Any], baselines: Mapping[str, Mapping[str, Any
     part = "valid" if known[metrics["model"]]["valid"] else "train"
     values = {name: one[part] for name, one in known.items()}
     control = [ControlDimension(**one) for one in metrics["control_dimensions"]]
-    return Dimensions(_table(control, values), "held-out" if part == "valid" else "training")
+    return Dimensions(
+        _table(control, values, metrics.get("measure", {})), "held-out" if part == "valid" else "training"
+    )
 
 
 _KEY = "log_likelihood_by_dimension"
 
 
-def _table(control: Sequence[ControlDimension], values: Mapping[str, Mapping[str, Any]]) -> Table:
+def _table(
+    control: Sequence[ControlDimension], values: Mapping[str, Mapping[str, Any]], measure: Mapping[str, Sequence[Any]]
+) -> Table:
     rows = [
-        [str(one.number), *(number(value["by_dimension"][one.number]) for value in values.values()), one.note]
+        [
+            str(one.number),
+            *(number(value["by_dimension"][one.number]) for value in values.values()),
+            str(measure.get(str(one.number), [""])[0]),
+            one.note,
+        ]
         for one in control
     ]
     totals = [sum(filter(None, value["by_dimension"])) + value["options"] for value in values.values()]
     return Table(
-        ["Control dimension", *map(method, values), "In the demonstrations"],
+        ["Control dimension", *map(method, values), "Modelled as", "In the demonstrations"],
         [
             *rows,
-            ["options", *(number(value["options"]) for value in values.values()), ""],
-            ["sum", *map(number, totals), ""],
+            ["options", *(number(value["options"]) for value in values.values()), "", ""],
+            ["sum", *map(number, totals), "", ""],
         ],
     )

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
+from ddco_pyro.data.control_parts import difference
 from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy, parameters
 from ddco_pyro.spec import Spec, SpecError, with_overrides
 from ddco_pyro.spec.messages import show
@@ -83,7 +84,22 @@ def candidates(spec: Spec, dimensions: Dimensions) -> list[Candidate]:
             problems += [f"selection.grid: {_where(grid, values)}: {problem}" for problem in error.problems]
     if problems:
         raise SpecError(*problems)
+    _refuse_other_measures(grid, found, dimensions)
     return found
+
+
+def _refuse_other_measures(grid: Mapping[str, Any], found: Sequence[Candidate], dimensions: Dimensions) -> None:
+    """A density cannot be ranked against a probability.
+
+    :raises SpecError: candidates model a control dimension as different kinds.
+    """
+    measures = [build_hierarchy(candidate.spec, dimensions).scaling.measure for candidate in found]
+    for candidate, measure in zip(found[1:], measures[1:], strict=True):
+        if different := difference(measures[0], measure):
+            raise SpecError(
+                f"selection.grid: {found[0].name} and {candidate.name} measure different things: {different}; "
+                "densities and probabilities cannot be ranked, so give all candidates the same control.kind"
+            )
 
 
 def _where(grid: Mapping[str, Any], values: tuple[Any, ...]) -> str:

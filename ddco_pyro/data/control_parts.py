@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -52,6 +52,41 @@ class ControlPart:
         """That of plain data."""
         lists = {key: tuple(value) for key, value in data.items() if isinstance(value, list)}
         return cls(**{**data, **lists})
+
+
+def described(parts: Sequence[ControlPart]) -> list[str]:
+    """A line for each part: its dimensions, its kind, and why."""
+    return [f"control {_listed(part.dims)}: {part.kind}" + (f" ({part.why})" if part.why else "") for part in parts]
+
+
+def _listed(dims: Sequence[int]) -> str:
+    """``dimension 3``, or ``dimensions 0-2, 5``."""
+    runs: list[list[int]] = []
+    for dimension in sorted(dims):
+        if runs and dimension == runs[-1][-1] + 1:
+            runs[-1].append(dimension)
+        else:
+            runs.append([dimension])
+    texts = (str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+    return ("dimension " if len(dims) == 1 else "dimensions ") + ", ".join(texts)
+
+
+def difference(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
+    """In which control dimension two measures differ, and how; nothing where they are the same."""
+    for dimension in sorted(set(ours) | set(theirs), key=int):
+        one, two = ours.get(dimension), theirs.get(dimension)
+        if one != two:
+            kinds = [_told(each) for each in (one, two)]
+            return f"control dimension {dimension} is {kinds[0]} in one and {kinds[1]} in the other"
+    return ""
+
+
+def _told(measured: Sequence[Any] | None) -> str:
+    if measured is None:
+        return "no part of the likelihood"
+    kind, *about = measured
+    ends = " and ".join("none" if end is None else number(end) for end in about)
+    return f"{kind} with bounds {ends}" if kind == "clipped" else str(kind)
 
 
 def all_gaussian(varying: Sequence[int]) -> tuple[ControlPart, ...]:
@@ -110,8 +145,7 @@ def _decided(dimension: ControlDimension, alone: bool) -> tuple[str, str]:
     if alone and dimension.whole:
         return "categorical", f"takes {len(dimension.distinct)} whole numbers and is the only dimension"
     if dimension.extremes:
-        share = max(share for _, _, share in dimension.extremes)
-        return "clipped", f"sits on an extreme in up to {100 * share:.0f} % of the steps"
+        return "clipped", "often exactly at an extreme"
     return "gaussian", "varies freely"
 
 
