@@ -278,7 +278,9 @@ def _changes(root: Path, today: Files, one: Record) -> str:
     commit = one.get("commit") or one.get("added_at")
     then = _sources_at(root, commit, one["command"]) if commit else None
     if then is None:
-        return f"older than its code (commit {commit or 'unknown'}, which git does not have here)"
+        known = commit and _tree_at(root, commit)
+        why = "at which its script lay elsewhere" if known else "which git does not have here"
+        return f"older than its code (commit {commit or 'unknown'}, {why})"
     files = now.keys() | then.keys()
     changed = [name for name in files if now.get(name) != then.get(name)]
     more = ", and others that were not committed" if one.get("dirty") else ""

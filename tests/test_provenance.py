@@ -195,6 +195,19 @@ def test_results_older_than_their_code_are_named_with_the_number_of_changed_file
     ]
 
 
+def test_a_script_that_has_moved_is_told_from_a_commit_that_is_gone(checkout):
+    name = git(checkout, "rev-parse", "--short", "HEAD")
+    script = next(word for word in COMMAND.split() if word.endswith(".py"))
+    git(checkout, "mv", script, "benchmarks/moved.py")
+    moved = COMMAND.replace(script, "benchmarks/moved.py")
+    made = record(COMMAND.replace(script, "benchmarks/moved.py"), checkout) | {"commit": name, "code": "another"}
+    write(checkout, "docs/results/study.json", text([1], [made]))
+    assert moved in made["command"]
+    assert outdated(checkout) == [
+        f"docs/results/study: older than its code (commit {name}, at which its script lay elsewhere)"
+    ]
+
+
 def test_where_git_does_not_have_the_commit_the_hash_still_tells(project):
     write(project, "docs/results/study.json", text(None, [record(COMMAND, project)]))
     assert outdated(project) == []
