@@ -46,7 +46,7 @@ class Minari:
         except (*DAMAGE, AssertionError) as error:
             raise damaged(self.folder, name, error) from error
         actions, steps = episode["actions"], len(episode["rewards"])
-        if not isinstance(actions, np.ndarray) or actions.dtype.kind != "f":
+        if not isinstance(actions, np.ndarray) or actions.dtype.kind not in "fiu":
             what = actions.dtype if isinstance(actions, np.ndarray) else "several arrays"
             raise DemonstrationsError(f"{self.folder}: {name}: actions are {what}, they have to be one array of reals")
         observations = {key: of_array(one[:steps]) for key, one in _leaves(episode["observations"], "")}

@@ -77,6 +77,13 @@ def of_array(values: ArrayLike) -> Column:
     return Column(array.shape, array.dtype, lambda: iter([array]))
 
 
+def discrete(actions: Column) -> Column:
+    """Discrete actions, integers [T], as [T, 1]; other actions as they are."""
+    if len(actions.shape) != 1 or actions.dtype.kind not in "iu":
+        return actions
+    return Column((*actions.shape, 1), actions.dtype, lambda: (block[:, None] for block in actions.blocks()))
+
+
 def of_dataset(dataset: h5py.Dataset, where: str) -> Column:
     """A dataset of an open file; reading it raises :class:`DemonstrationsError` where the file is damaged.
 

@@ -1,0 +1,240 @@
+"""What kind each control dimension is decided to be, what is refused, and that nothing impossible is emitted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+import yaml
+from command_line import call
+
+import ddco_pyro
+from ddco_pyro.acting.controller import Controller
+from ddco_pyro.data.control_dimensions import control_dimensions
+from ddco_pyro.data.control_parts import control_parts, described
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.export import TOLERANCE, export, runner
+from ddco_pyro.spec import ControlSpec, SpecError, dump_spec, parse_spec, with_overrides
+
+STEPS = 30
+
+
+def mixed(seed=0, steps=STEPS):
+    """[T, 5]: free, at its bounds ±2 and within, a switch between 0.1 and 0.7, at its upper bound alone, constant."""
+    random = np.random.default_rng(seed)
+    wide = random.normal(0, 3, (steps, 2))
+    return np.stack(
+        [
+            random.normal(5, 2, steps),
+            wide[:, 0].clip(-2, 2),
+            np.where(random.random(steps) < 0.4, 0.7, 0.1),
+            np.minimum(wide[:, 1], 1.0),
+            np.full(steps, 3.0),
+        ],
+        axis=1,
+    )
+
+
+def demonstrations(actions=mixed, number=6):
+    """Demonstrations whose state says something of the control."""
+    made = []
+    for n in range(number):
+        controls = np.asarray(actions(n), dtype=float)
+        noise = np.random.default_rng(100 + n).normal(0, 0.3, controls.shape)
+        made.append(Demonstration(f"demo_{n}", {"state": controls + noise}, controls))
+    return Demonstrations(tuple(made))
+
+
+def spec_of(**control):
+    return parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.34},
+            "observations": ["state"],
+            "control": {"std": {"learn": True}, **control},
+            "hierarchy": {
+                "levels": [{"count": 2, "policy": {"network": "linear"}}],
+                "meta_policy": {"network": "linear", "emits": ["options", "control"]},
+            },
+            "training": {"epochs": 6},
+        }
+    )
+
+
+def kinds(actions, **control):
+    parts = control_parts(ControlSpec(**control), control_dimensions([actions]))
+    return {dimension: part.kind for part in parts for dimension in part.dims}
+
+
+def test_kinds_are_decided_from_the_demonstrations():
+    assert kinds(mixed()) == {0: "gaussian", 1: "clipped", 2: "binary", 3: "clipped"}
+    parts = {part.kind: part for part in control_parts(ControlSpec(), control_dimensions([mixed()]))}
+    assert parts["clipped"].low == (-2.0, -np.inf)
+    assert parts["clipped"].high == (2.0, 1.0)
+    assert (parts["binary"].low, parts["binary"].high) == ((0.1,), (0.7,))
+    assert described(parts.values())[0] == "control dimension 0: gaussian (varies freely)"
+
+
+def test_one_in_a_hundred_at_an_extreme_is_a_bound_and_a_single_extreme_is_none():
+    values = np.linspace(-1, 1, 500)[:, None]
+    assert kinds(values) == {0: "gaussian"}
+    values[-5:] = 1.0
+    assert kinds(values) == {0: "gaussian"}  # 5 of 500 are 1 %, not more
+    values[-6:] = 1.0
+    assert kinds(values) == {0: "clipped"}
+
+
+def test_whole_numbers_alone_are_discrete_actions():
+    actions = np.random.default_rng(0).integers(0, 5, (40, 1)).astype(float)
+    (part,) = control_parts(ControlSpec(), control_dimensions([actions]))
+    assert (part.kind, part.values) == ("categorical", (0.0, 1.0, 2.0, 3.0, 4.0))
+    both = np.concatenate([actions, np.random.default_rng(1).normal(size=(40, 1))], axis=1)
+    assert "categorical" not in kinds(both).values()
+
+
+def test_parts_by_name_come_first_and_the_rest_follows():
+    parts = [{"name": "arm", "dims": [1, 0], "kind": "gaussian"}, {"name": "jaw", "dims": [2, 4]}]
+    assert kinds(mixed(), parts=parts) == {0: "gaussian", 1: "gaussian", 2: "binary", 3: "clipped"}
+
+
+@pytest.mark.parametrize(
+    ("control", "message"),
+    [
+        ({"kind": "binary"}, "control.kind: control dimension 0 takes more than two values; it is no switch"),
+        ({"parts": [{"name": "a", "dims": [9]}]}, "control.parts.0.dims: there is no control dimension 9"),
+        (
+            {"parts": [{"name": "a", "dims": [1], "kind": "clipped", "bounds": [-1, 1]}]},
+            "control.parts.0.bounds: control dimension 1 goes from -2 to 2",
+        ),
+        ({"parts": [{"name": "a", "dims": [0, 2], "kind": "categorical"}]}, "control dimension 0 is not 0 or 1"),
+    ],
+)
+def test_what_does_not_fit_the_demonstrations_is_refused(control, message):
+    with pytest.raises(SpecError, match=message):
+        control_parts(spec_of(**control).control, control_dimensions([mixed()]))
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [{"name": "a", "dims": [0]}, {"name": "b", "dims": [1, 0]}],
+        [{"name": "a", "dims": [0]}, {"name": "a", "dims": [1]}],
+        [{"name": "a", "dims": [0], "bounds": [0, 1]}],
+        [{"name": "a", "dims": [0], "kind": "clipped", "bounds": [1, 0]}],
+    ],
+)
+def test_contradictions_in_parts_are_refused(parts):
+    with pytest.raises(SpecError, match=r"control\.parts\.\d\."):
+        spec_of(parts=parts)
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    return ddco_pyro.fit(spec_of(), demonstrations(), out=tmp_path_factory.mktemp("runs") / "mixed")
+
+
+@pytest.mark.parametrize("control", ["mean", "sample"])
+def test_switches_and_bounds_are_emitted_exactly(fitted, control):
+    """In states far beyond the demonstrations, where means lie beyond every bound."""
+    controller = Controller(fitted.hierarchy, control)
+    controls = []
+    for seed in range(8):
+        controller.reset(seed)
+        controls += [controller.act({"state": row}) for row in np.random.default_rng(seed).normal(0, 50, (20, 5))]
+    emitted = np.stack(controls)
+    assert set(emitted[:, 2]) == {0.1, 0.7}
+    assert set(emitted[:, 4]) == {3.0}
+    assert (np.abs(emitted[:, 1]) <= 2).all()
+    assert (emitted[:, 3] <= 1).all()
+    assert {-2.0, 2.0} <= set(emitted[:, 1])
+    assert 1.0 in emitted[:, 3]
+
+
+def test_what_was_decided_comes_back_from_the_run(fitted):
+    again = ddco_pyro.load(fitted.folder)
+    assert again.hierarchy.scaling.parts == fitted.hierarchy.scaling.parts
+    np.testing.assert_allclose(again.log_likelihood(demonstrations()), fitted.log_likelihood(demonstrations()))
+    assert again.metrics["measure"] == {
+        "0": ["gaussian"], "1": ["clipped", -2.0, 2.0], "2": ["binary", 0.1, 0.7], "3": ["clipped", None, 1.0],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("control", ["mean", "sample"])
+def test_exports_act_as_the_run_does(fitted, tmp_path, control):
+    changed = fitted.__class__(
+        fitted.spec.model_copy(update={"rollout": fitted.spec.rollout.model_copy(update={"control": control})}),
+        fitted.hierarchy,
+        fitted.metrics,
+        fitted.folder,
+    )
+    differences = export(changed, tmp_path / "out", onnx=True)
+    assert all(difference < TOLERANCE for difference, _ in differences.values())
+    exported, original = runner.Runner(tmp_path / "out"), changed.controller()
+    for observation in demonstrations()[1].observations["state"]:
+        ours, theirs = exported.act({"state": observation}), original.act({"state": observation})
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+        assert (ours[2], ours[4]) == (theirs[2], theirs[4])
+
+
+@pytest.mark.parametrize("rows", [False, True])
+def test_discrete_actions_from_file_to_controller(tmp_path: Path, rows):
+    """Integers [T] in the file, or rows with a single 1."""
+    random = np.random.default_rng(0)
+    with h5py.File(tmp_path / "demos.hdf5", "w") as file:
+        for n in range(6):
+            index = random.integers(0, 3, 20)
+            group = file.create_group(f"data/demo_{n}")
+            group.attrs["num_samples"] = 20
+            group["actions"] = np.eye(3)[index] if rows else index
+            group["obs/state"] = np.eye(3)[index] + random.normal(0, 0.05, (20, 3))
+    control = {"kind": "categorical"} if rows else {}
+    training = {"epochs": 150, "optimizer": {"lr": 0.03}}
+    spec = in_file(spec_of(**control), tmp_path / "demos.hdf5", training=training)
+    fit = ddco_pyro.fit(spec, out=tmp_path / "run")
+    assert fit.hierarchy.scaling.parts[0].kind == "categorical"
+    controller = Controller(fit.hierarchy)
+    for action in range(3):
+        controller.reset()
+        expected = np.eye(3)[action] if rows else [float(action)]
+        np.testing.assert_array_equal(controller.act({"state": np.eye(3)[action]}), expected)
+    assert fit.metrics["log_likelihood_per_step"]["valid"] > -0.3
+    assert all(d < TOLERANCE for d, _ in export(fit, tmp_path / "out", onnx=True).values())
+
+
+def in_file(spec, path, **changes):
+    """The spec with the demonstrations of a file."""
+    data = yaml.safe_load(dump_spec(spec))
+    return parse_spec({**data, "demonstrations": {"path": str(path), "valid_fraction": 0.34}, **changes})
+
+
+def test_a_value_that_a_switch_does_not_have_is_one_line():
+    broken = demonstrations(lambda n: np.where(np.arange(5) == 2, 0.5, mixed(n)), number=1)
+    fit = ddco_pyro.fit(spec_of(), demonstrations())
+    with pytest.raises(DemonstrationsError, match=r"demo_0: control dimension 2 is 0\.5 at step 0"):
+        fit.log_likelihood(broken)
+
+
+def test_different_measures_are_not_ranked(fitted, tmp_path):
+    path = tmp_path / "demos.hdf5"
+    demonstrations().write(path)
+    runs = []
+    for kind in ("auto", "gaussian"):
+        runs.append(ddco_pyro.fit(in_file(spec_of(kind=kind), path), out=tmp_path / kind).folder)
+    ended = call("compare", *runs)
+    assert ended.status == 2
+    assert "control dimension 1 is clipped with bounds -2 and 2 in one and gaussian in the other" in ended.err
+    grid = in_file(spec_of(), path, selection={"folds": 2, "grid": {"control.kind": ["auto", "gaussian"]}})
+    (tmp_path / "grid.yaml").write_text(dump_spec(grid))
+    ended = call("select", tmp_path / "grid.yaml", "--out", tmp_path / "selected")
+    assert ended.status == 2
+    assert "kind = auto and kind = gaussian measure different things: control dimension 1" in ended.err
+
+
+def test_a_sigma_for_each_option_is_learned():
+    spec = spec_of(std={"learn": True, "per_option": True})
+    fit = ddco_pyro.fit(with_overrides(spec, {"training.epochs": 60}), demonstrations())
+    level = fit.hierarchy.levels[0].policy.std()
+    assert level.shape == (2, 3)  # three continuous dimensions; the switch has none
+    assert not torch.allclose(level[0], level[1])
