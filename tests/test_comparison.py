@@ -202,7 +202,7 @@ def test_demonstrations_that_have_changed_since_are_refused(toy_spec, other, tmp
     first, second = (other(name, demonstrations__path=str(path), seed=0) for name in ("first", "second"))
     assert len(compare([first.folder, second.folder]).rows) == 2
     for demo in demos:
-        demo.actions[0] += 0.5
+        demo.actions[0] *= 0.5
     demos.write(path)
     with pytest.raises(NotShared, match=r"first: demo_\d+ has changed since this run was fitted to it; fit it again"):
         compare([first.folder, second.folder])

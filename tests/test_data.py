@@ -45,7 +45,7 @@ def test_what_never_changes_is_constant(path):
         "takes two values, 1 and 2",
         "constant (-0.25): no part of the model, emitted as it is",
     ]
-    hierarchy = check_networks(spec(control={"scale": [4.0, 2.0, 8.0]}), found)
+    hierarchy = check_networks(spec(control={"kind": "gaussian", "scale": [4.0, 2.0, 8.0]}), found)
     assert hierarchy.scaling.scale.tolist() == [4.0, 2.0]
     with pytest.raises(SpecError, match=r"control.scale: has 2 numbers, but the control has 3 dimensions"):
         check_networks(spec(control={"scale": [4.0, 2.0]}), found)
