@@ -8,7 +8,8 @@ import pytest
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.events import DemonstrationsDone
-from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy, check_networks, demonstrations, dimensions
+from ddco_pyro.fitting.building import Dimensions, build_hierarchy, check_networks
+from ddco_pyro.fitting.prepare import demonstrations, dimensions
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 
 TASK = "toy_task:task"

@@ -11,7 +11,7 @@ from oracle import paths
 from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.fitting.prepare import Dimensions
+from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.decomposition import decompose
 from ddco_pyro.model.encoding import Batch, encode

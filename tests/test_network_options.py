@@ -10,7 +10,7 @@ import torch
 from pydantic import Field
 from torch import nn
 
-from ddco_pyro.fitting.prepare import Dimensions, check_networks
+from ddco_pyro.fitting.building import Dimensions, check_networks
 from ddco_pyro.model.networks import CLASSES, InputShape, build
 from ddco_pyro.spec import NetworkSpec, SpecError, parse_spec
 from ddco_pyro.spec.networks import SETTINGS

@@ -19,8 +19,9 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan, TrainingEnded
+from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.fitting.fit import RunError
-from ddco_pyro.fitting.prepare import Dimensions, demonstrations
+from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.fitting.run import claim, fit, train
 from ddco_pyro.spec import dump_spec, load_spec, with_overrides
 

@@ -17,8 +17,8 @@ from selecting import Told, data_at, kept, score, spec_at, two_skills
 
 import ddco_pyro
 from ddco_pyro.errors import Failed
+from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.prepare import Dimensions
 from ddco_pyro.fitting.run import train
 from ddco_pyro.selection import SelectionFailed, Workers, check, final_spec, parallel, scoring, select
 from ddco_pyro.selection.folds import FoldError

@@ -7,7 +7,7 @@ import re
 import pytest
 from selecting import DATA, spec_at
 
-from ddco_pyro.fitting.prepare import Dimensions
+from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.selection.grid import candidates, wide
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 

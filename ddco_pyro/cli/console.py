@@ -30,7 +30,7 @@ from ddco_pyro.events import (
 from ddco_pyro.fitting.convergence import effort
 
 if TYPE_CHECKING:
-    from ddco_pyro.fitting.prepare import Dimensions
+    from ddco_pyro.fitting.building import Dimensions
     from ddco_pyro.model.hierarchy import Hierarchy
     from ddco_pyro.selection import Choice
     from ddco_pyro.spec import Spec
@@ -145,7 +145,7 @@ class Progress(_Bar):
 
 def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Sequence[tuple[Spec, Hierarchy]]) -> None:
     """Shapes of observations and control, and the parameters of each network and of each baseline."""
-    from ddco_pyro.fitting.prepare import parameters
+    from ddco_pyro.fitting.building import parameters
 
     table = Table("", "shape or parameters", show_edge=False)
     for one in spec.observations:
@@ -169,7 +169,8 @@ def _baseline(spec: Spec) -> str:
 
 def control(size: Dimensions, hierarchy: Hierarchy) -> None:
     """What is odd about dimensions of the control, and how each is modelled, a line each."""
-    for note in (*notes(size.control), *(described(hierarchy.scaling.parts) if size.control else ())):
+    unknown = ["control: its kinds are decided once demonstrations have been collected (ddco-pyro collect)"]
+    for note in (*notes(size.control), *(described(hierarchy.scaling.parts) if size.control else unknown)):
         Console().print(Text(note), soft_wrap=True)
 
 

@@ -42,7 +42,8 @@ def check(
         raise SpecError("name a spec, such as: ddco-pyro check specs/needle.yaml")
     found = load_spec(spec, overrides, allow_code)
     from ddco_pyro.cli import console
-    from ddco_pyro.fitting.prepare import baselines, check_networks, dimensions
+    from ddco_pyro.fitting.building import baselines, check_networks
+    from ddco_pyro.fitting.prepare import dimensions
 
     size = dimensions(found)
     hierarchy = check_networks(found, size)

@@ -19,8 +19,9 @@ from ddco_pyro.data.control_parts import ControlPart
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.tensors import read_tensors
 from ddco_pyro.errors import BadInput
+from ddco_pyro.fitting.building import Dimensions, build_hierarchy, named_baselines
 from ddco_pyro.fitting.inferred import Inferred, infer
-from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy, demonstrations, named_baselines
+from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.fitting.records import read_metrics, refit
 from ddco_pyro.inference import Posterior
 from ddco_pyro.model.hierarchy import Hierarchy

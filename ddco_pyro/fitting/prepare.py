@@ -5,205 +5,39 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import torch
-from torch import nn
 
-from ddco_pyro.data.control_dimensions import ControlDimension, all_constant, control_dimensions
-from ddco_pyro.data.control_parts import ControlPart, control_parts
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, extent
 from ddco_pyro.data.hdf5 import dataset_at, member, opened
 from ddco_pyro.data.memory import Work, refuse_too_much
 from ddco_pyro.errors import nearest
 from ddco_pyro.events import OnEvent, ignore
-from ddco_pyro.fitting.widths import nearest_widths
-from ddco_pyro.model.encoding import STEPS_AT_ONCE, Shapes
+from ddco_pyro.fitting.building import Dimensions, baselines, build_hierarchy
+from ddco_pyro.model.encoding import STEPS_AT_ONCE
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks import ShapeError
 from ddco_pyro.model.networks.conv import POOLED
-from ddco_pyro.simulation.collect import collect
+from ddco_pyro.simulation.collect import cache_path, collect
 from ddco_pyro.simulation.task import find_task
-from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code
-
-
-@dataclass(frozen=True)
-class Dimensions:
-    """Shapes of the observations by name, control dimensions A, and the longest demonstration where it is known.
-
-    :param constant: the control dimensions that are constant in all demonstrations, and their values: they are no part
-        of the model.
-    :param control: what each control dimension does in the demonstrations; empty where that is not known.
-    :param parts: how a fitted model has the control; None where that is still to be decided.
-    """
-
-    shapes: Shapes
-    control_size: int
-    steps: int
-    constant: Mapping[int, float] = field(default_factory=dict)
-    control: tuple[ControlDimension, ...] = field(default=(), compare=False)
-    parts: tuple[ControlPart, ...] | None = None
-
-    @classmethod
-    def of(cls, demonstrations: Demonstrations) -> Dimensions:
-        """The dimensions of these demonstrations.
-
-        :raises DemonstrationsError: every dimension of the control is constant.
-        """
-        control = control_dimensions(demo.actions for demo in demonstrations)
-        constant = {one.number: one.minimum for one in control if one.constant}
-        if len(constant) == len(control):
-            raise DemonstrationsError(all_constant(control))
-        shapes, size = demonstrations.observation_shapes, demonstrations.control_size
-        return cls(shapes, size, max(demonstrations.lengths), constant, control)
-
-
-def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
-    """The spec's networks for these dimensions, randomly initialised.
-
-    :raises SpecError: something in the spec does not fit the observations or the control.
-    """
-    missing = [one.key for one in spec.observations if one.key not in dimensions.shapes]
-    if missing:
-        known = ", ".join(sorted(dimensions.shapes))
-        raise SpecError(f"observations: there is no {', '.join(missing)} (there are: {known})")
-    drawn = spec.report.trajectory
-    shape = dimensions.shapes[drawn] if drawn else (3,)
-    if len(shape) != 1 or shape[0] < 3:
-        raise SpecError(
-            f"report.trajectory: {drawn!r} has shape {list(shape)} at each step; name a vector of three numbers or more"
-        )
-    scale = spec.control.scale
-    if isinstance(scale, tuple) and len(scale) != dimensions.control_size:
-        raise SpecError(
-            f"control.scale: has {len(scale)} numbers, but the control has {dimensions.control_size} dimensions"
-        )
-    _refuse_giants(spec, dimensions)
-    try:
-        return _hierarchy(spec, dimensions)
-    except ShapeError as error:
-        raise SpecError(str(error)) from error
-
-
-MOST_PARAMETERS = 50_000_000
-"""Of all networks together. Training holds each five times: itself, its gradient, Adam's moments, the best so far."""
-
-MOST_CHOICES = 10_000
-"""Joint choices of all levels, Π(1 + k): every step of a demonstration has so many entries in the inference."""
-
-
-def _refuse_giants(spec: Spec, dimensions: Dimensions) -> None:
-    """A typing error in a size is refused before it fills the memory: networks are made without their numbers first.
-
-    :raises SpecError: the model is larger than any that can be trained here.
-    """
-    choices = math.prod(1 + level.count for level in spec.hierarchy.levels) if spec.hierarchy else 1
-    if choices > MOST_CHOICES:
-        raise SpecError(
-            f"hierarchy.levels: the levels have {choices} joint choices, at most {MOST_CHOICES} can be summed over; "
-            "lower count"
-        )
-    if any(place.endswith(".network") for place in user_code(spec)):
-        return  # its sizes are its own affair
-    try:
-        number = _counted(spec, dimensions)
-    except ShapeError:
-        return  # it is said better where the networks are made
-    except (RuntimeError, MemoryError, TypeError):  # sizes that no tensor can have
-        said = "more parameters than a machine can count"
-    else:
-        if number <= MOST_PARAMETERS:
-            return
-        said = f"{number} parameters, more than {MOST_PARAMETERS}"
-    raise SpecError(f"the networks have {said}; lower count, hidden, filters or kernel, or scale the images down")
-
-
-def _counted(spec: Spec, dimensions: Dimensions) -> int:
-    """The number of parameters of the spec's networks, which are made without their numbers."""
-    with torch.device("meta"):
-        return parameters(_hierarchy(spec, dimensions))
-
-
-def _hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
-    parts = dimensions.parts
-    if parts is None and dimensions.control:
-        parts = control_parts(spec.control, dimensions.control)
-    size = dimensions.shapes, dimensions.control_size, dimensions.steps, dimensions.constant
-    return Hierarchy(spec, *size, parts)
-
-
-def parameters(network: nn.Module) -> int:
-    """The number of trained parameters."""
-    return sum(parameter.numel() for parameter in network.parameters())
-
-
-def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
-    """The spec's networks, after those of its baselines were made too.
-
-    :raises SpecError: something in the spec does not fit the observations or the control.
-    """
-    hierarchy = build_hierarchy(spec, dimensions)
-    baselines(spec, dimensions)
-    return hierarchy
-
-
-def baselines(spec: Spec, dimensions: Dimensions) -> list[tuple[Spec, Hierarchy]]:
-    """The spec and the networks of each baseline that is trained beside.
-
-    :raises SpecError: a baseline's network does not fit the observations.
-    """
-    found = []
-    for number, baseline in enumerate(spec.compare_with):
-        try:
-            beside = baseline_spec(spec, baseline, dimensions)
-            found.append((beside, build_hierarchy(beside, dimensions)))
-        except SpecError as error:  # what it shares with the spec is in order: it is about its own network
-            problems = (problem.removeprefix("baseline.") for problem in error.problems)
-            raise SpecError(*(f"compare_with.{number}.{problem}" for problem in problems)) from error
-    return found
-
-
-def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
-    """The baselines trained beside, by name: their kind, numbered from the second of one kind on."""
-    names: dict[str, BaselineSpec] = {}
-    for baseline in spec.compare_with:
-        before = sum(other.kind == baseline.kind for other in names.values())
-        names[f"{baseline.kind}_{before + 1}" if before else baseline.kind] = baseline
-    return names
-
-
-def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) -> Spec:
-    """The spec of a baseline trained beside: the same but for the model.
-
-    :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
-    """
-    grid = spec.selection.model_copy(update={"grid": {}})  # it is about the hierarchy
-    alone = spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": (), "selection": grid})
-    if baseline.kind != "flat_equal":
-        return alone
-
-    def resized(hidden: tuple[int, ...]) -> Spec:
-        policy = baseline.policy.model_copy(update={"hidden": hidden})
-        return alone.model_copy(update={"baseline": baseline.model_copy(update={"policy": policy})})
-
-    build_hierarchy(alone, dimensions)  # what is wrong with it is said here
-    target = parameters(build_hierarchy(spec, dimensions))
-    return resized(nearest_widths(baseline.policy.hidden, target, lambda hidden: _counted(resized(hidden), dimensions)))
+from ddco_pyro.spec import Spec, SpecError
 
 
 def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
-    """The dimensions of what the spec names, without collecting anything: from its file, or else from its task.
+    """The dimensions of what the spec names, without collecting anything.
+
+    They are those of its file, of what its task's supervisor has recorded already, or else of the task.
 
     A task that does not say how long its episodes are counts as having one step.
 
     :param demos: the demonstrations, where they have been read; of a file no observation is read otherwise.
     """
-    if demos is None and in_file(spec):
-        demos = outline(spec)
+    if demos is None and (path := _there_already(spec)):
+        demos = outline(spec, path)
     if demos is not None:
         return Dimensions.of(demos)
     assert spec.demonstrated_task is not None  # or they would be in a file
@@ -250,13 +84,21 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
     return Demonstrations.read(path, [one.key for one in spec.observations], _labels(spec), own.exclude)
 
 
-def outline(spec: Spec) -> Demonstrations:
-    """The demonstrations in the spec's file with their controls and labels, but with zeros for observations, of which
+def _there_already(spec: Spec) -> Path | None:
+    """The spec's file, or that of the demonstrations that have been collected for it; None where there is none."""
+    own = spec.demonstrations
+    if in_file(spec):
+        return Path(str(own.path))
+    path = Path(own.path) if own.path else cache_path(find_task(name := str(spec.demonstrated_task)), name, own)
+    return path if path.exists() else None
+
+
+def outline(spec: Spec, path: Path) -> Demonstrations:
+    """The demonstrations in a file with their controls and labels, but with zeros for observations, of which
     headers alone are read.
 
     :raises DemonstrationsError: as :func:`demonstrations`, but for the values of observations.
     """
-    path = Path(str(spec.demonstrations.path))
     _refuse_what_cannot_be_read(spec, path)
     controls = Demonstrations.read(path, [], _labels(spec), spec.demonstrations.exclude)
     keys = [one.key for one in spec.observations]

@@ -19,21 +19,11 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import leftovers, only_one, write_text
 from ddco_pyro.data.tensors import write_tensors
 from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, ignore
+from ddco_pyro.fitting.building import Dimensions, baseline_spec, check_networks, named_baselines, parameters
 from ddco_pyro.fitting.fit import Fit, RunError, is_finished, load, model_name
 from ddco_pyro.fitting.metrics import evaluate, supervisor
-from ddco_pyro.fitting.prepare import (
-    Dimensions,
-    baseline_spec,
-    check_networks,
-    digest,
-    dimensions,
-    known_demonstrations,
-    named_baselines,
-    parameters,
-    parts,
-    seen,
-)
 from ddco_pyro.fitting.prepare import demonstrations as read_demonstrations
+from ddco_pyro.fitting.prepare import digest, dimensions, known_demonstrations, parts, seen
 from ddco_pyro.fitting.training import Trainer, TrainingError
 from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.model.encoding import refuse_unusable

@@ -24,9 +24,9 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.errors import Failed
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
+from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.clusters import Clusters
 from ddco_pyro.fitting.convergence import StageEnd, share, summary
-from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
 from ddco_pyro.model.encoding import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy

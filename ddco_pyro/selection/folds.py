@@ -12,7 +12,8 @@ from sklearn.model_selection import KFold
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.prepare import Dimensions, digest
+from ddco_pyro.fitting.building import Dimensions
+from ddco_pyro.fitting.prepare import digest
 from ddco_pyro.fitting.records import Record, read_record
 
 

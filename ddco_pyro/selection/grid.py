@@ -8,7 +8,7 @@ from itertools import product
 from typing import Any
 
 from ddco_pyro.data.control_parts import difference
-from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy, parameters
+from ddco_pyro.fitting.building import Dimensions, build_hierarchy, parameters
 from ddco_pyro.spec import Spec, SpecError, with_overrides
 from ddco_pyro.spec.messages import show
 

@@ -7,7 +7,7 @@ from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import ignore
-from ddco_pyro.fitting.prepare import Dimensions, build_hierarchy
+from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.training import Trainer
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.ahmm import choose

@@ -1,0 +1,183 @@
+"""The networks that a spec asks for, and those of its baselines, for observations and a control of known dimensions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import nn
+
+from ddco_pyro.data.control_dimensions import ControlDimension, all_constant, control_dimensions
+from ddco_pyro.data.control_parts import ControlPart, control_parts
+from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.fitting.widths import nearest_widths
+from ddco_pyro.model.encoding import Shapes
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import ShapeError
+from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code
+
+
+@dataclass(frozen=True)
+class Dimensions:
+    """Shapes of the observations by name, control dimensions A, and the longest demonstration where it is known.
+
+    :param constant: the control dimensions that are constant in all demonstrations, and their values: they are no part
+        of the model.
+    :param control: what each control dimension does in the demonstrations; empty where that is not known.
+    :param parts: how a fitted model has the control; None where that is still to be decided.
+    """
+
+    shapes: Shapes
+    control_size: int
+    steps: int
+    constant: Mapping[int, float] = field(default_factory=dict)
+    control: tuple[ControlDimension, ...] = field(default=(), compare=False)
+    parts: tuple[ControlPart, ...] | None = None
+
+    @classmethod
+    def of(cls, demonstrations: Demonstrations) -> Dimensions:
+        """The dimensions of these demonstrations.
+
+        :raises DemonstrationsError: every dimension of the control is constant.
+        """
+        control = control_dimensions(demo.actions for demo in demonstrations)
+        constant = {one.number: one.minimum for one in control if one.constant}
+        if len(constant) == len(control):
+            raise DemonstrationsError(all_constant(control))
+        shapes, size = demonstrations.observation_shapes, demonstrations.control_size
+        return cls(shapes, size, max(demonstrations.lengths), constant, control)
+
+
+def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
+    """The spec's networks for these dimensions, randomly initialised.
+
+    :raises SpecError: something in the spec does not fit the observations or the control.
+    """
+    missing = [one.key for one in spec.observations if one.key not in dimensions.shapes]
+    if missing:
+        known = ", ".join(sorted(dimensions.shapes))
+        raise SpecError(f"observations: there is no {', '.join(missing)} (there are: {known})")
+    drawn = spec.report.trajectory
+    shape = dimensions.shapes[drawn] if drawn else (3,)
+    if len(shape) != 1 or shape[0] < 3:
+        raise SpecError(
+            f"report.trajectory: {drawn!r} has shape {list(shape)} at each step; name a vector of three numbers or more"
+        )
+    scale = spec.control.scale
+    if isinstance(scale, tuple) and len(scale) != dimensions.control_size:
+        raise SpecError(
+            f"control.scale: has {len(scale)} numbers, but the control has {dimensions.control_size} dimensions"
+        )
+    _refuse_giants(spec, dimensions)
+    try:
+        return _hierarchy(spec, dimensions)
+    except ShapeError as error:
+        raise SpecError(str(error)) from error
+
+
+MOST_PARAMETERS = 50_000_000
+"""Of all networks together. Training holds each five times: itself, its gradient, Adam's moments, the best so far."""
+
+MOST_CHOICES = 10_000
+"""Joint choices of all levels, Π(1 + k): every step of a demonstration has so many entries in the inference."""
+
+
+def _refuse_giants(spec: Spec, dimensions: Dimensions) -> None:
+    """A typing error in a size is refused before it fills the memory: networks are made without their numbers first.
+
+    :raises SpecError: the model is larger than any that can be trained here.
+    """
+    choices = math.prod(1 + level.count for level in spec.hierarchy.levels) if spec.hierarchy else 1
+    if choices > MOST_CHOICES:
+        raise SpecError(
+            f"hierarchy.levels: the levels have {choices} joint choices, at most {MOST_CHOICES} can be summed over; "
+            "lower count"
+        )
+    if any(place.endswith(".network") for place in user_code(spec)):
+        return  # its sizes are its own affair
+    try:
+        number = _counted(spec, dimensions)
+    except ShapeError:
+        return  # it is said better where the networks are made
+    except (RuntimeError, MemoryError, TypeError):  # sizes that no tensor can have
+        said = "more parameters than a machine can count"
+    else:
+        if number <= MOST_PARAMETERS:
+            return
+        said = f"{number} parameters, more than {MOST_PARAMETERS}"
+    raise SpecError(f"the networks have {said}; lower count, hidden, filters or kernel, or scale the images down")
+
+
+def _counted(spec: Spec, dimensions: Dimensions) -> int:
+    """The number of parameters of the spec's networks, which are made without their numbers."""
+    with torch.device("meta"):
+        return parameters(_hierarchy(spec, dimensions))
+
+
+def _hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
+    parts = dimensions.parts
+    if parts is None and dimensions.control:
+        parts = control_parts(spec.control, dimensions.control)
+    size = dimensions.shapes, dimensions.control_size, dimensions.steps, dimensions.constant
+    return Hierarchy(spec, *size, parts)
+
+
+def parameters(network: nn.Module) -> int:
+    """The number of trained parameters."""
+    return sum(parameter.numel() for parameter in network.parameters())
+
+
+def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
+    """The spec's networks, after those of its baselines were made too.
+
+    :raises SpecError: something in the spec does not fit the observations or the control.
+    """
+    hierarchy = build_hierarchy(spec, dimensions)
+    baselines(spec, dimensions)
+    return hierarchy
+
+
+def baselines(spec: Spec, dimensions: Dimensions) -> list[tuple[Spec, Hierarchy]]:
+    """The spec and the networks of each baseline that is trained beside.
+
+    :raises SpecError: a baseline's network does not fit the observations.
+    """
+    found = []
+    for number, baseline in enumerate(spec.compare_with):
+        try:
+            beside = baseline_spec(spec, baseline, dimensions)
+            found.append((beside, build_hierarchy(beside, dimensions)))
+        except SpecError as error:  # what it shares with the spec is in order: it is about its own network
+            problems = (problem.removeprefix("baseline.") for problem in error.problems)
+            raise SpecError(*(f"compare_with.{number}.{problem}" for problem in problems)) from error
+    return found
+
+
+def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
+    """The baselines trained beside, by name: their kind, numbered from the second of one kind on."""
+    names: dict[str, BaselineSpec] = {}
+    for baseline in spec.compare_with:
+        before = sum(other.kind == baseline.kind for other in names.values())
+        names[f"{baseline.kind}_{before + 1}" if before else baseline.kind] = baseline
+    return names
+
+
+def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) -> Spec:
+    """The spec of a baseline trained beside: the same but for the model.
+
+    :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
+    """
+    grid = spec.selection.model_copy(update={"grid": {}})  # it is about the hierarchy
+    alone = spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": (), "selection": grid})
+    if baseline.kind != "flat_equal":
+        return alone
+
+    def resized(hidden: tuple[int, ...]) -> Spec:
+        policy = baseline.policy.model_copy(update={"hidden": hidden})
+        return alone.model_copy(update={"baseline": baseline.model_copy(update={"policy": policy})})
+
+    build_hierarchy(alone, dimensions)  # what is wrong with it is said here
+    target = parameters(build_hierarchy(spec, dimensions))
+    return resized(nearest_widths(baseline.policy.hidden, target, lambda hidden: _counted(resized(hidden), dimensions)))
