@@ -122,8 +122,10 @@ def test_demonstrations_that_are_left_out_do_not_count(path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file["data/demo_1/actions"][:, 1] = 7
     found, rest = inspect(path), inspect(path, exclude=["demo_1"])
-    assert found.notes == ["control dimension 1: takes two values, 0.5 and 7"]
-    assert rest.notes == ["control dimension 1: constant (0.5): no part of the model, emitted as it is"]
+    assert found.notes[0] == "control dimension 1: takes two values, 0.5 and 7"
+    assert rest.notes[0] == "control dimension 1: constant (0.5): no part of the model, emitted as it is"
+    assert found.notes[-1] == "control dimension 1: binary (takes two values, 0.5 and 7), by control.kind: auto"
+    assert not any("dimension 1: binary" in note for note in rest.notes)
     assert list(rest.lengths) == ["demo_0", "demo_2", "demo_3", "demo_4"]
     assert rest.masks == {"valid": (), "20_percent": ("demo_0",)}
 

@@ -30,14 +30,15 @@ from ddco_pyro.spec import Spec, SpecError
 def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
     """The dimensions of what the spec names, without collecting anything.
 
-    They are those of its file, of what its task's supervisor has recorded already, or else of the task.
+    They are those of its file, or else of its task; of the control then what is known of demonstrations that have been
+    collected already.
 
     A task that does not say how long its episodes are counts as having one step.
 
     :param demos: the demonstrations, where they have been read; of a file no observation is read otherwise.
     """
-    if demos is None and (path := _there_already(spec)):
-        demos = outline(spec, path)
+    if demos is None and in_file(spec):
+        demos = outline(spec)
     if demos is not None:
         return Dimensions.of(demos)
     assert spec.demonstrated_task is not None  # or they would be in a file
@@ -45,9 +46,15 @@ def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
     environment = task.load(spec.demonstrations.seed)
     try:
         shapes = {name: tuple(one.shape) for name, one in environment.observation_spec().items()}
-        return Dimensions(shapes, environment.action_spec().shape[0], task.steps)
+        size = Dimensions(shapes, environment.action_spec().shape[0], task.steps)
     finally:
         environment.close()
+    own = spec.demonstrations
+    collected = Path(own.path) if own.path else cache_path(task, spec.demonstrated_task, own)
+    if not collected.exists():
+        return size
+    known = Dimensions.of(Demonstrations.read(collected, [], exclude=own.exclude))
+    return replace(size, constant=known.constant, control=known.control)
 
 
 def parts(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
@@ -84,21 +91,13 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
     return Demonstrations.read(path, [one.key for one in spec.observations], _labels(spec), own.exclude)
 
 
-def _there_already(spec: Spec) -> Path | None:
-    """The spec's file, or that of the demonstrations that have been collected for it; None where there is none."""
-    own = spec.demonstrations
-    if in_file(spec):
-        return Path(str(own.path))
-    path = Path(own.path) if own.path else cache_path(find_task(name := str(spec.demonstrated_task)), name, own)
-    return path if path.exists() else None
-
-
-def outline(spec: Spec, path: Path) -> Demonstrations:
-    """The demonstrations in a file with their controls and labels, but with zeros for observations, of which
+def outline(spec: Spec) -> Demonstrations:
+    """The demonstrations in the spec's file with their controls and labels, but with zeros for observations, of which
     headers alone are read.
 
     :raises DemonstrationsError: as :func:`demonstrations`, but for the values of observations.
     """
+    path = Path(str(spec.demonstrations.path))
     _refuse_what_cannot_be_read(spec, path)
     controls = Demonstrations.read(path, [], _labels(spec), spec.demonstrations.exclude)
     keys = [one.key for one in spec.observations]

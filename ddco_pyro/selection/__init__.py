@@ -60,7 +60,7 @@ def check(spec: Spec, workers: Workers = HERE, demos: Demonstrations | None = No
     :raises BackendError: the workers cannot be reached.
     """
     wide, own = grid.wide(spec), spec.demonstrations
-    demos = prepare.outline(wide, Path(str(own.path))) if demos is None and prepare.in_file(wide) else demos
+    demos = prepare.outline(wide) if demos is None and prepare.in_file(wide) else demos
     found = grid.candidates(spec, prepare.dimensions(wide, demos))
     if demos is None:  # they will be collected
         dividing.assign(own.count - len(set(own.exclude)), spec.selection.folds, spec.seed)
