@@ -58,6 +58,30 @@ def test_stages_go_from_the_lowest_level_up(training, depth, names):
     assert [stage.name for stage in plan(make_spec(**training), depth)] == names
 
 
+def test_learning_rates_warm_up_and_fall_along_half_a_cosine(tmp_path, monkeypatch):
+    """The rate of every gradient step against torch's own cosine schedule, stage by stage."""
+    used = []
+
+    class Adam(torch.optim.Adam):
+        def step(self, closure=None):
+            used.append(self.param_groups[0]["lr"])
+            return super().step(closure)
+
+    monkeypatch.setattr(torch.optim, "Adam", Adam)
+    optimizer = {"lr": 0.01, "schedule": "cosine", "warmup": 2}
+    trainer = make_trainer(make_spec(epochs=40, patience=None, optimizer=optimizer), random_demonstrations(), tmp_path)
+    trainer.run()
+    parameter, expected = torch.nn.Parameter(torch.zeros(1)), []
+    for epochs in epochs_of(trainer).values():
+        reference = torch.optim.SGD([parameter], lr=0.01)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(reference, epochs)
+        for epoch in range(epochs):
+            expected.append(schedule.get_last_lr()[0] * min(1, (epoch + 1) / 3))
+            reference.step()
+            schedule.step()
+    np.testing.assert_allclose(used, expected, rtol=1e-9)
+
+
 def epochs_of(trainer, restart=0):
     """The number of epochs of each stage that made some."""
     return Counter(row["stage"] for row in trainer.progress.history if row["restart"] == restart)

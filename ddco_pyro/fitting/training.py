@@ -180,6 +180,8 @@ class Trainer:
             now.best = now.start
             self._saved["best"] = _copy(model)
         while (cap is None or now.epoch < cap) and (training.patience is None or now.stale < training.patience):
+            for group in optimizer.param_groups:
+                group["lr"] = learning_rate(training.optimizer, now.epoch, cap)
             train = self._epoch(model, optimizer, parameters, objective)
             self._record(stage, train, objective.tune(model), model)
             if time.monotonic() - self._saved_at > SAVE_EVERY:
@@ -301,6 +303,18 @@ class _Objective:
             f"stage {self.stage.name}, epoch {self.trainer.progress.epoch + 1}: the log-likelihood of {where} is not "
             "finite; look at these demonstrations, raise control.std, or lower training.optimizer.lr"
         )
+
+
+def learning_rate(spec: OptimizerSpec, epoch: int, cap: int | None) -> float:
+    """The learning rate of a stage's epoch, counted from 0.
+
+    :param cap: the epochs that the stage may take.
+    """
+    rate = spec.lr * min(1.0, (epoch + 1) / (spec.warmup + 1))
+    if spec.schedule == "constant":
+        return rate
+    assert cap is not None  # a spec with this schedule has a budget
+    return rate * 0.5 * (1 + math.cos(math.pi * epoch / cap))
 
 
 def _optimizer(spec: OptimizerSpec, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:

@@ -134,6 +134,11 @@ class OptimizerSpec(Model):
     """``adam``, or ``momentum`` for gradient descent with momentum."""
     lr: Positive = 1e-3
     """Learning rate."""
+    schedule: Literal["constant", "cosine"] = "constant"
+    """``cosine``: in each stage the learning rate falls to 0 at the last epoch that its budget allows, along half a
+    cosine; it needs ``training.epochs``."""
+    warmup: int = Field(default=0, ge=0)
+    """Epochs at the beginning of each stage over which the learning rate rises to its value."""
     momentum: Share = 0.9
     """Momentum (``momentum`` only)."""
     weight_decay: float = Field(default=0.0, ge=0)
@@ -171,6 +176,8 @@ class TrainingSpec(Model):
     def _ends(self) -> TrainingSpec:
         if self.epochs is None and self.patience is None:
             raise invalid(("epochs", "null trains until training.patience, which is null too; give one of them"))
+        if self.epochs is None and self.optimizer.schedule == "cosine":
+            raise invalid(("optimizer.schedule", "cosine falls to 0 at the end of training.epochs, which is null"))
         return self
 
 
