@@ -40,8 +40,10 @@ def log_termination(logits: Tensor) -> Tensor:
 
 def weighted_squares(mean: Tensor, weight: Tensor, actions: Tensor) -> Tensor:
     """Σ_d w_d (a_d - μ_d)², [..., K], of means [..., K, A], weights [A] or [K, A] and actions [..., A]."""
-    batch = torch.broadcast_shapes(mean.shape[:-2], actions.shape[:-1])
-    return _linked(_SQUARES, mean.expand(*batch, -1, -1), weight, actions.expand(*batch, -1).to(mean.dtype))
+    actions = actions.to(mean.dtype)
+    if actions.shape[:-1] != mean.shape[:-2]:
+        return _squares_formula(mean, weight, actions)
+    return _linked(_SQUARES, mean, weight, actions)
 
 
 def bounded(logits: Tensor) -> Tensor:
@@ -50,8 +52,10 @@ def bounded(logits: Tensor) -> Tensor:
 
 
 class Link(NamedTuple):
-    """A function of tensors: ``formula`` in torch, ``forward`` to the value and what is kept of it, and ``backward`` from
-    the gradient, what was kept and the inputs to the gradients of the first inputs; the others' are left to the formula.
+    """A function of tensors, in torch (``formula``) and compiled.
+
+    ``forward`` gives the value and what else ``backward`` needs; that takes what is wanted, the gradient of the value,
+    the inputs and what ``forward`` gave, and returns the gradients of the first ``differentiable`` inputs.
     """
 
     formula: Callable[..., Tensor]
@@ -219,9 +223,8 @@ def _weight_gradient(upstream: Array, mean: Array, weight: Array, actions: Array
 
 def _rows(table: Tensor, columns: int) -> Array:
     """A table as an array, its dimensions before the last ``columns`` as one."""
-    flat = table.detach().contiguous()
-    found: Array = flat.reshape(-1, *flat.shape[flat.dim() - columns :]).numpy()
-    return found
+    array = np.ascontiguousarray(table.detach().numpy())
+    return array.reshape(-1, *array.shape[array.ndim - columns :])
 
 
 def _selection_formula(logits: Tensor, control: Tensor) -> Tensor:
