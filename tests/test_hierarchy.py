@@ -12,8 +12,8 @@ from torch.distributions import Normal
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.links import TERMINATION_BOUND
 from ddco_pyro.model.networks import Inputs
-from ddco_pyro.model.outputs import TERMINATION_BOUND
 from ddco_pyro.spec import parse_spec
 
 

@@ -26,7 +26,7 @@ from ddco_pyro.export.weights import weights_and_networks
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.encoding import ObservationEncoder
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.outputs import TERMINATION_BOUND
+from ddco_pyro.model.links import TERMINATION_BOUND
 from ddco_pyro.spec import RolloutSpec
 
 __all__ = ["TOLERANCE", "Exported", "export"]

@@ -11,12 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.inference import logspace
-from ddco_pyro.inference.kernel import forward_backward
+from ddco_pyro.inference import kernel, logspace, one_level
+from ddco_pyro.inference.kernel import subtract_largest
 from ddco_pyro.inference.once import once
 from ddco_pyro.inference.structure import Structure, structure_of
 from ddco_pyro.inference.threads import as_many_threads_as_torch
@@ -25,9 +24,9 @@ from ddco_pyro.model.tables import Tables, complete
 
 @dataclass(frozen=True)
 class Elimination:
-    """What one pass finds, float64; every table of posteriors has the shape of the table it belongs to.
+    """What one pass finds; every table of posteriors has the shape of the table it belongs to.
 
-    :param value: log p(ξ), [N].
+    :param value: log p(ξ), [N] float64.
     :param tables: posterior probabilities of the tables' entries (evidence left out).
     :param marginals: p(h^d_t = h | ξ) of each level, [N, T, C_d]; empty where they were not asked for.
     """
@@ -56,7 +55,7 @@ class _Eliminate(torch.autograd.Function):
     def forward(ctx: Any, lengths: Tensor, depth: int, *leaves: Tensor | None) -> Tensor:
         tables = Tables.of(depth, leaves)
         ctx.evidence = ctx.needs_input_grad[3 + 3 * depth :]
-        found = eliminate(tables, lengths, marginals=any(ctx.evidence))
+        found = eliminate(tables, lengths, any(ctx.evidence), tables.control[0].dtype)
         posteriors = *found.tables.leaves(), *found.marginals
         ctx.posteriors = len(posteriors)
         ctx.save_for_backward(*posteriors, *leaves)
@@ -65,29 +64,27 @@ class _Eliminate(torch.autograd.Function):
     @staticmethod
     @once
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        gradients = [
-            upstream.reshape(-1, *(1,) * (table.dim() - 1)) * table for table in ctx.saved_tensors[: ctx.posteriors]
-        ]
+        posteriors = ctx.saved_tensors[: ctx.posteriors]
+        weight = upstream.to(posteriors[0].dtype)
+        gradients = [weight.reshape(-1, *(1,) * (table.dim() - 1)) * table for table in posteriors]
         networks = len(ctx.needs_input_grad) - 2 - len(ctx.evidence)
         evidence = gradients[networks:] or [None] * len(ctx.evidence)
         return None, None, *gradients[:networks], *evidence
 
 
-def eliminate(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elimination:
-    """Log-likelihoods and posteriors of tables on the CPU with at least one option level."""
-    control = torch.cat([table.detach() for table in tables.control], dim=-1).double()
-    shift = control.amax(-1, keepdim=True)
-    shift = torch.where(torch.isfinite(shift), shift, 0.0)
-    rows = _rows(tables.selection), _rows(tables.termination), (control - shift).exp_()
-    value, exact, results, choices = run(structure_of(tables), rows, _weight(tables), lengths, marginals)
-    alive = torch.arange(control.shape[1]) < lengths[:, None]
+def eliminate(
+    tables: Tables, lengths: Tensor, marginals: bool = False, dtype: torch.dtype = torch.float64
+) -> Elimination:
+    """Log-likelihoods and posteriors, of this ``dtype``, of tables on the CPU with at least one option level."""
+    densities = _rows(tables.control)
+    shift = densities.new_empty(len(lengths))
+    subtract_largest(densities.numpy(), lengths.numpy(), shift.numpy())
+    rows = _rows(tables.selection).exp_(), _rows(tables.termination).exp_(), densities.exp_()
+    value, exact, results, choices = run(structure_of(tables), rows, _weight(tables), lengths, marginals, dtype)
+    groups = zip(results, (tables.selection, tables.termination, tables.control), strict=True)
     found = Elimination(
-        value + (shift.squeeze(-1) * alive).sum(1),
-        Tables(
-            _unrows(results[0], tables.selection),
-            _unrows(results[1], tables.termination),
-            _unrows(results[2], tables.control),
-        ),
+        value.add_(shift),
+        Tables(*(_unrows(*group) for group in groups)),
         choices.split([table.shape[-1] for table in tables.selection], dim=-1) if marginals else (),
     )
     for n in torch.nonzero(~exact).flatten():
@@ -102,33 +99,39 @@ tables side by side, as :class:`ddco_pyro.inference.structure.Structure` orders 
 
 
 def run(
-    structure: Structure, rows: Rows, weight: Tensor, lengths: Tensor, marginals: bool = False
+    structure: Structure,
+    rows: Rows,
+    weight: Tensor,
+    lengths: Tensor,
+    marginals: bool = False,
+    dtype: torch.dtype = torch.float64,
 ) -> tuple[Tensor, Tensor, Rows, Tensor]:
     """The compiled pass: log-likelihoods [N], whether they are exact [N], posteriors of the rows, choices' marginals.
 
     :param weight: factors of the joint choices, float64 [N, T, S], or [N, T, 0] where there are none.
     """
-    select, end, emission = rows
-    results = torch.empty_like(select), torch.empty_like(end), torch.empty_like(emission)
+    select, end, emission = (torch.empty_like(table, dtype=dtype) for table in rows)
     number, steps = emission.shape[:2]
-    choices = emission.new_empty(number, steps, sum(structure.sizes) if marginals else 0)
-    value, exact = emission.new_empty(number), torch.empty(number, dtype=torch.bool)
+    choices = torch.empty(number, steps, sum(structure.sizes) if marginals else 0, dtype=dtype)
+    value, exact = torch.empty(number, dtype=torch.float64), torch.empty(number, dtype=torch.bool)
+    arrays = [table.numpy() for table in (*rows, weight, lengths, value, exact, select, end, emission, choices)]
     with as_many_threads_as_torch():
-        forward_backward(  # type: ignore[call-arg]
-            *_arrays(*rows, weight, lengths, value, exact, *results, choices),  # type: ignore[arg-type]
-            structure.sizes, structure.starts, structure.selects, structure.ends, structure.actors, structure.choices,
-        )  # fmt: skip
-    return value, exact, results, choices
-
-
-def _arrays(*tables: Tensor) -> list[np.ndarray]:
-    return [table.numpy() for table in tables]
+        if len(structure.sizes) == 1:
+            one_level.forward_backward(*arrays)  # type: ignore[call-arg]
+        else:
+            kernel.forward_backward(  # type: ignore[call-arg]
+                *arrays,  # type: ignore[arg-type]
+                structure.sizes, structure.starts, structure.selects, structure.ends, structure.actors,
+                structure.choices,
+            )  # fmt: skip
+    return value, exact, (select, end, emission), choices
 
 
 def _rows(tables: Sequence[Tensor]) -> Tensor:
-    """exp of each level's table, flattened and side by side, [N, T, ...]."""
+    """Each level's table, flattened and side by side, a float64 copy [N, T, ...]."""
     flat = [table.detach().flatten(2) for table in tables]
-    return torch.cat(flat, dim=-1).to(torch.float64, copy=True).exp_()
+    rows = flat[0] if len(flat) == 1 else torch.cat(flat, dim=-1)
+    return rows.to(torch.float64, copy=True, memory_format=torch.contiguous_format)
 
 
 def _unrows(rows: Tensor, tables: Sequence[Tensor]) -> tuple[Tensor, ...]:

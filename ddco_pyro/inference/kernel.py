@@ -21,7 +21,7 @@ Choices = tuple[int, ...]
 TOLERANCE = 1e-9
 """Of Σ_s α_t(s) β_t(s), which rounding changes by less than 1e-12 over 10 000 steps."""
 
-jit = numba.njit(cache=True, forceinline=True, error_model="numpy")
+jit = numba.njit(cache=True, error_model="numpy")
 
 
 @jit
@@ -295,6 +295,22 @@ def _backward(
     for adjoint in back:  # at t = 0 nothing else would tell that it has overflowed
         exact &= np.isfinite(adjoint)
     return exact
+
+
+@jit
+def subtract_largest(rows: Array, lengths: Array, shift: Array) -> None:
+    """Subtract from each step's log-densities the largest, if it is finite; ``shift`` [N] is what they sum to."""
+    for n in range(len(rows)):
+        shift[n] = 0.0
+        for t in range(rows.shape[1]):
+            top = rows[n, t, 0]
+            for j in range(1, rows.shape[2]):
+                top = max(top, rows[n, t, j])
+            if np.isfinite(top):
+                for j in range(rows.shape[2]):
+                    rows[n, t, j] -= top
+                if t < lengths[n]:
+                    shift[n] += top
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

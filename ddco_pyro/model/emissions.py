@@ -18,6 +18,7 @@ from torch.distributions import constraints
 from torch.nn.functional import logsigmoid, one_hot, pad
 from torch.special import ndtr
 
+from ddco_pyro.model.links import weighted_squares
 from ddco_pyro.model.tables import NEVER
 
 LOG_2PI = math.log(2 * math.pi)
@@ -118,11 +119,9 @@ class Gaussian(Kind):
 
     def log_density(self, actions: Tensor) -> Tensor:
         """log N(a; μ, σ²), [..., K]."""
-        error, precision = actions.unsqueeze(-2) - self.mean, (-0.5 / self.std.square()).to(self.mean.dtype)
         constant = self.std.log().sum(-1) + 0.5 * LOG_2PI * self.std.shape[-1] + self.log_scale.sum(-1)
-        if precision.dim() == 1:
-            return error.square() @ precision - constant
-        return (error.square() * precision).sum(-1) - constant.to(self.mean.dtype)
+        weight = (-0.5 / self.std.square()).to(self.mean.dtype)
+        return weighted_squares(self.mean, weight, actions) - constant.to(self.mean.dtype)
 
     @property
     def mode(self) -> Tensor:

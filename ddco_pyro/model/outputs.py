@@ -7,13 +7,11 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import logsigmoid, pad
+from torch.nn.functional import pad
 
 from ddco_pyro.model.emissions import Emission
+from ddco_pyro.model.links import log_selection, log_termination
 from ddco_pyro.model.tables import NEVER, Tables
-
-TERMINATION_BOUND = 12.0
-"""Termination logits lie within ±12 (ψ between 6e-6 and 1 - 6e-6), so no path's probability is ever exactly 0."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class CallerOutputs:
         if not self.options:
             return None
         if self.logits is not None:
-            return pad(self.logits.log_softmax(-1), (1 + self.options - self.logits.shape[-1], 0), value=NEVER)
+            return log_selection(self.logits, 1 + self.options - self.logits.shape[-1])
         assert self.emission is not None  # a caller emits something
         return pad(torch.zeros(*self.emission.shape[:-1], 1), (0, self.options), value=NEVER)
 
@@ -67,8 +65,7 @@ class Outputs:
     @property
     def termination(self) -> tuple[Tensor, ...]:
         """(log(1 - ψ), log ψ) of each level, [N, T, k, 2]."""
-        logits = (bounded(logit) for logit in self.termination_logits)
-        return tuple(torch.stack([logsigmoid(-logit), logsigmoid(logit)], dim=-1) for logit in logits)
+        return tuple(log_termination(logit) for logit in self.termination_logits)
 
     def tables(self, actions: Tensor | None = None) -> Tables:
         """The tables for controls [N, T, A] in scaled units; without them, of selections and terminations alone."""
@@ -93,8 +90,3 @@ class Outputs:
             for caller in self.callers
         )
         return Outputs(tuple(callers), tuple(change(logit) for logit in self.termination_logits))
-
-
-def bounded(logit: Tensor) -> Tensor:
-    """Termination logits within ±``TERMINATION_BOUND``, by a scaled tanh."""
-    return TERMINATION_BOUND * torch.tanh(logit / TERMINATION_BOUND)
