@@ -11,6 +11,7 @@ from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.training import Trainer
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.ahmm import choose
+from ddco_pyro.model.emissions import Acting
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import complete
@@ -53,13 +54,14 @@ def plant(truth, number, steps, seed):
             outputs = truth(Inputs(state[:, None], {}, torch.tensor([t])))
             chain = complete(outputs.tables(), torch.ones(number, dtype=torch.long))
             previous = choose(t, chain.steps()[0], previous)
-            lowest = outputs.emissions[0]
-            mean = lowest.mean[torch.arange(number), 0, previous[0] - 1]
-        action = torch.normal(mean, lowest.std.expand_as(mean), generator=generator)
+            steps = (emission and emission.steps()[0] for emission in outputs.emissions)
+            acting = Acting(tuple(steps), previous)
+            action = acting.draw(torch.randn(number, *acting.event_shape, generator=generator))
         states.append(state)
+        action = truth.scaling.emitted(action)
         actions.append(action)
         choices.append(torch.stack(previous, -1))
-        state = (state + action).clamp(-1, 1)
+        state = (state + action[:, :2].float()).clamp(-1, 1)
     arrays = [torch.stack(part, 1).double().numpy() for part in (states, actions)]
     demos = Demonstrations(
         tuple(Demonstration(f"demo_{n}", {"state": arrays[0][n]}, arrays[1][n]) for n in range(number))
@@ -74,16 +76,21 @@ def preferences(callers, options):
     return torch.where(offset < 2, 4.0, -4.0).unsqueeze(1)
 
 
-def make_truth(spec, ending=-1.7):
-    """Options that each head for a corner of their own; callers that each select among some of the options below."""
-    truth = build_hierarchy(spec, Dimensions({"state": (2,)}, 2, 1))
+def make_truth(spec, ending=-1.7, parts=None):
+    """Options that each head for a corner of their own; callers that each select among some of the options below.
+
+    :param parts: how the control is modelled, if not as two Gaussian dimensions; further ones are 0.
+    """
+    size = 2 if parts is None else sum(len(part.dims) for part in parts)
+    truth = build_hierarchy(spec, Dimensions({"state": (2,)}, size, 1, parts=parts))
     truth.encoder.requires_grad_(False)
     corners = torch.tensor([[0.8, 0.8], [-0.8, 0.8], [-0.8, -0.8], [0.8, -0.8]])
     with torch.no_grad():
         for number, level in enumerate(truth.levels):
             if number == 0:
-                level.policy.network.layers[0].weight[:] = -0.35 * torch.eye(2)
-                level.policy.network.layers[0].bias[:] = 0.35 * corners[: level.count, None]
+                level.policy.network.layers[0].weight[:] = -0.35 * torch.eye(2, size)
+                level.policy.network.layers[0].bias[..., :2] = 0.35 * corners[: level.count, None]
+                level.policy.network.layers[0].bias[..., 2:] = 0.0
             else:
                 level.policy.network.layers[0].weight.zero_()
                 level.policy.network.layers[0].bias[:] = preferences(level.count, truth.levels[number - 1].count)
