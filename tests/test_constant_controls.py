@@ -257,12 +257,17 @@ def test_every_command_says_the_same(whole: Fit, folder: Path, tmp_path: Path) -
         3: "constant (-7): no part of the model, emitted as it is",
     }
     lines = [f"control dimension {number}: {note}" for number, note in notes.items()]
+    kinds = [
+        "control dimension 0: gaussian (varies freely)",
+        "control dimension 2: binary (takes two values, -1 and 1)",
+    ]
     assert call("init", demos, "--out", spec).status == 0
     written = [line.strip("# ") for line in spec.read_text().splitlines() if "control dimension" in line]
-    assert written == lines
-    for command in (["inspect", demos], ["check", spec]):
+    decided = [f"{kind}, by control.kind: auto" for kind in kinds]
+    assert written == [*lines, *decided]
+    for command, told in ((["inspect", demos], decided), (["check", spec], kinds)):
         said = [line for line in call(*command).out.splitlines() if line.startswith("control dimension")]
-        assert said == lines
+        assert said == [*lines, *told]
     assert call("report", whole.folder).status == 0
     page = (whole.folder / "report.html").read_text()
     assert all(note in page for note in notes.values())

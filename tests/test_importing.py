@@ -258,10 +258,11 @@ def test_minari(written_by_minari, out: Path) -> None:
         assert inspect(other).format == "minari"
 
 
-def test_minari_with_actions_that_are_no_numbers_is_refused(written_by_minari, out: Path) -> None:
-    folder, _ = written_by_minari(spaces.Discrete(3))
-    with pytest.raises(DemonstrationsError, match="demo_0: actions are int64, they have to be one array of reals"):
-        import_demonstrations(folder, out)
+def test_minari_with_discrete_actions(written_by_minari, out: Path) -> None:
+    folder, buffers = written_by_minari(spaces.Discrete(3))
+    import_demonstrations(folder, out)
+    for buffer, demo in zip(buffers, Demonstrations.read(out), strict=True):
+        np.testing.assert_array_equal(demo.actions[:, 0], buffer.actions)
 
 
 def test_minaris_environment_is_never_made(written_by_minari, out: Path) -> None:

@@ -48,7 +48,9 @@ class Minari:
         actions, steps = episode["actions"], len(episode["rewards"])
         if not isinstance(actions, np.ndarray) or actions.dtype.kind not in "fiu":
             what = actions.dtype if isinstance(actions, np.ndarray) else "several arrays"
-            raise DemonstrationsError(f"{self.folder}: {name}: actions are {what}, they have to be one array of reals")
+            raise DemonstrationsError(
+                f"{self.folder}: {name}: actions are {what}, they have to be one array of numbers"
+            )
         observations = {key: of_array(one[:steps]) for key, one in _leaves(episode["observations"], "")}
         seed = facts.get("seed")
         known: dict[str, Attribute] = {"episode_index": index}
