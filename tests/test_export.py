@@ -22,26 +22,27 @@ from ddco_pyro.spec import parse_spec
 SHAPES = {"state": (3,), "goal": (2, 2), "camera": (9, 12, 3)}
 
 
-def make(network="mlp", counts=(3,), emits=("options",), camera=False, steps=7, **rollout):
+def make(network="mlp", counts=(3,), emits=("options",), camera=False, steps=7, endings=None, built_in=(), **rollout):
     """A run that was never fitted: random weights, observations with a mean and a spread."""
+    policy = network if isinstance(network, dict) else {"network": network}
     levels = [
-        {"name": f"level-{d}", "count": k, "policy": {"network": network} | ({"emits": list(emits)} if d else {})}
+        {"name": f"level-{d}", "count": k, "policy": policy | ({"emits": list(emits)} if d else {})}
         for d, k in enumerate(counts)
     ]
-    endings = {"network": network if network in ("conv", "per_timestep") else "linear"}
+    endings = endings or {"network": network if network in ("conv", "per_timestep") else "linear"}
     model = {
         "hierarchy": {
             "levels": [level | {"termination": endings} for level in levels],
-            "meta_policy": {"network": network, "emits": list(emits)},
+            "meta_policy": policy | {"emits": list(emits)},
         }
     }
     spec = parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5"},
-            "observations": [{"key": "state", "differences": True}, "goal", *(["camera"] if camera else [])],
+            "observations": [{"key": "state", "differences": True}, "goal", *built_in, *(["camera"] if camera else [])],
             "control": {"std": {"learn": True}},
             "rollout": rollout,
-            **(model if counts else {"baseline": {"kind": "flat", "policy": {"network": network}}}),
+            **(model if counts else {"baseline": {"kind": "flat", "policy": policy}}),
         }
     )
     torch.manual_seed(1)
@@ -54,6 +55,12 @@ def make(network="mlp", counts=(3,), emits=("options",), camera=False, steps=7, 
     return Fit(spec, hierarchy.eval())
 
 
+CONVOLUTIONS = {
+    "network": "conv",
+    "inputs": ["camera", "state"],
+    "layers": [{"filters": 3, "kernel": 4, "stride": 2, "padding": 1}, {"filters": 2, "kernel": 3}],
+    "pool": "spatial_softmax",
+}
 FITS = {
     "linear": make("linear", options="most_likely"),
     "mlp": make("mlp", control="sample"),
@@ -61,7 +68,10 @@ FITS = {
     "conv": make("conv", camera=True),
     "hybrid": make("mlp", (2, 3), ("options", "control"), control="sample"),
     "three levels": make("mlp", (2, 3, 2), ("options", "control")),
-    "flat": make("mlp", ()),
+    "flat": make("mlp", (), built_in=("step",)),
+    "several convolutions": make(
+        CONVOLUTIONS, camera=True, endings={"network": "linear", "inputs": ["step", "goal"]}, built_in=("step",)
+    ),
 }
 
 

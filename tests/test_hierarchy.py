@@ -21,7 +21,9 @@ from ddco_pyro.spec import parse_spec
 def test_gradient_is_the_papers_gradient_equation(emits):
     """∇L of §4.1 (and its hybrid terms, §4.2) with u, v, w summed over every path, against autograd."""
     hierarchy, batch = make_hierarchy((3,), emits).double(), make_batch()
-    batch = Batch(Inputs(batch.inputs.vector.double(), {}, batch.inputs.time), batch.actions.double(), batch.lengths)
+    batch = Batch(
+        Inputs({"state": batch.inputs.vector.double()}, {}, batch.inputs.time), batch.actions.double(), batch.lengths
+    )
     parameters = list(hierarchy.parameters())
     found = torch.autograd.grad(
         total_log_likelihood(hierarchy.tabulate(batch), batch.lengths), parameters, retain_graph=True

@@ -74,6 +74,15 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"hierarchy.meta_policy": {"network": "mlp", "options": {"a": 1}}},
         "hierarchy.meta_policy.options: does not apply to network 'mlp'; leave it out",
     ),
+    ({"observations": ["step"]}, "observations: step alone says nothing of the state; name an observation beside it"),
+    (
+        {"observations": ["state", {"key": "step", "differences": True}]},
+        "observations.1.differences: step grows by the same at each step; leave it out",
+    ),
+    (
+        {"hierarchy.meta_policy": {"network": "conv", "kernel": 3, "layers": [{"filters": 2, "kernel": 3}]}},
+        "hierarchy.meta_policy.kernel: stands beside layers, which say it of each; leave it out",
+    ),
     ({"hierarchy.meta_policy.hidden": [8, 0]}, "hierarchy.meta_policy.hidden.1: must be at least 1, got 0"),
     ({"hierarchy.meta_policy.dropout": 1}, "hierarchy.meta_policy.dropout: must be less than 1, got 1"),
     ({"hierarchy": None}, "hierarchy: missing; declare a hierarchy, or a baseline in its place"),

@@ -27,7 +27,7 @@ from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.encoding import ObservationEncoder
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import TERMINATION_BOUND
-from ddco_pyro.spec import RolloutSpec
+from ddco_pyro.spec import STEP, RolloutSpec
 
 __all__ = ["TOLERANCE", "Exported", "export"]
 
@@ -128,8 +128,10 @@ def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
                 "image": key in encoder.images,
                 "differences": key in vectors and vectors[key].differences,
             }
-            for key, shape in [*((key, encoder.shapes[key]) for key in vectors), *encoder.images.items()]
+            for key, shape in [*((key, encoder.shapes.get(key, (1,))) for key in vectors), *encoder.images.items()]
         ],
+        "step": {"key": STEP, "longest": float(encoder.longest)} if STEP in vectors else None,
+        "features": dict(zip(encoder.keys, encoder.sizes, strict=True)),
         "levels": [level.count for level in hierarchy.option_levels()],
         "varying": scaling.varying.tolist(),
         "scale": scale.tolist(),
@@ -226,6 +228,9 @@ def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generato
     found: dict[str, np.ndarray] = {}
     at = 0
     for spec, size in zip(encoder.specs, encoder.sizes, strict=True):
+        if spec.key == STEP:
+            at += size
+            continue
         shape = encoder.shapes[spec.key]
         mean, std = (one[at : at + size].numpy() for one in (encoder.mean, encoder.std))
         length = int(np.prod(shape))

@@ -17,23 +17,18 @@ class StepProgram(nn.Module):
     callers of level d (the last is the meta-policy), and ``termination_d`` ψ [k].
     """
 
-    mean: Tensor
-    std: Tensor
-
     def __init__(self, hierarchy: Hierarchy) -> None:
         super().__init__()
         self.hierarchy = hierarchy
-        self.register_buffer("mean", hierarchy.encoder.mean)
-        self.register_buffer("std", hierarchy.encoder.std)
         self.keys = list(hierarchy.encoder.images)
         with torch.no_grad():
             self.names = list(self.outputs(*example(hierarchy.encoder)))
 
     def outputs(self, features: Tensor, step: Tensor, *images: Tensor) -> dict[str, Tensor]:
         """The outputs by name."""
-        vector = ((features - self.mean) / self.std).float().reshape(1, 1, -1)
+        vectors = self.hierarchy.encoder.standardized(features.reshape(1, 1, -1))
         pictures = {key: image.reshape(1, 1, *image.shape) for key, image in zip(self.keys, images, strict=True)}
-        said = self.hierarchy(Inputs(vector, pictures, step))
+        said = self.hierarchy(Inputs(vectors, pictures, step))
         found = {}
         for level, caller in enumerate(said.callers):
             if caller.selection is not None:

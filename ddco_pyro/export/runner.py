@@ -64,6 +64,9 @@ class Runner:
 
         :raises ValueError: an observation is missing, has an unseen shape or is not finite.
         """
+        built_in = self.about["step"]
+        if built_in:
+            observation = {**observation, built_in["key"]: np.array([self.time / built_in["longest"]])}
         now = {one["key"]: _checked(observation, one) for one in self.about["observations"]}
         features = self._features(now, self._last or now)
         images = {one["key"]: now[one["key"]] for one in self.about["observations"] if one["image"]}
@@ -202,45 +205,85 @@ class NumpyNetworks:
         """The outputs of every network for one observation."""
         weights, depth = self._weights, len(self._about["levels"])
         vector = ((features - weights["mean"]) / weights["deviation"]).astype(np.float32)
+        sizes = self._about["features"]
+        ends = np.cumsum([0, *sizes.values()])
+        self._seen = {key: vector[first:end] for key, first, end in zip(sizes, ends, ends[1:], strict=False)}
+        self._images, self._step = images, step
         found: Outputs = {}
         for level, one in enumerate(self._about["callers"]):
-            out = self._network(one["network"], f"caller_{level}", vector, step, images)
+            out = self._evaluate(one["network"], f"caller_{level}")
             logits, mean = out[:, : one["logits"]], out[:, one["logits"] :]
             if one["choices"]:
                 found[f"selection_{level}"] = _selection(logits, one)
             if mean.shape[1]:
                 found[f"control_{level}"] = mean
             if level < depth:
-                raw = self._network(self._about["terminations"][level], f"end_{level}", vector, step, images)[:, 0]
+                raw = self._evaluate(self._about["terminations"][level], f"end_{level}")[:, 0]
                 bound = np.float32(self._about["termination_bound"])
                 found[f"termination_{level}"] = 1 / (1 + np.exp(-(bound * np.tanh(raw / bound)).astype(np.float64)))
         return found
 
-    def _network(
-        self, kind: Mapping[str, Any], name: str, vector: np.ndarray, step: int, images: Mapping[str, np.ndarray]
-    ) -> np.ndarray:
-        """[K, outputs] of K perceptrons, those of this step, over the vector and the convolutions of the images."""
-        copies = kind["copies"]
-        maps = [self._convolved(kind, f"{name}.image.{key}", images[key])[:, None] for key in kind["images"]]
-        values = np.concatenate([np.broadcast_to(vector, (copies, 1, len(vector))), *maps], axis=2)
-        first = min(step, kind["steps"] - 1) * copies
-        for layer in range(kind["layers"]):
-            weight, bias = self._weights[f"{name}.{layer}.weight"], self._weights[f"{name}.{layer}.bias"]
-            values = values @ weight[first : first + copies] + bias[first : first + copies]
-            if layer < kind["layers"] - 1:
+    def _evaluate(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        """What a part of a network gives for each of K copies, [K, features]; ``name`` begins those of its arrays."""
+        found: np.ndarray = getattr(self, f"_{node['kind']}")(node, name)
+        return found
+
+    def _vectors(self, node: Mapping[str, Any], _: str) -> np.ndarray:
+        vector = np.concatenate([np.zeros(0, np.float32), *(self._seen[key] for key in node["keys"])])
+        return np.broadcast_to(vector, (node["copies"], len(vector)))
+
+    def _joined(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        return np.concatenate([self._evaluate(of, f"{name}.{number}") for number, of in enumerate(node["of"])], axis=1)
+
+    def _perceptrons(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        """K perceptrons, those of this step; ReLU follows the hidden layers."""
+        values = self._evaluate(node["of"], f"{name}.of")[:, None]
+        first = min(self._step, node["steps"] - 1) * node["copies"]
+        own = slice(first, first + node["copies"])
+        for layer in range(node["layers"]):
+            values = values @ self._weights[f"{name}.{layer}.weight"][own] + self._weights[f"{name}.{layer}.bias"][own]
+            if layer < node["hidden"]:
                 values = np.maximum(values, 0)
         return values[:, 0]
 
-    def _convolved(self, kind: Mapping[str, Any], name: str, image: np.ndarray) -> np.ndarray:
-        """Convolution with stride 2, ReLU, and means over ``pooled`` × ``pooled`` fields, [K, filters · pooled²]."""
-        weight, bias = self._weights[f"{name}.weight"], self._weights[f"{name}.bias"]
-        size, pooled = weight.shape[-1], kind["pooled"]
-        padded = np.pad(image.astype(np.float32) / 255, ((size // 2,) * 2, (size // 2,) * 2, (0, 0)))
-        windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(0, 1))[::2, ::2]
-        maps = np.maximum(np.einsum("hwcij,fcij->fhw", windows, weight, optimize=True) + bias[:, None, None], 0)
-        rows, columns = (_fields(length, pooled) for length in maps.shape[1:])
-        means = np.stack([[maps[:, a:b, c:d].mean((1, 2)) for c, d in columns] for a, b in rows])
-        return means.transpose(2, 0, 1).reshape(kind["copies"], -1)
+    def _convolutions(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        """Convolutions with ReLU of a picture, and what is read of their maps."""
+        maps = self._images[node["key"]].astype(np.float32).transpose(2, 0, 1)[None] / 255
+        for number, layer in enumerate(node["layers"]):
+            weight, bias = self._weights[f"{name}.{number}.weight"], self._weights[f"{name}.{number}.bias"]
+            maps = _convolved(np.broadcast_to(maps, (node["copies"], *maps.shape[1:])), weight, bias, layer)
+        return POOLS[node["pool"]](maps, node["pooled"]).reshape(node["copies"], -1)
+
+
+def _convolved(maps: np.ndarray, weight: np.ndarray, bias: np.ndarray, layer: Mapping[str, Any]) -> np.ndarray:
+    """[K, C, H, W] to [K, filters, H', W'], ReLU after it; filters [K · filters, C, size, size]."""
+    size, pad, stride = weight.shape[-1], (layer["padding"],) * 2, layer["stride"]
+    padded = np.pad(maps, ((0, 0), (0, 0), pad, pad))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(2, 3))[:, :, ::stride, ::stride]
+    own = weight.reshape(len(maps), -1, *weight.shape[1:])
+    found = np.einsum("kchwij,kfcij->kfhw", windows, own, optimize=True)
+    return np.maximum(found + bias.reshape(len(maps), -1, 1, 1), 0)
+
+
+def _means(maps: np.ndarray, pooled: int) -> np.ndarray:
+    """Means over ``pooled`` × ``pooled`` fields, [K, filters, pooled, pooled]."""
+    rows, columns = (_fields(length, pooled) for length in maps.shape[2:])
+    return np.stack([np.stack([maps[:, :, a:b, c:d].mean((2, 3)) for c, d in columns], -1) for a, b in rows], -2)
+
+
+def _expected_places(maps: np.ndarray, _: int) -> np.ndarray:
+    """The expected (row, column), each from -1 to 1, under the softmax of each map, [K, filters, 2]."""
+    weights = np.exp(maps - maps.max((2, 3), keepdims=True))
+    weights /= weights.sum((2, 3), keepdims=True)
+    rows, columns = (np.linspace(-1, 1, length, dtype=np.float32) for length in maps.shape[2:])
+    return np.stack([weights.sum(3) @ rows, weights.sum(2) @ columns], -1)
+
+
+POOLS: dict[str, Callable[[np.ndarray, int], np.ndarray]] = {
+    "mean": _means,
+    "flatten": lambda maps, _: maps,
+    "spatial_softmax": _expected_places,
+}
 
 
 def _fields(length: int, number: int) -> list[tuple[int, int]]:

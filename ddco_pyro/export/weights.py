@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks.numpy_form import HasNumpyForm
+from ddco_pyro.model.networks.numpy_form import numpy_form
 
 Arrays = dict[str, np.ndarray]
 
@@ -19,7 +19,7 @@ def weights_and_networks(hierarchy: Hierarchy) -> tuple[Arrays, dict[str, Any]]:
     levels = hierarchy.option_levels()
     networks = {f"caller_{number}": one.network for number, one in enumerate(hierarchy.callers())}
     networks |= {f"end_{number}": one.termination for number, one in enumerate(levels)}
-    forms = {name: network.numpy_form() for name, network in networks.items() if isinstance(network, HasNumpyForm)}
+    forms = {name: form for name, network in networks.items() if (form := numpy_form(network)) is not None}
     facts = {name: about for name, (about, _) in forms.items()}
     arrays |= {f"{name}.{key}": array for name, (_, each) in forms.items() for key, array in each.items()}
     callers = [

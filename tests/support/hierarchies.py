@@ -38,4 +38,4 @@ def make_batch(trajectories=2, steps=4, seed=1):
     vector = torch.randn(trajectories, steps, 3, generator=generator)
     actions = torch.randn(trajectories, steps, 2, generator=generator)
     lengths = torch.tensor([steps, *[steps - 1] * (trajectories - 1)])
-    return Batch(Inputs(vector, {}, torch.arange(steps)), actions, lengths)
+    return Batch(Inputs({"state": vector}, {}, torch.arange(steps)), actions, lengths)

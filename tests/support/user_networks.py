@@ -55,7 +55,7 @@ class Stateful(Own):
         assert {key: image.shape[2:] for key, image in inputs.images.items()} == self.pictures
         assert all(image.dtype == torch.uint8 for image in inputs.images.values())
         seen = self.norm(inputs.vector.flatten(0, 1)).unflatten(0, inputs.batch)
-        return super().forward(Inputs(seen + self.bias[inputs.time, None], {}, inputs.time))
+        return super().forward(Inputs({"seen": seen + self.bias[inputs.time, None]}, {}, inputs.time))
 
 
 class NotANetwork:

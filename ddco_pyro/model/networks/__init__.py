@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 from torch import nn
 
@@ -29,6 +32,20 @@ def build(spec: NetworkSpec, shape: InputShape, outputs: int, copies: int) -> nn
         :func:`ddco_pyro.model.networks.trial.try_network`.
     :raises SpecError: where the options do not fit the signature of a user's class.
     """
+    if spec.inputs:
+        shape = shape.select(spec.inputs)
+    network = _built(spec, shape, outputs, copies)
+    if spec.inputs:
+        network.register_forward_pre_hook(partial(_select, spec.inputs))
+    return network
+
+
+def _select(names: Sequence[str], network: nn.Module, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    """A network that is to read some observations is given no others."""
+    return (arguments[0].select(names), *arguments[1:])
+
+
+def _built(spec: NetworkSpec, shape: InputShape, outputs: int, copies: int) -> nn.Module:
     if spec.network in CLASSES:
         return CLASSES[spec.network](shape, outputs, copies, **spec.settings)
     network_class = _imported(spec.network)

@@ -22,9 +22,10 @@ def training_bytes(networks: Iterable[nn.Module], shape: InputShape) -> int:
 
 def _zeros(shape: InputShape, steps: int) -> Inputs:
     """Observations that are 0, N = 1."""
+    vectors = {key: torch.zeros(1, steps, size) for key, size in shape.vectors.items()}
     images = {key: torch.zeros(1, steps, *image, dtype=torch.uint8) for key, image in shape.images.items()}
     time = torch.arange(steps).clamp(max=shape.steps - 1)  # a network may have parameters for each step
-    return Inputs(torch.zeros(1, steps, shape.vector), images, time)
+    return Inputs(vectors, images, time)
 
 
 def _kept(network: nn.Module, inputs: Inputs) -> int:

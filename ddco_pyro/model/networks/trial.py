@@ -63,12 +63,13 @@ def _random_inputs(shape: InputShape) -> Inputs:
     """Vectors between 0 and 1, and images."""
     generator = torch.Generator().manual_seed(0)
     batch = (TRAJECTORIES, STEPS)
+    vectors = {key: torch.rand(*batch, size, generator=generator) for key, size in shape.vectors.items()}
     images = {
         key: torch.randint(256, (*batch, *image), generator=generator, dtype=torch.uint8)
         for key, image in shape.images.items()
     }
     time = torch.arange(STEPS).clamp(max=shape.steps - 1)  # it may have parameters for each step
-    return Inputs(torch.rand(*batch, shape.vector, generator=generator), images, time)
+    return Inputs(vectors, images, time)
 
 
 def _steps(inputs: Inputs) -> Iterator[Inputs]:
@@ -76,8 +77,7 @@ def _steps(inputs: Inputs) -> Iterator[Inputs]:
     for trajectory in range(TRAJECTORIES):
         for step in range(STEPS):
             here = (slice(trajectory, trajectory + 1), slice(step, step + 1))
-            images = {key: image[here] for key, image in inputs.images.items()}
-            yield Inputs(inputs.vector[here], images, inputs.time[step : step + 1])
+            yield inputs.map(lambda array, here=here: array[here], inputs.time[step : step + 1])  # type: ignore[misc]
 
 
 @contextmanager
