@@ -61,6 +61,7 @@ CONVOLUTIONS = {
     "layers": [{"filters": 3, "kernel": 4, "stride": 2, "padding": 1}, {"filters": 2, "kernel": 3}],
     "pool": "spatial_softmax",
 }
+RECURRENT = {"network": "lstm", "over": {"hidden": [6]}, "hidden": [5, 4]}
 FITS = {
     "linear": make("linear", options="most_likely"),
     "mlp": make("mlp", control="sample"),
@@ -69,6 +70,8 @@ FITS = {
     "hybrid": make("mlp", (2, 3), ("options", "control"), control="sample"),
     "three levels": make("mlp", (2, 3, 2), ("options", "control")),
     "flat": make("mlp", (), built_in=("step",)),
+    "lstm": make(RECURRENT, (2, 2), ("options", "control"), endings=RECURRENT, control="sample"),
+    "lstm over pictures": make({"network": "lstm", "over": CONVOLUTIONS}, camera=True, endings=CONVOLUTIONS, steps=30),
     "several convolutions": make(
         CONVOLUTIONS, camera=True, endings={"network": "linear", "inputs": ["step", "goal"]}, built_in=("step",)
     ),
@@ -78,7 +81,7 @@ FITS = {
 @pytest.mark.parametrize("name", FITS)
 def test_every_form_acts_as_the_controller_does(name, tmp_path):
     """On other observations than those that it was compared on when it was written, past the longest demonstration."""
-    fit, onnx = FITS[name], name in ("per_timestep", "conv")
+    fit, onnx = FITS[name], name in ("per_timestep", "conv", "lstm")
     found = export(fit, tmp_path, onnx)
     assert list(found) == ["numpy", "torch", *(["onnx"] if onnx else [])]
     assert all(difference < TOLERANCE for difference, _ in found.values())

@@ -39,6 +39,9 @@ def test_the_settings_of_a_spec_reach_the_network(name):
     given = {key: value for key, value in other.items() if key in SETTINGS[name].model_fields}
     shape = InputShape({"state": 3}, {"camera": (6, 6, 3)} if name == "conv" else {}, 5)
     network = build(NetworkSpec(network=name, **given), shape, 2, 4)
+    if name == "lstm":
+        assert [layer.recurrent.shape for layer in network.memory] == [(4, 7, 28), (4, 9, 36)]
+        return
     sizes = [layer.weight.shape[1] for layer in network.layers if hasattr(layer, "weight")]
     assert sizes == [3 + (2 * 64 if name == "conv" else 0), *given.get("hidden", [])]
     assert {layer.p for layer in network.layers if isinstance(layer, nn.Dropout)} == (

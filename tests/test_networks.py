@@ -13,6 +13,7 @@ from user_networks import Stateful
 from ddco_pyro.model.networks import CLASSES, Inputs, InputShape, ShapeError, build
 from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.model.networks.stacked import StackedLinear
+from ddco_pyro.model.networks.state import answer
 from ddco_pyro.spec import NetworkSpec
 
 FEATURES, OUTPUTS, COPIES, LONGEST = 3, 2, 4, 5
@@ -327,13 +328,15 @@ def random_inputs(shape, trajectories, steps, start):
 
 
 def step_by_step(network, inputs):
-    """The outputs of a call for every step of every trajectory."""
+    """The outputs of a call for every step of every trajectory, the state carried from each to the next."""
     trajectories, steps = inputs.batch
     rows = []
     for n in range(trajectories):
+        state = None
         for t in range(steps):
             here = inputs.map(lambda array, n=n, t=t: array[n, t][None, None], inputs.time[t : t + 1])
-            rows.append(network(here))
+            row, state = answer(network, here, state)
+            rows.append(row)
     return torch.stack([torch.stack(rows[n * steps : (n + 1) * steps]) for n in range(trajectories)])[:, :, 0, 0]
 
 
@@ -348,11 +351,22 @@ convolutions = st.fixed_dictionaries(
     {"network": st.just("conv"), "hidden": sizes, "filters": st.integers(1, 3), "kernel": st.integers(1, 5)},
     optional={"pool": st.sampled_from(["flatten", "mean", "spatial_softmax"]), "pooled": st.integers(1, 3)},
 )
-users = st.just({"network": "user_networks:Own", "options": {"gain": 0.7}})
-assert set(CLASSES) == {"linear", "mlp", "per_timestep", "conv"}, "a new network belongs in every_kind"
+users = st.sampled_from(
+    [{"network": "user_networks:Own", "options": {"gain": 0.7}}, {"network": "user_networks:Remembering"}]
+)
+
+
+def lstm(over):
+    """An LSTM over another network."""
+    some = st.lists(st.integers(1, 5), min_size=1, max_size=2)
+    return st.fixed_dictionaries({"network": st.just("lstm"), "over": over, "hidden": some})
+
+
+assert set(CLASSES) == {"linear", "mlp", "per_timestep", "conv", "lstm"}, "a new network belongs in every_kind"
 every_kind = st.one_of(
     st.tuples(st.just({"network": "linear"}) | perceptrons | users, some_vectors, st.just({})),
-    st.tuples(convolutions, some_vectors | st.just({}), pictures),
+    st.tuples(lstm(st.none() | perceptrons | users | lstm(perceptrons)), some_vectors, st.just({})),
+    st.tuples(convolutions | lstm(convolutions), some_vectors | st.just({}), pictures),
 )
 
 
@@ -362,7 +376,57 @@ def test_a_call_for_many_steps_is_a_call_for_each(kind, longest, trajectories, s
     spec, vectors, images = kind
     network = make(InputShape(vectors, images, longest), **spec)
     inputs = random_inputs(InputShape(vectors, images), trajectories, steps, start)
-    assert_close(network(inputs), step_by_step(network, inputs))
+    whole, _ = answer(network, inputs)
+    assert_close(whole, step_by_step(network, inputs))
+
+
+@pytest.mark.parametrize("over", [None, {"hidden": [7]}])
+def test_lstms_are_separate_networks(over):
+    network, inputs = make(network="lstm", over=over, hidden=[6, 5]), make_inputs()
+    values = torch.stack([inputs.vector] * COPIES)
+    if over:
+        values = torch.stack([separate(network.over.layers, k)(inputs.vector) for k in range(COPIES)])
+    expected = []
+    for k in range(COPIES):
+        own = values[k]
+        for layer in network.memory:
+            alone = nn.LSTM(layer.inputs.weight.shape[1], layer.size[1], batch_first=True)
+            with torch.no_grad():
+                alone.weight_ih_l0.copy_(layer.inputs.weight[k].T)
+                alone.weight_hh_l0.copy_(layer.recurrent[k].T)
+                alone.bias_ih_l0.copy_(layer.inputs.bias[k, 0])
+                alone.bias_hh_l0.zero_()
+            own, _ = alone(own)
+        expected.append(separate(network.layers, k)(own))
+    assert_close(answer(network, inputs)[0], torch.stack(expected, dim=2))
+
+
+def test_no_option_is_trained_by_another_options_memory():
+    network = make(network="lstm", hidden=[8])
+    answer(network, make_inputs())[0][:, :, 1].sum().backward()
+    for parameter in network.parameters():
+        per_option = parameter.grad.abs().flatten(1).sum(1)
+        assert per_option[1] > 0
+        assert per_option[[0, 2, 3]].tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("alone", "has initial_state(N), which has to give a tuple of tensors [N, ...]; each call"),
+        ("list", "has initial_state(N), which has to give a tuple"),
+        ("without trajectories", "has initial_state(N), which has to give a tuple"),
+        ("other shape", "has initial_state(N), which has to give a tuple"),
+        ("forgets", "gives other outputs step by step than for a whole trajectory: its state has to hold all"),
+        ("looks ahead", "gives other outputs step by step than for a whole trajectory"),
+        ("over trajectories", "gives other outputs step by step than for a whole trajectory"),
+    ],
+)
+def test_a_state_that_does_not_go_on_is_refused_when_the_network_is_made(how, message):
+    with pytest.raises(ShapeError) as caught:
+        make(network="user_networks:Remembering", options={"how": how})
+    assert str(caught.value).startswith(f"network 'user_networks:Remembering' {message}")
+    assert "\n" not in str(caught.value)
 
 
 MEMORIES = ["over time", "over trajectories", "differences", "later steps", "whole trajectory", "whole batch", "chance"]

@@ -314,7 +314,13 @@ values = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(texts, inner, max_size=3),
     max_leaves=6,
 )
+perceptrons = st.fixed_dictionaries({}, optional={"hidden": counts | st.lists(counts, max_size=3), "dropout": shares})
 networks = st.one_of(
+    perceptrons,
+    st.fixed_dictionaries(
+        {"network": st.just("lstm")},
+        optional={"over": st.none() | perceptrons, "hidden": st.lists(counts, min_size=1), "inputs": st.lists(texts)},
+    ),
     st.fixed_dictionaries({"network": st.just("linear")}),
     st.fixed_dictionaries(
         {}, optional={"network": st.just("per_timestep"), "hidden": st.lists(counts, max_size=3), "dropout": shares}
@@ -417,9 +423,9 @@ def test_the_schema_refuses_networks_that_are_refused(place: str, network: dict[
 def test_the_schema_says_which_networks_have_a_setting() -> None:
     for name in ("NetworkSpec", "PolicySpec", "MetaPolicySpec"):
         properties = spec_schema()["$defs"][name]["properties"]
-        assert properties["network"]["anyOf"][0] == {"enum": ["linear", "mlp", "per_timestep", "conv"]}
+        assert properties["network"]["anyOf"][0] == {"enum": ["linear", "mlp", "per_timestep", "conv", "lstm"]}
         assert properties["filters"]["description"].endswith(" For ``conv``.")
-        assert properties["hidden"]["description"].endswith(" For ``mlp``, ``per_timestep``, ``conv``.")
+        assert properties["hidden"]["description"].endswith(" For ``mlp``, ``per_timestep``, ``conv``, ``lstm``.")
         assert properties["hidden"]["default"] == [64]
 
 

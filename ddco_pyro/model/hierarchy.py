@@ -12,13 +12,14 @@ from types import MappingProxyType
 from typing import Literal
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from ddco_pyro.data.control_parts import ControlPart, all_gaussian
 from ddco_pyro.model.controls import ControlScaling, ControlStd
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch, ObservationEncoder, Shapes
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
 from ddco_pyro.model.networks.activations import training_bytes
+from ddco_pyro.model.networks.state import Carried, HasState, State, States, initial_state
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec, SpecError
@@ -54,9 +55,8 @@ class Caller(nn.Module):
         self.network = build(network, shape, sum(self.sizes), copies)
         self.std = ControlStd(control, scaling, copies)
 
-    def forward(self, inputs: Inputs, scaling: ControlScaling) -> CallerOutputs:
-        """What the callers say at every step of the inputs."""
-        said = self.network(inputs)
+    def forward(self, said: Tensor, scaling: ControlScaling) -> CallerOutputs:
+        """What the callers say at every step, given what their network says, [N, T, K, outputs]."""
         logits, numbers = said.split(self.sizes, dim=-1) if all(self.sizes) else (said, said)
         emission = scaling.emission(numbers, self.std()) if self.emits_control else None
         return CallerOutputs(self.options, logits if self.emits_options else None, emission)
@@ -143,6 +143,14 @@ class Hierarchy(nn.Module):
         """The levels of options, lowest first."""
         return [level for level in self.levels if isinstance(level, Level)]
 
+    def networks(self) -> dict[str, nn.Module]:
+        """Every network by its place here."""
+        each: dict[str, nn.Module] = {}
+        for number, level in enumerate(self.option_levels()):
+            each[f"levels.{number}.policy"] = level.policy.network
+            each[f"levels.{number}.termination"] = level.termination
+        return each | {"meta_policy": self.meta_policy.network}
+
     def named_networks(self) -> Iterator[tuple[str, nn.Module]]:
         """Every network by its place in the spec."""
         for number, level in enumerate(self.option_levels()):
@@ -153,8 +161,7 @@ class Hierarchy(nn.Module):
     @cached_property
     def step_bytes(self) -> int:
         """Bytes that all networks take for a step in training."""
-        networks = (one.network if isinstance(one, Caller) else one for _, one in self.named_networks())
-        return training_bytes(networks, self.input_shape)
+        return training_bytes(self.networks().values(), self.input_shape)
 
     @property
     def steps_at_once(self) -> int:
@@ -162,14 +169,37 @@ class Hierarchy(nn.Module):
         return max(1, min(STEPS_AT_ONCE, BYTES_AT_ONCE // max(1, self.step_bytes)))
 
     def forward(self, inputs: Inputs, discovering: int | None = None) -> Outputs:
-        """What the networks say about these observations.
+        """What the networks say about these observations, from the first step of their trajectories on.
 
         :param discovering: d gives levels 1 to d alone under a uniform meta-policy (layer-wise training, SM 2.3).
         """
+        return self.advance(inputs, None, discovering)[0]
+
+    def advance(
+        self, inputs: Inputs, states: States | None, discovering: int | None = None
+    ) -> tuple[Outputs, dict[str, State]]:
+        """What the networks say about these observations, and their states after them, by :meth:`networks`' names.
+
+        :param states: those after the observations before; None at the first step.
+        """
+        carried = Carried(states)
         levels = self.option_levels()[:discovering]
-        callers = [level.policy(inputs, self.scaling) for level in levels]
-        top = _uniform(inputs, levels[-1].count) if discovering else self.meta_policy(inputs, self.scaling)
-        return Outputs((*callers, top), tuple(level.termination(inputs).squeeze(-1) for level in levels))
+        callers, endings = [], []
+        for number, level in enumerate(levels):
+            place = f"levels.{number}"
+            callers.append(level.policy(carried.answer(f"{place}.policy", level.policy.network, inputs), self.scaling))
+            endings.append(carried.answer(f"{place}.termination", level.termination, inputs).squeeze(-1))
+        if discovering:
+            callers.append(_uniform(inputs, levels[-1].count))
+        else:
+            said = carried.answer("meta_policy", self.meta_policy.network, inputs)
+            callers.append(self.meta_policy(said, self.scaling))
+        return Outputs(tuple(callers), tuple(endings)), carried.after
+
+    def initial_states(self, trajectories: int) -> dict[str, State]:
+        """The states of the networks that remember before the first step, by name."""
+        each = self.networks().items()
+        return {name: initial_state(network, trajectories) for name, network in each if isinstance(network, HasState)}
 
     def tabulate(self, batch: Batch, discovering: int | None = None) -> Tables:
         """The tables of a batch: every network once, over all options, steps and trajectories."""

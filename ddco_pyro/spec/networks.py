@@ -51,7 +51,7 @@ class Perceptron(Network):
     """Settings of a multi-layer perceptron."""
 
     hidden: Sizes = Field(default=(64,), validate_default=True)
-    """Sizes of the hidden layers, first one first; a bare number is a single layer."""
+    """Sizes of the hidden layers, first one first; a bare number is a single layer. Those of ``lstm`` remember."""
     dropout: Share = 0.0
     """Probability with which a unit is dropped while training."""
 
@@ -85,11 +85,21 @@ class Convolution(Perceptron):
     """Fields by side."""
 
 
+class Recurrent(Network):
+    """Settings of an LSTM."""
+
+    over: NetworkSpec | None = None
+    """The network whose last hidden layer it reads; null: it reads the observed vectors."""
+    hidden: Sizes = (64,)
+
+
 class UserDefined(Network):
     """Settings of a user's class."""
 
     options: dict[str, Any] = Field(default={})
     """Keyword arguments of the class."""
+    features: Count = 64
+    """Outputs of each copy where another network reads them."""
 
 
 SETTINGS: dict[str, type[Network]] = {
@@ -97,8 +107,11 @@ SETTINGS: dict[str, type[Network]] = {
     "mlp": Perceptron,
     "per_timestep": Perceptron,
     "conv": Convolution,
+    "lstm": Recurrent,
 }
 """The built-in networks by name; every other name is a user's ``module:Class``."""
+LAYERED = ("lstm",)
+"""Those that need a hidden layer."""
 
 
 def foreign_keys(network: Any) -> tuple[str, ...]:
@@ -118,7 +131,7 @@ def _describe_kinds(schema: dict[str, Any]) -> None:
         properties[key]["description"] += f" For {names}."
 
 
-class NetworkSpec(UserDefined, Convolution):
+class NetworkSpec(UserDefined, Convolution, Recurrent):
     """A network from observations to the parameters of a distribution. Settings of other networks are refused."""
 
     model_config = ConfigDict(json_schema_extra=_describe_kinds)
@@ -149,6 +162,8 @@ class NetworkSpec(UserDefined, Convolution):
         given = [key for key in foreign_keys(self.network) if key in self.model_fields_set]
         if given:
             raise invalid(*((key, f"does not apply to network {self.network!r}; leave it out") for key in given))
+        if self.network in LAYERED and not self.hidden:
+            raise invalid(("hidden", f"{self.network} has one layer at least; give its size"))
         twice = [key for key in ("filters", "kernel") if self.layers and key in self.model_fields_set]
         if twice:
             raise invalid(*((key, "stands beside layers, which say it of each; leave it out") for key in twice))
@@ -160,6 +175,9 @@ class NetworkSpec(UserDefined, Convolution):
         unused = (*foreign_keys(self.network), *(() if self.inputs else ("inputs",)))
         unused += ("filters", "kernel") if self.layers else ("layers",)
         return {key: value for key, value in fields.items() if key not in unused}
+
+
+Recurrent.model_rebuild()
 
 
 class PolicySpec(NetworkSpec):

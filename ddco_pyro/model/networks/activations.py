@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape
+from ddco_pyro.model.networks.state import answer
 
 
 def training_bytes(networks: Iterable[nn.Module], shape: InputShape) -> int:
@@ -41,7 +42,9 @@ def _kept(network: nn.Module, inputs: Inputs) -> int:
     network.eval()  # nothing it keeps track of is to change
     try:
         with torch.enable_grad(), torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-            outputs = network(inputs)  # while it is there, so is what was kept: no two tensors have the same place
+            outputs = answer(
+                network, inputs
+            )  # while it is there, so is what was kept: no two tensors have the same place
         del outputs
     finally:
         network.train(training)

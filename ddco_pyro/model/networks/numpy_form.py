@@ -38,10 +38,10 @@ def perceptrons(layers: Perceptrons, of: NumpyForm) -> NumpyForm:
     linear = [layer for layer in layers if isinstance(layer, StackedLinear)]
     hidden = sum(isinstance(layer, nn.ReLU) for layer in layers)
     facts = {"kind": "perceptrons", "layers": len(linear), "hidden": hidden, "copies": layers.copies, "steps": 1}
-    return over(of, facts, {str(number): layer for number, layer in enumerate(linear)})
+    return over_layers(of, facts, {str(number): layer for number, layer in enumerate(linear)})
 
 
-def over(of: NumpyForm, facts: Mapping[str, Any], layers: Mapping[str, nn.Module]) -> NumpyForm:
+def over_layers(of: NumpyForm, facts: Mapping[str, Any], layers: Mapping[str, nn.Module]) -> NumpyForm:
     """The form of layers, by name, that read what another form gives."""
     return {**facts, "of": of[0]}, arrays_of(layers) | _within("of", of[1])
 
