@@ -22,7 +22,18 @@ from ddco_pyro.spec import parse_spec
 SHAPES = {"state": (3,), "goal": (2, 2), "camera": (9, 12, 3)}
 
 
-def make(network="mlp", counts=(3,), emits=("options",), camera=False, steps=7, endings=None, built_in=(), **rollout):
+def make(
+    network="mlp",
+    counts=(3,),
+    emits=("options",),
+    camera=False,
+    steps=7,
+    endings=None,
+    built_in=(),
+    trunk=None,
+    meta_policy=None,
+    **rollout,
+):
     """A run that was never fitted: random weights, observations with a mean and a spread."""
     policy = network if isinstance(network, dict) else {"network": network}
     levels = [
@@ -32,8 +43,8 @@ def make(network="mlp", counts=(3,), emits=("options",), camera=False, steps=7, 
     endings = endings or {"network": network if network in ("conv", "per_timestep") else "linear"}
     model = {
         "hierarchy": {
-            "levels": [level | {"termination": endings} for level in levels],
-            "meta_policy": policy | {"emits": list(emits)},
+            "levels": [level | {"termination": endings, "trunk": trunk} for level in levels],
+            "meta_policy": (meta_policy or policy) | {"emits": list(emits)},
         }
     }
     spec = parse_spec(
@@ -62,6 +73,15 @@ CONVOLUTIONS = {
     "pool": "spatial_softmax",
 }
 RECURRENT = {"network": "lstm", "over": {"hidden": [6]}, "hidden": [5, 4]}
+BRANCHES = {
+    "network": "branches",
+    "of": {
+        "camera": {"network": "lstm", "over": {"network": "conv", "filters": 2, "pool": "flatten"}, "hidden": 4},
+        "pair": {"network": "mlp", "inputs": ["goal", "state"], "hidden": [6]},
+        "step": {"network": "linear"},
+    },
+    "hidden": [7],
+}
 FITS = {
     "linear": make("linear", options="most_likely"),
     "mlp": make("mlp", control="sample"),
@@ -72,6 +92,9 @@ FITS = {
     "flat": make("mlp", (), built_in=("step",)),
     "lstm": make(RECURRENT, (2, 2), ("options", "control"), endings=RECURRENT, control="sample"),
     "lstm over pictures": make({"network": "lstm", "over": CONVOLUTIONS}, camera=True, endings=CONVOLUTIONS, steps=30),
+    "trunk": make(
+        "linear", (2, 3), ("options", "control"), True, trunk=BRANCHES, meta_policy=BRANCHES, built_in=("step",)
+    ),
     "several convolutions": make(
         CONVOLUTIONS, camera=True, endings={"network": "linear", "inputs": ["step", "goal"]}, built_in=("step",)
     ),
@@ -81,7 +104,7 @@ FITS = {
 @pytest.mark.parametrize("name", FITS)
 def test_every_form_acts_as_the_controller_does(name, tmp_path):
     """On other observations than those that it was compared on when it was written, past the longest demonstration."""
-    fit, onnx = FITS[name], name in ("per_timestep", "conv", "lstm")
+    fit, onnx = FITS[name], name in ("per_timestep", "conv", "lstm", "trunk")
     found = export(fit, tmp_path, onnx)
     assert list(found) == ["numpy", "torch", *(["onnx"] if onnx else [])]
     assert all(difference < TOLERANCE for difference, _ in found.values())

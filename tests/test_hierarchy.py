@@ -13,6 +13,7 @@ from ddco_pyro.inference import log_likelihood, total_log_likelihood
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.networks.state import answer
 from ddco_pyro.model.outputs import TERMINATION_BOUND
 from ddco_pyro.spec import parse_spec
 
@@ -87,6 +88,26 @@ def test_terminations_keep_their_bound():
     bound = torch.tensor(TERMINATION_BOUND)
     np.testing.assert_allclose(psi[..., 0].detach(), bound.sigmoid(), rtol=1e-5)
     np.testing.assert_allclose(psi[..., 1].detach(), (-bound).sigmoid(), rtol=1e-3)
+
+
+def test_policy_and_termination_read_the_trunk_of_their_option():
+    hierarchy = make_hierarchy((3,), network="linear", trunk={"network": "lstm", "over": {"hidden": [5]}, "hidden": 4})
+    batch, level = make_batch(), hierarchy.levels[0]
+    outputs = hierarchy(batch.inputs)
+    features, _ = answer(level.trunk, batch.inputs)
+    assert features.shape == (*batch.inputs.batch, 3, 4)
+    for head, found in (
+        (level.policy.network, outputs.callers[0].emission.numbers),
+        (level.termination, outputs.termination_logits[0].unsqueeze(-1)),
+    ):
+        weight, bias = head.layers[0].weight, head.layers[0].bias
+        expected = torch.stack([features[:, :, k] @ weight[k] + bias[k] for k in range(3)], dim=2)
+        torch.testing.assert_close(found, expected)
+    assert [name for name, _ in hierarchy.named_networks()] == [
+        *(f"hierarchy.levels.0.{part}" for part in ("trunk", "policy", "termination")),
+        "hierarchy.meta_policy",
+    ]
+    assert hierarchy.step_bytes > make_hierarchy((3,), network="linear").step_bytes
 
 
 def test_discovery_sees_a_uniform_meta_policy():

@@ -38,6 +38,8 @@ def test_the_settings_of_a_spec_reach_the_network(name):
     other = {"hidden": [7, 9], "dropout": 0.25, "filters": 2, "kernel": 3}
     given = {key: value for key, value in other.items() if key in SETTINGS[name].model_fields}
     shape = InputShape({"state": 3}, {"camera": (6, 6, 3)} if name == "conv" else {}, 5)
+    if name == "branches":
+        given["of"] = {"state": NetworkSpec(network="linear")}
     network = build(NetworkSpec(network=name, **given), shape, 2, 4)
     if name == "lstm":
         assert [layer.recurrent.shape for layer in network.memory] == [(4, 7, 28), (4, 9, 36)]

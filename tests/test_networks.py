@@ -216,6 +216,25 @@ def test_an_image_may_be_called_as_a_layer_is():
     assert sorted(array.shape for array in arrays.values()) == shapes
 
 
+def test_branches_read_each_their_own_and_are_joined():
+    shape = InputShape({"pose": 2, "goal": 3, "other": 4}, {"camera": PIXELS})
+    pair = {"network": "linear", "inputs": ["goal", "pose"]}
+    picture = {"network": "conv", "filters": 2, "hidden": [6]}
+    network = make(shape, network="branches", of={"camera": picture, "pair": pair, "goal": {"hidden": [5]}}, hidden=[8])
+    inputs = random_inputs(shape, 2, LONGEST, 0)
+    seen = Inputs({}, inputs.images, inputs.time)
+    camera, _, goal = network.of
+    for layers in (camera.layers, goal.layers):
+        assert isinstance(layers[-2], nn.ReLU)  # what is read are hidden layers
+    expected = []
+    for k in range(COPIES):
+        picture = separate_conv(camera, k, seen, 2)
+        vectors = inputs.vectors
+        joined = [picture, vectors["goal"], vectors["pose"], separate(goal.layers, k)(vectors["goal"])]
+        expected.append(separate(network.layers, k)(torch.cat(joined, -1)))
+    assert_close(answer(network, inputs)[0], torch.stack(expected, dim=2))
+
+
 # --- some of the observations -----------------------------------------------------------------------------------------
 
 
@@ -297,6 +316,16 @@ def test_an_output_of_another_shape_is_refused_when_the_network_is_made(how, mes
             "reads vectors, but camera are images",
         ),
         (SHAPE, {"network": "conv"}, "needs an image among the observations"),
+        (
+            SHAPE,
+            {"network": "branches", "of": {"camera": {"network": "conv"}}},
+            r"^of.camera: inputs: there is no observation 'camera'; there is: state",
+        ),
+        (
+            InputShape({"state": 3}, {"camera": PIXELS}),
+            {"network": "lstm", "over": {"network": "linear"}},
+            "^over: reads vectors, but camera are images",
+        ),
         (SHAPE, {"inputs": ["stat"]}, r"no observation 'stat' \(did you mean 'state'\?\); there is: state"),
         (
             InputShape({}, {"camera": (6, 6, 3)}),
@@ -362,10 +391,24 @@ def lstm(over):
     return st.fixed_dictionaries({"network": st.just("lstm"), "over": over, "hidden": some})
 
 
-assert set(CLASSES) == {"linear", "mlp", "per_timestep", "conv", "lstm"}, "a new network belongs in every_kind"
+def branches():
+    """A branch for each of three observations, and one for two of them."""
+    pair = (perceptrons | lstm(perceptrons)).map(lambda network: network | {"inputs": ["goal", "pose"]})
+    vector = st.just({"network": "linear"}) | perceptrons | users | lstm(perceptrons)
+    of = st.fixed_dictionaries(
+        {"camera": convolutions | lstm(convolutions)}, optional={"pose": vector, "goal": vector, "pair": pair}
+    )
+    some = st.lists(st.integers(1, 5), min_size=1, max_size=2)
+    return st.fixed_dictionaries({"network": st.just("branches"), "of": of, "hidden": some})
+
+
+assert set(CLASSES) == {"linear", "mlp", "per_timestep", "conv", "lstm", "branches"}, (
+    "a new network belongs in every_kind"
+)
 every_kind = st.one_of(
     st.tuples(st.just({"network": "linear"}) | perceptrons | users, some_vectors, st.just({})),
     st.tuples(lstm(st.none() | perceptrons | users | lstm(perceptrons)), some_vectors, st.just({})),
+    st.tuples(branches(), st.just({"pose": 2, "goal": 3}), st.just({"camera": (7, 6, 2)})),
     st.tuples(convolutions | lstm(convolutions), some_vectors | st.just({}), pictures),
 )
 

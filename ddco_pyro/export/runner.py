@@ -220,6 +220,8 @@ class NumpyNetworks:
         self._before, self._after = iter(state), []
         found: Outputs = {}
         for level, one in enumerate(self._about["callers"]):
+            if level < depth and self._about["trunks"][level]:
+                self._features = self._evaluate(self._about["trunks"][level], f"trunk_{level}")
             out = self._evaluate(one["network"], f"caller_{level}")
             logits, mean = out[:, : one["logits"]], out[:, one["logits"] :]
             if one["choices"]:
@@ -240,6 +242,9 @@ class NumpyNetworks:
     def _vectors(self, node: Mapping[str, Any], _: str) -> np.ndarray:
         vector = np.concatenate([np.zeros(0, np.float32), *(self._seen[key] for key in node["keys"])])
         return np.broadcast_to(vector, (node["copies"], len(vector)))
+
+    def _trunk(self, _: Mapping[str, Any], __: str) -> np.ndarray:
+        return self._features
 
     def _joined(self, node: Mapping[str, Any], name: str) -> np.ndarray:
         return np.concatenate([self._evaluate(of, f"{name}.{number}") for number, of in enumerate(node["of"])], axis=1)

@@ -6,7 +6,6 @@ A baseline is a hierarchy without option levels whose meta-policy emits control.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from functools import cached_property
 from types import MappingProxyType
 from typing import Literal
@@ -17,12 +16,12 @@ from torch import Tensor, nn
 from ddco_pyro.data.control_parts import ControlPart, all_gaussian
 from ddco_pyro.model.controls import ControlScaling, ControlStd
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch, ObservationEncoder, Shapes
-from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
+from ddco_pyro.model.networks import Inputs, InputShape, build, build_trunk, named
 from ddco_pyro.model.networks.activations import training_bytes
-from ddco_pyro.model.networks.state import Carried, HasState, State, States, initial_state
+from ddco_pyro.model.networks.state import Carried, HasState, State, States, Trunk, initial_state
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import Tables
-from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec, SpecError
+from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
 
 BYTES_AT_ONCE = 256 * 10**6
 """Most bytes that networks take for the trajectories that go through them together, one trajectory at least."""
@@ -41,7 +40,7 @@ class Caller(nn.Module):
         network: NetworkSpec,
         emits: tuple[Emits, ...],
         options: int,
-        shape: InputShape,
+        shape: InputShape | Trunk,
         control: ControlSpec,
         scaling: ControlScaling,
         copies: int,
@@ -63,7 +62,9 @@ class Caller(nn.Module):
 
 
 class Level(nn.Module):
-    """The k options of one level: their policies π (or, above the lowest level, η) and terminations ψ."""
+    """The k options of one level: their policies π (or, above the lowest level, η) and terminations ψ, which read the
+    observations, or the features of a trunk that they share.
+    """
 
     def __init__(
         self,
@@ -76,21 +77,15 @@ class Level(nn.Module):
     ) -> None:
         super().__init__()
         self.count = spec.count
-        with _named(f"{place}.policy"):
-            self.policy = Caller(spec.policy, spec.policy.emits, options_below, shape, control, scaling, spec.count)
-        with _named(f"{place}.termination"):
-            self.termination = build(spec.termination, shape, 1, spec.count)
-
-
-@contextmanager
-def _named(place: str) -> Iterator[None]:
-    """Errors about a network say where in the spec it stands."""
-    try:
-        yield
-    except SpecError as error:
-        raise SpecError(*(f"{place}.{problem}" for problem in error.problems)) from error
-    except ShapeError as error:
-        raise ShapeError(f"{place}: {error}") from error
+        seen: InputShape | Trunk = shape
+        if spec.trunk is not None:
+            with named(f"{place}.trunk"):
+                seen = build_trunk(spec.trunk, shape, spec.count)
+        self.trunk = seen.network if isinstance(seen, Trunk) else None
+        with named(f"{place}.policy"):
+            self.policy = Caller(spec.policy, spec.policy.emits, options_below, seen, control, scaling, spec.count)
+        with named(f"{place}.termination"):
+            self.termination = build(spec.termination, seen, 1, spec.count)
 
 
 class Hierarchy(nn.Module):
@@ -127,7 +122,7 @@ class Hierarchy(nn.Module):
             below = level.count
         self.levels = nn.ModuleList(levels)
         network, emits = _meta_policy(spec)
-        with _named("hierarchy.meta_policy" if levels else "baseline.policy"):
+        with named("hierarchy.meta_policy" if levels else "baseline.policy"):
             self.meta_policy = Caller(network, emits, below, shape, spec.control, scaling, copies=1)
 
     @property
@@ -147,6 +142,8 @@ class Hierarchy(nn.Module):
         """Every network by its place here."""
         each: dict[str, nn.Module] = {}
         for number, level in enumerate(self.option_levels()):
+            if level.trunk is not None:
+                each[f"levels.{number}.trunk"] = level.trunk
             each[f"levels.{number}.policy"] = level.policy.network
             each[f"levels.{number}.termination"] = level.termination
         return each | {"meta_policy": self.meta_policy.network}
@@ -154,6 +151,8 @@ class Hierarchy(nn.Module):
     def named_networks(self) -> Iterator[tuple[str, nn.Module]]:
         """Every network by its place in the spec."""
         for number, level in enumerate(self.option_levels()):
+            if level.trunk is not None:
+                yield f"hierarchy.levels.{number}.trunk", level.trunk
             yield f"hierarchy.levels.{number}.policy", level.policy
             yield f"hierarchy.levels.{number}.termination", level.termination
         yield "hierarchy.meta_policy" if self.depth else "baseline.policy", self.meta_policy
@@ -186,9 +185,10 @@ class Hierarchy(nn.Module):
         levels = self.option_levels()[:discovering]
         callers, endings = [], []
         for number, level in enumerate(levels):
-            place = f"levels.{number}"
-            callers.append(level.policy(carried.answer(f"{place}.policy", level.policy.network, inputs), self.scaling))
-            endings.append(carried.answer(f"{place}.termination", level.termination, inputs).squeeze(-1))
+            place, trunk = f"levels.{number}", level.trunk
+            seen = inputs if trunk is None else carried.answer(f"{place}.trunk", trunk, inputs)
+            callers.append(level.policy(carried.answer(f"{place}.policy", level.policy.network, seen), self.scaling))
+            endings.append(carried.answer(f"{place}.termination", level.termination, seen).squeeze(-1))
         if discovering:
             callers.append(_uniform(inputs, levels[-1].count))
         else:

@@ -93,6 +93,14 @@ class Recurrent(Network):
     hidden: Sizes = (64,)
 
 
+class Branched(Perceptron):
+    """Settings of several networks whose last hidden layers are joined by a perceptron."""
+
+    of: dict[str, NetworkSpec] = Field(default={})
+    """A network for each observation, by the observation's name; under another name one that says what it reads in
+    ``inputs``."""
+
+
 class UserDefined(Network):
     """Settings of a user's class."""
 
@@ -108,9 +116,10 @@ SETTINGS: dict[str, type[Network]] = {
     "per_timestep": Perceptron,
     "conv": Convolution,
     "lstm": Recurrent,
+    "branches": Branched,
 }
 """The built-in networks by name; every other name is a user's ``module:Class``."""
-LAYERED = ("lstm",)
+LAYERED = ("lstm", "branches")
 """Those that need a hidden layer."""
 
 
@@ -131,7 +140,7 @@ def _describe_kinds(schema: dict[str, Any]) -> None:
         properties[key]["description"] += f" For {names}."
 
 
-class NetworkSpec(UserDefined, Convolution, Recurrent):
+class NetworkSpec(UserDefined, Convolution, Recurrent, Branched):
     """A network from observations to the parameters of a distribution. Settings of other networks are refused."""
 
     model_config = ConfigDict(json_schema_extra=_describe_kinds)
@@ -164,6 +173,8 @@ class NetworkSpec(UserDefined, Convolution, Recurrent):
             raise invalid(*((key, f"does not apply to network {self.network!r}; leave it out") for key in given))
         if self.network in LAYERED and not self.hidden:
             raise invalid(("hidden", f"{self.network} has one layer at least; give its size"))
+        if self.network == "branches" and not self.of:
+            raise invalid(("of", "missing; name an observation and its network, such as {state: {network: mlp}}"))
         twice = [key for key in ("filters", "kernel") if self.layers and key in self.model_fields_set]
         if twice:
             raise invalid(*((key, "stands beside layers, which say it of each; leave it out") for key in twice))
@@ -178,6 +189,7 @@ class NetworkSpec(UserDefined, Convolution, Recurrent):
 
 
 Recurrent.model_rebuild()
+Branched.model_rebuild()
 
 
 class PolicySpec(NetworkSpec):

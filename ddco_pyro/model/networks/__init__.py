@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
 from torch import nn
 
+from ddco_pyro.model.networks.branches import Branches
 from ddco_pyro.model.networks.conv import Conv
+from ddco_pyro.model.networks.head import Head
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.lstm import Lstm
 from ddco_pyro.model.networks.mlp import Linear, Mlp
@@ -17,9 +20,9 @@ from ddco_pyro.model.networks.options import checked_options
 from ddco_pyro.model.networks.per_timestep import PerTimestep
 from ddco_pyro.model.networks.state import Trunk
 from ddco_pyro.model.networks.trial import try_network
-from ddco_pyro.spec import NetworkSpec
+from ddco_pyro.spec import NetworkSpec, SpecError
 
-__all__ = ["CLASSES", "InputShape", "Inputs", "ShapeError", "build"]
+__all__ = ["CLASSES", "InputShape", "Inputs", "ShapeError", "build", "build_trunk", "named"]
 
 CLASSES: dict[str, type[nn.Module]] = {
     "linear": Linear,
@@ -27,12 +30,13 @@ CLASSES: dict[str, type[nn.Module]] = {
     "per_timestep": PerTimestep,
     "conv": Conv,
     "lstm": Lstm,
+    "branches": Branches,
 }
 """The built-in networks by name. Their settings, as a spec has them, are those of :mod:`ddco_pyro.spec.networks`."""
 
 
-def build(spec: NetworkSpec, shape: InputShape, outputs: int, copies: int) -> nn.Module:
-    """``copies`` independent networks that map :class:`Inputs` to [N, T, copies, outputs].
+def build(spec: NetworkSpec, shape: InputShape | Trunk, outputs: int, copies: int) -> nn.Module:
+    """``copies`` independent networks that map :class:`Inputs`, or the features of a trunk, to [N, T, copies, outputs].
 
     Each is made as ``Class(shape, outputs, copies, **settings)``, a user's too, which is also tried. One that
     remembers is a :class:`~ddco_pyro.model.networks.state.HasState`.
@@ -41,6 +45,8 @@ def build(spec: NetworkSpec, shape: InputShape, outputs: int, copies: int) -> nn
         :func:`ddco_pyro.model.networks.trial.try_network`.
     :raises SpecError: where the options do not fit the signature of a user's class.
     """
+    if isinstance(shape, Trunk):
+        return Head(shape.features, outputs, copies, **spec.settings)
     return _read(spec, shape, outputs, copies)
 
 
@@ -74,10 +80,12 @@ def _select(names: Sequence[str], network: nn.Module, arguments: tuple[Any, ...]
 
 def _built(spec: NetworkSpec, shape: InputShape, outputs: int | None, copies: int) -> nn.Module:
     if spec.network in CLASSES:
-        settings = {
-            key: build_trunk(value, shape, copies) if isinstance(value, NetworkSpec) else value
-            for key, value in spec.settings.items()
-        }
+        settings = spec.settings
+        if settings.get("over"):
+            with named("over"):
+                settings["over"] = build_trunk(settings["over"], shape, copies)
+        if "of" in settings:
+            settings["of"] = {name: _branch(name, branch, shape, copies) for name, branch in settings["of"].items()}
         return CLASSES[spec.network](shape, outputs, copies, **settings)
     assert outputs is not None  # a user's network always has some
     network_class = _imported(spec.network)
@@ -88,6 +96,23 @@ def _built(spec: NetworkSpec, shape: InputShape, outputs: int | None, copies: in
         raise ShapeError(f"network {spec.network!r} cannot be made with options {spec.options}: {error}") from error
     try_network(spec.network, network, shape, (copies, outputs))
     return network
+
+
+def _branch(name: str, spec: NetworkSpec, shape: InputShape, copies: int) -> Trunk:
+    """A branch reads the observation that it is named after, unless it is told which."""
+    with named(f"of.{name}"):
+        return build_trunk(spec.model_copy(update={"inputs": spec.inputs or (name,)}), shape, copies)
+
+
+@contextmanager
+def named(place: str) -> Iterator[None]:
+    """Errors about a network say where in the spec it stands."""
+    try:
+        yield
+    except SpecError as error:
+        raise SpecError(*(f"{place}.{problem}" for problem in error.problems)) from error
+    except ShapeError as error:
+        raise ShapeError(f"{place}: {error}") from error
 
 
 def _imported(name: str) -> type[nn.Module]:

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor, nn
 
+from ddco_pyro.model.networks.head import Head
 from ddco_pyro.model.networks.inputs import Inputs, InputShape
 from ddco_pyro.model.networks.state import answer
 
@@ -17,7 +18,7 @@ def training_bytes(networks: Iterable[nn.Module], shape: InputShape) -> int:
     Each keeps tensors until its gradient is computed; meanwhile what it computed, and the gradient of that, are there
     too: measured with convolutions, that is at most twice what the largest network keeps.
     """
-    kept = [_kept(network, _zeros(shape, 2)) - _kept(network, _zeros(shape, 1)) for network in networks]
+    kept = [_kept(network, shape, 2) - _kept(network, shape, 1) for network in networks]
     return sum(kept) + 2 * max(kept)
 
 
@@ -29,8 +30,9 @@ def _zeros(shape: InputShape, steps: int) -> Inputs:
     return Inputs(vectors, images, time)
 
 
-def _kept(network: nn.Module, inputs: Inputs) -> int:
+def _kept(network: nn.Module, shape: InputShape, steps: int) -> int:
     """Bytes of all tensors, parameters too, that are kept for the gradient."""
+    seen = torch.zeros(1, steps, *network.reads) if isinstance(network, Head) else _zeros(shape, steps)
     storages: dict[int, int] = {}
 
     def keep(tensor: Tensor) -> Tensor:
@@ -42,9 +44,9 @@ def _kept(network: nn.Module, inputs: Inputs) -> int:
     network.eval()  # nothing it keeps track of is to change
     try:
         with torch.enable_grad(), torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-            outputs = answer(
-                network, inputs
-            )  # while it is there, so is what was kept: no two tensors have the same place
+            outputs, _ = answer(
+                network, seen
+            )  # while they are there, so is what was kept: no two tensors share a place
         del outputs
     finally:
         network.train(training)

@@ -39,12 +39,13 @@ def initial_state(network: nn.Module, trajectories: int) -> State:
     return network.initial_state(trajectories) if isinstance(network, HasState) else ()
 
 
-def answer(network: nn.Module, inputs: Inputs, state: State | None = None) -> tuple[Tensor, State]:
+def answer(network: nn.Module, inputs: Inputs | Tensor, state: State | None = None) -> tuple[Tensor, State]:
     """The outputs of any network [N, T, K, outputs], and its state after them.
 
+    :param inputs: for a head the features of its trunk, [N, T, K, features].
     :param state: that after the steps before; None for the first step.
     """
-    if not isinstance(network, HasState):
+    if isinstance(inputs, Tensor) or not isinstance(network, HasState):
         return network(inputs), ()
     said: tuple[Tensor, State] = network(inputs, initial_state(network, inputs.batch[0]) if state is None else state)
     return said
@@ -57,7 +58,7 @@ class Carried:
         self.before = before or {}
         self.after: dict[str, State] = {}
 
-    def answer(self, name: str, network: nn.Module, inputs: Inputs) -> Tensor:
+    def answer(self, name: str, network: nn.Module, inputs: Inputs | Tensor) -> Tensor:
         """The outputs of the network of this name."""
         outputs, state = answer(network, inputs, self.before.get(name))
         if isinstance(network, HasState):
