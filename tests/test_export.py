@@ -10,6 +10,7 @@ import onnx
 import pytest
 import torch
 from command_line import call
+from user_networks import Remembering
 
 import ddco_pyro
 import ddco_pyro.export as module
@@ -17,6 +18,7 @@ from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.export import TOLERANCE, export, runner
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import InputShape
 from ddco_pyro.spec import parse_spec
 
 SHAPES = {"state": (3,), "goal": (2, 2), "camera": (9, 12, 3)}
@@ -317,6 +319,19 @@ def test_networks_that_numpy_cannot_evaluate_are_compared_as_a_program(tmp_path,
     with pytest.raises(Failed, match="as torch"):
         export(fit, tmp_path / "other")
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("place", ["network", "over"])
+def test_a_users_state_is_carried_by_programs(place, tmp_path):
+    fit = make(RECURRENT)
+    meta_policy = fit.hierarchy.meta_policy
+    if place == "network":
+        meta_policy.network = Remembering(InputShape({"all": 10}), 3, 1)
+    else:
+        meta_policy.network.over = Remembering(InputShape({"all": 10}), 6, 1)
+    assert list(export(fit, tmp_path / "out", onnx=True)) == ["torch", "onnx"]
+    for form in ("torch", "onnx"):
+        assert len(compare(runner.Runner(tmp_path / "out", form), fit.controller(), 10)) > 1
 
 
 class Adding(torch.nn.Module):

@@ -107,6 +107,13 @@ def test_policy_and_termination_read_the_trunk_of_their_option():
         *(f"hierarchy.levels.0.{part}" for part in ("trunk", "policy", "termination")),
         "hierarchy.meta_policy",
     ]
+    sizes = [100, 200]
+    bytes_of = [
+        make_hierarchy((3,), network="linear", trunk={"network": "lstm", "hidden": size}).step_bytes for size in sizes
+    ]
+    assert bytes_of[1] == pytest.approx(
+        2 * bytes_of[0], rel=0.1
+    )  # the gates of each step, not weights, which are squares
     assert hierarchy.step_bytes > make_hierarchy((3,), network="linear").step_bytes
 
 

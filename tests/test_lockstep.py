@@ -43,7 +43,7 @@ MODELS = {
     "flat": {"baseline": "flat"},
     "options": two_levels(["options"]),
     "hybrid": two_levels(["options", "control"]),
-    "lstm": {"baseline": {"kind": "flat", "policy": {"network": "lstm"}}},
+    "lstm": {"observations": [*OBSERVATIONS, "step"], "baseline": {"kind": "flat", "policy": {"network": "lstm"}}},
 }
 
 

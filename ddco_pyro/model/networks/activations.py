@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from ddco_pyro.model.networks.head import Head
 from ddco_pyro.model.networks.inputs import Inputs, InputShape
-from ddco_pyro.model.networks.state import answer
+from ddco_pyro.model.networks.state import HasState, answer
 
 
 def training_bytes(networks: Iterable[nn.Module], shape: InputShape) -> int:
@@ -18,21 +18,30 @@ def training_bytes(networks: Iterable[nn.Module], shape: InputShape) -> int:
     Each keeps tensors until its gradient is computed; meanwhile what it computed, and the gradient of that, are there
     too: measured with convolutions, that is at most twice what the largest network keeps.
     """
-    kept = [_kept(network, shape, 2) - _kept(network, shape, 1) for network in networks]
+    kept = [_kept(network, shape, *_another(network)) - _kept(network, shape, 1, 1) for network in networks]
     return sum(kept) + 2 * max(kept)
 
 
-def _zeros(shape: InputShape, steps: int) -> Inputs:
-    """Observations that are 0, N = 1."""
-    vectors = {key: torch.zeros(1, steps, size) for key, size in shape.vectors.items()}
-    images = {key: torch.zeros(1, steps, *image, dtype=torch.uint8) for key, image in shape.images.items()}
+def _another(network: nn.Module) -> tuple[int, int]:
+    """Trajectories and steps that are one more than (1, 1) together: a step, since a network may have parameters for each;
+    of one that remembers a trajectory, since what torch keeps of several steps grows in leaps.
+    """
+    return (2, 1) if isinstance(network, HasState) else (1, 2)
+
+
+def _zeros(shape: InputShape, trajectories: int, steps: int) -> Inputs:
+    """Observations that are 0."""
+    batch = (trajectories, steps)
+    vectors = {key: torch.zeros(*batch, size) for key, size in shape.vectors.items()}
+    images = {key: torch.zeros(*batch, *image, dtype=torch.uint8) for key, image in shape.images.items()}
     time = torch.arange(steps).clamp(max=shape.steps - 1)  # a network may have parameters for each step
     return Inputs(vectors, images, time)
 
 
-def _kept(network: nn.Module, shape: InputShape, steps: int) -> int:
+def _kept(network: nn.Module, shape: InputShape, trajectories: int, steps: int) -> int:
     """Bytes of all tensors, parameters too, that are kept for the gradient."""
-    seen = torch.zeros(1, steps, *network.reads) if isinstance(network, Head) else _zeros(shape, steps)
+    batch = (trajectories, steps)
+    seen = torch.zeros(*batch, *network.reads) if isinstance(network, Head) else _zeros(shape, *batch)
     storages: dict[int, int] = {}
 
     def keep(tensor: Tensor) -> Tensor:
