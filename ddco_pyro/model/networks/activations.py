@@ -23,8 +23,8 @@ def training_bytes(networks: Iterable[nn.Module], shape: InputShape) -> int:
 
 
 def _another(network: nn.Module) -> tuple[int, int]:
-    """Trajectories and steps that are one more than (1, 1) together: a step, since a network may have parameters for each;
-    of one that remembers a trajectory, since what torch keeps of several steps grows in leaps.
+    """Trajectories and steps that are one more than (1, 1): a step, since a network may have parameters for each; where
+    it remembers a trajectory, since what torch keeps of several steps grows in leaps.
     """
     return (2, 1) if isinstance(network, HasState) else (1, 2)
 
