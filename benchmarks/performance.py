@@ -58,7 +58,7 @@ def problem(network: str, number: int, steps: int, counts: tuple[int, ...] = (5,
         }
     )
     hierarchy = Hierarchy(spec, {"state": (FEATURES,)}, CONTROLS, steps)
-    inputs = Inputs(torch.randn(number, steps, FEATURES), {}, torch.arange(steps))
+    inputs = Inputs({"state": torch.randn(number, steps, FEATURES)}, {}, torch.arange(steps))
     return hierarchy, Batch(inputs, torch.randn(number, steps, CONTROLS), torch.full((number,), steps))
 
 

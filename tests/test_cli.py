@@ -183,7 +183,7 @@ GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
         ),
         (
             ["check", "SPEC", "--allow-code", *with_set(f"hierarchy.levels.0.policy={WITH_MEMORY}")],
-            r"hierarchy\.levels\.0\.policy: network .*; networks with a memory are not supported yet",
+            r"hierarchy\.levels\.0\.policy: network .*; one that remembers has to have initial_state",
         ),
         (
             ["check", "SPEC", *with_set("control.scale=[1, 2, 3]")],

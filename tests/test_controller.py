@@ -117,10 +117,13 @@ def test_most_likely_takes_the_mode_of_every_choice():
     assert play(controller, 2)[0] == [1, 1]
 
 
-@pytest.mark.parametrize(("counts", "emits"), [((2,), ("options",)), ((2, 2), ("options", "control"))])
-def test_choices_follow_the_models_latents(counts, emits):
+@pytest.mark.parametrize(
+    ("counts", "emits", "network"),
+    [((2,), ("options",), "linear"), ((2, 2), ("options", "control"), "linear"), ((2,), ("options",), "lstm")],
+)
+def test_choices_follow_the_models_latents(counts, emits, network):
     """Over many episodes of three different states, p(h_t) is that of the AHMM without any control seen."""
-    hierarchy = make(counts, emits, seed=3)
+    hierarchy = make(counts, emits, network, seed=3)
     states = torch.randn(3, 3, generator=torch.Generator().manual_seed(1)).numpy()
     with torch.no_grad():
         tables = hierarchy.tabulate(encode(demonstrations([states]), hierarchy.encoder, hierarchy.scaling))

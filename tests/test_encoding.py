@@ -106,6 +106,15 @@ def test_images_alone_have_no_features():
     assert (found.vector.shape, set(found.images)) == ((3, 5, 0), {"camera"})
 
 
+def test_the_step_is_a_part_of_the_longest_training_demonstration():
+    encoder = fitted(ObservationSpec(key="pose"), ObservationSpec(key="step", standardize=False))
+    found = encoder.inputs(demo.observations for demo in DEMOS)
+    assert list(found.vectors) == ["pose", "step"]
+    np.testing.assert_allclose(found.vectors["step"][0, :, 0], np.arange(5) / 5, rtol=1e-6)
+    np.testing.assert_allclose(found.vectors["step"][1, :3, 0], np.arange(3) / 5, rtol=1e-6)
+    assert "step" not in encoder.shapes  # nothing has to be observed for it
+
+
 def batch():
     encoder = fitted(ObservationSpec(key="pose"), ObservationSpec(key="camera"))
     scaling = ControlScaling(ControlSpec(scale="none"), 3, {}, all_gaussian(range(3)))

@@ -10,6 +10,7 @@ import onnx
 import pytest
 import torch
 from command_line import call
+from user_networks import Remembering
 
 import ddco_pyro
 import ddco_pyro.export as module
@@ -17,31 +18,44 @@ from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.export import TOLERANCE, export, runner
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import InputShape
 from ddco_pyro.spec import parse_spec
 
 SHAPES = {"state": (3,), "goal": (2, 2), "camera": (9, 12, 3)}
 
 
-def make(network="mlp", counts=(3,), emits=("options",), camera=False, steps=7, **rollout):
+def make(
+    network="mlp",
+    counts=(3,),
+    emits=("options",),
+    camera=False,
+    steps=7,
+    endings=None,
+    built_in=(),
+    trunk=None,
+    meta_policy=None,
+    **rollout,
+):
     """A run that was never fitted: random weights, observations with a mean and a spread."""
+    policy = network if isinstance(network, dict) else {"network": network}
     levels = [
-        {"name": f"level-{d}", "count": k, "policy": {"network": network} | ({"emits": list(emits)} if d else {})}
+        {"name": f"level-{d}", "count": k, "policy": policy | ({"emits": list(emits)} if d else {})}
         for d, k in enumerate(counts)
     ]
-    endings = {"network": network if network in ("conv", "per_timestep") else "linear"}
+    endings = endings or {"network": network if network in ("conv", "per_timestep") else "linear"}
     model = {
         "hierarchy": {
-            "levels": [level | {"termination": endings} for level in levels],
-            "meta_policy": {"network": network, "emits": list(emits)},
+            "levels": [level | {"termination": endings, "trunk": trunk} for level in levels],
+            "meta_policy": (meta_policy or policy) | {"emits": list(emits)},
         }
     }
     spec = parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5"},
-            "observations": [{"key": "state", "differences": True}, "goal", *(["camera"] if camera else [])],
+            "observations": [{"key": "state", "differences": True}, "goal", *built_in, *(["camera"] if camera else [])],
             "control": {"std": {"learn": True}},
             "rollout": rollout,
-            **(model if counts else {"baseline": {"kind": "flat", "policy": {"network": network}}}),
+            **(model if counts else {"baseline": {"kind": "flat", "policy": policy}}),
         }
     )
     torch.manual_seed(1)
@@ -54,6 +68,22 @@ def make(network="mlp", counts=(3,), emits=("options",), camera=False, steps=7, 
     return Fit(spec, hierarchy.eval())
 
 
+CONVOLUTIONS = {
+    "network": "conv",
+    "inputs": ["camera", "state"],
+    "layers": [{"filters": 3, "kernel": 4, "stride": 2, "padding": 1}, {"filters": 2, "kernel": 3}],
+    "pool": "spatial_softmax",
+}
+RECURRENT = {"network": "lstm", "over": {"hidden": [6]}, "hidden": [5, 4]}
+BRANCHES = {
+    "network": "branches",
+    "of": {
+        "camera": {"network": "lstm", "over": {"network": "conv", "filters": 2, "pool": "flatten"}, "hidden": 4},
+        "pair": {"network": "mlp", "inputs": ["goal", "state"], "hidden": [6]},
+        "step": {"network": "linear"},
+    },
+    "hidden": [7],
+}
 FITS = {
     "linear": make("linear", options="most_likely"),
     "mlp": make("mlp", control="sample"),
@@ -61,14 +91,22 @@ FITS = {
     "conv": make("conv", camera=True),
     "hybrid": make("mlp", (2, 3), ("options", "control"), control="sample"),
     "three levels": make("mlp", (2, 3, 2), ("options", "control")),
-    "flat": make("mlp", ()),
+    "flat": make("mlp", (), built_in=("step",)),
+    "lstm": make(RECURRENT, (2, 2), ("options", "control"), endings=RECURRENT, control="sample"),
+    "lstm over pictures": make({"network": "lstm", "over": CONVOLUTIONS}, camera=True, endings=CONVOLUTIONS, steps=30),
+    "trunk": make(
+        "linear", (2, 3), ("options", "control"), True, trunk=BRANCHES, meta_policy=BRANCHES, built_in=("step",)
+    ),
+    "several convolutions": make(
+        CONVOLUTIONS, camera=True, endings={"network": "linear", "inputs": ["step", "goal"]}, built_in=("step",)
+    ),
 }
 
 
 @pytest.mark.parametrize("name", FITS)
 def test_every_form_acts_as_the_controller_does(name, tmp_path):
     """On other observations than those that it was compared on when it was written, past the longest demonstration."""
-    fit, onnx = FITS[name], name in ("per_timestep", "conv")
+    fit, onnx = FITS[name], name in ("per_timestep", "conv", "lstm", "trunk")
     found = export(fit, tmp_path, onnx)
     assert list(found) == ["numpy", "torch", *(["onnx"] if onnx else [])]
     assert all(difference < TOLERANCE for difference, _ in found.values())
@@ -281,6 +319,19 @@ def test_networks_that_numpy_cannot_evaluate_are_compared_as_a_program(tmp_path,
     with pytest.raises(Failed, match="as torch"):
         export(fit, tmp_path / "other")
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("place", ["network", "over"])
+def test_a_users_state_is_carried_by_programs(place, tmp_path):
+    fit = make(RECURRENT)
+    meta_policy = fit.hierarchy.meta_policy
+    if place == "network":
+        meta_policy.network = Remembering(InputShape({"all": 10}), 3, 1)
+    else:
+        meta_policy.network.over = Remembering(InputShape({"all": 10}), 6, 1)
+    assert list(export(fit, tmp_path / "out", onnx=True)) == ["torch", "onnx"]
+    for form in ("torch", "onnx"):
+        assert len(compare(runner.Runner(tmp_path / "out", form), fit.controller(), 10)) > 1
 
 
 class Adding(torch.nn.Module):

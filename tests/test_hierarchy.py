@@ -14,6 +14,7 @@ from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.links import TERMINATION_BOUND
 from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.networks.state import answer
 from ddco_pyro.spec import parse_spec
 
 
@@ -21,7 +22,9 @@ from ddco_pyro.spec import parse_spec
 def test_gradient_is_the_papers_gradient_equation(emits):
     """∇L of §4.1 (and its hybrid terms, §4.2) with u, v, w summed over every path, against autograd."""
     hierarchy, batch = make_hierarchy((3,), emits).double(), make_batch()
-    batch = Batch(Inputs(batch.inputs.vector.double(), {}, batch.inputs.time), batch.actions.double(), batch.lengths)
+    batch = Batch(
+        Inputs({"state": batch.inputs.vector.double()}, {}, batch.inputs.time), batch.actions.double(), batch.lengths
+    )
     parameters = list(hierarchy.parameters())
     found = torch.autograd.grad(
         total_log_likelihood(hierarchy.tabulate(batch), batch.lengths), parameters, retain_graph=True
@@ -85,6 +88,33 @@ def test_terminations_keep_their_bound():
     bound = torch.tensor(TERMINATION_BOUND)
     np.testing.assert_allclose(psi[..., 0].detach(), bound.sigmoid(), rtol=1e-5)
     np.testing.assert_allclose(psi[..., 1].detach(), (-bound).sigmoid(), rtol=1e-3)
+
+
+def test_policy_and_termination_read_the_trunk_of_their_option():
+    hierarchy = make_hierarchy((3,), network="linear", trunk={"network": "lstm", "over": {"hidden": [5]}, "hidden": 4})
+    batch, level = make_batch(), hierarchy.levels[0]
+    outputs = hierarchy(batch.inputs)
+    features, _ = answer(level.trunk, batch.inputs)
+    assert features.shape == (*batch.inputs.batch, 3, 4)
+    for head, found in (
+        (level.policy.network, outputs.callers[0].emission.numbers),
+        (level.termination, outputs.termination_logits[0].unsqueeze(-1)),
+    ):
+        weight, bias = head.layers[0].weight, head.layers[0].bias
+        expected = torch.stack([features[:, :, k] @ weight[k] + bias[k] for k in range(3)], dim=2)
+        torch.testing.assert_close(found, expected)
+    assert [name for name, _ in hierarchy.named_networks()] == [
+        *(f"hierarchy.levels.0.{part}" for part in ("trunk", "policy", "termination")),
+        "hierarchy.meta_policy",
+    ]
+    sizes = [100, 200]
+    bytes_of = [
+        make_hierarchy((3,), network="linear", trunk={"network": "lstm", "hidden": size}).step_bytes for size in sizes
+    ]
+    assert bytes_of[1] == pytest.approx(
+        2 * bytes_of[0], rel=0.1
+    )  # the gates of each step, not weights, which are squares
+    assert hierarchy.step_bytes > make_hierarchy((3,), network="linear").step_bytes
 
 
 def test_discovery_sees_a_uniform_meta_policy():

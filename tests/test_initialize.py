@@ -27,7 +27,7 @@ def make_batch(vector, actions, images=None, lengths=LENGTHS):
         return torch.nn.utils.rnn.pad_sequence(parts, batch_first=True, padding_value=value)
 
     pictures = {key: pad(rows, 255) for key, rows in (images or {}).items()}
-    inputs = Inputs(pad(vector, 1e3).float(), pictures, torch.arange(max(lengths)))
+    inputs = Inputs({"state": pad(vector, 1e3).float()}, pictures, torch.arange(max(lengths)))
     return Batch(inputs, pad(actions, 1e3).float(), torch.tensor(lengths))
 
 

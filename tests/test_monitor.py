@@ -19,10 +19,10 @@ def demonstration(steps):
     return Demonstration("demo_0", {"state": rng.normal(size=(steps, 3))}, rng.normal(size=(steps, 2)))
 
 
-@pytest.mark.parametrize("counts", [(3,), (2, 2)])
-def test_what_it_says_at_the_end_is_what_the_demonstration_says(counts):
+@pytest.mark.parametrize(("counts", "network"), [((3,), "mlp"), ((2, 2), "mlp"), ((2, 2), "lstm")])
+def test_what_it_says_at_the_end_is_what_the_demonstration_says(counts, network):
     """Before the last control is known, the belief is the posterior of the demonstration without that control."""
-    hierarchy, demo = make_hierarchy(counts, ("options", "control")), demonstration(6)
+    hierarchy, demo = make_hierarchy(counts, ("options", "control"), network), demonstration(6)
     monitor = Monitor(hierarchy)
     for t in range(6):
         belief = monitor.step({"state": demo.observations["state"][t]}, demo.actions[t - 1] if t else None)
@@ -39,8 +39,9 @@ def test_what_it_says_at_the_end_is_what_the_demonstration_says(counts):
         torch.testing.assert_close(level[0, :, 1], expected.v[d][0, -1], atol=1e-6, rtol=0)
 
 
-def test_reset_forgets():
-    hierarchy, demo = make_hierarchy((3,)), demonstration(3)
+@pytest.mark.parametrize("network", ["mlp", "lstm"])
+def test_reset_forgets(network):
+    hierarchy, demo = make_hierarchy((3,), network=network), demonstration(3)
     monitor = Monitor(hierarchy)
     first = monitor.step({"state": demo.observations["state"][0]})
     monitor.step({"state": demo.observations["state"][1]}, demo.actions[0])

@@ -18,7 +18,7 @@ from ddco_pyro.spec.networks import SETTINGS
 if TYPE_CHECKING:
     from collections.abc import Hashable
 
-SHAPE = InputShape(3, {}, 5)
+SHAPE = InputShape({"state": 3}, {}, 5)
 
 
 # --- built-in ---------------------------------------------------------------------------------------------------------
@@ -28,7 +28,7 @@ def test_every_built_in_network_takes_the_settings_that_a_spec_has_for_it():
     assert list(CLASSES) == list(SETTINGS)
     for name, built_in in CLASSES.items():
         parameters = inspect.signature(built_in).parameters
-        settings = [key for key in SETTINGS[name].model_fields if key != "network"]
+        settings = [key for key in SETTINGS[name].model_fields if key not in ("network", "inputs")]
         assert list(parameters) == ["shape", "outputs", "copies", *settings], name
         assert all(one.default is inspect.Parameter.empty for one in parameters.values()), name  # the spec has them
 
@@ -37,8 +37,13 @@ def test_every_built_in_network_takes_the_settings_that_a_spec_has_for_it():
 def test_the_settings_of_a_spec_reach_the_network(name):
     other = {"hidden": [7, 9], "dropout": 0.25, "filters": 2, "kernel": 3}
     given = {key: value for key, value in other.items() if key in SETTINGS[name].model_fields}
-    shape = InputShape(3, {"camera": (6, 6, 3)} if name == "conv" else {}, 5)
+    shape = InputShape({"state": 3}, {"camera": (6, 6, 3)} if name == "conv" else {}, 5)
+    if name == "branches":
+        given["of"] = {"state": NetworkSpec(network="linear")}
     network = build(NetworkSpec(network=name, **given), shape, 2, 4)
+    if name == "lstm":
+        assert [layer.recurrent.shape for layer in network.memory] == [(4, 7, 28), (4, 9, 36)]
+        return
     sizes = [layer.weight.shape[1] for layer in network.layers if hasattr(layer, "weight")]
     assert sizes == [3 + (2 * 64 if name == "conv" else 0), *given.get("hidden", [])]
     assert {layer.p for layer in network.layers if isinstance(layer, nn.Dropout)} == (

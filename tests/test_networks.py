@@ -13,10 +13,11 @@ from user_networks import Stateful
 from ddco_pyro.model.networks import CLASSES, Inputs, InputShape, ShapeError, build
 from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.model.networks.stacked import StackedLinear
+from ddco_pyro.model.networks.state import answer
 from ddco_pyro.spec import NetworkSpec
 
 FEATURES, OUTPUTS, COPIES, LONGEST = 3, 2, 4, 5
-SHAPE = InputShape(FEATURES, {}, LONGEST)
+SHAPE = InputShape({"state": FEATURES}, {}, LONGEST)
 PIXELS = (14, 18, 3)
 
 
@@ -32,7 +33,7 @@ def make_inputs(trajectories=2, steps=LONGEST, start=0, images=()):
         key: torch.randint(0, 256, (trajectories, steps, *PIXELS), generator=generator, dtype=torch.uint8)
         for key in images
     }
-    return Inputs(vector, pictures, torch.arange(start, start + steps))
+    return Inputs({"state": vector}, pictures, torch.arange(start, start + steps))
 
 
 def separate(layers, k):
@@ -65,14 +66,14 @@ def test_stacked_networks_are_separate_networks(settings):
 def test_a_linear_network_is_affine():
     network, one, other = make(network="linear"), make_inputs(), make_inputs()
     other.vector[:] = torch.randn(other.vector.shape, generator=torch.Generator().manual_seed(2))
-    between = Inputs(0.3 * one.vector + 0.7 * other.vector, {}, one.time)
+    between = Inputs({"state": 0.3 * one.vector + 0.7 * other.vector}, {}, one.time)
     assert_close(network(between), 0.3 * network(one) + 0.7 * network(other))
 
 
 def test_an_mlp_is_not_affine():
     network, one = make(hidden=[8]), make_inputs()
-    twice = Inputs(2 * one.vector, {}, one.time)
-    nothing = Inputs(0 * one.vector, {}, one.time)
+    twice = Inputs({"state": 2 * one.vector}, {}, one.time)
+    nothing = Inputs({"state": 0 * one.vector}, {}, one.time)
     assert not torch.allclose(network(twice) + network(nothing), 2 * network(one), atol=1e-3)
 
 
@@ -94,7 +95,7 @@ def test_no_option_is_trained_by_another_options_output(settings):
 
 
 def test_no_option_is_trained_by_another_options_images():
-    network = make(InputShape(FEATURES, {"camera": PIXELS}), network="conv", filters=3, hidden=[8])
+    network = make(InputShape({"state": FEATURES}, {"camera": PIXELS}), network="conv", filters=3, hidden=[8])
     network(make_inputs(images=("camera",)))[:, :, 1].sum().backward()
     for parameter in network.parameters():
         per_option = parameter.grad.reshape(COPIES, -1).abs().sum(1)
@@ -137,7 +138,7 @@ def test_networks_of_different_steps_differ():
 )
 def test_each_step_costs_one_network_however_many_there_are(trajectories, steps, start):
     width, longest = 16, 60
-    network = make(InputShape(FEATURES, {}, longest), network="per_timestep", hidden=[width])
+    network = make(InputShape({"state": FEATURES}, {}, longest), network="per_timestep", hidden=[width])
     with FlopCounterMode(display=False) as counter:
         network(make_inputs(trajectories, steps, start))
     multiplications = COPIES * (FEATURES * width + width * OUTPUTS)
@@ -161,7 +162,7 @@ def separate_conv(network, k, inputs, filters):
 
 @pytest.mark.parametrize("images", [("camera",), ("camera", "wrist")])
 def test_conv_networks_are_separate_networks(images):
-    shape, filters = InputShape(FEATURES, dict.fromkeys(images, PIXELS), LONGEST), 3
+    shape, filters = InputShape({"state": FEATURES}, dict.fromkeys(images, PIXELS), LONGEST), 3
     network = make(shape, network="conv", filters=filters, hidden=[8])
     inputs = make_inputs(images=images)
     expected = torch.stack([separate_conv(network, k, inputs, filters) for k in range(COPIES)], dim=2)
@@ -169,18 +170,95 @@ def test_conv_networks_are_separate_networks(images):
 
 
 def test_conv_reads_images_without_any_vector():
-    network = make(InputShape(0, {"camera": PIXELS}), network="conv", filters=2)
+    network = make(InputShape({}, {"camera": PIXELS}), network="conv", filters=2)
     inputs = make_inputs(images=("camera",))
-    alone = Inputs(inputs.vector[..., :0], inputs.images, inputs.time)
+    alone = Inputs({}, inputs.images, inputs.time)
     assert network(alone).shape == (2, LONGEST, COPIES, OUTPUTS)
     assert not torch.allclose(network(alone)[0, 0], network(alone)[0, 1])
 
 
+POOLS = {
+    "mean": lambda maps: nn.functional.adaptive_avg_pool2d(maps, 3).flatten(1),
+    "flatten": lambda maps: maps.flatten(1),
+    "spatial_softmax": lambda maps: expected_places(maps),
+}
+
+
+def expected_places(maps):
+    """Sum of the places of all pixels, weighted with the softmax over the pixels of each map."""
+    height, width = maps.shape[2:]
+    weights = torch.softmax(maps.flatten(2), 2).reshape(maps.shape)
+    rows, columns = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
+    return torch.stack([(weights * place).sum((2, 3)) for place in (rows, columns)], 2).flatten(1)
+
+
+@pytest.mark.parametrize("pool", POOLS)
+def test_several_convolutions_are_separate_networks(pool):
+    layers = [{"filters": 3, "kernel": 4, "stride": 2, "padding": 1}, {"filters": 2, "kernel": 3}]
+    shape = InputShape({}, {"camera": PIXELS})
+    network = make(shape, network="conv", layers=layers, pool=pool, pooled=3, hidden=[8])
+    inputs = Inputs({}, make_inputs(images=("camera",)).images, torch.arange(LONGEST))
+    pixels = inputs.images["camera"].flatten(0, 1).permute(0, 3, 1, 2) / 255
+    first, second = network.convolutions["camera"], network.deeper["camera"][0]
+    expected = []
+    for k in range(COPIES):
+        a, b = slice(3 * k, 3 * (k + 1)), slice(2 * k, 2 * (k + 1))
+        maps = nn.functional.conv2d(pixels, first.weight[a], first.bias[a], stride=2, padding=1).relu()
+        maps = nn.functional.conv2d(maps, second.weight[b], second.bias[b]).relu()
+        expected.append(separate(network.layers, k)(POOLS[pool](maps)).unflatten(0, inputs.batch))
+    assert_close(network(inputs), torch.stack(expected, dim=2))
+
+
 def test_an_image_may_be_called_as_a_layer_is():
-    network = make(InputShape(FEATURES, {"0": PIXELS}), network="conv", filters=2, hidden=[3])
+    network = make(InputShape({"state": FEATURES}, {"0": PIXELS}), network="conv", filters=2, hidden=[3])
     _, arrays = network.numpy_form()
     shapes = sorted(parameter.shape for parameter in network.parameters())
     assert sorted(array.shape for array in arrays.values()) == shapes
+
+
+def test_branches_read_each_their_own_and_are_joined():
+    shape = InputShape({"pose": 2, "goal": 3, "other": 4}, {"camera": PIXELS})
+    pair = {"network": "linear", "inputs": ["goal", "pose"]}
+    picture = {"network": "conv", "filters": 2, "hidden": [6]}
+    network = make(shape, network="branches", of={"camera": picture, "pair": pair, "goal": {"hidden": [5]}}, hidden=[8])
+    inputs = random_inputs(shape, 2, LONGEST, 0)
+    seen = Inputs({}, inputs.images, inputs.time)
+    camera, _, goal = network.of
+    for layers in (camera.layers, goal.layers):
+        assert isinstance(layers[-2], nn.ReLU)  # what is read are hidden layers
+    expected = []
+    for k in range(COPIES):
+        picture = separate_conv(camera, k, seen, 2)
+        vectors = inputs.vectors
+        joined = [picture, vectors["goal"], vectors["pose"], separate(goal.layers, k)(vectors["goal"])]
+        expected.append(separate(network.layers, k)(torch.cat(joined, -1)))
+    assert_close(answer(network, inputs)[0], torch.stack(expected, dim=2))
+
+
+# --- some of the observations -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("settings", [{"network": "linear"}, {"network": "user_networks:Own"}])
+def test_a_network_reads_the_observations_that_it_is_to_read(settings):
+    shape = InputShape({"pose": 2, "goal": 3}, {"camera": PIXELS})
+    generator = torch.Generator().manual_seed(1)
+    pose, goal = (torch.randn(2, LONGEST, size, generator=generator) for size in (2, 3))
+    images = make_inputs(images=("camera",)).images
+    torch.manual_seed(0)
+    network = build(NetworkSpec(**settings, inputs=("goal",)), shape, OUTPUTS, COPIES)
+    torch.manual_seed(0)
+    alone = build(NetworkSpec(**settings), InputShape({"goal": 3}), OUTPUTS, COPIES)
+    time = torch.arange(LONGEST)
+    found = network(Inputs({"pose": pose, "goal": goal}, images, time))
+    assert_close(found, alone(Inputs({"goal": goal}, {}, time)))
+
+
+def test_all_vectors_are_read_in_the_order_of_the_spec():
+    network = make(InputShape({"b": 1, "a": 2}), network="linear")
+    generator = torch.Generator().manual_seed(1)
+    b, a = (torch.randn(2, LONGEST, size, generator=generator) for size in (1, 2))
+    expected = torch.stack([separate(network.layers, k)(torch.cat([b, a], -1)) for k in range(COPIES)], dim=2)
+    assert_close(network(Inputs({"b": b, "a": a}, {}, torch.arange(LONGEST))), expected)
 
 
 # --- a user's own -----------------------------------------------------------------------------------------------------
@@ -192,7 +270,10 @@ def test_a_network_of_ones_own():
 
 
 def test_trying_a_network_of_ones_own_leaves_no_trace():
-    spec, shape = NetworkSpec(network="user_networks:Stateful"), InputShape(FEATURES, {"camera": PIXELS}, steps=1)
+    spec, shape = (
+        NetworkSpec(network="user_networks:Stateful"),
+        InputShape({"state": FEATURES}, {"camera": PIXELS}, steps=1),
+    )
     torch.manual_seed(0)
     network = build(spec, shape, OUTPUTS, COPIES)
     drawn = torch.rand(3)
@@ -228,9 +309,29 @@ def test_an_output_of_another_shape_is_refused_when_the_network_is_made(how, mes
 @pytest.mark.parametrize(
     ("shape", "settings", "message"),
     [
-        (InputShape(3, {"camera": PIXELS}), {"network": "linear"}, "reads vectors, but camera are images"),
-        (InputShape(3, {"camera": PIXELS}), {"network": "per_timestep"}, "reads vectors, but camera are images"),
+        (InputShape({"state": 3}, {"camera": PIXELS}), {"network": "linear"}, "reads vectors, but camera are images"),
+        (
+            InputShape({"state": 3}, {"camera": PIXELS}),
+            {"network": "per_timestep"},
+            "reads vectors, but camera are images",
+        ),
         (SHAPE, {"network": "conv"}, "needs an image among the observations"),
+        (
+            SHAPE,
+            {"network": "branches", "of": {"camera": {"network": "conv"}}},
+            r"^of.camera: inputs: there is no observation 'camera'; there is: state",
+        ),
+        (
+            InputShape({"state": 3}, {"camera": PIXELS}),
+            {"network": "lstm", "over": {"network": "linear"}},
+            "^over: reads vectors, but camera are images",
+        ),
+        (SHAPE, {"inputs": ["stat"]}, r"no observation 'stat' \(did you mean 'state'\?\); there is: state"),
+        (
+            InputShape({}, {"camera": (6, 6, 3)}),
+            {"network": "conv", "layers": [{"filters": 2, "kernel": 5}, {"filters": 2, "kernel": 3}]},
+            "camera of 6 × 6 is too small for its layers",
+        ),
         (SHAPE, {"network": "no_such_module:Net"}, "'no_such_module:Net' cannot be imported: No module named"),
         (SHAPE, {"network": "user_networks:Missing"}, "'user_networks:Missing' cannot be imported: .*no attribute"),
         (SHAPE, {"network": "user_networks:NotANetwork"}, "is not a torch.nn.Module class"),
@@ -251,45 +352,124 @@ def random_inputs(shape, trajectories, steps, start):
         key: torch.randint(256, (trajectories, steps, *size), generator=generator, dtype=torch.uint8)
         for key, size in shape.images.items()
     }
-    vector = torch.randn(trajectories, steps, shape.vector, generator=generator)
-    return Inputs(vector, images, torch.arange(start, start + steps))
+    vectors = {key: torch.randn(trajectories, steps, size, generator=generator) for key, size in shape.vectors.items()}
+    return Inputs(vectors, images, torch.arange(start, start + steps))
 
 
 def step_by_step(network, inputs):
-    """The outputs of a call for every step of every trajectory."""
+    """The outputs of a call for every step of every trajectory, the state carried from each to the next."""
     trajectories, steps = inputs.batch
     rows = []
     for n in range(trajectories):
+        state = None
         for t in range(steps):
-            images = {key: image[n, t][None, None] for key, image in inputs.images.items()}
-            rows.append(network(Inputs(inputs.vector[n, t][None, None], images, inputs.time[t : t + 1])))
+            here = inputs.map(lambda array, n=n, t=t: array[n, t][None, None], inputs.time[t : t + 1])
+            row, state = answer(network, here, state)
+            rows.append(row)
     return torch.stack([torch.stack(rows[n * steps : (n + 1) * steps]) for n in range(trajectories)])[:, :, 0, 0]
 
 
-vectors, sizes = st.integers(1, 6), st.lists(st.integers(1, 5), max_size=2)
+sizes = st.lists(st.integers(1, 5), max_size=2)
+some_vectors = st.dictionaries(st.sampled_from(["pose", "goal"]), st.integers(1, 6), min_size=1)
 pictures = st.dictionaries(
     st.sampled_from(["camera", "wrist"]), st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(1, 4)),
     min_size=1,
 )  # fmt: skip
 perceptrons = st.fixed_dictionaries({"network": st.sampled_from(["mlp", "per_timestep"]), "hidden": sizes})
 convolutions = st.fixed_dictionaries(
-    {"network": st.just("conv"), "hidden": sizes, "filters": st.integers(1, 3), "kernel": st.integers(1, 5)}
+    {"network": st.just("conv"), "hidden": sizes, "filters": st.integers(1, 3), "kernel": st.integers(1, 5)},
+    optional={"pool": st.sampled_from(["flatten", "mean", "spatial_softmax"]), "pooled": st.integers(1, 3)},
 )
-users = st.just({"network": "user_networks:Own", "options": {"gain": 0.7}})
-assert set(CLASSES) == {"linear", "mlp", "per_timestep", "conv"}, "a new network belongs in every_kind"
+users = st.sampled_from(
+    [{"network": "user_networks:Own", "options": {"gain": 0.7}}, {"network": "user_networks:Remembering"}]
+)
+
+
+def lstm(over):
+    """An LSTM over another network."""
+    some = st.lists(st.integers(1, 5), min_size=1, max_size=2)
+    return st.fixed_dictionaries({"network": st.just("lstm"), "over": over, "hidden": some})
+
+
+def branches():
+    """A branch for each of three observations, and one for two of them."""
+    pair = (perceptrons | lstm(perceptrons)).map(lambda network: network | {"inputs": ["goal", "pose"]})
+    vector = st.just({"network": "linear"}) | perceptrons | users | lstm(perceptrons)
+    of = st.fixed_dictionaries(
+        {"camera": convolutions | lstm(convolutions)}, optional={"pose": vector, "goal": vector, "pair": pair}
+    )
+    some = st.lists(st.integers(1, 5), min_size=1, max_size=2)
+    return st.fixed_dictionaries({"network": st.just("branches"), "of": of, "hidden": some})
+
+
+assert set(CLASSES) == {"linear", "mlp", "per_timestep", "conv", "lstm", "branches"}, (
+    "a new network belongs in every_kind"
+)
 every_kind = st.one_of(
-    st.tuples(st.just({"network": "linear"}) | perceptrons | users, vectors, st.just({})),
-    st.tuples(convolutions, st.integers(0, 4), pictures),
+    st.tuples(st.just({"network": "linear"}) | perceptrons | users, some_vectors, st.just({})),
+    st.tuples(lstm(st.none() | perceptrons | users | lstm(perceptrons)), some_vectors, st.just({})),
+    st.tuples(branches(), st.just({"pose": 2, "goal": 3}), st.just({"camera": (7, 6, 2)})),
+    st.tuples(convolutions | lstm(convolutions), some_vectors | st.just({}), pictures),
 )
 
 
 @settings(deadline=None)
 @given(every_kind, st.integers(1, 9), st.integers(1, 3), st.integers(1, 8), st.integers(0, 12))
 def test_a_call_for_many_steps_is_a_call_for_each(kind, longest, trajectories, steps, start):
-    spec, vector, images = kind
-    network = make(InputShape(vector, images, longest), **spec)
-    inputs = random_inputs(InputShape(vector, images), trajectories, steps, start)
-    assert_close(network(inputs), step_by_step(network, inputs))
+    spec, vectors, images = kind
+    network = make(InputShape(vectors, images, longest), **spec)
+    inputs = random_inputs(InputShape(vectors, images), trajectories, steps, start)
+    whole, _ = answer(network, inputs)
+    assert_close(whole, step_by_step(network, inputs))
+
+
+@pytest.mark.parametrize("over", [None, {"hidden": [7]}])
+def test_lstms_are_separate_networks(over):
+    network, inputs = make(network="lstm", over=over, hidden=[6, 5]), make_inputs()
+    values = torch.stack([inputs.vector] * COPIES)
+    if over:
+        values = torch.stack([separate(network.over.layers, k)(inputs.vector) for k in range(COPIES)])
+    expected = []
+    for k in range(COPIES):
+        own = values[k]
+        for layer in network.memory:
+            alone = nn.LSTM(layer.inputs.weight.shape[1], layer.size[1], batch_first=True)
+            with torch.no_grad():
+                alone.weight_ih_l0.copy_(layer.inputs.weight[k].T)
+                alone.weight_hh_l0.copy_(layer.recurrent[k].T)
+                alone.bias_ih_l0.copy_(layer.inputs.bias[k, 0])
+                alone.bias_hh_l0.zero_()
+            own, _ = alone(own)
+        expected.append(separate(network.layers, k)(own))
+    assert_close(answer(network, inputs)[0], torch.stack(expected, dim=2))
+
+
+def test_no_option_is_trained_by_another_options_memory():
+    network = make(network="lstm", hidden=[8])
+    answer(network, make_inputs())[0][:, :, 1].sum().backward()
+    for parameter in network.parameters():
+        per_option = parameter.grad.abs().flatten(1).sum(1)
+        assert per_option[1] > 0
+        assert per_option[[0, 2, 3]].tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("alone", "has initial_state(N), which has to give a tuple of tensors [N, ...]; each call"),
+        ("list", "has initial_state(N), which has to give a tuple"),
+        ("without trajectories", "has initial_state(N), which has to give a tuple"),
+        ("other shape", "has initial_state(N), which has to give a tuple"),
+        ("forgets", "gives other outputs step by step than for a whole trajectory: its state has to hold all"),
+        ("looks ahead", "gives other outputs step by step than for a whole trajectory"),
+        ("over trajectories", "gives other outputs step by step than for a whole trajectory"),
+    ],
+)
+def test_a_state_that_does_not_go_on_is_refused_when_the_network_is_made(how, message):
+    with pytest.raises(ShapeError) as caught:
+        make(network="user_networks:Remembering", options={"how": how})
+    assert str(caught.value).startswith(f"network 'user_networks:Remembering' {message}")
+    assert "\n" not in str(caught.value)
 
 
 MEMORIES = ["over time", "over trajectories", "differences", "later steps", "whole trajectory", "whole batch", "chance"]

@@ -13,7 +13,8 @@ from ddco_pyro.spec import ObservationSpec
 
 
 def make_encoder(differences=True):
-    encoder = ObservationEncoder([ObservationSpec(key="state", differences=differences)], {"state": (2,)})
+    specs = [ObservationSpec(key="state", differences=differences), ObservationSpec(key="step")]
+    encoder = ObservationEncoder(specs, {"state": (2,)})
     states = np.random.default_rng(0).normal(size=(7, 2))
     demos = Demonstrations((Demonstration("demo_0", {"state": states}, np.zeros((7, 1))),))
     encoder.fit(demos)
@@ -29,6 +30,7 @@ def test_steps_are_those_of_the_whole_demonstration(differences):
         one = window.inputs([{"state": state}])
         assert one.time.tolist() == [t]
         torch.testing.assert_close(one.vector[0, 0], whole.vector[0, t])
+        assert one.vectors["step"].shape == (1, 1, 1)
 
 
 @pytest.mark.parametrize(

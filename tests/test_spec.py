@@ -314,7 +314,16 @@ values = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(texts, inner, max_size=3),
     max_leaves=6,
 )
+perceptrons = st.fixed_dictionaries({}, optional={"hidden": counts | st.lists(counts, max_size=3), "dropout": shares})
 networks = st.one_of(
+    perceptrons,
+    st.fixed_dictionaries(
+        {"network": st.just("branches"), "of": st.dictionaries(texts, perceptrons, min_size=1, max_size=2)}
+    ),
+    st.fixed_dictionaries(
+        {"network": st.just("lstm")},
+        optional={"over": st.none() | perceptrons, "hidden": st.lists(counts, min_size=1), "inputs": st.lists(texts)},
+    ),
     st.fixed_dictionaries({"network": st.just("linear")}),
     st.fixed_dictionaries(
         {}, optional={"network": st.just("per_timestep"), "hidden": st.lists(counts, max_size=3), "dropout": shares}
@@ -341,6 +350,9 @@ def hierarchies(draw: st.DrawFn) -> dict[str, Any]:
         if index:
             policy["emits"] = draw(emissions)
         level = {"name": f"level-{index}", "count": draw(counts), "policy": policy, "termination": draw(networks)}
+        if draw(st.booleans()):
+            heads = {"policy": policy | draw(perceptrons), "termination": {"network": "linear"}}
+            level |= heads | {"trunk": draw(networks)} if set(policy) <= {"emits", "hidden", "dropout"} else {}
         levels.append(level)
     return {"levels": levels, "meta_policy": {**draw(networks), "emits": draw(emissions)}}
 
@@ -419,9 +431,13 @@ def test_the_schema_refuses_networks_that_are_refused(place: str, network: dict[
 def test_the_schema_says_which_networks_have_a_setting() -> None:
     for name in ("NetworkSpec", "PolicySpec", "MetaPolicySpec"):
         properties = spec_schema()["$defs"][name]["properties"]
-        assert properties["network"]["anyOf"][0] == {"enum": ["linear", "mlp", "per_timestep", "conv"]}
+        assert properties["network"]["anyOf"][0] == {
+            "enum": ["linear", "mlp", "per_timestep", "conv", "lstm", "branches"]
+        }
         assert properties["filters"]["description"].endswith(" For ``conv``.")
-        assert properties["hidden"]["description"].endswith(" For ``mlp``, ``per_timestep``, ``conv``.")
+        assert properties["hidden"]["description"].endswith(
+            " For ``mlp``, ``per_timestep``, ``conv``, ``lstm``, ``branches``."
+        )
         assert properties["hidden"]["default"] == [64]
 
 
@@ -437,7 +453,7 @@ def test_the_schema_knows_the_keys_of_the_example() -> None:
     example = yaml.safe_load(EXAMPLE)
     assert set(example) <= set(schema["properties"])
     assert set(example["training"]) <= set(schema["$defs"]["TrainingSpec"]["properties"])
-    assert set(example["hierarchy"]["levels"][0]) == set(schema["$defs"]["LevelSpec"]["properties"])
+    assert {*example["hierarchy"]["levels"][0], "trunk"} == set(schema["$defs"]["LevelSpec"]["properties"])
     assert schema["required"] == ["observations"]
     assert schema["additionalProperties"] is False
     assert schema["$defs"]["LevelSpec"]["properties"]["count"]["minimum"] == 1

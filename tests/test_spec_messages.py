@@ -64,7 +64,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     (
         {"hierarchy.meta_policy.network": "mpl"},
         "hierarchy.meta_policy.network: no network is called 'mpl' (did you mean 'mlp'?); "
-        "use one of linear, mlp, per_timestep, conv, module:Class",
+        "use one of linear, mlp, per_timestep, conv, lstm, branches, module:Class",
     ),
     (
         {"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}},
@@ -73,6 +73,35 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     (
         {"hierarchy.meta_policy": {"network": "mlp", "options": {"a": 1}}},
         "hierarchy.meta_policy.options: does not apply to network 'mlp'; leave it out",
+    ),
+    ({"observations": ["step"]}, "observations: step alone says nothing of the state; name an observation beside it"),
+    (
+        {"observations": ["state", {"key": "step", "differences": True}]},
+        "observations.1.differences: step grows by the same at each step; leave it out",
+    ),
+    (
+        {"hierarchy.meta_policy": {"network": "conv", "kernel": 3, "layers": [{"filters": 2, "kernel": 3}]}},
+        "hierarchy.meta_policy.kernel: stands beside layers, which say it of each; leave it out",
+    ),
+    (
+        {"hierarchy.meta_policy": {"network": "lstm", "hidden": []}},
+        "hierarchy.meta_policy.hidden: lstm has one layer at least; give its size",
+    ),
+    (
+        {"hierarchy.meta_policy": {"network": "branches"}},
+        "hierarchy.meta_policy.of: missing; name an observation and its network, such as {state: {network: mlp}}",
+    ),
+    (
+        {"hierarchy.meta_policy": {"network": "lstm", "over": {"network": "mlp", "hiden": [8]}}},
+        "hierarchy.meta_policy.over.hiden: unknown key; did you mean hierarchy.meta_policy.over.hidden?",
+    ),
+    (
+        {"hierarchy.meta_policy": {"network": "branches", "of": {"state": {"network": "mlp", "hiden": [8]}}}},
+        "hierarchy.meta_policy.of.state.hiden: unknown key; did you mean hierarchy.meta_policy.of.state.hidden?",
+    ),
+    (
+        {"hierarchy.levels.0.trunk": {"network": "mlp"}, "hierarchy.levels.0.policy": {"network": "lstm"}},
+        "hierarchy.levels.0.policy.network: reads the trunk: use one of linear, mlp, got 'lstm'",
     ),
     ({"hierarchy.meta_policy.hidden": [8, 0]}, "hierarchy.meta_policy.hidden.1: must be at least 1, got 0"),
     ({"hierarchy.meta_policy.dropout": 1}, "hierarchy.meta_policy.dropout: must be less than 1, got 1"),

@@ -53,6 +53,11 @@ PLACES = [
     (f"hierarchy.levels.0.termination.network={NETWORK}", "hierarchy.levels.0.termination.network", NETWORK),
     (f"hierarchy.meta_policy.network={NETWORK}", "hierarchy.meta_policy.network", NETWORK),
     (
+        f"hierarchy.meta_policy={{network: branches, of: {{offsets: {{network: '{NETWORK}'}}}}}}",
+        "hierarchy.meta_policy.of.offsets.network",
+        NETWORK,
+    ),
+    (
         f"compare_with=[flat, {{kind: flat, policy: {{network: '{NETWORK}'}}}}]",
         "compare_with.1.policy.network",
         NETWORK,

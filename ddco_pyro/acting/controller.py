@@ -14,6 +14,7 @@ from ddco_pyro.acting.window import Window
 from ddco_pyro.model.ahmm import Tabulated, choose
 from ddco_pyro.model.emissions import Acting
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks.state import States
 from ddco_pyro.model.tables import complete
 from ddco_pyro.spec import RolloutSpec
 
@@ -56,6 +57,7 @@ class Controller:
         self.seeds, self.time = list(seeds), 0
         self._window = Window(self.hierarchy.encoder)
         self._choices: tuple[Tensor, ...] | None = None
+        self._states: States | None = None
         self.all_terminations = np.zeros((len(seeds), 0))
 
     @property
@@ -88,7 +90,7 @@ class Controller:
         """
         generators = [np.random.default_rng([seed, self.time]) for seed in self.seeds]
         with torch.no_grad():
-            outputs = self.hierarchy(self._window.inputs(observations))
+            outputs, self._states = self.hierarchy.advance(self._window.inputs(observations), self._states)
             now = complete(outputs.tables(), torch.ones(len(self.seeds), dtype=torch.int64)).steps()[0]
             with MostLikely() if self.options == "most_likely" else Drawn(generators):
                 self._choices = choose(self.time, now, self._choices)

@@ -11,6 +11,7 @@ from torch import Tensor
 from ddco_pyro.acting.window import ObservationError, Window
 from ddco_pyro.inference.filtering import Belief, Filter
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks.state import States
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.model.tables import complete
 
@@ -26,6 +27,7 @@ class Monitor:
         """Begin an episode."""
         self._window, self._filter = Window(self.hierarchy.encoder), Filter()
         self._outputs: Outputs | None = None
+        self._states: States | None = None
 
     @property
     def log_likelihood(self) -> float:
@@ -46,7 +48,7 @@ class Monitor:
                 self._filter.update(emission)
             elif control is not None:
                 raise ObservationError("no control comes before the first observation: leave it out")
-            self._outputs = self.hierarchy(inputs)
+            self._outputs, self._states = self.hierarchy.advance(inputs, self._states)
             return self._filter.predict(complete(self._outputs.tables(), ONE_STEP).steps()[0])
 
     def _scaled(self, control: np.ndarray | None) -> Tensor:

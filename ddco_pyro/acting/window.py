@@ -33,9 +33,11 @@ class Window:
             for observation in observations
         ]
         pairs = zip(self._last or now, now, strict=True)
-        both = self.encoder.inputs({key: np.stack([old[key], new[key]]) for key in new} for old, new in pairs)
-        images = {key: image[:, 1:] for key, image in both.images.items()}
-        inputs = Inputs(both.vector[:, 1:], images, torch.tensor([self.time]))
+        both = self.encoder.inputs(
+            ({key: np.stack([old[key], new[key]]) for key in new} for old, new in pairs),
+            np.array([self.time, self.time]),
+        )
+        inputs = both.map(lambda array: array[:, 1:], torch.tensor([self.time]))
         self._last, self.time = now, self.time + 1
         return inputs
 

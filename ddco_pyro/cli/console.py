@@ -148,8 +148,8 @@ def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Se
     from ddco_pyro.fitting.building import parameters
 
     table = Table("", "shape or parameters", show_edge=False)
-    for one in spec.observations:
-        table.add_row(f"observation {one.key}", str(list(size.shapes[one.key])))
+    for key in spec.observed:
+        table.add_row(f"observation {key}", str(list(size.shapes[key])))
     table.add_row("features", str(len(hierarchy.encoder.mean)))
     table.add_row("control", str([size.control_size]))
     for name, network in hierarchy.named_networks():

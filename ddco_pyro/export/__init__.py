@@ -20,14 +20,14 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.files import whole_folder
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.export import runner
-from ddco_pyro.export.program import StepProgram, example, input_names
+from ddco_pyro.export.program import StepProgram
 from ddco_pyro.export.runner import TOLERANCE
 from ddco_pyro.export.weights import weights_and_networks
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.encoding import ObservationEncoder
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.links import TERMINATION_BOUND
-from ddco_pyro.spec import RolloutSpec
+from ddco_pyro.spec import STEP, RolloutSpec
 
 __all__ = ["TOLERANCE", "Exported", "export"]
 
@@ -76,10 +76,10 @@ def _write(fit: Fit, folder: Path, onnx: bool) -> list[str]:
     hierarchy = fit.hierarchy.eval()
     program = StepProgram(hierarchy).eval()
     weights, about = weights_and_networks(hierarchy)
-    about |= _about(hierarchy, fit.spec.rollout) | {"outputs": program.names}
+    about |= _about(hierarchy, fit.spec.rollout) | {"outputs": program.names, "state": _state(program)}
     if about["numpy"]:
         np.savez(folder / "weights.npz", **weights)  # type: ignore[arg-type]
-    for name, content in _programs(program, hierarchy.encoder, onnx).items():
+    for name, content in _programs(program, onnx).items():
         (folder / name).write_bytes(content)
     shutil.copyfile(runner.__file__, folder / "runner.py")
     np.savez(folder / "check.npz", **record(fit.controller(), hierarchy))  # type: ignore[arg-type]
@@ -128,8 +128,10 @@ def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
                 "image": key in encoder.images,
                 "differences": key in vectors and vectors[key].differences,
             }
-            for key, shape in [*((key, encoder.shapes[key]) for key in vectors), *encoder.images.items()]
+            for key, shape in [*((key, encoder.shapes.get(key, (1,))) for key in vectors), *encoder.images.items()]
         ],
+        "step": {"key": STEP, "longest": float(encoder.longest)} if STEP in vectors else None,
+        "features": dict(zip(encoder.keys, encoder.sizes, strict=True)),
         "levels": [level.count for level in hierarchy.option_levels()],
         "varying": scaling.varying.tolist(),
         "scale": scale.tolist(),
@@ -140,6 +142,12 @@ def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
         "parts": [_part(hierarchy, number) for number in range(len(scaling.parts))],
         "termination_bound": TERMINATION_BOUND,
     }
+
+
+def _state(program: StepProgram) -> list[dict[str, Any]]:
+    """The state before the first step."""
+    tensors = [tensor.numpy() for tensor in program.initial_state()]
+    return [{"kind": str(one.dtype), "shape": list(one.shape), "values": one.ravel().tolist()} for one in tensors]
 
 
 def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
@@ -162,9 +170,9 @@ def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
     }
 
 
-def _programs(program: StepProgram, encoder: ObservationEncoder, onnx: bool) -> dict[str, bytes]:
+def _programs(program: StepProgram, onnx: bool) -> dict[str, bytes]:
     """The contents of ``controller.pt2`` and, if asked for, of ``controller.onnx``, by name."""
-    inputs, content = example(encoder), io.BytesIO()
+    inputs, content = program.example(), io.BytesIO()
     with _reported("the networks cannot be exported"), warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # of torch about itself
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, which nothing here needs
@@ -172,7 +180,7 @@ def _programs(program: StepProgram, encoder: ObservationEncoder, onnx: bool) -> 
         torch.export.save(exported, content)
         found = {"controller.pt2": content.getvalue()}
         if onnx:
-            found["controller.onnx"] = _onnx(exported, inputs, input_names(encoder), program.names)
+            found["controller.onnx"] = _onnx(exported, inputs, *program.onnx_names())
     return found
 
 
@@ -226,6 +234,9 @@ def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generato
     found: dict[str, np.ndarray] = {}
     at = 0
     for spec, size in zip(encoder.specs, encoder.sizes, strict=True):
+        if spec.key == STEP:
+            at += size
+            continue
         shape = encoder.shapes[spec.key]
         mean, std = (one[at : at + size].numpy() for one in (encoder.mean, encoder.std))
         length = int(np.prod(shape))

@@ -5,35 +5,34 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ddco_pyro.model.encoding import ObservationEncoder
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 
 
 class StepProgram(nn.Module):
-    """Features [F] (float64, not yet standardised), step [1] and images [H, W, C] to the outputs in ``names``.
+    """Features [F] (float64, not yet standardised), step [1], images [H, W, C] and the state to the outputs in
+    ``names`` and the next state.
 
     ``selection_d`` log-probabilities [K, 1 + k], ``control_d`` the numbers of the control [K, size], both of the
-    callers of level d (the last is the meta-policy), and ``termination_d`` ψ [k].
+    callers of level d (the last is the meta-policy), and ``termination_d`` ψ [k]. The state has the tensors [1, ...] of
+    each network that remembers, in the order of :meth:`~ddco_pyro.model.hierarchy.Hierarchy.networks`.
     """
-
-    mean: Tensor
-    std: Tensor
 
     def __init__(self, hierarchy: Hierarchy) -> None:
         super().__init__()
         self.hierarchy = hierarchy
-        self.register_buffer("mean", hierarchy.encoder.mean)
-        self.register_buffer("std", hierarchy.encoder.std)
         self.keys = list(hierarchy.encoder.images)
         with torch.no_grad():
-            self.names = list(self.outputs(*example(hierarchy.encoder)))
+            self.state = hierarchy.initial_states(1)
+            self.names = list(self.outputs(*self.example())[0])
 
-    def outputs(self, features: Tensor, step: Tensor, *images: Tensor) -> dict[str, Tensor]:
-        """The outputs by name."""
-        vector = ((features - self.mean) / self.std).float().reshape(1, 1, -1)
+    def outputs(self, features: Tensor, step: Tensor, *rest: Tensor) -> tuple[dict[str, Tensor], list[Tensor]]:
+        """The outputs by name, and the next state."""
+        images, tensors = rest[: len(self.keys)], iter(rest[len(self.keys) :])
+        states = {name: tuple(next(tensors) for _ in state) for name, state in self.state.items()}
+        vectors = self.hierarchy.encoder.standardized(features.reshape(1, 1, -1))
         pictures = {key: image.reshape(1, 1, *image.shape) for key, image in zip(self.keys, images, strict=True)}
-        said = self.hierarchy(Inputs(vector, pictures, step))
+        said, states = self.hierarchy.advance(Inputs(vectors, pictures, step), states)
         found = {}
         for level, caller in enumerate(said.callers):
             if caller.selection is not None:
@@ -42,19 +41,26 @@ class StepProgram(nn.Module):
                 found[f"control_{level}"] = caller.emission.numbers[0, 0]
         for level, log in enumerate(said.termination):
             found[f"termination_{level}"] = log[0, 0, :, 1].double().exp()
-        return found
+        return found, [tensor for state in states.values() for tensor in state]
 
-    def forward(self, features: Tensor, step: Tensor, *images: Tensor) -> tuple[Tensor, ...]:
-        """The outputs, in the order of ``names``."""
-        return tuple(self.outputs(features, step, *images).values())
+    def forward(self, features: Tensor, step: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
+        """The outputs, in the order of ``names``, and the next state."""
+        outputs, state = self.outputs(features, step, *rest)
+        return (*outputs.values(), *state)
 
+    def initial_state(self) -> list[Tensor]:
+        """The state before the first step."""
+        return [tensor.detach() for state in self.state.values() for tensor in state]
 
-def example(encoder: ObservationEncoder) -> tuple[Tensor, ...]:
-    """Inputs of the right shapes."""
-    images = [torch.zeros(shape, dtype=torch.uint8) for shape in encoder.images.values()]
-    return (torch.zeros(len(encoder.mean), dtype=torch.float64), torch.zeros(1, dtype=torch.int64), *images)
+    def example(self) -> tuple[Tensor, ...]:
+        """Inputs of the right shapes."""
+        encoder = self.hierarchy.encoder
+        images = [torch.zeros(shape, dtype=torch.uint8) for shape in encoder.images.values()]
+        features = torch.zeros(len(encoder.mean), dtype=torch.float64)
+        return (features, torch.zeros(1, dtype=torch.int64), *images, *self.initial_state())
 
-
-def input_names(encoder: ObservationEncoder) -> list[str]:
-    """What the inputs are called in ONNX."""
-    return ["features", "step", *(f"image_{number}" for number in range(len(encoder.images)))]
+    def onnx_names(self) -> tuple[list[str], list[str]]:
+        """What the inputs and outputs are called in ONNX."""
+        images = [f"image_{number}" for number in range(len(self.keys))]
+        state = [f"state_{number}" for number in range(len(self.initial_state()))]
+        return ["features", "step", *images, *state], [*self.names, *(f"next_{name}" for name in state)]

@@ -18,7 +18,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +33,11 @@ Outputs = dict[str, np.ndarray]
 [K, size] (scaled means, logits of switches and of discrete actions); d counts levels from 0, and the last d is the
 meta-policy."""
 
-Networks = Callable[[np.ndarray, int, Mapping[str, np.ndarray]], Outputs]
-"""Features [F], step, and images by key to :data:`Outputs`."""
+State = list[np.ndarray]
+"""What networks remember, each array [1, ...]."""
+
+Networks = Callable[[np.ndarray, int, Mapping[str, np.ndarray], State], tuple[Outputs, State]]
+"""Features [F], step, images by key and the state to :data:`Outputs` and the next state."""
 
 
 class Runner:
@@ -58,16 +61,21 @@ class Runner:
         self.terminations: tuple[float, ...] = ()
         self.outputs: Outputs = {}
         self._last: dict[str, np.ndarray] | None = None
+        self._state = [np.array(one["values"], one["kind"]).reshape(one["shape"]) for one in self.about["state"]]
 
     def act(self, observation: Mapping[str, Any]) -> np.ndarray:
         """The control [A], in the control's own units.
 
         :raises ValueError: an observation is missing, has an unseen shape or is not finite.
         """
+        built_in = self.about["step"]
+        if built_in:
+            observation = {**observation, built_in["key"]: np.array([self.time / built_in["longest"]])}
         now = {one["key"]: _checked(observation, one) for one in self.about["observations"]}
         features = self._features(now, self._last or now)
         images = {one["key"]: now[one["key"]] for one in self.about["observations"] if one["image"]}
-        self.outputs = outputs = self._networks(features, self.time, images)
+        self.outputs, self._state = self._networks(features, self.time, images, self._state)
+        outputs = self.outputs
         generator = np.random.default_rng([self.seed, self.time])
         self.choices = self._choose(outputs, generator)
         self.terminations = tuple(
@@ -197,50 +205,117 @@ class NumpyNetworks:
         with np.load(folder / "weights.npz", allow_pickle=False) as file:
             self._weights = {name: file[name] for name in file.files}
         self._about = about
+        self._after: State = []
 
-    def __call__(self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray]) -> Outputs:
-        """The outputs of every network for one observation."""
+    def __call__(
+        self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
+    ) -> tuple[Outputs, State]:
+        """The outputs of every network for one observation, and the next state."""
         weights, depth = self._weights, len(self._about["levels"])
         vector = ((features - weights["mean"]) / weights["deviation"]).astype(np.float32)
+        sizes = self._about["features"]
+        ends = np.cumsum([0, *sizes.values()])
+        self._seen = {key: vector[first:end] for key, first, end in zip(sizes, ends, ends[1:], strict=False)}
+        self._images, self._step = images, step
+        self._before, self._after = iter(state), []
         found: Outputs = {}
         for level, one in enumerate(self._about["callers"]):
-            out = self._network(one["network"], f"caller_{level}", vector, step, images)
+            if level < depth and self._about["trunks"][level]:
+                self._features = self._evaluate(self._about["trunks"][level], f"trunk_{level}")
+            out = self._evaluate(one["network"], f"caller_{level}")
             logits, mean = out[:, : one["logits"]], out[:, one["logits"] :]
             if one["choices"]:
                 found[f"selection_{level}"] = _selection(logits, one)
             if mean.shape[1]:
                 found[f"control_{level}"] = mean
             if level < depth:
-                raw = self._network(self._about["terminations"][level], f"end_{level}", vector, step, images)[:, 0]
+                raw = self._evaluate(self._about["terminations"][level], f"end_{level}")[:, 0]
                 bound = np.float32(self._about["termination_bound"])
                 found[f"termination_{level}"] = 1 / (1 + np.exp(-(bound * np.tanh(raw / bound)).astype(np.float64)))
+        return found, self._after
+
+    def _evaluate(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        """What a part of a network gives for each of K copies, [K, features]; ``name`` begins those of its arrays."""
+        found: np.ndarray = getattr(self, f"_{node['kind']}")(node, name)
         return found
 
-    def _network(
-        self, kind: Mapping[str, Any], name: str, vector: np.ndarray, step: int, images: Mapping[str, np.ndarray]
-    ) -> np.ndarray:
-        """[K, outputs] of K perceptrons, those of this step, over the vector and the convolutions of the images."""
-        copies = kind["copies"]
-        maps = [self._convolved(kind, f"{name}.image.{key}", images[key])[:, None] for key in kind["images"]]
-        values = np.concatenate([np.broadcast_to(vector, (copies, 1, len(vector))), *maps], axis=2)
-        first = min(step, kind["steps"] - 1) * copies
-        for layer in range(kind["layers"]):
-            weight, bias = self._weights[f"{name}.{layer}.weight"], self._weights[f"{name}.{layer}.bias"]
-            values = values @ weight[first : first + copies] + bias[first : first + copies]
-            if layer < kind["layers"] - 1:
+    def _vectors(self, node: Mapping[str, Any], _: str) -> np.ndarray:
+        vector = np.concatenate([np.zeros(0, np.float32), *(self._seen[key] for key in node["keys"])])
+        return np.broadcast_to(vector, (node["copies"], len(vector)))
+
+    def _trunk(self, _: Mapping[str, Any], __: str) -> np.ndarray:
+        return self._features
+
+    def _joined(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        return np.concatenate([self._evaluate(of, f"{name}.{number}") for number, of in enumerate(node["of"])], axis=1)
+
+    def _perceptrons(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        """K perceptrons, those of this step; ReLU follows the hidden layers."""
+        values = self._evaluate(node["of"], f"{name}.of")[:, None]
+        first = min(self._step, node["steps"] - 1) * node["copies"]
+        own = slice(first, first + node["copies"])
+        for layer in range(node["layers"]):
+            values = values @ self._weights[f"{name}.{layer}.weight"][own] + self._weights[f"{name}.{layer}.bias"][own]
+            if layer < node["hidden"]:
                 values = np.maximum(values, 0)
         return values[:, 0]
 
-    def _convolved(self, kind: Mapping[str, Any], name: str, image: np.ndarray) -> np.ndarray:
-        """Convolution with stride 2, ReLU, and means over ``pooled`` × ``pooled`` fields, [K, filters · pooled²]."""
-        weight, bias = self._weights[f"{name}.weight"], self._weights[f"{name}.bias"]
-        size, pooled = weight.shape[-1], kind["pooled"]
-        padded = np.pad(image.astype(np.float32) / 255, ((size // 2,) * 2, (size // 2,) * 2, (0, 0)))
-        windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(0, 1))[::2, ::2]
-        maps = np.maximum(np.einsum("hwcij,fcij->fhw", windows, weight, optimize=True) + bias[:, None, None], 0)
-        rows, columns = (_fields(length, pooled) for length in maps.shape[1:])
-        means = np.stack([[maps[:, a:b, c:d].mean((1, 2)) for c, d in columns] for a, b in rows])
-        return means.transpose(2, 0, 1).reshape(kind["copies"], -1)
+    def _lstm(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        """K LSTMs; networks are evaluated in the order in which the state has theirs."""
+        values = self._evaluate(node["of"], f"{name}.of")[:, None]
+        for layer in range(node["layers"]):
+            weight, bias, recurrent = (
+                self._weights[f"{name}.{layer}.{part}"] for part in ("inputs.weight", "inputs.bias", "recurrent")
+            )
+            h, c = (next(self._before).transpose(1, 0, 2) for _ in "hc")
+            take, keep, new, give = np.split(values @ weight + bias + h @ recurrent, 4, axis=2)
+            c = _sigmoid(keep) * c + _sigmoid(take) * np.tanh(new)
+            values = _sigmoid(give) * np.tanh(c)
+            self._after += [one.transpose(1, 0, 2) for one in (values, c)]
+        return values[:, 0]
+
+    def _convolutions(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        """Convolutions with ReLU of a picture, and what is read of their maps."""
+        maps = self._images[node["key"]].astype(np.float32).transpose(2, 0, 1)[None] / 255
+        for number, layer in enumerate(node["layers"]):
+            weight, bias = self._weights[f"{name}.{number}.weight"], self._weights[f"{name}.{number}.bias"]
+            maps = _convolved(np.broadcast_to(maps, (node["copies"], *maps.shape[1:])), weight, bias, layer)
+        return POOLS[node["pool"]](maps, node["pooled"]).reshape(node["copies"], -1)
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    return 0.5 * (1 + np.tanh(0.5 * x))
+
+
+def _convolved(maps: np.ndarray, weight: np.ndarray, bias: np.ndarray, layer: Mapping[str, Any]) -> np.ndarray:
+    """[K, C, H, W] to [K, filters, H', W'], ReLU after it; filters [K · filters, C, size, size]."""
+    size, pad, stride = weight.shape[-1], (layer["padding"],) * 2, layer["stride"]
+    padded = np.pad(maps, ((0, 0), (0, 0), pad, pad))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(2, 3))[:, :, ::stride, ::stride]
+    own = weight.reshape(len(maps), -1, *weight.shape[1:])
+    found = np.einsum("kchwij,kfcij->kfhw", windows, own, optimize=True)
+    return np.maximum(found + bias.reshape(len(maps), -1, 1, 1), 0)
+
+
+def _means(maps: np.ndarray, pooled: int) -> np.ndarray:
+    """Means over ``pooled`` × ``pooled`` fields, [K, filters, pooled, pooled]."""
+    rows, columns = (_fields(length, pooled) for length in maps.shape[2:])
+    return np.stack([np.stack([maps[:, :, a:b, c:d].mean((2, 3)) for c, d in columns], -1) for a, b in rows], -2)
+
+
+def _expected_places(maps: np.ndarray, _: int) -> np.ndarray:
+    """The expected (row, column), each from -1 to 1, under the softmax of each map, [K, filters, 2]."""
+    weights = np.exp(maps - maps.max((2, 3), keepdims=True))
+    weights /= weights.sum((2, 3), keepdims=True)
+    rows, columns = (np.linspace(-1, 1, length, dtype=np.float32) for length in maps.shape[2:])
+    return np.stack([weights.sum(3) @ rows, weights.sum(2) @ columns], -1)
+
+
+POOLS: dict[str, Callable[[np.ndarray, int], np.ndarray]] = {
+    "mean": _means,
+    "flatten": lambda maps, _: maps,
+    "spatial_softmax": _expected_places,
+}
 
 
 def _fields(length: int, number: int) -> list[tuple[int, int]]:
@@ -266,9 +341,11 @@ class TorchNetworks:
         self._program = torch.export.load(folder / "controller.pt2").module()
         self._outputs = about["outputs"]
 
-    def __call__(self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray]) -> Outputs:
-        """The outputs of every network for one observation."""
-        given = (features, np.array([step], np.int64), *images.values())
+    def __call__(
+        self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
+    ) -> tuple[Outputs, State]:
+        """The outputs of every network for one observation, and the next state."""
+        given = (features, np.array([step], np.int64), *images.values(), *state)
         threads = self._torch.get_num_threads()
         self._torch.set_num_threads(1)  # networks are small: more threads only wait for one another
         try:
@@ -276,7 +353,7 @@ class TorchNetworks:
                 values = self._program(*(self._torch.tensor(one) for one in given))
         finally:
             self._torch.set_num_threads(threads)
-        return {name: one.numpy() for name, one in zip(self._outputs, values, strict=True)}
+        return _divided(self._outputs, [one.numpy() for one in values])
 
 
 class OnnxNetworks:
@@ -289,14 +366,22 @@ class OnnxNetworks:
         options.intra_op_num_threads = 1
         self._session = onnxruntime.InferenceSession(str(folder / "controller.onnx"), options)
         self._inputs = {one.name for one in self._session.get_inputs()}
-        self._outputs = [one.name for one in self._session.get_outputs()]
+        self._outputs = about["outputs"]
 
-    def __call__(self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray]) -> Outputs:
-        """The outputs of every network for one observation."""
+    def __call__(
+        self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
+    ) -> tuple[Outputs, State]:
+        """The outputs of every network for one observation, and the next state."""
         given = {"features": features, "step": np.array([step], np.int64)}
         given |= {f"image_{number}": image for number, image in enumerate(images.values())}
-        values = self._session.run(self._outputs, {name: one for name, one in given.items() if name in self._inputs})
-        return dict(zip(self._outputs, values, strict=True))
+        given |= {f"state_{number}": one for number, one in enumerate(state)}
+        values = self._session.run(None, {name: one for name, one in given.items() if name in self._inputs})
+        return _divided(self._outputs, values)
+
+
+def _divided(names: Sequence[str], values: Sequence[np.ndarray]) -> tuple[Outputs, State]:
+    """What a program gives: first its outputs, then the next state."""
+    return dict(zip(names, values, strict=False)), list(values[len(names) :])
 
 
 FORMS: dict[str, Callable[[Path, Mapping[str, Any]], Networks]] = {

@@ -7,19 +7,20 @@ from typing import Any
 import numpy as np
 
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks.numpy_form import HasNumpyForm
+from ddco_pyro.model.networks.numpy_form import numpy_form
 
 Arrays = dict[str, np.ndarray]
 
 
 def weights_and_networks(hierarchy: Hierarchy) -> tuple[Arrays, dict[str, Any]]:
-    """Every array by name; ``callers``, ``terminations`` and whether ``numpy`` can evaluate all of them."""
+    """Every array by name; ``callers``, ``terminations``, ``trunks`` and whether ``numpy`` can evaluate all of them."""
     encoder = hierarchy.encoder
     arrays: Arrays = {"mean": encoder.mean.numpy(), "deviation": encoder.std.numpy()}
     levels = hierarchy.option_levels()
     networks = {f"caller_{number}": one.network for number, one in enumerate(hierarchy.callers())}
     networks |= {f"end_{number}": one.termination for number, one in enumerate(levels)}
-    forms = {name: network.numpy_form() for name, network in networks.items() if isinstance(network, HasNumpyForm)}
+    networks |= {f"trunk_{number}": one.trunk for number, one in enumerate(levels) if one.trunk is not None}
+    forms = {name: form for name, network in networks.items() if (form := numpy_form(network)) is not None}
     facts = {name: about for name, (about, _) in forms.items()}
     arrays |= {f"{name}.{key}": array for name, (_, each) in forms.items() for key, array in each.items()}
     callers = [
@@ -32,4 +33,10 @@ def weights_and_networks(hierarchy: Hierarchy) -> tuple[Arrays, dict[str, Any]]:
         for number, one in enumerate(hierarchy.callers())
     ]
     terminations = [facts.get(f"end_{number}") for number in range(len(levels))]
-    return arrays, {"callers": callers, "terminations": terminations, "numpy": len(forms) == len(networks)}
+    trunks = [facts.get(f"trunk_{number}") for number in range(len(levels))]
+    return arrays, {
+        "callers": callers,
+        "terminations": terminations,
+        "trunks": trunks,
+        "numpy": len(forms) == len(networks),
+    }

@@ -55,7 +55,7 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
 
     :raises SpecError: something in the spec does not fit the observations or the control.
     """
-    missing = [one.key for one in spec.observations if one.key not in dimensions.shapes]
+    missing = [key for key in spec.observed if key not in dimensions.shapes]
     if missing:
         known = ", ".join(sorted(dimensions.shapes))
         raise SpecError(f"observations: there is no {', '.join(missing)} (there are: {known})")

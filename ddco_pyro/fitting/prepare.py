@@ -88,7 +88,7 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
     else:
         path = collect(str(spec.demonstrated_task), own, Path(own.path) if own.path else None, on_event)
     _refuse_what_cannot_be_read(spec, path)
-    return Demonstrations.read(path, [one.key for one in spec.observations], _labels(spec), own.exclude)
+    return Demonstrations.read(path, spec.observed, _labels(spec), own.exclude)
 
 
 def outline(spec: Spec) -> Demonstrations:
@@ -100,7 +100,7 @@ def outline(spec: Spec) -> Demonstrations:
     path = Path(str(spec.demonstrations.path))
     _refuse_what_cannot_be_read(spec, path)
     controls = Demonstrations.read(path, [], _labels(spec), spec.demonstrations.exclude)
-    keys = [one.key for one in spec.observations]
+    keys = spec.observed
     with opened(path) as file:
         return replace(
             controls, demonstrations=tuple(_outlined(file[f"data/{one.name}"], one, keys) for one in controls)
@@ -120,7 +120,7 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
 
     :raises DemonstrationsError: they lack one of them.
     """
-    keys, labels, exclude = [one.key for one in spec.observations], _labels(spec), set(spec.demonstrations.exclude)
+    keys, labels, exclude = spec.observed, _labels(spec), set(spec.demonstrations.exclude)
     first = demos[0]
     if (first.observations.keys(), first.labels.keys(), exclude) == ({*keys}, {*labels}, set()):
         return demos
@@ -161,7 +161,7 @@ def _labels(spec: Spec) -> tuple[str, ...]:
 
 def _needed(spec: Spec) -> str:
     """What to do about a file that is not there."""
-    read = ["actions", *(f"obs/{one.key}" for one in spec.observations), *(f"labels/{name}" for name in _labels(spec))]
+    read = ["actions", *(f"obs/{key}" for key in spec.observed), *(f"labels/{name}" for name in _labels(spec))]
     return (
         "put it there, or fit to another with --set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, "
         f"with {', '.join(read)} in each data/<demonstration>"
@@ -176,7 +176,7 @@ def _refuse_what_cannot_be_read(spec: Spec, path: Path) -> None:
         "leave observations out, make its demonstrations fewer, shorter or equally long, scale pictures down, or lower "
         "filters or hidden"
     )
-    what = f"{path}: a fit to {', '.join(one.key for one in spec.observations)}"
+    what = f"{path}: a fit to {', '.join(spec.observed)}"
     refuse_too_much(memory_needed(spec, path), what, remedy)
 
 
@@ -185,7 +185,7 @@ def memory_needed(spec: Spec, path: Path) -> float:
 
     :raises DemonstrationsError: the file cannot be read or does not hold what the spec names.
     """
-    found = extent(path, [one.key for one in spec.observations], spec.demonstrations.exclude)
+    found = extent(path, spec.observed, spec.demonstrations.exclude)
     shapes = {place.removeprefix("obs/"): shape for place, shape in found.shapes.items() if place != "actions"}
     size = Dimensions(shapes, math.prod(found.shapes["actions"]), max(1, *found.lengths))
     try:

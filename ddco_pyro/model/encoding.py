@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.model.controls import ControlScaling, refuse_impossible
 from ddco_pyro.model.networks import Inputs, InputShape
-from ddco_pyro.spec import ObservationSpec
+from ddco_pyro.spec import STEP, ObservationSpec
 
 Shapes = Mapping[str, tuple[int, ...]]
 IMAGE_DIMENSIONS = 3
@@ -50,8 +50,7 @@ class Batch:
         """The demonstrations ``rows`` [M], padded to the longest among them; their first ``at_most`` steps if given."""
         lengths = self.lengths[rows].clamp(max=at_most or int(self.lengths.max()))
         steps = int(lengths.max())
-        images = {key: image[rows, :steps] for key, image in self.inputs.images.items()}
-        inputs = Inputs(self.inputs.vector[rows, :steps], images, self.inputs.time[:steps])
+        inputs = self.inputs.map(lambda array: array[rows, :steps], self.inputs.time[:steps])
         return Batch(inputs, self.actions[rows, :steps], lengths)
 
 
@@ -59,27 +58,39 @@ class ObservationEncoder(nn.Module):
     """Observations by name to one feature vector: differences appended, standardised where the spec says so.
 
     Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model.
-    A dimension that never changes is only centred.
+    A dimension that never changes is only centred. The built-in observation :data:`~ddco_pyro.spec.STEP` is made here:
+    the number of the step divided by ``longest``, the steps of the longest demonstration given to :meth:`fit`.
     """
 
     mean: Tensor
     std: Tensor
+    longest: Tensor
 
     def __init__(self, specs: Sequence[ObservationSpec], shapes: Shapes) -> None:
         super().__init__()
-        self.shapes = {spec.key: tuple(shapes[spec.key]) for spec in specs}
+        shapes = {**shapes, STEP: (1,)}
+        self.shapes = {spec.key: tuple(shapes[spec.key]) for spec in specs if spec.key != STEP}
         self.specs = tuple(spec for spec in specs if len(shapes[spec.key]) < IMAGE_DIMENSIONS)
         self.images = {spec.key: shapes[spec.key] for spec in specs if len(shapes[spec.key]) == IMAGE_DIMENSIONS}
         self.sizes = [int(np.prod(shapes[spec.key])) * (2 if spec.differences else 1) for spec in self.specs]
         self.register_buffer("mean", torch.zeros(sum(self.sizes), dtype=torch.float64))
         self.register_buffer("std", torch.ones(sum(self.sizes), dtype=torch.float64))
+        if STEP in self.keys:
+            self.register_buffer("longest", torch.ones((), dtype=torch.float64))
+
+    @property
+    def keys(self) -> list[str]:
+        """The vectors, in the spec's order."""
+        return [spec.key for spec in self.specs]
 
     def shape(self, steps: int) -> InputShape:
         """What networks are built for."""
-        return InputShape(sum(self.sizes), self.images, steps)
+        return InputShape(dict(zip(self.keys, self.sizes, strict=True)), self.images, steps)
 
     def fit(self, demonstrations: Demonstrations) -> None:
-        """Take mean and standard deviation from every step of these demonstrations."""
+        """Take mean and standard deviation from every step of these demonstrations, and the longest of them."""
+        if STEP in self.keys:
+            self.longest.fill_(max(demonstrations.lengths))
         rows = np.concatenate([self.features(demo.observations) for demo in demonstrations])
         standardize = np.repeat(np.array([spec.standardize for spec in self.specs], dtype=bool), self.sizes)
         spread = rows.std(0)
@@ -87,24 +98,37 @@ class ObservationEncoder(nn.Module):
         self.mean.copy_(torch.as_tensor(np.where(standardize, rows.mean(0), 0.0)))
         self.std.copy_(torch.as_tensor(np.where(changes, spread, 1.0)))
 
-    def features(self, observations: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Observations [T, ...] by name to features [T, F], not yet standardised."""
+    def features(self, observations: Mapping[str, np.ndarray], times: np.ndarray | None = None) -> np.ndarray:
+        """Observations [T, ...] by name to features [T, F], not yet standardised.
+
+        :param times: the number of each step [T]; 0 to T - 1 where it is not given.
+        """
         steps = len(next(iter(observations.values())))
+        times = np.arange(steps) if times is None else times
         columns: list[np.ndarray] = [np.zeros((steps, 0))]
         for spec in self.specs:
-            column = np.asarray(observations[spec.key], dtype=np.float64).reshape(steps, -1)
+            values = times / float(self.longest) if spec.key == STEP else observations[spec.key]
+            column = np.asarray(values, dtype=np.float64).reshape(steps, -1)
             columns.append(column)
             if spec.differences:
                 columns.append(np.diff(column, axis=0, prepend=column[:1]))
         return np.concatenate(columns, axis=1)
 
-    def inputs(self, observations: Iterable[Mapping[str, np.ndarray]]) -> Inputs:
-        """Sequences of observations, each [T_n, ...] by name, to padded network inputs."""
+    def standardized(self, features: Tensor) -> dict[str, Tensor]:
+        """Features [..., F] as networks see them, [..., F_key] by name."""
+        vector = ((features - self.mean) / self.std).float()
+        return dict(zip(self.keys, vector.split(self.sizes, -1), strict=True))
+
+    def inputs(self, observations: Iterable[Mapping[str, np.ndarray]], times: np.ndarray | None = None) -> Inputs:
+        """Sequences of observations, each [T_n, ...] by name, to padded network inputs; ``times`` as in
+        :meth:`features`.
+        """
         sequences = list(observations)
-        vectors = [(self.features(one) - self.mean.numpy()) / self.std.numpy() for one in sequences]
+        vectors = [(self.features(one, times) - self.mean.numpy()) / self.std.numpy() for one in sequences]
         images = {key: _pad([np.asarray(one[key]) for one in sequences]) for key in self.images}
         vector = _pad(vectors).float()
-        return Inputs(vector, images, torch.arange(vector.shape[1]))
+        by_key = dict(zip(self.keys, vector.split(self.sizes, -1), strict=True))
+        return Inputs(by_key, images, torch.arange(vector.shape[1]))
 
 
 LARGEST_SCALED = 1e12

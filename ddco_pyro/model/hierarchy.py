@@ -6,22 +6,22 @@ A baseline is a hierarchy without option levels whose meta-policy emits control.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from functools import cached_property
 from types import MappingProxyType
 from typing import Literal
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from ddco_pyro.data.control_parts import ControlPart, all_gaussian
 from ddco_pyro.model.controls import ControlScaling, ControlStd
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch, ObservationEncoder, Shapes
-from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
+from ddco_pyro.model.networks import Inputs, InputShape, build, build_trunk, named
 from ddco_pyro.model.networks.activations import training_bytes
+from ddco_pyro.model.networks.state import Carried, HasState, State, States, Trunk, initial_state
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import Tables
-from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec, SpecError
+from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
 
 BYTES_AT_ONCE = 256 * 10**6
 """Most bytes that networks take for the trajectories that go through them together, one trajectory at least."""
@@ -40,7 +40,7 @@ class Caller(nn.Module):
         network: NetworkSpec,
         emits: tuple[Emits, ...],
         options: int,
-        shape: InputShape,
+        shape: InputShape | Trunk,
         control: ControlSpec,
         scaling: ControlScaling,
         copies: int,
@@ -54,16 +54,17 @@ class Caller(nn.Module):
         self.network = build(network, shape, sum(self.sizes), copies)
         self.std = ControlStd(control, scaling, copies)
 
-    def forward(self, inputs: Inputs, scaling: ControlScaling) -> CallerOutputs:
-        """What the callers say at every step of the inputs."""
-        said = self.network(inputs)
+    def forward(self, said: Tensor, scaling: ControlScaling) -> CallerOutputs:
+        """What the callers say at every step, given what their network says, [N, T, K, outputs]."""
         logits, numbers = said.split(self.sizes, dim=-1) if all(self.sizes) else (said, said)
         emission = scaling.emission(numbers, self.std()) if self.emits_control else None
         return CallerOutputs(self.options, logits if self.emits_options else None, emission)
 
 
 class Level(nn.Module):
-    """The k options of one level: their policies π (or, above the lowest level, η) and terminations ψ."""
+    """The k options of one level: their policies π (or, above the lowest level, η) and terminations ψ, which read the
+    observations, or the features of a trunk that they share.
+    """
 
     def __init__(
         self,
@@ -76,21 +77,15 @@ class Level(nn.Module):
     ) -> None:
         super().__init__()
         self.count = spec.count
-        with _named(f"{place}.policy"):
-            self.policy = Caller(spec.policy, spec.policy.emits, options_below, shape, control, scaling, spec.count)
-        with _named(f"{place}.termination"):
-            self.termination = build(spec.termination, shape, 1, spec.count)
-
-
-@contextmanager
-def _named(place: str) -> Iterator[None]:
-    """Errors about a network say where in the spec it stands."""
-    try:
-        yield
-    except SpecError as error:
-        raise SpecError(*(f"{place}.{problem}" for problem in error.problems)) from error
-    except ShapeError as error:
-        raise ShapeError(f"{place}: {error}") from error
+        seen: InputShape | Trunk = shape
+        if spec.trunk is not None:
+            with named(f"{place}.trunk"):
+                seen = build_trunk(spec.trunk, shape, spec.count)
+        self.trunk = seen.network if isinstance(seen, Trunk) else None
+        with named(f"{place}.policy"):
+            self.policy = Caller(spec.policy, spec.policy.emits, options_below, seen, control, scaling, spec.count)
+        with named(f"{place}.termination"):
+            self.termination = build(spec.termination, seen, 1, spec.count)
 
 
 class Hierarchy(nn.Module):
@@ -127,7 +122,7 @@ class Hierarchy(nn.Module):
             below = level.count
         self.levels = nn.ModuleList(levels)
         network, emits = _meta_policy(spec)
-        with _named("hierarchy.meta_policy" if levels else "baseline.policy"):
+        with named("hierarchy.meta_policy" if levels else "baseline.policy"):
             self.meta_policy = Caller(network, emits, below, shape, spec.control, scaling, copies=1)
 
     @property
@@ -143,9 +138,21 @@ class Hierarchy(nn.Module):
         """The levels of options, lowest first."""
         return [level for level in self.levels if isinstance(level, Level)]
 
+    def networks(self) -> dict[str, nn.Module]:
+        """Every network by its place here."""
+        each: dict[str, nn.Module] = {}
+        for number, level in enumerate(self.option_levels()):
+            if level.trunk is not None:
+                each[f"levels.{number}.trunk"] = level.trunk
+            each[f"levels.{number}.policy"] = level.policy.network
+            each[f"levels.{number}.termination"] = level.termination
+        return each | {"meta_policy": self.meta_policy.network}
+
     def named_networks(self) -> Iterator[tuple[str, nn.Module]]:
         """Every network by its place in the spec."""
         for number, level in enumerate(self.option_levels()):
+            if level.trunk is not None:
+                yield f"hierarchy.levels.{number}.trunk", level.trunk
             yield f"hierarchy.levels.{number}.policy", level.policy
             yield f"hierarchy.levels.{number}.termination", level.termination
         yield "hierarchy.meta_policy" if self.depth else "baseline.policy", self.meta_policy
@@ -153,8 +160,7 @@ class Hierarchy(nn.Module):
     @cached_property
     def step_bytes(self) -> int:
         """Bytes that all networks take for a step in training."""
-        networks = (one.network if isinstance(one, Caller) else one for _, one in self.named_networks())
-        return training_bytes(networks, self.input_shape)
+        return training_bytes(self.networks().values(), self.input_shape)
 
     @property
     def steps_at_once(self) -> int:
@@ -162,14 +168,38 @@ class Hierarchy(nn.Module):
         return max(1, min(STEPS_AT_ONCE, BYTES_AT_ONCE // max(1, self.step_bytes)))
 
     def forward(self, inputs: Inputs, discovering: int | None = None) -> Outputs:
-        """What the networks say about these observations.
+        """What the networks say about these observations, from the first step of their trajectories on.
 
         :param discovering: d gives levels 1 to d alone under a uniform meta-policy (layer-wise training, SM 2.3).
         """
+        return self.advance(inputs, None, discovering)[0]
+
+    def advance(
+        self, inputs: Inputs, states: States | None, discovering: int | None = None
+    ) -> tuple[Outputs, dict[str, State]]:
+        """What the networks say about these observations, and their states after them, by :meth:`networks`' names.
+
+        :param states: those after the observations before; None at the first step.
+        """
+        carried = Carried(states)
         levels = self.option_levels()[:discovering]
-        callers = [level.policy(inputs, self.scaling) for level in levels]
-        top = _uniform(inputs, levels[-1].count) if discovering else self.meta_policy(inputs, self.scaling)
-        return Outputs((*callers, top), tuple(level.termination(inputs).squeeze(-1) for level in levels))
+        callers, endings = [], []
+        for number, level in enumerate(levels):
+            place, trunk = f"levels.{number}", level.trunk
+            seen = inputs if trunk is None else carried.answer(f"{place}.trunk", trunk, inputs)
+            callers.append(level.policy(carried.answer(f"{place}.policy", level.policy.network, seen), self.scaling))
+            endings.append(carried.answer(f"{place}.termination", level.termination, seen).squeeze(-1))
+        if discovering:
+            callers.append(_uniform(inputs, levels[-1].count))
+        else:
+            said = carried.answer("meta_policy", self.meta_policy.network, inputs)
+            callers.append(self.meta_policy(said, self.scaling))
+        return Outputs(tuple(callers), tuple(endings)), carried.after
+
+    def initial_states(self, trajectories: int) -> dict[str, State]:
+        """The states of the networks that remember before the first step, by name."""
+        each = self.networks().items()
+        return {name: initial_state(network, trajectories) for name, network in each if isinstance(network, HasState)}
 
     def tabulate(self, batch: Batch, discovering: int | None = None) -> Tables:
         """The tables of a batch: every network once, over all options, steps and trajectories."""
@@ -183,7 +213,7 @@ def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
     assert spec.baseline is not None  # a spec has one or the other
     policy = spec.baseline.policy
     if spec.baseline.kind == "per_timestep":
-        policy = NetworkSpec(network="per_timestep", hidden=policy.hidden, dropout=policy.dropout)
+        policy = NetworkSpec(network="per_timestep", inputs=policy.inputs, hidden=policy.hidden, dropout=policy.dropout)
     return policy, ("control",)
 
 

@@ -5,9 +5,10 @@ An unknown key, a wrong type or a value out of range is a :class:`SpecError` wit
 
 from ddco_pyro.spec.hierarchy import BaselineSpec, HierarchySpec, LevelSpec
 from ddco_pyro.spec.messages import SpecError
-from ddco_pyro.spec.networks import MetaPolicySpec, NetworkSpec, PolicySpec
+from ddco_pyro.spec.networks import ConvolutionLayer, MetaPolicySpec, NetworkSpec, PolicySpec, Pool
 from ddco_pyro.spec.reading import dump_spec, load_spec, spec_schema
 from ddco_pyro.spec.settings import (
+    STEP,
     ControlSpec,
     DemonstrationsSpec,
     InferenceSpec,
@@ -24,8 +25,10 @@ from ddco_pyro.spec.user_code import user_code
 from ddco_pyro.spec.whole import Spec, parse_spec, with_overrides
 
 __all__ = [
+    "STEP",
     "BaselineSpec",
     "ControlSpec",
+    "ConvolutionLayer",
     "DemonstrationsSpec",
     "HierarchySpec",
     "InferenceSpec",
@@ -37,6 +40,7 @@ __all__ = [
     "OptimizerSpec",
     "PartSpec",
     "PolicySpec",
+    "Pool",
     "ReportSpec",
     "RolloutSpec",
     "SelectionSpec",

@@ -10,6 +10,9 @@ from ddco_pyro.spec.messages import invalid
 from ddco_pyro.spec.networks import MetaPolicySpec, NetworkSpec, PolicySpec
 from ddco_pyro.spec.types import Count, Emission, Items, Model, bare
 
+HEADS = ("linear", "mlp")
+"""The networks that can read a trunk."""
+
 
 class LevelSpec(Model):
     """One level of options."""
@@ -18,10 +21,23 @@ class LevelSpec(Model):
     """Name of the level in reports and files; letters, digits, ``_`` and ``-``, a letter first."""
     count: Count
     """Number of options, k."""
+    trunk: NetworkSpec | None = None
+    """A network for each option whose last hidden layer is read by both ``policy`` and ``termination``, which then are
+    ``linear`` or ``mlp``; null: each of them reads the observations."""
     policy: PolicySpec = PolicySpec()
     """The options' policies, π: one network for each option."""
     termination: NetworkSpec = NetworkSpec(network="linear")
     """The options' termination conditions, ψ: one network for each option."""
+
+    @model_validator(mode="after")
+    def _heads(self) -> LevelSpec:
+        for place, head in (("policy", self.policy), ("termination", self.termination)):
+            if self.trunk is not None and head.network not in HEADS:
+                text = f"reads the trunk: use one of {', '.join(HEADS)}, got {head.network!r}"
+                raise invalid((f"{place}.network", text))
+            if self.trunk is not None and head.inputs:
+                raise invalid((f"{place}.inputs", "the trunk reads the observations; say it there"))
+        return self
 
 
 class HierarchySpec(Model):

@@ -118,7 +118,8 @@ def _models_at(parts: list[str], whole: type[BaseModel]) -> list[type[BaseModel]
     for part in parts:
         if not part.isdecimal():
             fields = [model.model_fields[part] for model in models if part in model.model_fields]
-            models = [found for field in fields for found in _models_in(field.annotation)]
+            if fields:  # else it is a name in a mapping of models
+                models = [found for field in fields for found in _models_in(field.annotation)]
     return models
 
 
@@ -130,10 +131,11 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
         yield from _models_in(argument)
 
 
-def _all_paths(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
-    """Every key path below a model, with 0 for the place in a list."""
+def _all_paths(model: type[BaseModel], prefix: str = "", above: tuple[type[BaseModel], ...] = ()) -> Iterator[str]:
+    """Every key path below a model, with 0 for the place in a list; networks within networks are left out."""
     for name, field in model.model_fields.items():
         yield prefix + name
         place = ".0" if get_origin(field.annotation) is tuple else ""
         for inner in _models_in(field.annotation):
-            yield from _all_paths(inner, f"{prefix}{name}{place}.")
+            if not any(issubclass(one, inner) for one in (*above, model)):
+                yield from _all_paths(inner, f"{prefix}{name}{place}.", (*above, model))

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from pydantic import (
+    BeforeValidator,
     ConfigDict,
     Field,
     SerializerFunctionWrapHandler,
@@ -22,35 +23,82 @@ from pydantic import (
 
 from ddco_pyro.errors import nearest
 from ddco_pyro.spec.messages import invalid
-from ddco_pyro.spec.types import Count, Emission, Items, Model, NetworkName, Share
+from ddco_pyro.spec.types import Count, Emission, Items, Model, NetworkName, Share, Text
 
 USER_DEFINED = "module:Class"
 _USER_DEFINED_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
 
+Sizes = Annotated[
+    Items[Count],
+    BeforeValidator(
+        lambda value: (value,) if type(value) is int else value, json_schema_input_type=Count | Items[Count]
+    ),
+]
+"""Sizes of layers; a bare number is a single one."""
+Pool = Literal["mean", "flatten", "spatial_softmax"]
+
 
 class Network(Model):
-    """A network without settings."""
+    """The settings that every network has."""
 
     network: NetworkName = "mlp"
     """The kind of network; ``module:Class`` for a network of your own."""
+    inputs: Items[Text] = ()
+    """Names of the observations that it reads; all of them where none is named."""
 
 
 class Perceptron(Network):
     """Settings of a multi-layer perceptron."""
 
-    hidden: Items[Count] = Field(default=(64,), validate_default=True)
-    """Sizes of the hidden layers, first one first."""
+    hidden: Sizes = Field(default=(64,), validate_default=True)
+    """Sizes of the hidden layers, first one first; a bare number is a single layer. Those of ``lstm`` remember."""
     dropout: Share = 0.0
     """Probability with which a unit is dropped while training."""
 
 
+class ConvolutionLayer(Model):
+    """One convolution, with ReLU after it."""
+
+    filters: Count
+    """Number of filters."""
+    kernel: Count
+    """Height and width of each filter."""
+    stride: Count = 1
+    """Rows and columns from one place of a filter to the next."""
+    padding: int = Field(default=0, ge=0)
+    """Zeros added on each side."""
+
+
 class Convolution(Perceptron):
-    """Settings of a convolution followed by a perceptron."""
+    """Settings of convolutions followed by a perceptron."""
 
     filters: Count = 64
-    """Number of filters of each convolution."""
+    """Number of filters of a single convolution with stride 2."""
     kernel: Count = 5
-    """Height and width of each filter in pixels."""
+    """Height and width in pixels of each filter of a single convolution."""
+    layers: Items[ConvolutionLayer] = ()
+    """Several convolutions, first one first, in place of ``filters`` and ``kernel``."""
+    pool: Pool = "mean"
+    """What is read of each map: ``mean`` of ``pooled`` × ``pooled`` fields, ``flatten`` for all of it, or the place
+    where it is active, ``spatial_softmax``."""
+    pooled: Count = 8
+    """Fields by side."""
+
+
+class Recurrent(Network):
+    """Settings of an LSTM."""
+
+    over: NetworkSpec | None = None
+    """The network whose last hidden layer it reads; null: it reads the observed vectors."""
+    hidden: Sizes = (64,)
+
+
+class Branched(Perceptron):
+    """Settings of several networks whose last hidden layers are joined by a perceptron."""
+
+    of: dict[str, NetworkSpec] = Field(default={})
+    """A network for each observation, by the observation's name; under another name one that says what it reads in
+    ``inputs``."""
 
 
 class UserDefined(Network):
@@ -58,6 +106,8 @@ class UserDefined(Network):
 
     options: dict[str, Any] = Field(default={})
     """Keyword arguments of the class."""
+    features: Count = 64
+    """Outputs of each copy where another network reads them."""
 
 
 SETTINGS: dict[str, type[Network]] = {
@@ -65,8 +115,12 @@ SETTINGS: dict[str, type[Network]] = {
     "mlp": Perceptron,
     "per_timestep": Perceptron,
     "conv": Convolution,
+    "lstm": Recurrent,
+    "branches": Branched,
 }
 """The built-in networks by name; every other name is a user's ``module:Class``."""
+LAYERED = ("lstm", "branches")
+"""Those that need a hidden layer."""
 
 
 def foreign_keys(network: Any) -> tuple[str, ...]:
@@ -86,7 +140,7 @@ def _describe_kinds(schema: dict[str, Any]) -> None:
         properties[key]["description"] += f" For {names}."
 
 
-class NetworkSpec(UserDefined, Convolution):
+class NetworkSpec(UserDefined, Convolution, Recurrent, Branched):
     """A network from observations to the parameters of a distribution. Settings of other networks are refused."""
 
     model_config = ConfigDict(json_schema_extra=_describe_kinds)
@@ -96,7 +150,8 @@ class NetworkSpec(UserDefined, Convolution):
         """Keyword arguments of the network's class."""
         if self.network not in SETTINGS:
             return self.options
-        return {key: getattr(self, key) for key in SETTINGS[self.network].model_fields if key != "network"}
+        kind = SETTINGS[self.network]
+        return {key: getattr(self, key) for key in kind.model_fields if key not in Network.model_fields}
 
     @field_validator("network")
     @classmethod
@@ -116,12 +171,25 @@ class NetworkSpec(UserDefined, Convolution):
         given = [key for key in foreign_keys(self.network) if key in self.model_fields_set]
         if given:
             raise invalid(*((key, f"does not apply to network {self.network!r}; leave it out") for key in given))
+        if self.network in LAYERED and not self.hidden:
+            raise invalid(("hidden", f"{self.network} has one layer at least; give its size"))
+        if self.network == "branches" and not self.of:
+            raise invalid(("of", "missing; name an observation and its network, such as {state: {network: mlp}}"))
+        twice = [key for key in ("filters", "kernel") if self.layers and key in self.model_fields_set]
+        if twice:
+            raise invalid(*((key, "stands beside layers, which say it of each; leave it out") for key in twice))
         return self
 
     @model_serializer(mode="wrap")
     def _without_foreign_keys(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         fields: dict[str, Any] = serialize(self)
-        return {key: value for key, value in fields.items() if key not in foreign_keys(self.network)}
+        unused = (*foreign_keys(self.network), *(() if self.inputs else ("inputs",)))
+        unused += ("filters", "kernel") if self.layers else ("layers",)
+        return {key: value for key, value in fields.items() if key not in unused}
+
+
+Recurrent.model_rebuild()
+Branched.model_rebuild()
 
 
 class PolicySpec(NetworkSpec):

@@ -32,15 +32,25 @@ class DemonstrationsSpec(Model):
     """Name of ground-truth labels in the file; the discovered options are compared with them (NMI)."""
 
 
+STEP = "step"
+"""The built-in observation: the number of the step divided by the steps of the longest training demonstration."""
+
+
 class ObservationSpec(Model):
     """One observation that the networks see."""
 
     key: Text
-    """Name of the observation in the demonstrations."""
+    """Name of the observation in the demonstrations; ``step`` is built in, and not read from them."""
     differences: bool = False
     """Append x_t − x_{t−1}."""
     standardize: bool = True
     """Shift and scale to mean 0 and standard deviation 1 over the training demonstrations."""
+
+    @model_validator(mode="after")
+    def _steps_are_even(self) -> ObservationSpec:
+        if self.key == STEP and self.differences:
+            raise invalid(("differences", f"{STEP} grows by the same at each step; leave it out"))
+        return self
 
 
 Observation = Annotated[ObservationSpec, bare("key", str | ObservationSpec)]

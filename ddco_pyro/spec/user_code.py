@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, get_args
@@ -55,9 +55,10 @@ def _named(value: Any, place: str) -> Iterator[tuple[str, str]]:
                 if isinstance(part, str) and ":" in part and part not in _registered(mark):
                     yield below, part
             yield from _named(part, below)
-    elif isinstance(value, tuple):
-        for number, part in enumerate(value):
-            yield from _named(part, f"{place}.{number}")
+    elif isinstance(value, tuple | Mapping):
+        items = value.items() if isinstance(value, Mapping) else enumerate(value)
+        for name, part in items:
+            yield from _named(part, f"{place}.{name}")
 
 
 def _registered(mark: Importable) -> set[str]:

@@ -11,6 +11,7 @@ from ddco_pyro.spec.hierarchy import Baseline, HierarchySpec
 from ddco_pyro.spec.keypaths import edited
 from ddco_pyro.spec.messages import SpecError, invalid, lines, nearest, show
 from ddco_pyro.spec.settings import (
+    STEP,
     ControlSpec,
     DemonstrationsSpec,
     InferenceSpec,
@@ -31,7 +32,8 @@ class Spec(Model):
     demonstrations: DemonstrationsSpec = DemonstrationsSpec()
     """Where the demonstrations come from."""
     observations: Items[Observation] = Field(min_length=1)
-    """The observations that the networks see; a bare name stands for ``{key: name}``."""
+    """The observations that the networks see; a bare name stands for ``{key: name}``. ``step`` is built in: the number
+    of the step divided by the steps of the longest training demonstration."""
     control: ControlSpec = ControlSpec()
     """The distribution of the control."""
     hierarchy: HierarchySpec | None = None
@@ -58,11 +60,17 @@ class Spec(Model):
         """Name of the task in which demonstrations are collected; None where there is only a file."""
         return self.demonstrations.task or self.task
 
+    @property
+    def observed(self) -> list[str]:
+        """Names of the observations that demonstrations have to hold: all but the built-in ``step``."""
+        return [observation.key for observation in self.observations if observation.key != STEP]
+
     @model_validator(mode="after")
     def _consistent(self) -> Spec:
         problems = [
             *self._choices(),
             *self._repeated_observations(),
+            *self._nothing_observed(),
             *self._unknown_trajectory(),
             *self._nothing_held_out(),
         ]
@@ -95,8 +103,12 @@ class Spec(Model):
             if key in keys[:index]:
                 yield f"observations.{index}.key", f"{key!r} is given twice; keep one"
 
+    def _nothing_observed(self) -> Iterator[tuple[str, str]]:
+        if not self.observed:
+            yield "observations", f"{STEP} alone says nothing of the state; name an observation beside it"
+
     def _unknown_trajectory(self) -> Iterator[tuple[str, str]]:
-        key, known = self.report.trajectory, [observation.key for observation in self.observations]
+        key, known = self.report.trajectory, self.observed
         if key is not None and key not in known:
             there = ", ".join(known)
             yield "report.trajectory", f"there is no observation {key!r}{nearest(key, known)}; there is: {there}"

@@ -12,9 +12,11 @@ from ddco_pyro.spec import parse_spec
 SHAPES = {"state": (3,)}
 
 
-def make_hierarchy(counts=(3,), emits=("options",), network="mlp", seed=0, **control):
+def make_hierarchy(counts=(3,), emits=("options",), network="mlp", seed=0, trunk=None, **control):
     """A random hierarchy over 3 features and 2 control dimensions; ``counts`` lowest level first."""
     levels = [{"name": f"level-{d}", "count": k, "policy": {"network": network}} for d, k in enumerate(counts, 1)]
+    for level in levels if trunk else ():
+        level["trunk"] = trunk
     for level in levels[1:]:
         level["policy"]["emits"] = list(emits)
     spec = parse_spec(
@@ -38,4 +40,4 @@ def make_batch(trajectories=2, steps=4, seed=1):
     vector = torch.randn(trajectories, steps, 3, generator=generator)
     actions = torch.randn(trajectories, steps, 2, generator=generator)
     lengths = torch.tensor([steps, *[steps - 1] * (trajectories - 1)])
-    return Batch(Inputs(vector, {}, torch.arange(steps)), actions, lengths)
+    return Batch(Inputs({"state": vector}, {}, torch.arange(steps)), actions, lengths)

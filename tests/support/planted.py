@@ -51,7 +51,7 @@ def plant(truth, number, steps, seed):
     states, actions, choices, previous = [], [], [], None
     for t in range(steps):
         with torch.no_grad():
-            outputs = truth(Inputs(state[:, None], {}, torch.tensor([t])))
+            outputs = truth(Inputs({"state": state[:, None]}, {}, torch.tensor([t])))
             chain = complete(outputs.tables(), torch.ones(number, dtype=torch.long))
             previous = choose(t, chain.steps()[0], previous)
             steps = (emission and emission.steps()[0] for emission in outputs.emissions)

@@ -55,7 +55,35 @@ class Stateful(Own):
         assert {key: image.shape[2:] for key, image in inputs.images.items()} == self.pictures
         assert all(image.dtype == torch.uint8 for image in inputs.images.values())
         seen = self.norm(inputs.vector.flatten(0, 1)).unflatten(0, inputs.batch)
-        return super().forward(Inputs(seen + self.bias[inputs.time, None], {}, inputs.time))
+        return super().forward(Inputs({"seen": seen + self.bias[inputs.time, None]}, {}, inputs.time))
+
+
+class Remembering(nn.Module):
+    """A network of one's own with a state: the sum of what it has seen, and how many steps that were."""
+
+    def __init__(self, shape, outputs, copies, how="right"):
+        super().__init__()
+        self.how, self.size = how, (copies, outputs)
+        self.head = nn.Linear(shape.vector, copies * outputs)
+
+    def initial_state(self, trajectories):
+        features = self.head.in_features
+        state = torch.zeros(trajectories, features), torch.zeros(trajectories)
+        return {"list": list(state), "without trajectories": (torch.zeros(features), state[1])}.get(self.how, state)
+
+    def forward(self, inputs, state):
+        total, steps = state
+        sums = total[:, None] + inputs.vector.cumsum(1)
+        counts = steps[:, None] + torch.arange(1, inputs.batch[1] + 1)
+        outputs = self.head(sums / counts[..., None]).unflatten(-1, self.size)
+        after = sums[:, -1], counts[:, -1]
+        return {
+            "alone": lambda: outputs,
+            "other shape": lambda: (outputs, (sums, counts)),
+            "forgets": lambda: (outputs, (total, counts[:, -1])),
+            "looks ahead": lambda: (outputs + sums[:, -1:, None, :1], after),
+            "over trajectories": lambda: (outputs + sums.mean((0, 2), keepdim=True)[..., None], after),
+        }.get(self.how, lambda: (outputs, after))()
 
 
 class NotANetwork:

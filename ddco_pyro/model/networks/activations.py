@@ -7,7 +7,9 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor, nn
 
+from ddco_pyro.model.networks.head import Head
 from ddco_pyro.model.networks.inputs import Inputs, InputShape
+from ddco_pyro.model.networks.state import HasState, answer
 
 
 def training_bytes(networks: Iterable[nn.Module], shape: InputShape) -> int:
@@ -16,19 +18,30 @@ def training_bytes(networks: Iterable[nn.Module], shape: InputShape) -> int:
     Each keeps tensors until its gradient is computed; meanwhile what it computed, and the gradient of that, are there
     too: measured with convolutions, that is at most twice what the largest network keeps.
     """
-    kept = [_kept(network, _zeros(shape, 2)) - _kept(network, _zeros(shape, 1)) for network in networks]
+    kept = [_kept(network, shape, *_another(network)) - _kept(network, shape, 1, 1) for network in networks]
     return sum(kept) + 2 * max(kept)
 
 
-def _zeros(shape: InputShape, steps: int) -> Inputs:
-    """Observations that are 0, N = 1."""
-    images = {key: torch.zeros(1, steps, *image, dtype=torch.uint8) for key, image in shape.images.items()}
+def _another(network: nn.Module) -> tuple[int, int]:
+    """Trajectories and steps that are one more than (1, 1): a step, since a network may have parameters for each; where
+    it remembers a trajectory, since what torch keeps of several steps grows in leaps.
+    """
+    return (2, 1) if isinstance(network, HasState) else (1, 2)
+
+
+def _zeros(shape: InputShape, trajectories: int, steps: int) -> Inputs:
+    """Observations that are 0."""
+    batch = (trajectories, steps)
+    vectors = {key: torch.zeros(*batch, size) for key, size in shape.vectors.items()}
+    images = {key: torch.zeros(*batch, *image, dtype=torch.uint8) for key, image in shape.images.items()}
     time = torch.arange(steps).clamp(max=shape.steps - 1)  # a network may have parameters for each step
-    return Inputs(torch.zeros(1, steps, shape.vector), images, time)
+    return Inputs(vectors, images, time)
 
 
-def _kept(network: nn.Module, inputs: Inputs) -> int:
+def _kept(network: nn.Module, shape: InputShape, trajectories: int, steps: int) -> int:
     """Bytes of all tensors, parameters too, that are kept for the gradient."""
+    batch = (trajectories, steps)
+    seen = torch.zeros(*batch, *network.reads) if isinstance(network, Head) else _zeros(shape, *batch)
     storages: dict[int, int] = {}
 
     def keep(tensor: Tensor) -> Tensor:
@@ -40,7 +53,9 @@ def _kept(network: nn.Module, inputs: Inputs) -> int:
     network.eval()  # nothing it keeps track of is to change
     try:
         with torch.enable_grad(), torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-            outputs = network(inputs)  # while it is there, so is what was kept: no two tensors have the same place
+            outputs, _ = answer(
+                network, seen
+            )  # while they are there, so is what was kept: no two tensors share a place
         del outputs
     finally:
         network.train(training)

@@ -1,61 +1,121 @@
-"""A convolutional layer followed by a fully connected one: the FF network of SM 1.2."""
+"""Convolutional layers followed by fully connected ones: the FF network of SM 1.2."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
-from ddco_pyro.model.networks.numpy_form import NumpyForm, arrays_of, perceptrons
-from ddco_pyro.model.networks.stacked import stacked_mlp
+from ddco_pyro.model.networks.numpy_form import NumpyForm, arrays_of, joined, perceptrons, vectors
+from ddco_pyro.model.networks.stacked import Perceptrons, options_last
+from ddco_pyro.spec import ConvolutionLayer, Pool
 
 POOLED = 8
-"""Each feature map is averaged to POOLED × POOLED before the fully connected layer, whatever the image's size."""
+"""Blocks by side to whose means a picture is reduced where it is clustered."""
 
 
 class Conv(nn.Module):
-    """K networks of one convolution (stride 2, ReLU) over the images and a perceptron over it and the vector."""
+    """K networks of convolutions (ReLU) over each picture, pooled, and a perceptron over that and the vectors.
+
+    :param layers: the convolutions; where there are none, a single one of ``filters`` and ``kernel``, stride 2.
+    :param pool: ``mean`` of ``pooled`` × ``pooled`` fields of each map, ``flatten`` for all of it, or where in the map
+        it is active, ``spatial_softmax``.
+    """
 
     def __init__(
         self,
         shape: InputShape,
-        outputs: int,
+        outputs: int | None,
         copies: int,
         hidden: tuple[int, ...],
         dropout: float,
         filters: int,
         kernel: int,
+        layers: Sequence[ConvolutionLayer],
+        pool: Pool,
+        pooled: int,
     ) -> None:
         super().__init__()
         if not shape.images:
             raise ShapeError("needs an image among the observations, and all of them are vectors: use network: mlp")
-        self.copies = copies
+        self.reads, self.copies, self.pool, self.pooled = list(shape.vectors), copies, pool, pooled
+        first, *rest = layers or [ConvolutionLayer(filters=filters, kernel=kernel, stride=2, padding=kernel // 2)]
         self.convolutions = nn.ModuleDict(
+            {key: _convolution(first, size[-1], copies) for key, size in shape.images.items()}
+        )
+        self.deeper = nn.ModuleDict(
             {
-                key: nn.Conv2d(size[-1], copies * filters, kernel, stride=2, padding=kernel // 2)
-                for key, size in shape.images.items()
+                key: nn.ModuleList(
+                    _convolution(layer, copies * before.filters, copies, copies)
+                    for before, layer in zip([first, *rest], rest, strict=False)
+                )
+                for key in shape.images
+                if rest
             }
         )
-        features = shape.vector + len(shape.images) * filters * POOLED**2
-        self.layers = stacked_mlp(copies, features, hidden, outputs, dropout)
+        maps = sum(self._map_features(key, size) for key, size in shape.images.items())
+        self.layers = Perceptrons(copies, shape.vector + maps, hidden, outputs, dropout)
+        self.features = self.layers.features
 
     def forward(self, inputs: Inputs) -> Tensor:
         """[N, T, K, outputs]."""
         vector = inputs.vector.flatten(0, 1).expand(self.copies, -1, -1)
-        maps = [self._features(key, image.flatten(0, 1)) for key, image in inputs.images.items()]
-        found = self.layers(torch.cat([vector, *maps], dim=-1))
-        return found.transpose(0, 1).reshape(*inputs.batch, *found.shape[::2])
+        maps = [self._map(key, image.flatten(0, 1)) for key, image in inputs.images.items()]
+        return options_last(self.layers(torch.cat([vector, *maps], dim=-1)), inputs.batch)
 
     def numpy_form(self) -> NumpyForm:
         """What the numpy runner has to know of it."""
-        about, arrays = perceptrons(self.layers)
-        for key, convolution in self.convolutions.items():
-            arrays |= arrays_of(convolution, f"image.{key}")
-        return about | {"images": list(self.convolutions), "pooled": POOLED}, arrays
+        pictures = [self._picture_form(key) for key in self.convolutions]
+        return perceptrons(self.layers, joined([vectors(self.reads, self.copies), *pictures]))
 
-    def _features(self, key: str, image: Tensor) -> Tensor:
-        """uint8 [M, H, W, C] to [K, M, filters · POOLED²]."""
-        scaled = image.permute(0, 3, 1, 2).float() / 255
-        maps = torch.relu(self.convolutions[key](scaled))
-        pooled = nn.functional.adaptive_avg_pool2d(maps, POOLED)
-        return pooled.reshape(len(image), self.copies, -1).transpose(0, 1)
+    def _picture_form(self, key: str) -> NumpyForm:
+        layers = self._layers(key)
+        strides = [{"stride": layer.stride[0], "padding": int(layer.padding[0])} for layer in layers]
+        facts = {"kind": "convolutions", "key": key, "copies": self.copies, "layers": strides}
+        arrays = arrays_of({str(number): layer for number, layer in enumerate(layers)})
+        return facts | {"pool": self.pool, "pooled": self.pooled}, arrays
+
+    def _layers(self, key: str) -> list[nn.Conv2d]:
+        layers = [self.convolutions[key], *(self.deeper[key].children() if key in self.deeper else ())]
+        return [layer for layer in layers if isinstance(layer, nn.Conv2d)]
+
+    def _map(self, key: str, image: Tensor) -> Tensor:
+        """uint8 [M, H, W, C] to [K, M, features of the picture]."""
+        maps = image.permute(0, 3, 1, 2).float() / 255
+        for layer in self._layers(key):
+            maps = torch.relu(layer(maps))
+        return self._pool(maps).reshape(len(image), self.copies, -1).transpose(0, 1)
+
+    def _pool(self, maps: Tensor) -> Tensor:
+        """[M, K · filters, H, W] to [M, K · filters, features of a map]."""
+        if self.pool == "mean":
+            return nn.functional.adaptive_avg_pool2d(maps, self.pooled)
+        return maps if self.pool == "flatten" else _spatial_softmax(maps)
+
+    def _map_features(self, key: str, size: tuple[int, ...]) -> int:
+        """How many features there are of a picture [H, W, C], for each option."""
+        height, width, _ = size
+        for layer in self._layers(key):
+            height, width = (
+                (length + 2 * int(layer.padding[0]) - layer.kernel_size[0]) // layer.stride[0] + 1
+                for length in (height, width)
+            )
+            if min(height, width) < 1:
+                raise ShapeError(f"{key} of {size[0]} × {size[1]} is too small for its layers: take some out, or pad")
+        each = {"mean": self.pooled**2, "flatten": height * width, "spatial_softmax": 2}[self.pool]
+        return layer.out_channels // self.copies * each
+
+
+def _convolution(layer: ConvolutionLayer, channels: int, copies: int, groups: int = 1) -> nn.Conv2d:
+    size = copies * layer.filters
+    return nn.Conv2d(channels, size, layer.kernel, layer.stride, layer.padding, groups=groups)
+
+
+def _spatial_softmax(maps: Tensor) -> Tensor:
+    """The expected place (row, column), each from -1 to 1, under the softmax of each map [..., H, W], [..., 2]."""
+    height, width = maps.shape[-2:]
+    weights = maps.flatten(-2).softmax(-1).unflatten(-1, (height, width))
+    rows, columns = (torch.linspace(-1, 1, length, device=maps.device) for length in (height, width))
+    return torch.stack([(weights.sum(-1) * rows).sum(-1), (weights.sum(-2) * columns).sum(-1)], -1)

@@ -2,34 +2,86 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TypeVar
 
+import torch
 from torch import Tensor
+
+from ddco_pyro.errors import nearest
+
+T = TypeVar("T")
+
+
+class ShapeError(ValueError):
+    """A network cannot read the observations it was given, lacks an option, or gives another shape than it has to."""
 
 
 @dataclass(frozen=True)
 class InputShape:
-    """Shapes of :class:`Inputs` without the batch: ``vector`` features, images [H, W, C] by key, steps of time."""
+    """Shapes of :class:`Inputs` without the batch: ``vectors`` has the features of each vector observation, ``images``
+    [H, W, C] of each picture, both by name in the spec's order; ``steps`` is the longest demonstration.
+    """
 
-    vector: int
+    vectors: Mapping[str, int]
     images: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     steps: int = 1
+
+    @property
+    def vector(self) -> int:
+        """Features of all vectors together."""
+        return sum(self.vectors.values())
+
+    def select(self, names: Sequence[str]) -> InputShape:
+        """The same of these observations alone, in this order.
+
+        :raises ShapeError: there is no such observation.
+        """
+        known = [*self.vectors, *self.images]
+        for name in names:
+            if name not in known:
+                there = ", ".join(known)
+                raise ShapeError(f"inputs: there is no observation {name!r}{nearest(name, known)}; there is: {there}")
+        return InputShape(_of(self.vectors, names), _of(self.images, names), self.steps)
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """Observations of N trajectories: ``vector`` [N, T, F] float; images uint8 [N, T, H, W, C] by key; ``time`` [T]."""
+    """Observations of N trajectories by name: ``vectors`` float32 [N, T, F_key]; ``images`` uint8 [N, T, H, W, C];
+    ``time`` [T] counts steps.
+    """
 
-    vector: Tensor
+    vectors: Mapping[str, Tensor]
     images: Mapping[str, Tensor]
     time: Tensor
 
     @property
     def batch(self) -> tuple[int, int]:
         """(N, T)."""
-        return self.vector.shape[0], self.vector.shape[1]
+        array = next(iter([*self.vectors.values(), *self.images.values()]))
+        return array.shape[0], array.shape[1]
+
+    @cached_property
+    def vector(self) -> Tensor:
+        """All vectors side by side, [N, T, F]."""
+        vectors = list(self.vectors.values())
+        if len(vectors) == 1:
+            return vectors[0]
+        return torch.cat(vectors, -1) if vectors else torch.zeros(*self.batch, 0, device=self.time.device)
+
+    def select(self, names: Sequence[str]) -> Inputs:
+        """These observations alone, in this order."""
+        return Inputs(_of(self.vectors, names), _of(self.images, names), self.time)
+
+    def map(self, change: Callable[[Tensor], Tensor], time: Tensor) -> Inputs:
+        """The same of changed arrays, at other times."""
+        vectors, images = (
+            {key: change(array) for key, array in arrays.items()} for arrays in (self.vectors, self.images)
+        )
+        return Inputs(vectors, images, time)
 
 
-class ShapeError(ValueError):
-    """A network cannot read the observations it was given, lacks an option, or gives another shape than it has to."""
+def _of(values: Mapping[str, T], names: Sequence[str]) -> dict[str, T]:
+    return {name: values[name] for name in names if name in values}

@@ -1,36 +1,39 @@
-"""Linear maps and multi-layer perceptrons of the observation vector (SM 1.1, SM 1.3)."""
+"""Linear maps and multi-layer perceptrons of the observed vectors (SM 1.1, SM 1.3)."""
 
 from __future__ import annotations
 
 from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
-from ddco_pyro.model.networks.numpy_form import NumpyForm, perceptrons
-from ddco_pyro.model.networks.stacked import stacked_mlp
+from ddco_pyro.model.networks.numpy_form import NumpyForm, perceptrons, vectors
+from ddco_pyro.model.networks.stacked import Perceptrons, options_last
 
 
 class Mlp(nn.Module):
-    """K perceptrons over the observation vector."""
+    """K perceptrons over all vectors side by side."""
 
-    def __init__(self, shape: InputShape, outputs: int, copies: int, hidden: tuple[int, ...], dropout: float) -> None:
+    def __init__(
+        self, shape: InputShape, outputs: int | None, copies: int, hidden: tuple[int, ...], dropout: float
+    ) -> None:
         super().__init__()
         refuse_images(shape)
-        self.layers = stacked_mlp(copies, shape.vector, hidden, outputs, dropout)
+        self.reads = list(shape.vectors)
+        self.layers = Perceptrons(copies, shape.vector, hidden, outputs, dropout)
+        self.features = self.layers.features
 
     def forward(self, inputs: Inputs) -> Tensor:
         """[N, T, K, outputs]."""
-        found: Tensor = self.layers(inputs.vector.flatten(0, 1).unsqueeze(0))
-        return found.transpose(0, 1).reshape(*inputs.batch, *found.shape[::2])
+        return options_last(self.layers(inputs.vector.flatten(0, 1).unsqueeze(0)), inputs.batch)
 
     def numpy_form(self) -> NumpyForm:
         """What the numpy runner has to know of it."""
-        return perceptrons(self.layers)
+        return perceptrons(self.layers, vectors(self.reads, self.layers.copies))
 
 
 class Linear(Mlp):
-    """K linear maps of the observation vector."""
+    """K linear maps of all vectors; as a trunk the vectors themselves."""
 
-    def __init__(self, shape: InputShape, outputs: int, copies: int) -> None:
+    def __init__(self, shape: InputShape, outputs: int | None, copies: int) -> None:
         super().__init__(shape, outputs, copies, hidden=(), dropout=0.0)
 
 
@@ -38,4 +41,5 @@ def refuse_images(shape: InputShape) -> None:
     """:raises ShapeError: where there are images, which only a convolution can read."""
     if shape.images:
         names = ", ".join(sorted(shape.images))
-        raise ShapeError(f"reads vectors, but {names} are images: use network: conv, or leave them out")
+        remedy = "use network: conv, or name the vectors that it is to read in inputs"
+        raise ShapeError(f"reads vectors, but {names} are images: {remedy}")

@@ -7,18 +7,22 @@ from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape
 from ddco_pyro.model.networks.mlp import refuse_images
-from ddco_pyro.model.networks.numpy_form import NumpyForm, perceptrons
-from ddco_pyro.model.networks.stacked import StackedLinear, stacked_mlp
+from ddco_pyro.model.networks.numpy_form import NumpyForm, perceptrons, vectors
+from ddco_pyro.model.networks.stacked import Perceptrons, StackedLinear
 
 
 class PerTimestep(nn.Module):
     """K × T perceptrons; step t is read by the t-th, steps past the longest demonstration by the last."""
 
-    def __init__(self, shape: InputShape, outputs: int, copies: int, hidden: tuple[int, ...], dropout: float) -> None:
+    def __init__(
+        self, shape: InputShape, outputs: int | None, copies: int, hidden: tuple[int, ...], dropout: float
+    ) -> None:
         super().__init__()
         refuse_images(shape)
+        self.reads = list(shape.vectors)
         self.copies, self.steps = copies, shape.steps
-        self.layers = stacked_mlp(shape.steps * copies, shape.vector, hidden, outputs, dropout)
+        self.layers = Perceptrons(shape.steps * copies, shape.vector, hidden, outputs, dropout)
+        self.features = self.layers.features
 
     def forward(self, inputs: Inputs) -> Tensor:
         """[N, T, K, outputs]."""
@@ -31,5 +35,5 @@ class PerTimestep(nn.Module):
 
     def numpy_form(self) -> NumpyForm:
         """What the numpy runner has to know of it."""
-        about, arrays = perceptrons(self.layers)
+        about, arrays = perceptrons(self.layers, vectors(self.reads, self.copies))
         return about | {"copies": self.copies, "steps": self.steps}, arrays

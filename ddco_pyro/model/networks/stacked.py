@@ -34,10 +34,37 @@ class StackedLinear(nn.Module):
         return (x @ joined).reshape(-1, copies, outputs).transpose(0, 1) + self.bias
 
 
-def stacked_mlp(copies: int, inputs: int, hidden: tuple[int, ...], outputs: int, dropout: float) -> nn.Sequential:
-    """K multi-layer perceptrons with ReLU and dropout after every hidden layer; no hidden layer: K linear maps."""
-    layers: list[nn.Module] = []
-    for size in hidden:
-        layers += [StackedLinear(copies, inputs, size), nn.ReLU(), nn.Dropout(dropout)]
-        inputs = size
-    return nn.Sequential(*layers, StackedLinear(copies, inputs, outputs))
+class Perceptrons(nn.Sequential):
+    """K multi-layer perceptrons with ReLU and dropout after every hidden layer; no hidden layer: K linear maps.
+
+    :param outputs: None leaves the last map out: they then give ``features`` numbers, those of the last hidden layer.
+    """
+
+    def __init__(
+        self, copies: int, inputs: int, hidden: tuple[int, ...], outputs: int | None, dropout: float = 0.0
+    ) -> None:
+        layers: list[nn.Module] = []
+        features = inputs
+        for size in hidden:
+            layers += [StackedLinear(copies, features, size), nn.ReLU(), nn.Dropout(dropout)]
+            features = size
+        if outputs is not None:
+            layers.append(StackedLinear(copies, features, outputs))
+            features = outputs
+        super().__init__(*layers)
+        self.copies, self.features = copies, features
+
+    def forward(self, values: Tensor) -> Tensor:
+        """[K, M, inputs], or [1, M, inputs] shared by all K, to [K, M, features]."""
+        said: Tensor = super().forward(values)
+        return said.expand(self.copies, -1, -1)
+
+
+def options_last(values: Tensor, batch: tuple[int, int]) -> Tensor:
+    """[K, N · T, F] to [N, T, K, F]."""
+    return values.transpose(0, 1).unflatten(0, batch)
+
+
+def options_first(values: Tensor) -> Tensor:
+    """[N, T, K, F] to [K, N · T, F]."""
+    return values.flatten(0, 1).transpose(0, 1)
