@@ -13,6 +13,7 @@ import torch
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting import analysis
+from ddco_pyro.fitting.branch_use import branch_use
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.inferred import Inferred
 from ddco_pyro.inference import Posterior
@@ -96,6 +97,8 @@ def evaluate(found: Fit, parts: dict[str, Demonstrations], demos: Demonstrations
             for name, fit in found.baselines.items()
         },
     }
+    if uses := branch_use(found.hierarchy, found.infer(parts.get("valid", demos))):
+        metrics["branches"] = uses
     if found.hierarchy.depth:
         metrics |= _options(found, demos)
         if found.spec.demonstrations.labels:

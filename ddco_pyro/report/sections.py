@@ -13,6 +13,7 @@ from ddco_pyro.fitting.diagnostics import diagnose
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.report import (
     film,
+    plot_branches,
     plot_learning,
     plot_likelihood,
     plot_posterior,
@@ -161,6 +162,26 @@ STAGES = {
     "joint": "“All together” trains everything once more.",
 }
 STAGE_NAMES = "In history.csv and on the console the stages are {}."
+
+
+def branches(fit: Fit, metrics: Mapping[str, Any]) -> Figures | None:
+    """Which inputs matter; None where no network has branches."""
+    uses = metrics.get("branches")
+    if not uses:
+        return None
+    levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
+    names = [
+        [f"{levels[use['level']].name} {number + 1}" for number in range(len(use["loss"]))]
+        if use["level"] < len(levels)
+        else ["meta-policy" if levels else "policy"]
+        for use in uses
+    ]
+    caption = (
+        "Left: the mean of what each branch gives the joint layer, while the option is active. Right: by how many nats "
+        "per step its control is less likely where the branch reads what was observed at another step."
+    )
+    picture = keep(plot_branches.draw(uses, names), fit.run_folder / "figures" / "branches.png", "Branches", caption)
+    return Figures([picture], tables.branches(uses, names))
 
 
 def options(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Figures:

@@ -74,3 +74,14 @@ def likelihood(found: Sequence[Likelihood]) -> Table:
         rows.append([method(one.name), *likelihoods, size, effort(one.training)])
     ours = f"{method(found[0].name)} minus it, held out"
     return Table(["Method", "Held out", "Training", ours, "Parameters", "Gradient steps"], rows)
+
+
+def branches(uses: Sequence[Mapping[str, Any]], names: Sequence[Sequence[str]]) -> Table:
+    """Activation of each branch and what is lost without its input, a row for each option and branch."""
+    rows = [
+        [option, branch, number(use["activation"][row][column], 3), number(use["loss"][row][column], 3)]
+        for use, options in zip(uses, names, strict=True)
+        for row, option in enumerate(options)
+        for column, branch in enumerate(use["branches"])
+    ]
+    return Table(["Option", "Branch", "Mean activation", "Nats per step lost"], rows)

@@ -26,6 +26,7 @@ class Branches(nn.Module):
         of: Mapping[str, Trunk],
     ) -> None:
         super().__init__()
+        self.names = tuple(of)
         self.of = nn.ModuleList(trunk.network for trunk in of.values())
         features = sum(trunk.features for trunk in of.values())
         self.layers = Perceptrons(copies, features, hidden, outputs, dropout)

@@ -1,0 +1,138 @@
+"""Which inputs matter: how active each branch of a network is, and what is lost without what it reads (SM 1.4)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ddco_pyro.fitting.inferred import Inferred
+from ddco_pyro.inference import log_likelihood
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.networks.branches import Branches
+
+SEED = 0
+"""Of the steps whose observations stand in for others."""
+
+
+def branch_use(hierarchy: Hierarchy, pieces: Iterable[Inferred]) -> list[dict[str, Any]]:
+    """For each level whose policies are branches, lowest first, the meta-policy last.
+
+    ``level`` is its number from 0, ``branches`` the branches' names, and both of these have a row for each option and
+    a column for each branch, weighted by the posterior probability that the option is active:
+
+    - ``activation``: the mean of what the branch gives the joint layer;
+    - ``loss``: by how many nats per step the option's control, and the meta-policy's choices, are less likely where the
+      branch reads what was observed at another step, drawn among all steps; None where the level emits no control.
+    """
+    branched = _branched(hierarchy)
+    if not branched:
+        return []
+    sums: dict[tuple[int, int], Tensor] = {}
+    for piece in pieces:
+        for level, network in branched.items():
+            for number, branch in enumerate(network.of):
+                own = _sums(hierarchy, piece, level, branch)
+                sums[level, number] = sums.get((level, number), torch.zeros(1)) + own
+    return [
+        {
+            "level": level,
+            "branches": list(network.names),
+            "activation": _rows(sums, level, len(network.of), 0),
+            "loss": _rows(sums, level, len(network.of), 1),
+        }
+        for level, network in branched.items()
+    ]
+
+
+def _branched(hierarchy: Hierarchy) -> dict[int, Branches]:
+    """The branches that each level's policies read, by level; the meta-policy's is the last."""
+    found: dict[int, Branches] = {}
+    for place, network in hierarchy.networks().items():
+        level = hierarchy.depth if place == "meta_policy" else int(place.split(".")[1])
+        inside = [module for module in network.modules() if isinstance(module, Branches)]
+        if inside and not place.endswith("termination"):
+            found.setdefault(level, inside[0])
+    return dict(sorted(found.items()))
+
+
+def _rows(sums: dict[tuple[int, int], Tensor], level: int, branches: int, what: int) -> list[list[float | None]]:
+    """Means by option and branch; None where an option is never active, or has no such number."""
+    columns = [sums[level, number][:, what] / sums[level, number][:, 2] for number in range(branches)]
+    values = torch.stack(columns, dim=1).tolist()
+    return [[None if math.isnan(value) else value for value in row] for row in values]
+
+
+def _sums(hierarchy: Hierarchy, piece: Inferred, level: int, branch: nn.Module) -> Tensor:
+    """Weighted sums over the steps of activation, loss and weight, [K, 3]."""
+    weight = _weight(hierarchy, piece, level)
+    with torch.no_grad(), ExitStack() as hooks:
+        seen = hooks.enter_context(_watched(branch))
+        hierarchy(piece.batch.inputs)
+        activation = seen[0].double().mean(-1)
+        hooks.enter_context(_replaced(branch, piece.batch.lengths))
+        loss = _score(hierarchy, piece, level, weight) - _score(hierarchy, piece, level, weight, replaced=True)
+    return torch.stack([(weight * activation).sum((0, 1)), loss, weight.sum((0, 1))], dim=-1)
+
+
+def _weight(hierarchy: Hierarchy, piece: Inferred, level: int) -> Tensor:
+    """How probably each of a level's callers is active, [N, T, K]."""
+    if level < hierarchy.depth:
+        return piece.posterior.u[level][..., 1:]
+    alive = torch.arange(piece.batch.inputs.batch[1]) < piece.batch.lengths[:, None]
+    return alive.double().unsqueeze(-1)
+
+
+def _score(hierarchy: Hierarchy, piece: Inferred, level: int, weight: Tensor, replaced: bool = False) -> Tensor:
+    """Weighted sum of the log-density of each caller's control; of the meta-policy's, the whole log-likelihood, [K]."""
+    outputs = hierarchy(piece.batch.inputs) if replaced else piece.outputs
+    if level == hierarchy.depth:
+        return log_likelihood(outputs.tables(piece.batch.actions), piece.batch.lengths).sum().reshape(1)
+    emission = outputs.emissions[level]
+    if emission is None:
+        return torch.full((weight.shape[-1],), torch.nan, dtype=torch.float64)
+    density = emission.log_density(piece.batch.actions).double()
+    return torch.where(weight > 0, weight * density, 0.0).sum((0, 1))
+
+
+@contextmanager
+def _watched(branch: nn.Module) -> Iterator[list[Tensor]]:
+    """What a branch gives, [N, T, K, F] for each call."""
+    given: list[Tensor] = []
+
+    def keep(_: nn.Module, __: Any, output: Any) -> None:
+        given.append(output if isinstance(output, Tensor) else output[0])
+
+    handle = branch.register_forward_hook(keep)
+    try:
+        yield given
+    finally:
+        handle.remove()
+
+
+@contextmanager
+def _replaced(branch: nn.Module, lengths: Tensor) -> Iterator[None]:
+    """A branch reads at each step what was observed at another, drawn without replacement."""
+
+    def replace(_: nn.Module, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+        inputs: Inputs = arguments[0]
+        alive = torch.arange(inputs.batch[1]) < lengths[:, None]
+        order = torch.randperm(int(alive.sum()), generator=torch.Generator().manual_seed(SEED))
+
+        def shuffled(array: Tensor) -> Tensor:
+            changed = array.clone()
+            changed[alive] = array[alive][order]
+            return changed
+
+        return (inputs.map(shuffled, inputs.time), *arguments[1:])
+
+    handle = branch.register_forward_pre_hook(replace)
+    try:
+        yield
+    finally:
+        handle.remove()

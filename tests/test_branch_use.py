@@ -1,0 +1,93 @@
+"""Which branches matter: planted dependence, against sums by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import ddco_pyro
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.fitting.branch_use import branch_use
+from ddco_pyro.report import write_report
+from ddco_pyro.spec import parse_spec
+
+BRANCHES = {
+    "network": "branches",
+    "of": {"seen": {"network": "mlp", "hidden": [8]}, "noise": {"network": "mlp", "hidden": [8]}},
+    "hidden": [16],
+}
+
+
+def demonstrations(number=12, steps=20):
+    """What is seen decides the control; noise does not."""
+    random, made = np.random.default_rng(0), []
+    for n in range(number):
+        seen, noise = random.normal(size=(2, steps, 2))
+        controls = seen + random.normal(0, 0.1, seen.shape)
+        made.append(Demonstration(f"demo_{n}", {"seen": seen, "noise": noise}, controls))
+            Demonstration(f"demo_{n}", {"seen": seen, "noise": noise}, seen + random.normal(0, 0.1, seen.shape))
+        )
+    return Demonstrations(tuple(made))
+
+
+def spec_of(level, epochs=150):
+    return parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.25},
+            "observations": ["seen", "noise"],
+            "control": {"std": {"learn": True}},
+            "hierarchy": {"levels": [{"count": 2, **level}], "meta_policy": {"network": "linear"}},
+            "training": {"epochs": epochs, "optimizer": {"lr": 0.01}},
+        }
+    )
+
+
+@pytest.fixture(scope="module", params=["policy", "trunk"])
+def fitted(request, tmp_path_factory):
+    level = {request.param: BRANCHES}
+    if request.param == "trunk":
+        level |= {"policy": {"network": "linear"}, "termination": {"network": "linear"}}
+    out = tmp_path_factory.mktemp("runs") / request.param
+    return ddco_pyro.fit(spec_of(level), demonstrations(), out=out)
+
+
+def test_what_decides_the_control_is_told_from_what_does_not(fitted):
+    (use,) = fitted.metrics["branches"]
+    assert (use["level"], use["branches"]) == (0, ["seen", "noise"])
+    for seen, noise in use["loss"]:
+        assert seen > 1.0
+        assert abs(noise) < 0.3 * seen
+
+
+def test_activations_are_the_means_of_what_the_branches_give(fitted):
+    """By hand: each branch called alone, its units' mean, weighted by the posterior."""
+    demos = demonstrations(4)
+    (use,) = branch_use(fitted.hierarchy, fitted.infer(demos))
+    (piece,) = fitted.infer(demos)
+    level = fitted.hierarchy.levels[0]
+    network = level.policy.network if level.trunk is None else level.trunk
+    u = piece.posterior.u[0][..., 1:]
+    for column, branch in enumerate(network.of):
+        with torch.no_grad():
+            units = branch(piece.batch.inputs).double().mean(-1)
+        expected = (u * units).sum((0, 1)) / u.sum((0, 1))
+        np.testing.assert_allclose([row[column] for row in use["activation"]], expected, rtol=1e-6)
+
+
+def test_the_networks_are_as_they_were_afterwards(fitted):
+    demos = demonstrations(4)
+    before = fitted.log_likelihood(demos)
+    branch_use(fitted.hierarchy, fitted.infer(demos))
+    np.testing.assert_array_equal(fitted.log_likelihood(demos), before)
+
+
+def test_the_report_shows_them(fitted):
+    page = write_report(fitted, demonstrations()).read_text()
+    assert "Which inputs matter" in page
+    assert (fitted.folder / "figures" / "branches.png").exists()
+
+
+def test_without_branches_nothing_is_said():
+    fit = ddco_pyro.fit(spec_of({}, epochs=4), demonstrations())
+    assert "branches" not in fit.metrics
