@@ -26,8 +26,6 @@ def demonstrations(number=12, steps=20):
         seen, noise = random.normal(size=(2, steps, 2))
         controls = seen + random.normal(0, 0.1, seen.shape)
         made.append(Demonstration(f"demo_{n}", {"seen": seen, "noise": noise}, controls))
-            Demonstration(f"demo_{n}", {"seen": seen, "noise": noise}, seen + random.normal(0, 0.1, seen.shape))
-        )
     return Demonstrations(tuple(made))
 
 
