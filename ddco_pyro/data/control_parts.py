@@ -76,8 +76,7 @@ def difference(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
     for dimension in sorted(set(ours) | set(theirs), key=int):
         mine, yours = ours.get(dimension), theirs.get(dimension)
         if mine != yours:
-            kinds = [_told(each) for each in (mine, yours)]
-            return f"control dimension {dimension} is {kinds[0]} in one and {kinds[1]} in the other"
+            return f"control dimension {dimension} is {_told(mine)} in one and {_told(yours)} in the other"
     return ""
 
 
