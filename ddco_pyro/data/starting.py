@@ -213,9 +213,7 @@ def _only_images(inspection: Inspection) -> bool:
 
 
 def _network(inspection: Inspection) -> str:
-    if _only_images(inspection):
-        return "{network: conv, filters: 8, hidden: [32]}"
-    return "{network: mlp, hidden: [32]}"
+    return "{network: conv, filters: 8, hidden: [32]}" if _only_images(inspection) else "{network: mlp, hidden: [32]}"
 
 
 def _smallest(inspection: Inspection) -> str:
