@@ -74,7 +74,7 @@ class Comparison:
             }
             for place, (name, steps) in enumerate(zip(self.trajectories, self.steps, strict=True))
         ]
-        return sorted(listed, key=lambda one: one["log_likelihood_per_step"][self.sorted_by])
+        return sorted(listed, key=lambda demonstration: demonstration["log_likelihood_per_step"][self.sorted_by])
 
     def as_data(self) -> dict[str, Any]:
         """The same as plain data."""
@@ -100,27 +100,27 @@ def compare(folders: Sequence[Path], allow_code: bool = False) -> Comparison:
     if len(folders) < 2:
         raise CompareError("one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat")
     fits = [load(folder, allow_code) for folder in folders]
-    held = held_out(fits)
-    values = np.stack([one.values for one in held])
+    runs = held_out(fits)
+    values = np.stack([held.values for held in runs])
     best = int(values.sum(1).argmax())
-    rows = [_row(0, one, values[best]) for one in held]
+    rows = [_row(0, held, values[best]) for held in runs]
     ranked = sorted(rows, key=lambda row: row.difference)
-    with_options = {one.run for one in held if one.fit.spec.hierarchy}
+    with_options = {held.run for held in runs if held.fit.spec.hierarchy}
     return Comparison(
         [Row(**vars(row) | {"rank": rank}) for rank, row in enumerate(ranked)],
-        held[0].names,
-        held[0].steps,
+        runs[0].names,
+        runs[0].steps,
         paired_rollouts(fits, [row.name for row in ranked]),
         next((row.name for row in ranked if row.name in with_options), ranked[0].name),
     )
 
 
-def _row(rank: int, one: Held, best: np.ndarray) -> Row:
-    difference = best - one.values
+def _row(rank: int, held: Held, best: np.ndarray) -> Row:
+    difference = best - held.values
     return Row(
-        rank, one.run, one.fit.name, int(one.fit.metrics["parameters"]), float(one.values.sum()), _error(one.values),
-        float(difference.sum()), _error(difference), float(one.values.sum() / sum(one.steps)),
-        tuple(one.values.tolist()), one.fit.metrics.get("training"),
+        rank, held.run, held.fit.name, int(held.fit.metrics["parameters"]), float(held.values.sum()),
+        _error(held.values), float(difference.sum()), _error(difference), float(held.values.sum() / sum(held.steps)),
+        tuple(held.values.tolist()), held.fit.metrics.get("training"),
     )  # fmt: skip
 
 
@@ -129,13 +129,13 @@ def _error(values: np.ndarray) -> float:
     return float(np.sqrt(len(values) * values.var(ddof=1))) if len(values) > 1 else float("nan")
 
 
-def write(found: Comparison, folder: Path) -> Path:
+def write(compared: Comparison, folder: Path) -> Path:
     """Write ``compare.json``, ``.md``, ``.html`` and ``.png`` into a folder; the path of the page."""
-    picture = plot.write(found, folder / "compare.png")
-    data = json.dumps(_finite(found.as_data()), indent=1) + "\n"
+    picture = plot.write(compared, folder / "compare.png")
+    data = json.dumps(_finite(compared.as_data()), indent=1) + "\n"
     write_text(folder / "compare.json", data)
-    write_text(folder / "compare.md", page.markdown(found))
-    write_text(folder / "compare.html", page.html(found, picture, folder))
+    write_text(folder / "compare.md", page.markdown(compared))
+    write_text(folder / "compare.html", page.html(compared, picture, folder))
     return folder / "compare.html"
 
 

@@ -34,80 +34,80 @@ def cells(row: Row) -> list[str]:
     return [str(row.rank), row.name, row.model, str(row.parameters), *numbers, per_step, effort(row.training)]
 
 
-def rollout_cells(found: Comparison) -> list[list[str]]:
+def rollout_cells(compared: Comparison) -> list[list[str]]:
     """The rows of the paired rollouts."""
     return [
         [
-            one["run"],
-            words.rate(one["rate"]),
-            one["other"],
-            words.rate(one["other_rate"]),
-            str(one["only_ours"]),
-            str(one["only_theirs"]),
-            str(one["trials"]),
-            words.p_value(one["p_value"]),
+            pair["run"],
+            words.rate(pair["rate"]),
+            pair["other"],
+            words.rate(pair["other_rate"]),
+            str(pair["only_ours"]),
+            str(pair["only_theirs"]),
+            str(pair["trials"]),
+            words.p_value(pair["p_value"]),
         ]
-        for one in found.rollouts
+        for pair in compared.rollouts
     ]
 
 
-def verdict(found: Comparison) -> str:
+def verdict(compared: Comparison) -> str:
     """Which run is the best, by how much, and whether that is more than its error: the report's first sentence."""
-    best, *others = found.rows
-    lengths = np.array(found.steps, dtype=float)
+    best, *others = compared.rows
+    lengths = np.array(compared.steps, dtype=float)
     differences = {row.name: paired(np.array(best.each), np.array(row.each), lengths) for row in others}
-    rising = words.rising(row.name for row in found.rows if row.training and not row.training["converged"])
-    return f"{words.explains(best.name, differences, len(found.trajectories))}{rising}"
+    rising = words.rising(row.name for row in compared.rows if row.training and not row.training["converged"])
+    return f"{words.explains(best.name, differences, len(compared.trajectories))}{rising}"
 
 
-def list_head(found: Comparison) -> list[str]:
+def list_head(compared: Comparison) -> list[str]:
     """The columns of the list of demonstrations."""
-    return ["demonstration", "steps", *(row.name for row in found.rows)]
+    return ["demonstration", "steps", *(row.name for row in compared.rows)]
 
 
-def list_cells(found: Comparison) -> list[list[str]]:
+def list_cells(compared: Comparison) -> list[list[str]]:
     """The rows of the list of demonstrations, nats per step, the least likely first."""
     return [
-        [one["name"], str(one["steps"]), *(words.number(value) for value in one["log_likelihood_per_step"].values())]
-        for one in found.worst_first
+        [row["name"], str(row["steps"]), *(words.number(value) for value in row["log_likelihood_per_step"].values())]
+        for row in compared.worst_first
     ]
 
 
-def list_note(found: Comparison) -> str:
+def list_note(compared: Comparison) -> str:
     """What the list of demonstrations is."""
-    return f"All of them were held out by every run. Nats per step, the least likely under {found.sorted_by} first."
+    return f"All of them were held out by every run. Nats per step, the least likely under {compared.sorted_by} first."
 
 
-def _links(found: Comparison, folder: Path) -> dict[str, str]:
+def _links(compared: Comparison, folder: Path) -> dict[str, str]:
     """Demonstrations to the address, from a page in ``folder``, of their segments in a run's report, if it has them."""
-    report = Path(found.sorted_by) / "report.html"
+    report = Path(compared.sorted_by) / "report.html"
     text = report.read_text(encoding="utf-8") if report.exists() else ""
     address = quote(Path(os.path.relpath(report, folder)).as_posix())
-    places = {name: anchor(name) for name in found.trajectories}
+    places = {name: anchor(name) for name in compared.trajectories}
     return {name: f"{address}#{place}" for name, place in places.items() if f'id="{place}"' in text}
 
 
-def explanation(found: Comparison) -> str:
+def explanation(compared: Comparison) -> str:
     """What the columns are."""
     more = " A run that had not converged may rank higher with more epochs."
-    rising = any(row.training and not row.training["converged"] for row in found.rows)
+    rising = any(row.training and not row.training["converged"] for row in compared.rows)
     return (
-        f"Held-out log-likelihood of {len(found.trajectories)} trajectories ({sum(found.steps)} steps), in nats. "
+        f"Held-out log-likelihood of {len(compared.trajectories)} trajectories ({sum(compared.steps)} steps), in nats. "
         "total: sum over trajectories; se: its standard error; diff: the best's total minus this one's, trajectory by "
         f"trajectory; dse: the standard error of that difference.{more if rising else ''}"
     )
 
 
-def markdown(found: Comparison) -> str:
+def markdown(compared: Comparison) -> str:
     """The verdict and tables in Markdown."""
-    lines = [verdict(found), "", explanation(found), "", *_table(HEAD, [cells(row) for row in found.rows])]
-    listed = list_cells(found)
-    lines += ["", list_note(found), "", *_table(list_head(found), listed[:SHOWN])]
+    lines = [verdict(compared), "", explanation(compared), "", *_table(HEAD, [cells(row) for row in compared.rows])]
+    listed = list_cells(compared)
+    lines += ["", list_note(compared), "", *_table(list_head(compared), listed[:SHOWN])]
     if len(listed) > SHOWN:
         lines += ["", f"The other {len(listed) - SHOWN} are in `compare.json`."]
-    if found.rollouts:
+    if compared.rollouts:
         lines += ["", "Success in rollouts from the same initial states; p: McNemar's exact test, two-sided.", ""]
-        lines += _table(ROLLOUT_HEAD, rollout_cells(found))
+        lines += _table(ROLLOUT_HEAD, rollout_cells(compared))
     return "\n".join(lines) + "\n"
 
 
@@ -115,13 +115,13 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return [f"| {' | '.join(head)} |", "|" + "---|" * len(head), *(f"| {' | '.join(row)} |" for row in rows)]
 
 
-def html(found: Comparison, picture: Picture, folder: Path) -> str:
+def html(compared: Comparison, picture: Picture, folder: Path) -> str:
     """A self-contained page for ``folder``; only its links to segments lead elsewhere, to a run's report."""
-    listed = list_cells(found)
+    listed = list_cells(compared)
     values = {
-        "verdict": verdict(found), "explanation": explanation(found), "head": HEAD,
-        "rows": [cells(row) for row in found.rows], "list_head": list_head(found), "list_note": list_note(found),
-        "first": listed[:SHOWN], "rest": listed[SHOWN:], "links": _links(found, folder),
-        "rollout_head": ROLLOUT_HEAD, "rollouts": rollout_cells(found), "picture": picture,
+        "verdict": verdict(compared), "explanation": explanation(compared), "head": HEAD,
+        "rows": [cells(row) for row in compared.rows], "list_head": list_head(compared),
+        "list_note": list_note(compared), "first": listed[:SHOWN], "rest": listed[SHOWN:], "picture": picture,
+        "rollout_head": ROLLOUT_HEAD, "rollouts": rollout_cells(compared), "links": _links(compared, folder),
     }  # fmt: skip
     return render("report/compare.html.j2", values)

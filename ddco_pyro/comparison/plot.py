@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from ddco_pyro.comparison import Comparison, Row
 
 
-def write(found: Comparison, path: Path) -> Picture:
+def write(compared: Comparison, path: Path) -> Picture:
     """Draw the comparison as PNG."""
     with style():
-        alt = "; ".join(f"{row.name}: {row.total:.1f} nats held out" for row in found.rows)
+        alt = "; ".join(f"{row.name}: {row.total:.1f} nats held out" for row in compared.rows)
         caption = (
-            f"Held-out log-likelihood of {len(found.trajectories)} trajectories, ± one standard error (dots); "
+            f"Held-out log-likelihood of {len(compared.trajectories)} trajectories, ± one standard error (dots); "
             "below each but the best, its difference to the best, ± one standard error of the paired difference "
             "(triangles). The dashed line is the best's."
         )
-        return keep(draw(found.rows), path, alt, caption)
+        return keep(draw(compared.rows), path, alt, caption)
 
 
 def draw(rows: Sequence[Row]) -> Figure:

@@ -24,8 +24,7 @@ def paired_rollouts(fits: Sequence[Fit], order: Sequence[str]) -> list[dict[str,
         return []
     first, *others = known
     alike = [name for name in others if by_name[name].spec.task == by_name[first].spec.task]
-    found = [_pair(first, known[first], name, known[name]) for name in alike]
-    return [one for one in found if one["trials"]]
+    return [pair for name in alike if (pair := _pair(first, known[first], name, known[name]))["trials"]]
 
 
 def _pair(first: str, ours: Outcomes, second: str, theirs: Outcomes) -> dict[str, Any]:

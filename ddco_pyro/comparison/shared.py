@@ -44,10 +44,10 @@ def held_out(fits: Sequence[Fit]) -> list[Held]:
 
 def _own(fit: Fit) -> Demonstrations:
     """What a run held out."""
-    found = parts(fit.spec, fit.demonstrations)
-    if "valid" not in found:
+    split = parts(fit.spec, fit.demonstrations)
+    if "valid" not in split:
         raise NotShared(f"{fit}: held nothing out (demonstrations.valid_fraction: 0); there is nothing to compare")
-    return found["valid"]
+    return split["valid"]
 
 
 def _check_same(first: Fit, ours: Demonstrations, second: Fit, theirs: Demonstrations) -> None:
@@ -66,7 +66,7 @@ def _check_same(first: Fit, ours: Demonstrations, second: Fit, theirs: Demonstra
 
 def _check_dimensions(first: Fit, second: Fit) -> None:
     """Both likelihoods are of the same control dimensions (constant ones are no part of a model), in one measure."""
-    ours, theirs = (set(one.hierarchy.scaling.varying.tolist()) for one in (first, second))
+    ours, theirs = (set(fit.hierarchy.scaling.varying.tolist()) for fit in (first, second))
     if ours != theirs:
         dimension = min(ours ^ theirs)
         scored, left = (first, second) if dimension in ours else (second, first)

@@ -133,18 +133,18 @@ def _merged(before: Sequence[np.ndarray], new: Sequence[np.ndarray]) -> list[np.
 
 def all_constant(dimensions: Sequence[ControlDimension]) -> str:
     """What is wrong where no dimension varies."""
-    values = ", ".join(number(one.minimum) for one in dimensions[:5]) + ", ..." * (len(dimensions) > 5)
+    values = ", ".join(number(dimension.minimum) for dimension in dimensions[:5]) + ", ..." * (len(dimensions) > 5)
     return f"actions: every dimension is constant ({values}) in all demonstrations, so there is no control to model"
 
 
 def notes(dimensions: Iterable[ControlDimension]) -> list[str]:
     """A line for each dimension that is odd in some way."""
-    return [f"control dimension {one.number}: {one.note}" for one in dimensions if one.note]
+    return [f"control dimension {dimension.number}: {dimension.note}" for dimension in dimensions if dimension.note]
 
 
 def control_dimensions(controls: Iterable[np.ndarray]) -> tuple[ControlDimension, ...]:
     """What each control dimension does in these blocks of steps [T, A]."""
-    found = ControlStatistics()
+    statistics = ControlStatistics()
     for block in controls:
-        found.add(block)
-    return found.dimensions()
+        statistics.add(block)
+    return statistics.dimensions()

@@ -74,10 +74,9 @@ def _listed(dims: Sequence[int]) -> str:
 def difference(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
     """In which control dimension two measures differ, and how; nothing where they are the same."""
     for dimension in sorted(set(ours) | set(theirs), key=int):
-        one, two = ours.get(dimension), theirs.get(dimension)
-        if one != two:
-            kinds = [_told(each) for each in (one, two)]
-            return f"control dimension {dimension} is {kinds[0]} in one and {kinds[1]} in the other"
+        mine, yours = ours.get(dimension), theirs.get(dimension)
+        if mine != yours:
+            return f"control dimension {dimension} is {_told(mine)} in one and {_told(yours)} in the other"
     return ""
 
 
@@ -99,7 +98,7 @@ def control_parts(spec: ControlSpec, dimensions: Sequence[ControlDimension]) -> 
 
     :raises SpecError: the spec asks for what does not fit the demonstrations.
     """
-    varying = {one.number: one for one in dimensions if not one.constant}
+    varying = {dim.number: dim for dim in dimensions if not dim.constant}
     named = []
     for place, part in enumerate(spec.parts):
         unknown = [dimension for dimension in part.dims if dimension >= len(dimensions)]
@@ -121,18 +120,18 @@ def _parts(
         yield _categorical(dimensions, place, spec.name if spec else kind)
         return
     alone = len(dimensions) == 1
-    decided = {one.number: _decided(one, alone) if kind == "auto" else (kind, "as declared") for one in dimensions}
+    decided = {dim.number: _decided(dim, alone) if kind == "auto" else (kind, "as declared") for dim in dimensions}
     kinds = [each for each in KINDS if each in {kind for kind, _ in decided.values()}]
     for each in kinds:
-        own = [one for one in dimensions if decided[one.number][0] == each]
+        own = [dim for dim in dimensions if decided[dim.number][0] == each]
         name = each if spec is None else spec.name if len(kinds) == 1 else f"{spec.name} {each}"
         if each == "categorical":
             yield _categorical(own, place, name)
         else:
-            ends = [_ends(one, each, place, spec) for one in own]
+            ends = [_ends(dim, each, place, spec) for dim in own]
             low, high = zip(*ends, strict=True) if each in ("clipped", "binary") else ((), ())
-            why = "; ".join(dict.fromkeys(decided[one.number][1] for one in own))
-            yield ControlPart(name, tuple(one.number for one in own), each, low, high, why=why)
+            why = "; ".join(dict.fromkeys(decided[dim.number][1] for dim in own))
+            yield ControlPart(name, tuple(dim.number for dim in own), each, low, high, why=why)
 
 
 def _decided(dimension: ControlDimension, alone: bool) -> tuple[str, str]:
@@ -149,31 +148,31 @@ def _decided(dimension: ControlDimension, alone: bool) -> tuple[str, str]:
     return "gaussian", "varies freely"
 
 
-def _ends(one: ControlDimension, kind: str, place: str, spec: PartSpec | None) -> tuple[float, float]:
-    if kind == "binary" and len(one.values) != 2:
-        raise SpecError(f"{place}.kind: control dimension {one.number} takes more than two values; it is no switch")
+def _ends(dim: ControlDimension, kind: str, place: str, spec: PartSpec | None) -> tuple[float, float]:
+    if kind == "binary" and len(dim.values) != 2:
+        raise SpecError(f"{place}.kind: control dimension {dim.number} takes more than two values; it is no switch")
     if kind != "clipped":
-        return one.minimum, one.maximum
+        return dim.minimum, dim.maximum
     if spec is not None and spec.bounds is not None:
         low, high = spec.bounds
-        if one.minimum < low or one.maximum > high:
+        if dim.minimum < low or dim.maximum > high:
             raise SpecError(
-                f"{place}.bounds: control dimension {one.number} goes from {number(one.minimum)} to "
-                f"{number(one.maximum)} in the demonstrations, beyond these bounds"
+                f"{place}.bounds: control dimension {dim.number} goes from {number(dim.minimum)} to "
+                f"{number(dim.maximum)} in the demonstrations, beyond these bounds"
             )
         return low, high
-    often = {name: value for name, value, _ in one.extremes} or {"minimum": one.minimum, "maximum": one.maximum}
+    often = {name: value for name, value, _ in dim.extremes} or {"minimum": dim.minimum, "maximum": dim.maximum}
     return often.get("minimum", -math.inf), often.get("maximum", math.inf)
 
 
 def _categorical(dimensions: Sequence[ControlDimension], place: str, name: str) -> ControlPart:
-    dims = tuple(one.number for one in dimensions)
+    dims = tuple(dim.number for dim in dimensions)
     if len(dims) == 1:
         values = dimensions[0].distinct
         if not values:
             raise SpecError(f"{place}.kind: control dimension {dims[0]} takes more than {MOST_DISTINCT} values")
         return ControlPart(name, dims, "categorical", values=values, why=f"{len(values)} discrete actions")
-    wrong = [one.number for one in dimensions if one.values != (0.0, 1.0)]
+    wrong = [dim.number for dim in dimensions if dim.values != (0.0, 1.0)]
     if wrong:
         raise SpecError(
             f"{place}.kind: control dimension {wrong[0]} is not 0 or 1: discrete actions are one dimension, or rows "

@@ -137,8 +137,8 @@ class Demonstrations(Sequence[Demonstration]):
         with open_robomimic(Path(path)) as source:
             needed = PROGRAM + _extent(source, observations, labels, exclude).size
             refuse_too_much(needed, "reading it", "read only some observations, or scale pictures down")
-            read = tuple(Demonstration.of(one) for one in _recordings(source, observations, labels, exclude))
-            masks = {mask: tuple(one for one in names if one not in exclude) for mask, names in source.masks.items()}
+            read = tuple(map(Demonstration.of, _recordings(source, observations, labels, exclude)))
+            masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in source.masks.items()}
             return cls(read, masks, source.attributes)
 
     def write(self, path: str | Path) -> None:
@@ -235,7 +235,7 @@ def extent(path: str | Path, observations: Sequence[str], exclude: Sequence[str]
 def _extent(
     source: Robomimic, observations: Sequence[str] | None, labels: Sequence[str], exclude: Sequence[str]
 ) -> Extent:
-    return Extent.of(dict(one.columns()) for one in _recordings(source, observations, labels, exclude))
+    return Extent.of(dict(recording.columns()) for recording in _recordings(source, observations, labels, exclude))
 
 
 def _recordings(

@@ -29,7 +29,7 @@ class DemonstrationsError(BadInput):
 
 def printable(text: str) -> str:
     """A text as one line that does nothing to a terminal: names in a file can hold anything."""
-    return "".join(one if one.isprintable() else repr(one)[1:-1] for one in text)
+    return "".join(character if character.isprintable() else repr(character)[1:-1] for character in text)
 
 
 @contextmanager
@@ -125,9 +125,9 @@ def natural(name: str) -> list[tuple[int, str]]:
 
 def datasets(group: h5py.Group) -> list[str]:
     """The names of all datasets below a group; dm_control's own keys have a / in them."""
-    found: list[str] = []
-    group.visititems(lambda name, one: found.append(name) if isinstance(one, h5py.Dataset) else None)
-    return sorted(found)
+    names: list[str] = []
+    group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+    return sorted(names)
 
 
 def dataset_at(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
@@ -150,17 +150,17 @@ def dataset_at(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
 def member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
     """A group or a dataset below ``group``."""
     try:
-        found = group[key]
+        item = group[key]
     except (KeyError, OSError):
         known = datasets(group) if kind is h5py.Dataset else list(group)
         raise DemonstrationsError(
             f"{where}{key} is missing{nearest(key, known)}; there is: {', '.join(known) or 'nothing'}"
         ) from None
-    if not isinstance(found, kind):
+    if not isinstance(item, kind):
         raise DemonstrationsError(
-            f"{where}{key} has to be a {kind.__name__.lower()}, not a {type(found).__name__.lower()}"
+            f"{where}{key} has to be a {kind.__name__.lower()}, not a {type(item).__name__.lower()}"
         )
-    return found
+    return item
 
 
 def attributes_of(owner: h5py.HLObject) -> dict[str, Attribute]:

@@ -137,8 +137,8 @@ def _names(source: Source, choice: Choice) -> tuple[str, ...]:
 def _masks(source: Source, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """The masks, of those demonstrations that were imported."""
     present = set(names)
-    found = {mask: tuple(name for name in members if name in present) for mask, members in source.masks.items()}
-    return {mask: members for mask, members in found.items() if members}
+    imported = {mask: tuple(name for name in members if name in present) for mask, members in source.masks.items()}
+    return {mask: members for mask, members in imported.items() if members}
 
 
 def _attributes(source: Source, path: str | Path, identity: str) -> dict[str, Attribute]:
@@ -156,7 +156,7 @@ def _chosen(recording: Recording, choice: Choice) -> Recording:
                 f"{recording.name}: there is no observation {key!r}{nearest(key, known)}; there is: {', '.join(known)}"
             )
     wanted = choice.observations or tuple(
-        key for key, one in known.items() if one.dtype.kind in NUMBERS and (choice.videos or not one.video)
+        key for key, column in known.items() if column.dtype.kind in NUMBERS and (choice.videos or not column.video)
     )
     if not wanted:
         raise DemonstrationsError(f"{recording.name}: has no observation that can be used")
@@ -176,5 +176,4 @@ def _scaled(column: Column, size: tuple[int, int] | None) -> Column:
 
 
 def _resized(frame: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    found: np.ndarray = cv2.resize(frame, size[::-1], interpolation=cv2.INTER_AREA)
-    return found.reshape(*size, frame.shape[-1])
+    return cv2.resize(frame, size[::-1], interpolation=cv2.INTER_AREA).reshape(*size, frame.shape[-1])

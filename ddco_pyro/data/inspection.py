@@ -118,7 +118,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was found.
+    """What is in a file of demonstrations.
 
     :param lengths: steps of each demonstration by name.
     :param problems: what a fit would refuse, one line each.
@@ -148,27 +148,27 @@ class Inspection:
     @property
     def affected(self) -> list[str]:
         """Names of the demonstrations in which some value cannot be used, in order."""
-        names = {name for one in self.fields.values() for name in one.affected}
+        names = {name for array in self.fields.values() for name in array.affected}
         return [name for name in self.lengths if name in names]
 
     @property
     def observations(self) -> list[Field]:
         """The arrays under ``obs``."""
-        return [one for place, one in self.fields.items() if place.startswith("obs/")]
+        return [array for place, array in self.fields.items() if place.startswith("obs/")]
 
     @property
     def labels(self) -> list[Field]:
         """The arrays under ``labels``."""
-        return [one for place, one in self.fields.items() if place.startswith("labels/")]
+        return [array for place, array in self.fields.items() if place.startswith("labels/")]
 
     @property
     def actions(self) -> Field | None:
         """The control."""
         return self.fields.get("actions")
 
-    def everywhere(self, one: Field) -> bool:
+    def everywhere(self, array: Field) -> bool:
         """Whether every demonstration has this array."""
-        return one.demonstrations == len(self.lengths)
+        return array.demonstrations == len(self.lengths)
 
     def as_json(self) -> dict[str, Any]:
         """The same as plain data."""
@@ -178,17 +178,17 @@ class Inspection:
             "demonstrations": dict(self.lengths),
             "control_frequency": self.frequency,
             "masks": {name: list(names) for name, names in self.masks.items()},
-            "fields": [_as_json(one) for one in self.fields.values()],
-            "control_dimensions": [one.as_data() for one in self.control],
+            "fields": [_as_json(array) for array in self.fields.values()],
+            "control_dimensions": [dimension.as_data() for dimension in self.control],
             "notes": self.notes,
             "problems": self.problems,
         }
 
 
-def _as_json(one: Field) -> dict[str, Any]:
-    found = asdict(one)
-    ends = {name: [float(value) if np.isfinite(value) else None for value in found[name]] for name in _ENDS}
-    return found | ends | {"shape": list(one.shape), "constant": one.constant}
+def _as_json(array: Field) -> dict[str, Any]:
+    data = asdict(array)
+    ends = {name: [float(value) if np.isfinite(value) else None for value in data[name]] for name in _ENDS}
+    return data | ends | {"shape": list(array.shape), "constant": array.constant}
 
 
 _ENDS = ("minimum", "maximum")
@@ -222,12 +222,12 @@ def _inspect(path: Path, source: Source, exclude: tuple[str, ...]) -> Inspection
             unreadable.append(name)
     problems += problems_of_masks(source.masks, source.names)
     masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in source.masks.items()}
-    found = Inspection(
+    inspection = Inspection(
         path, source.format, lengths, fields, masks, source.frequency, problems, control.dimensions(), exclude,
         tuple(unreadable),
     )  # fmt: skip
-    found.problems.extend(_problems(found))
-    return found
+    inspection.problems.extend(_problems(inspection))
+    return inspection
 
 
 def _watched(column: Column, control: ControlStatistics) -> Column:
@@ -255,24 +255,24 @@ def _add(fields: dict[str, Field], place: str, column: Column, name: str, steps:
     return []
 
 
-def _problems(found: Inspection) -> list[str]:
+def _problems(inspection: Inspection) -> list[str]:
     problems = []
-    for one in found.fields.values():
-        if not one.numeric:
-            problems.append(f"{one.place} holds {one.dtype}, not numbers")
-        if one.first is not None:
-            name, step = one.first
-            number = len(one.affected)
+    for array in inspection.fields.values():
+        if not array.numeric:
+            problems.append(f"{array.place} holds {array.dtype}, not numbers")
+        if array.first is not None:
+            name, step = array.first
+            number = len(array.affected)
             problems.append(
-                f"{one.place} has {one.unusable}, the first in {name} at step {step}; "
-                f"{number} of {one.demonstrations} demonstrations {'is' if number == 1 else 'are'} affected"
+                f"{array.place} has {array.unusable}, the first in {name} at step {step}; "
+                f"{number} of {array.demonstrations} demonstrations {'is' if number == 1 else 'are'} affected"
             )
-        if not found.everywhere(one):
-            missing = len(found.lengths) - one.demonstrations
-            problems.append(f"{one.place} cannot be used in {missing} of {len(found.lengths)} demonstrations")
-    empty = [name for name, steps in found.lengths.items() if steps == 0]
+        if not inspection.everywhere(array):
+            missing = len(inspection.lengths) - array.demonstrations
+            problems.append(f"{array.place} cannot be used in {missing} of {len(inspection.lengths)} demonstrations")
+    empty = [name for name, steps in inspection.lengths.items() if steps == 0]
     if empty:
         problems.append(f"{', '.join(empty[:3])}{' ...' if len(empty) > 3 else ''}: no steps")
-    if found.actions is not None and len(found.actions.shape) != 1:
-        problems.append(f"actions has shape {list(found.actions.shape)} at each step, it has to be [dimensions]")
+    if inspection.actions is not None and len(inspection.actions.shape) != 1:
+        problems.append(f"actions has shape {list(inspection.actions.shape)} at each step, it has to be [dimensions]")
     return problems

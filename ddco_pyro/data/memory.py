@@ -81,12 +81,12 @@ class Extent:
         pictures: set[str] = set()
         for arrays in demonstrations:
             lengths.append(arrays["actions"].shape[0] if arrays["actions"].shape else 0)
-            for place, one in arrays.items():
-                plain = one.dtype == np.uint8
-                size += math.prod(one.shape) * (1 if plain else 8)
+            for place, array in arrays.items():
+                plain = array.dtype == np.uint8
+                size += math.prod(array.shape) * (1 if plain else 8)
                 if not place.startswith("labels/"):
-                    shapes[place] = max(shapes.get(place, ()), tuple(one.shape[1:]), key=math.prod)
-                    pictures |= {place} if plain and len(one.shape) == 4 else set()
+                    shapes[place] = max(shapes.get(place, ()), tuple(array.shape[1:]), key=math.prod)
+                    pictures |= {place} if plain and len(array.shape) == 4 else set()
         return cls(tuple(lengths), size, shapes, frozenset(pictures))
 
     @property
@@ -100,7 +100,7 @@ class Extent:
         :param differences: places of observations whose differences are appended.
         """
         numbers = {place: math.prod(shape) for place, shape in self.shapes.items() if place not in self.pictures}
-        return sum(one * (2 if place in differences else 1) for place, one in numbers.items())
+        return sum(count * (2 if place in differences else 1) for place, count in numbers.items())
 
     def step(self, differences: Collection[str] = ()) -> float:
         """Bytes that networks are given for a step, and what is made on the way there."""
@@ -129,12 +129,12 @@ def allowed() -> float:
     """
     text = os.environ.get(VARIABLE, str(ALLOWED))
     try:
-        found = float(text)
+        gigabytes = float(text)
     except ValueError:
-        found = math.nan
-    if not found > 0:
+        gigabytes = math.nan
+    if not gigabytes > 0:
         raise BadInput(f"{VARIABLE}={text}: has to be a positive number of GB")
-    return 1e9 * found
+    return 1e9 * gigabytes
 
 
 def refuse_too_much(needed: float, what: str, remedy: str) -> None:

@@ -61,11 +61,11 @@ class Parts:
 
     def attributes(self) -> list[dict[str, Attribute]]:
         """The attributes of every demonstration that is safe."""
-        found = []
+        attributes = []
         for part in self._files():
             with opened(part) as file:
-                found += [attributes_of(file[name]) for name in sorted(file, key=natural)]
-        return found
+                attributes += [attributes_of(file[name]) for name in sorted(file, key=natural)]
+        return attributes
 
     def finish(self, attributes: Mapping[str, Attribute], masks: Mapping[str, Sequence[str]]) -> None:
         """Put the file together."""

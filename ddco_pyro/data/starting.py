@@ -38,7 +38,7 @@ PATIENCE = 50
 """Epochs without improvement before a stage stops; with 20 flat policies stopped too early (docs/decisions.md)."""
 
 
-def starting_spec(found: Inspection, path: str | Path) -> str:
+def starting_spec(inspection: Inspection, path: str | Path) -> str:
     """The text of a spec for what was found, commented, with ``path`` as its file.
 
     Demonstrations that cannot be read are left out, and those with values that cannot be used where they are few; else
@@ -46,21 +46,23 @@ def starting_spec(found: Inspection, path: str | Path) -> str:
 
     :raises DemonstrationsError: nothing can be fitted to it; the line says why.
     """
-    excluded = sorted({*found.unreadable, *_few_affected(found)}, key=natural)
+    excluded = sorted({*inspection.unreadable, *_few_affected(inspection)}, key=natural)
     if excluded:
-        found = inspect(found.path, exclude=excluded)
-    if len(found.lengths) < LEAST:
+        inspection = inspect(inspection.path, exclude=excluded)
+    if len(inspection.lengths) < LEAST:
         raise DemonstrationsError(
-            f"{found.path}: holds {len(found.lengths)} demonstrations that can be read, and a fit needs {LEAST}: to "
-            "train, to stop early, and to validate; add some"
+            f"{inspection.path}: holds {len(inspection.lengths)} demonstrations that can be read, and a fit "
+            f"needs {LEAST}: to train, to stop early, and to validate; add some"
         )
-    actions = found.actions
-    wrong = _unusable(found, actions) if actions else "is missing"
+    actions = inspection.actions
+    wrong = _unusable(inspection, actions) if actions else "is missing"
     if actions is None or wrong:
-        raise DemonstrationsError(f"{found.path}: actions {wrong}; repair them first (ddco-pyro inspect {found.path})")
-    if all(one.constant for one in found.control):
-        raise DemonstrationsError(f"{found.path}: {all_constant(found.control)}")
-    text = "\n".join(_lines(found, str(path))) + "\n"
+        raise DemonstrationsError(
+            f"{inspection.path}: actions {wrong}; repair them first (ddco-pyro inspect {inspection.path})"
+        )
+    if all(dimension.constant for dimension in inspection.control):
+        raise DemonstrationsError(f"{inspection.path}: {all_constant(inspection.control)}")
+    text = "\n".join(_lines(inspection, str(path))) + "\n"
     parse_spec(read_yaml(text))  # what is written can be read
     return text
 
@@ -69,43 +71,43 @@ MOST_EXCLUDED = 0.2
 """Part of the demonstrations that may be left out for the sake of an observation; of more, the observation is."""
 
 
-def _few_affected(found: Inspection) -> list[str]:
+def _few_affected(inspection: Inspection) -> list[str]:
     """The demonstrations to leave out so that no key has to be: those with values that cannot be used, if they are few
     and enough are left; a key that is affected in many, or is not in all, is not to be saved.
     """
-    most = MOST_EXCLUDED * len(found.lengths)
-    keys = [one for one in (found.actions, *found.observations) if one and found.everywhere(one)]
-    names = {name for one in keys if len(one.affected) <= most for name in one.affected}
-    left = [set(found.masks[mask]) - names for mask in ("train", "valid") if mask in found.masks]
-    few = len(names) <= most and len(found.lengths) - len(names) >= LEAST and all(left)
-    return [name for name in found.lengths if name in names] if few else []
+    most = MOST_EXCLUDED * len(inspection.lengths)
+    keys = [field for field in (inspection.actions, *inspection.observations) if field and inspection.everywhere(field)]
+    names = {name for field in keys if len(field.affected) <= most for name in field.affected}
+    left = [set(inspection.masks[mask]) - names for mask in ("train", "valid") if mask in inspection.masks]
+    few = len(names) <= most and len(inspection.lengths) - len(names) >= LEAST and all(left)
+    return [name for name in inspection.lengths if name in names] if few else []
 
 
-def _lines(found: Inspection, path: str) -> Iterator[str]:
-    lengths = np.array(list(found.lengths.values()))
+def _lines(inspection: Inspection, path: str) -> Iterator[str]:
+    lengths = np.array(list(inspection.lengths.values()))
     yield f"# A starting spec for {len(lengths)} demonstrations of {lengths.min()} to {lengths.max()} steps."
     yield "# Fit it:              ddco-pyro fit THIS_FILE --out runs/first"
     yield "# Every key explained: ddco-pyro check --schema"
     yield "demonstrations:"
     yield f"  path: {_text(path)}"
-    if found.excluded:
-        names = ", ".join(map(_text, found.excluded))
+    if inspection.excluded:
+        names = ", ".join(map(_text, inspection.excluded))
         yield f"  exclude: [{names}]   # NaN, infinite or huge values, or damaged; where: ddco-pyro inspect"
-    yield from _validation(found)
-    yield from _labels(found)
-    yield from _observations(found)
+    yield from _validation(inspection)
+    yield from _labels(inspection)
+    yield from _observations(inspection)
     yield "control:"
     yield "  kind: auto                        # decided from the demonstrations; so it is:"
-    yield from (f"  # {note}" for note in found.notes)
+    yield from (f"  # {note}" for note in inspection.notes)
     yield "  std: {learn: true, floor: 0.01}   # in units of each dimension's own spread"
     yield "hierarchy:"
     yield "  levels:"
     yield "    - name: option"
     yield "      count: 4                      # how many options; try others: --set hierarchy.levels.0.count=3"
     few = lengths.sum() < LINEAR_BELOW
-    yield f"      policy: {_smallest(found) if few else _network(found)}"
-    yield f"      termination: {_smallest(found)}"
-    yield f"  meta_policy: {_smallest(found)}"
+    yield f"      policy: {_smallest(inspection) if few else _network(inspection)}"
+    yield f"      termination: {_smallest(inspection)}"
+    yield f"  meta_policy: {_smallest(inspection)}"
     yield "training:"
     yield "  initialize: vq_controls           # clusters of observations and controls; vq: of observations alone"
     yield "  optimizer: {name: adam, lr: 3.0e-3}"
@@ -115,8 +117,8 @@ def _lines(found: Inspection, path: str) -> Iterator[str]:
     yield f"  batch_size: {batch}                    # demonstrations in a gradient step"
     yield "# Is the hierarchy worth it? Policies without options, trained beside it with the same budget."
     yield "compare_with:"
-    yield f"  - {{kind: flat, policy: {_network(found)}}}"
-    yield f"  - {{kind: flat_equal, policy: {_network(found)}}}   # as wide as gives it the hierarchy's parameters"
+    yield f"  - {{kind: flat, policy: {_network(inspection)}}}"
+    yield f"  - {{kind: flat_equal, policy: {_network(inspection)}}}   # as wide as gives it the hierarchy's parameters"
 
 
 def _text(value: str) -> str:
@@ -135,84 +137,84 @@ def _epochs(lengths: np.ndarray, batch: int) -> int:
     return int(np.clip(round(wanted, -1), *EPOCHS))
 
 
-def _validation(found: Inspection) -> Iterator[str]:
-    used = [name for name in ("train", "valid") if name in found.masks]
+def _validation(inspection: Inspection) -> Iterator[str]:
+    used = [name for name in ("train", "valid") if name in inspection.masks]
     if used:
         yield f"  # held out: as mask/{' and mask/'.join(used)} in the file say"
     else:
-        number = len(found.lengths)
+        number = len(inspection.lengths)
         fraction = max(0.2 if number < MANY else 0.1, (1.5 if number > LEAST else 1) / number)  # one at least
         yield f"  valid_fraction: {fraction:.2g}               # of the demonstrations, held out"
-    others = [name for name in found.masks if name not in ("train", "valid")]
+    others = [name for name in inspection.masks if name not in ("train", "valid")]
     if others:
         yield f"  # other masks in the file, not used: {', '.join(others)}"
 
 
-def _labels(found: Inspection) -> Iterator[str]:
-    usable = [one for one in found.labels if np.dtype(one.dtype).kind in "iub" and found.everywhere(one)]
-    for number, one in enumerate(usable):
+def _labels(inspection: Inspection) -> Iterator[str]:
+    usable = [
+        field for field in inspection.labels if np.dtype(field.dtype).kind in "iub" and inspection.everywhere(field)
+    ]
+    for number, field in enumerate(usable):
         comment = "# compared with the options that are found, never trained on"
-        yield f"  {'# ' if number else ''}labels: {_text(one.key)}                  {comment}"
+        yield f"  {'# ' if number else ''}labels: {_text(field.key)}                  {comment}"
 
 
-def _observations(found: Inspection) -> Iterator[str]:
+def _observations(inspection: Inspection) -> Iterator[str]:
     vectors, left_out = [], []
-    for one in found.observations:
-        reason = _unusable(found, one) or ("is constant" if _constant(one) else "")
+    for field in inspection.observations:
+        reason = _unusable(inspection, field) or ("is constant" if _constant(field) else "")
         if reason:
-            left_out.append((one, reason))
-        elif not one.image:
-            vectors.append(one)
-    images = [one for one in found.observations if one.image and not _unusable(found, one)]
+            left_out.append((field, reason))
+        elif not field.image:
+            vectors.append(field)
+    images = [field for field in inspection.observations if field.image and not _unusable(inspection, field)]
     if not vectors and not images:
         raise DemonstrationsError(
-            f"{found.path}: no observation can be used; see what is wrong with: ddco-pyro inspect {found.path}"
+            f"{inspection.path}: no observation can be used; see what is wrong with: "
+            f"ddco-pyro inspect {inspection.path}"
         )
     yield "observations:                       # standardised; differences: appends x_t - x_(t-1), a velocity"
-    for one in vectors:
-        moving = "" if one.still else ", differences: true"
-        yield f"  - {{key: {_text(one.key)}{moving}}}"
-    for one in images:
+    for field in vectors:
+        moving = "" if field.still else ", differences: true"
+        yield f"  - {{key: {_text(field.key)}{moving}}}"
+    for field in images:
         comment = "# " if vectors else ""
         note = "   # an image: with it, every network has to be network: conv" if vectors else ""
-        yield f"  {comment}- {_text(one.key)}{note}"
-    for one, reason in left_out:
-        yield f"  # - {_text(one.key)}   # {reason}"
+        yield f"  {comment}- {_text(field.key)}{note}"
+    for field, reason in left_out:
+        yield f"  # - {_text(field.key)}   # {reason}"
 
 
-def _unusable(found: Inspection, one: Field) -> str:
+def _unusable(inspection: Inspection, field: Field) -> str:
     """Why an array cannot be used; nothing where it can."""
-    if not one.numeric:
-        return f"holds {one.dtype}, not numbers"
-    if one.unusable:
-        return f"has {one.unusable}"
-    if not found.everywhere(one):
-        return f"is in {one.demonstrations} of {len(found.lengths)} demonstrations"
-    if 0 in found.lengths.values():
+    if not field.numeric:
+        return f"holds {field.dtype}, not numbers"
+    if field.unusable:
+        return f"has {field.unusable}"
+    if not inspection.everywhere(field):
+        return f"is in {field.demonstrations} of {len(inspection.lengths)} demonstrations"
+    if 0 in inspection.lengths.values():
         return "has no steps in some demonstration"
-    if one.place == "actions" and (len(one.shape) != 1 or not one.shape[0]):
-        return f"has shape {list(one.shape)} at each step, not [dimensions]"
-    if len(one.shape) == 3 and not one.image:
-        return f"is {one.dtype} of shape {list(one.shape)}: an image has to be uint8"
-    if 0 in one.shape:
+    if field.place == "actions" and (len(field.shape) != 1 or not field.shape[0]):
+        return f"has shape {list(field.shape)} at each step, not [dimensions]"
+    if len(field.shape) == 3 and not field.image:
+        return f"is {field.dtype} of shape {list(field.shape)}: an image has to be uint8"
+    if 0 in field.shape:
         return "has no dimensions"
     return ""
 
 
-def _constant(one: Field) -> bool:
-    return len(one.constant) == len(one.minimum)
+def _constant(field: Field) -> bool:
+    return len(field.constant) == len(field.minimum)
 
 
-def _only_images(found: Inspection) -> bool:
-    usable = [one for one in found.observations if not _unusable(found, one)]
-    return all(one.image or _constant(one) for one in usable)
+def _only_images(inspection: Inspection) -> bool:
+    return all(field.image or _constant(field) for field in inspection.observations if not _unusable(inspection, field))
 
 
-def _network(found: Inspection) -> str:
-    if _only_images(found):
-        return "{network: conv, filters: 8, hidden: [32]}"
-    return "{network: mlp, hidden: [32]}"
+def _network(inspection: Inspection) -> str:
+    return "{network: conv, filters: 8, hidden: [32]}" if _only_images(inspection) else "{network: mlp, hidden: [32]}"
 
 
-def _smallest(found: Inspection) -> str:
-    return "{network: conv, filters: 8, hidden: []}" if _only_images(found) else "{network: linear}"
+def _smallest(inspection: Inspection) -> str:
+    return "{network: conv, filters: 8, hidden: []}" if _only_images(inspection) else "{network: linear}"

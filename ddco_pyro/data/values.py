@@ -15,5 +15,4 @@ def usable(values: np.ndarray) -> np.ndarray:
     """Whether each of these real numbers is finite and at most :data:`LARGEST` in size."""
     if values.dtype.kind != "f":
         return np.ones(values.shape, dtype=bool)
-    found: np.ndarray = np.abs(values) <= LARGEST  # NaN is not
-    return found
+    return np.abs(values) <= LARGEST  # NaN is not

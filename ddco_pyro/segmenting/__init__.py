@@ -91,11 +91,11 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
     counts = {level.name: level.count for level in hierarchy.levels}
     names = _names(source, fit)
     labels: dict[str, dict[str, np.ndarray]] = {}
-    found: list[Segments] = []
+    segmented: list[Segments] = []
     for piece in fit.infer(_demonstrations(source, names, fit, labels)):
-        found += _segments(fit, piece, tuple(counts), labels)
-        on_event(DemonstrationsDone(len(found), len(names)))
-    return Segmented(tuple(found), counts, source.frequency, fit.spec.demonstrations.labels)
+        segmented += _segments(fit, piece, tuple(counts), labels)
+        on_event(DemonstrationsDone(len(segmented), len(names)))
+    return Segmented(tuple(segmented), counts, source.frequency, fit.spec.demonstrations.labels)
 
 
 def _names(source: Source, fit: Fit) -> list[str]:
@@ -133,11 +133,11 @@ def _demonstrations(
 def _refuse_too_long(recording: Recording, fit: Fit, before: int) -> None:
     known = recording.observations
     seen = {f"obs/{key}": known[key] for key in fit.hierarchy.encoder.shapes if key in known}
-    found = Extent.of([{"actions": recording.actions, **seen}])
-    (steps,) = found.lengths
-    differences = {f"obs/{one.key}" for one in fit.spec.observations if one.differences}
-    each = found.step(differences) + fit.hierarchy.step_bytes + INFERENCE
-    needed = PROGRAM + found.size + steps * each + FOUND * fit.hierarchy.depth * (before + steps)
+    extent = Extent.of([{"actions": recording.actions, **seen}])
+    (steps,) = extent.lengths
+    differences = {f"obs/{observation.key}" for observation in fit.spec.observations if observation.differences}
+    each = extent.step(differences) + fit.hierarchy.step_bytes + INFERENCE
+    needed = PROGRAM + extent.size + steps * each + FOUND * fit.hierarchy.depth * (before + steps)
     refuse_too_much(needed, f"{recording.name}: segmenting its {steps} steps", "divide it, or the file")
 
 
@@ -159,9 +159,9 @@ def _demonstration(recording: Recording, fit: Fit) -> Demonstration:
     return Demonstration(recording.name, {key: known[key].array() for key in shapes}, recording.actions.array())
 
 
-def _check_shape(where: str, found: tuple[int, ...], fitted: tuple[int, ...]) -> None:
-    if tuple(found) != fitted:
-        raise DemonstrationsError(f"{where} has shape {found} at each step, the run was fitted to {fitted}")
+def _check_shape(where: str, shape: tuple[int, ...], fitted: tuple[int, ...]) -> None:
+    if tuple(shape) != fitted:
+        raise DemonstrationsError(f"{where} has shape {shape} at each step, the run was fitted to {fitted}")
 
 
 def _segments(

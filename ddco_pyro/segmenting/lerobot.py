@@ -20,16 +20,16 @@ from ddco_pyro.segmenting import Segmented
 from ddco_pyro.segmenting.lerobot_forms import PERSISTENT, Form, subtask_names
 
 
-def annotate(source: LeRobot, out: Path, found: Segmented, level: str, form: Form) -> None:
+def annotate(source: LeRobot, out: Path, segmented: Segmented, level: str, form: Form) -> None:
     """Write the dataset with its subtasks to ``out``, a new folder, whole or not at all.
 
     Videos are linked where the file system can, else copied. A copy that has these very subtasks stays as it is.
 
     :raises BadInput: ``out`` is something else, or the dataset has subtasks of its own.
     """
-    names = subtask_names(level, found.counts[level])
+    names = subtask_names(level, segmented.counts[level])
     check_target(source, out, names, form)
-    options = {one.name.removeprefix("demo_"): one.levels[level].options for one in found.segments}
+    options = {demo.name.removeprefix("demo_"): demo.levels[level].options for demo in segmented.segments}
     if out.exists():
         if not all(_has(source.folder / path, out / path, options, names, form) for path in _data(source)):
             raise _taken(out)

@@ -15,23 +15,23 @@ from ddco_pyro.segmenting import Segmented, Segments
 from ddco_pyro.segmenting.timeline import duration, option_name, timelines
 
 
-def write_page(path: Path, found: Segmented, run: str, file: str) -> None:
+def write_page(path: Path, segmented: Segmented, run: str, file: str) -> None:
     """Write the page, whole or not at all; whatever comes from files is escaped."""
     page = {
         "run": run,
         "file": file,
-        "levels": [_level(name, count, found) for name, count in found.counts.items()],
-        "truth": found.truth,
-        "demonstrations": timelines(found),
-        "held_out": sum(one.held_out for one in found.segments),
-        "longest": duration(max(len(one) for one in found.segments), found.frequency),
+        "levels": [_level(name, count, segmented) for name, count in segmented.counts.items()],
+        "truth": segmented.truth,
+        "demonstrations": timelines(segmented),
+        "held_out": sum(demo.held_out for demo in segmented.segments),
+        "longest": duration(max(len(demo) for demo in segmented.segments), segmented.frequency),
     }
     write_text(path, render("segmenting/page.html.j2", page))
 
 
-def _level(name: str, count: int, found: Segmented) -> dict[str, Any]:
+def _level(name: str, count: int, segmented: Segmented) -> dict[str, Any]:
     """How much of the time each option of a level takes, how often, and for how long; its agreement with the labels."""
-    runs = [run for one in found.segments for run in one.levels[name].runs()]
+    runs = [run for demo in segmented.segments for run in demo.levels[name].runs()]
     total = sum(end - start for _, start, end in runs)
     options = []
     for option in range(count + 1):
@@ -44,28 +44,28 @@ def _level(name: str, count: int, found: Segmented) -> dict[str, Any]:
                     "colour": option_colour(option),
                     "share": f"{sum(lengths) / total:.1%}",
                     "segments": len(lengths),
-                    "length": "-" if typical is None else duration(typical, found.frequency),
-                    "in": sum(any(c == option for c, _, _ in one.levels[name].runs()) for one in found.segments),
+                    "length": "-" if typical is None else duration(typical, segmented.frequency),
+                    "in": sum(any(c == option for c, _, _ in demo.levels[name].runs()) for demo in segmented.segments),
                 }
             )
-    return {"name": name, "options": options, "agreement": _agreement(name, found)}
+    return {"name": name, "options": options, "agreement": _agreement(name, segmented)}
 
 
-def _agreement(level: str, found: Segmented) -> str:
+def _agreement(level: str, segmented: Segmented) -> str:
     """A level's normalised mutual information with the labels that the run's spec names; empty where there are none."""
-    labelled = [one for one in found.segments if found.truth in one.labels]
+    labelled = [demo for demo in segmented.segments if segmented.truth in demo.labels]
     groups = {
-        "held-out": [one for one in labelled if one.held_out],
-        "other": [one for one in labelled if not one.held_out],
+        "held-out": [demo for demo in labelled if demo.held_out],
+        "other": [demo for demo in labelled if not demo.held_out],
     }
     if not groups["held-out"]:
         groups = {"": labelled}
     return " and ".join(
-        f"{_mutual_information(level, found.truth, group):.2f} on {f'{len(group)} {kind}'.strip()} demonstrations"
+        f"{_mutual_information(level, segmented.truth, group):.2f} on {f'{len(group)} {kind}'.strip()} demonstrations"
         for kind, group in groups.items()
-        if found.truth and group
+        if segmented.truth and group
     )
 
 
 def _mutual_information(level: str, truth: str, group: list[Segments]) -> float:
-    return agreement([one.levels[level].options for one in group], [one.labels[truth] for one in group])
+    return agreement([demo.levels[level].options for demo in group], [demo.labels[truth] for demo in group])

@@ -60,26 +60,26 @@ def anchor(name: str) -> str:
     return "segments-" + quote(name, safe="").replace("%", ".")
 
 
-def timelines(found: Segmented, most_boxes: float = math.inf) -> list[Timeline]:
+def timelines(segmented: Segmented, most_boxes: float = math.inf) -> list[Timeline]:
     """The first demonstrations on one scale: about ``most_boxes`` segments in all, one demonstration at least."""
-    shown = list(_first(found, most_boxes))
-    longest = max(len(one) for one in shown)
+    shown = list(_first(segmented, most_boxes))
+    longest = max(len(demo) for demo in shown)
     return [
         Timeline(
-            one.name, anchor(one.name), duration(len(one), found.frequency), one.log_likelihood, one.held_out,
-            tuple(_rows(one, found.frequency, longest)),
+            demo.name, anchor(demo.name), duration(len(demo), segmented.frequency), demo.log_likelihood, demo.held_out,
+            tuple(_rows(demo, segmented.frequency, longest)),
         )
-        for one in shown
+        for demo in shown
     ]  # fmt: skip
 
 
-def _first(found: Segmented, most_boxes: float) -> Iterator[Segments]:
+def _first(segmented: Segmented, most_boxes: float) -> Iterator[Segments]:
     boxes = 0
-    for one in found.segments:
+    for demo in segmented.segments:
         if boxes >= most_boxes:
             return
-        boxes += sum(int(level.boundaries.sum()) for level in one.levels.values())
-        yield one
+        boxes += sum(int(level.boundaries.sum()) for level in demo.levels.values())
+        yield demo
 
 
 def duration(steps: float, frequency: float | None) -> str:
@@ -92,11 +92,11 @@ def option_name(option: int) -> str:
     return f"option {option}" if option else "control"
 
 
-def _rows(one: Segments, frequency: float | None, longest: int) -> Iterator[Row]:
-    for name, level in reversed(one.levels.items()):
+def _rows(demo: Segments, frequency: float | None, longest: int) -> Iterator[Row]:
+    for name, level in reversed(demo.levels.items()):
         yield Row(name, tuple(_option_box(level, run, frequency, longest) for run in level.runs()))
-    for name, values in one.labels.items():
-        if name not in one.levels and not name.endswith("_boundary"):
+    for name, values in demo.labels.items():
+        if name not in demo.levels and not name.endswith("_boundary"):
             yield Row(name, tuple(_label_boxes(name, values, longest)))
 
 

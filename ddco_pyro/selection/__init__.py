@@ -61,13 +61,13 @@ def check(spec: Spec, workers: Workers = HERE, demos: Demonstrations | None = No
     """
     wide, own = grid.wide(spec), spec.demonstrations
     demos = prepare.outline(wide) if demos is None and prepare.in_file(wide) else demos
-    found = grid.candidates(spec, prepare.dimensions(wide, demos))
+    candidates = grid.candidates(spec, prepare.dimensions(wide, demos))
     if demos is None:  # they will be collected
         dividing.assign(own.count - len(set(own.exclude)), spec.selection.folds, spec.seed)
     else:
         dividing.divide(demos, spec.selection.folds, spec.seed)
     workers.check()
-    return found
+    return candidates
 
 
 def select(
@@ -104,12 +104,12 @@ def _select(
             work.score(pool, numbers)
             if stop_early:
                 work.give_up(numbers[-1])
-    found = choosing.choose(work.candidates, work.scores(), len(folds.held_out))
-    _write(folder, spec, found, folds, stop_early)
-    if found.chosen is None:
-        reasons = [reason for row in found.rows for reason in row.failed.values()]
+    choice = choosing.choose(work.candidates, work.scores(), len(folds.held_out))
+    _write(folder, spec, choice, folds, stop_early)
+    if choice.chosen is None:
+        reasons = [reason for row in choice.rows for reason in row.failed.values()]
         raise SelectionFailed(f"every candidate has failed in some fold; the first reason: {reasons[0]}")
-    return Selection(folder, demos, found, folds)
+    return Selection(folder, demos, choice, folds)
 
 
 def final_spec(spec: Spec, chosen: Candidate) -> Spec:
@@ -137,9 +137,9 @@ class _Work:
         """Take what is kept from before."""
         for candidate in self.candidates:
             for fold in range(len(self.folds.held_out)):
-                found = scoring.kept(self.folder, candidate.number, fold)
-                if found is not None:
-                    self.done[candidate.number, fold] = found
+                score = scoring.kept(self.folder, candidate.number, fold)
+                if score is not None:
+                    self.done[candidate.number, fold] = score
         self.on_event(SelectionBegan(len(self.candidates) * len(self.folds.held_out), len(self.done)))
 
     def score(self, pool: parallel.Parallel, folds: Sequence[int]) -> None:
@@ -152,17 +152,17 @@ class _Work:
         ]
         if not missing:
             return
-        for found in parallel.scores(pool, self.folds, missing):
-            scoring.keep(self.folder, found)
-            self.done[found.candidate, found.fold] = found
-            self.on_event(FoldScored(self.candidates[found.candidate].name, found.fold, found.failed))
+        for score in parallel.scores(pool, self.folds, missing):
+            scoring.keep(self.folder, score)
+            self.done[score.candidate, score.fold] = score
+            self.on_event(FoldScored(self.candidates[score.candidate].name, score.fold, score.failed))
 
     def give_up(self, last: int) -> None:
         """Give up the candidates that are hopeless by their folds 0 to ``last``; later scores of theirs do not count,
         should there be some from before.
         """
-        running = [one for one in self.candidates if one.number not in self.stopped]
-        seen = [one for one in self.scores() if one.fold <= last and one.candidate not in self.stopped]
+        running = [candidate for candidate in self.candidates if candidate.number not in self.stopped]
+        seen = [score for score in self.scores() if score.fold <= last and score.candidate not in self.stopped]
         for number in sorted(choosing.hopeless(running, seen)):
             later = [(number, fold) for fold in range(last + 1, len(self.folds.held_out))]
             missing = [key for key in later if self.done.pop(key, None) is None]
@@ -174,14 +174,14 @@ class _Work:
         return [self.done[key] for key in sorted(self.done)]
 
 
-def _write(folder: Path, spec: Spec, found: Choice, folds: Folds, stop_early: bool) -> None:
+def _write(folder: Path, spec: Spec, choice: Choice, folds: Folds, stop_early: bool) -> None:
     data = {
         "folds": len(folds.held_out),
         "demonstrations": len(folds.demos),
         "seed": spec.seed,
         "stop_early": STOP_RULE if stop_early else None,
-        **choosing.as_data(found),
+        **choosing.as_data(choice),
     }
-    write_text(folder / "selection.md", table.markdown(found, data))
-    plot.write(found, folder / "figures" / "selection.png")
+    write_text(folder / "selection.md", table.markdown(choice, data))
+    plot.write(choice, folder / "figures" / "selection.png")
     write_text(folder / "selection.json", json.dumps(data, indent=1) + "\n")

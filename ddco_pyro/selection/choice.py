@@ -86,11 +86,11 @@ def choose(candidates: Sequence[Candidate], scores: Sequence[Score], folds: int)
 
     :param folds: how many folds a candidate needs to have been scored in.
     """
-    by_candidate = {one.number: _Scored(one, [s for s in scores if s.candidate == one.number]) for one in candidates}
-    complete = [one for one in by_candidate.values() if len(one.good) == folds]
-    best = max(complete, key=lambda one: one.mean, default=None)
-    reference = best or max((one for one in by_candidate.values() if one.good), key=lambda one: one.mean, default=None)
-    rows = [one.row(folds, reference) for one in by_candidate.values()]
+    results = [_Scored(candidate, [s for s in scores if s.candidate == candidate.number]) for candidate in candidates]
+    complete = [result for result in results if len(result.good) == folds]
+    best = max(complete, key=lambda result: result.mean, default=None)
+    reference = best or max((result for result in results if result.good), key=lambda result: result.mean, default=None)
+    rows = [result.row(folds, reference) for result in results]
     best_row = rows[best.candidate.number] if best else None
     within = [row for row in rows if within_one_error(row, best_row)]
     chosen = min(within, key=lambda row: (row.candidate.parameters, -(row.mean or 0.0)), default=None)
@@ -109,13 +109,14 @@ class _Scored:
 
     def __init__(self, candidate: Candidate, scores: Sequence[Score]) -> None:
         self.candidate = candidate
-        self.good = {one.fold: one for one in sorted(scores, key=lambda one: one.fold) if not one.failed}
-        self.failed = {one.fold: one.failed for one in sorted(scores, key=lambda one: one.fold) if one.failed}
+        by_fold = sorted(scores, key=lambda score: score.fold)
+        self.good = {score.fold: score for score in by_fold if not score.failed}
+        self.failed = {score.fold: score.failed for score in by_fold if score.failed}
 
     def arrays(self, folds: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """Log-likelihood and steps of some folds."""
         chosen = [self.good[fold] for fold in folds]
-        return np.array([one.total for one in chosen]), np.array([float(sum(one.steps)) for one in chosen])
+        return np.array([score.total for score in chosen]), np.array([float(sum(score.steps)) for score in chosen])
 
     @property
     def mean(self) -> float:
@@ -131,8 +132,8 @@ class _Scored:
         values, steps = self.arrays(list(self.good))
         own = paired(values, np.zeros(len(values)), steps)
         per_fold = dict(zip(self.good, (values / steps).tolist(), strict=True))
-        took = float(np.mean([one.gradient_steps for one in self.good.values()]))
-        rising = tuple(fold for fold, one in self.good.items() if not one.converged)
+        took = float(np.mean([score.gradient_steps for score in self.good.values()]))
+        rising = tuple(fold for fold, score in self.good.items() if not score.converged)
         error, difference = _finite(own["standard_error"]), self.against(best)
         return Row(self.candidate, status, self.mean, error, difference, per_fold, self.failed, took, rising)
 
@@ -142,8 +143,8 @@ class _Scored:
         if best is None or len(both) < 2:
             return None
         (ours, steps), (theirs, _) = self.arrays(both), best.arrays(both)
-        found = paired(ours, theirs, steps)
-        return found["nats_per_step"], found["standard_error"]
+        margin = paired(ours, theirs, steps)
+        return margin["nats_per_step"], margin["standard_error"]
 
 
 def _finite(value: float) -> float | None:
@@ -152,17 +153,17 @@ def _finite(value: float) -> float | None:
 
 def hopeless(candidates: Sequence[Candidate], scores: Sequence[Score]) -> set[int]:
     """Numbers of the candidates to give up after some folds, by :data:`STOP_RULE`."""
-    found = {one.candidate for one in scores if one.failed}
-    scored = [_Scored(one, [s for s in scores if s.candidate == one.number]) for one in candidates]
-    scored = [one for one in scored if one.candidate.number not in found]
-    best = max(scored, key=lambda one: one.mean, default=None)
+    failed = {score.candidate for score in scores if score.failed}
+    results = [_Scored(candidate, [s for s in scores if s.candidate == candidate.number]) for candidate in candidates]
+    results = [result for result in results if result.candidate.number not in failed]
+    best = max(results, key=lambda result: result.mean, default=None)
     if best is None or len(best.good) < STOP_FOLDS:
-        return found
-    return found | {one.candidate.number for one in scored if one is not best and _below(one, best)}
+        return failed
+    return failed | {result.candidate.number for result in results if result is not best and _below(result, best)}
 
 
-def _below(one: _Scored, best: _Scored) -> bool:
-    (ours, steps), (theirs, _) = one.arrays(list(one.good)), best.arrays(list(one.good))
+def _below(result: _Scored, best: _Scored) -> bool:
+    (ours, steps), (theirs, _) = result.arrays(list(result.good)), best.arrays(list(result.good))
     difference = (ours - theirs) / steps
     if np.ptp(difference) == 0:
         return bool(difference[0] < 0)

@@ -35,30 +35,31 @@ class Candidate:
 
 def _short(path: str, paths: Iterable[str]) -> str:
     """As much of the end of a key path as tells it from the others."""
-    others = [f".{one}" for one in paths if one != path]
+    others = [f".{other}" for other in paths if other != path]
     parts = path.split(".")
     for start in range(len(parts) - 1, 0, -1):
         end = ".".join(parts[start:])
-        if not parts[start].isdecimal() and not any(one.endswith(f".{end}") for one in others):
+        if not parts[start].isdecimal() and not any(other.endswith(f".{end}") for other in others):
             return end
     return path
 
 
 def _value(value: Any) -> str:
     """A value of the grid in a few words: a list of levels as their numbers of options, lowest first."""
-    if isinstance(value, list | tuple) and value and all(isinstance(one, Mapping) and "count" in one for one in value):
-        return f"[{', '.join(str(one['count']) for one in value)}]"
+    levels = value if isinstance(value, list | tuple) else ()
+    if levels and all(isinstance(level, Mapping) and "count" in level for level in levels):
+        return f"[{', '.join(str(level['count']) for level in levels)}]"
     return value if isinstance(value, str) else show(value)
 
 
 def wide(spec: Spec) -> Spec:
     """The spec with every observation that a candidate sees, for reading the demonstrations once for all."""
     alone = with_overrides(spec, {"selection.grid": {}})
-    seen = {one.key: one for one in spec.observations}
+    seen = {obs.key: obs for obs in spec.observations}
     for path, values in spec.selection.grid.items():
         if path.partition(".")[0] == "observations":
             for value in values:
-                seen |= {one.key: one for one in with_overrides(alone, {path: value}).observations}
+                seen |= {obs.key: obs for obs in with_overrides(alone, {path: value}).observations}
     return alone.model_copy(update={"observations": tuple(seen.values())})
 
 
@@ -76,28 +77,28 @@ def candidates(spec: Spec, dimensions: Dimensions) -> list[Candidate]:
         raise SpecError(
             *(f"selection.grid.{path}: candidates are compared on the same data; remove it" for path in shared)
         )
-    found, problems = [], []
+    valid, problems = [], []
     for number, values in enumerate(product(*grid.values())):
         try:
-            found.append(_candidate(number, dict(zip(grid, values, strict=True)), spec, dimensions))
+            valid.append(_candidate(number, dict(zip(grid, values, strict=True)), spec, dimensions))
         except SpecError as error:
             problems += [f"selection.grid: {_where(grid, values)}: {problem}" for problem in error.problems]
     if problems:
         raise SpecError(*problems)
-    _refuse_other_measures(grid, found, dimensions)
-    return found
+    _refuse_other_measures(grid, valid, dimensions)
+    return valid
 
 
-def _refuse_other_measures(grid: Mapping[str, Any], found: Sequence[Candidate], dimensions: Dimensions) -> None:
+def _refuse_other_measures(grid: Mapping[str, Any], candidates: Sequence[Candidate], dimensions: Dimensions) -> None:
     """A density cannot be ranked against a probability.
 
     :raises SpecError: candidates model a control dimension as different kinds.
     """
-    measures = [build_hierarchy(candidate.spec, dimensions).scaling.measure for candidate in found]
-    for candidate, measure in zip(found[1:], measures[1:], strict=True):
+    measures = [build_hierarchy(candidate.spec, dimensions).scaling.measure for candidate in candidates]
+    for candidate, measure in zip(candidates[1:], measures[1:], strict=True):
         if different := difference(measures[0], measure):
             raise SpecError(
-                f"selection.grid: {found[0].name} and {candidate.name} measure different things: {different}; "
+                f"selection.grid: {candidates[0].name} and {candidate.name} measure different things: {different}; "
                 "densities and probabilities cannot be ranked, so give all candidates the same control.kind"
             )
 

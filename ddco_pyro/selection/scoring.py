@@ -61,10 +61,10 @@ def score(folds: Folds, candidate: Candidate, fold: int) -> Score:
             trained = train(candidate.spec, folds.dimensions, training, held_out=held_out)
             values = tuple(Fit(candidate.spec, trained.hierarchy).log_likelihood(held_out).tolist())
     except (BadInput, Failed) as error:
-        found = replace(empty, failed=str(error))
+        result = replace(empty, failed=str(error))
     except Exception as error:  # whatever it is, the other folds go on and the user is told
         reason = f"unexpected {type(error).__name__}: {' '.join(str(error).split())}"
-        found = replace(empty, failed=reason, final=False)
+        result = replace(empty, failed=reason, final=False)
     else:
         bad = [name for name, value in zip(held_out.names, values, strict=True) if not math.isfinite(value)]
         reason = f"the held-out log-likelihood of {', '.join(bad)} is not finite"
@@ -72,8 +72,8 @@ def score(folds: Folds, candidate: Candidate, fold: int) -> Score:
             "gradient_steps": trained.training["spent"]["gradient_steps"],
             "converged": trained.training["converged"],
         }
-        found = replace(empty, failed=reason) if bad else replace(empty, log_likelihood=values, **ended)
-    return replace(found, seconds=time.perf_counter() - start)
+        result = replace(empty, failed=reason) if bad else replace(empty, log_likelihood=values, **ended)
+    return replace(result, seconds=time.perf_counter() - start)
 
 
 def path_of(folder: Path, candidate: int, fold: int) -> Path:
@@ -81,10 +81,10 @@ def path_of(folder: Path, candidate: int, fold: int) -> Path:
     return folder / "folds" / f"{candidate:03d}-{fold:02d}.json"
 
 
-def keep(folder: Path, found: Score) -> None:
+def keep(folder: Path, score: Score) -> None:
     """Write a score, whole or not at all, unless another attempt could go otherwise."""
-    if found.final:
-        write_text(path_of(folder, found.candidate, found.fold), json.dumps(asdict(found)) + "\n")
+    if score.final:
+        write_text(path_of(folder, score.candidate, score.fold), json.dumps(asdict(score)) + "\n")
 
 
 def kept(folder: Path, candidate: int, fold: int) -> Score | None:
@@ -96,8 +96,8 @@ def kept(folder: Path, candidate: int, fold: int) -> Score | None:
     if not path.exists():
         return None
     remedy = "remove it and do the same again: this fold alone is trained anew"
-    found = read_record(path, Score, remedy)
-    lengths = (len(found.steps), len(found.names) if found.failed else len(found.log_likelihood))
-    if (found.candidate, found.fold) != (candidate, fold) or {*lengths} != {len(found.names)} or 0 in found.steps:
+    score = read_record(path, Score, remedy)
+    lengths = (len(score.steps), len(score.names) if score.failed else len(score.log_likelihood))
+    if (score.candidate, score.fold) != (candidate, fold) or {*lengths} != {len(score.names)} or 0 in score.steps:
         raise Damaged(path, "is not the score of this candidate and fold", remedy)
-    return found
+    return score

@@ -25,8 +25,8 @@ def markdown(choice: Choice, data: Mapping[str, Any]) -> str:
     ]
     if data["stop_early"]:
         lines += ["", data["stop_early"] + "."]
-    for one in data["failed"]:
-        lines += ["", f"**Failed:** {one['name']}, fold {one['fold']}: {one['reason']}"]
+    for failure in data["failed"]:
+        lines += ["", f"**Failed:** {failure['name']}, fold {failure['fold']}: {failure['reason']}"]
     for note in choice.notes:
         lines += ["", f"**Note:** {note}."]
     return "\n".join(lines) + "\n"
@@ -38,7 +38,7 @@ def cells(row: Row, choice: Choice) -> list[str]:
     difference = "–"
     if row.difference is not None and row is not choice.best:
         difference = f"{signed(row.difference[0], 3)} ± {number(row.difference[1], 3)}"
-    marks = [name for name, one in (("best", choice.best), ("chosen", choice.chosen)) if one is row]
+    marks = [name for name, marked in (("best", choice.best), ("chosen", choice.chosen)) if marked is row]
     marks += [] if row.status == "scored" else [row.status]
     marks += [f"not converged in {len(row.unconverged)}"] if row.unconverged else []
     took = [number(row.gradient_steps, 0), str(len(row.folds))]

@@ -19,12 +19,12 @@ def edited(data: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]
 
     :raises SpecError: a key path leads nowhere.
     """
-    found: dict[str, Any] = plain(data)
+    copy: dict[str, Any] = plain(data)
     for path, value in values.items():
-        _set(found, path, value)
+        _set(copy, path, value)
         if path.endswith(".network"):
-            _drop_foreign_keys(found, path, keep=values)
-    return found
+            _drop_foreign_keys(copy, path, keep=values)
+    return copy
 
 
 def plain(data: Any) -> Any:

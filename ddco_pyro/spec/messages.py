@@ -26,9 +26,9 @@ class SpecError(BadInput):
         return "\n".join(self.problems)
 
 
-def invalid(*found: tuple[str, str]) -> PydanticCustomError:
+def invalid(*problems: tuple[str, str]) -> PydanticCustomError:
     """An error for keys below the one that a validator validates: ``(key path from there, what is wrong)``."""
-    return PydanticCustomError("spec", "the spec has problems", {"problems": found})
+    return PydanticCustomError("spec", "the spec has problems", {"problems": problems})
 
 
 _MESSAGES = {
@@ -119,7 +119,7 @@ def _models_at(parts: list[str], whole: type[BaseModel]) -> list[type[BaseModel]
         if not part.isdecimal():
             fields = [model.model_fields[part] for model in models if part in model.model_fields]
             if fields:  # else it is a name in a mapping of models
-                models = [found for field in fields for found in _models_in(field.annotation)]
+                models = [inner for field in fields for inner in _models_in(field.annotation)]
     return models
 
 
@@ -137,5 +137,5 @@ def _all_paths(model: type[BaseModel], prefix: str = "", above: tuple[type[BaseM
         yield prefix + name
         place = ".0" if get_origin(field.annotation) is tuple else ""
         for inner in _models_in(field.annotation):
-            if not any(issubclass(one, inner) for one in (*above, model)):
+            if not any(issubclass(outer, inner) for outer in (*above, model)):
                 yield from _all_paths(inner, f"{prefix}{name}{place}.", (*above, model))

@@ -154,7 +154,7 @@ class _Rows:
         def blocks() -> Iterator[np.ndarray]:
             try:
                 for batch in self._batches(key, IMAGES_AT_ONCE):
-                    yield np.stack([self._picture(one["bytes"], size) for one in batch.column(0).to_pylist()])
+                    yield np.stack([self._picture(picture["bytes"], size) for picture in batch.column(0).to_pylist()])
             except _DAMAGE as error:
                 raise damaged(self.path, f"{self.name}: {key}", error) from error
 
@@ -163,10 +163,10 @@ class _Rows:
     def _picture(self, encoded: bytes | None, size: tuple[int, int]) -> np.ndarray:
         if encoded is None:
             raise DemonstrationsError(f"{self.path}: {self.name}: an image is not in the parquet file itself")
-        found = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
-        if found is None or found.shape[:2] != size:
+        image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+        if image is None or image.shape[:2] != size:
             raise DemonstrationsError(f"{self.path}: {self.name}: an image is damaged, or not {size[0]} x {size[1]}")
-        return np.ascontiguousarray(found[..., ::-1])
+        return np.ascontiguousarray(image[..., ::-1])
 
     def _batches(self, key: str, rows: int) -> Iterator[Any]:
         """The episode's part of one column, from the row groups that it lies in."""
@@ -184,8 +184,7 @@ class _Rows:
 def _flat(values: Any) -> np.ndarray:
     while pyarrow.types.is_nested(values.type):
         values = values.flatten()
-    found: np.ndarray = values.to_numpy(zero_copy_only=False)
-    return found
+    return values.to_numpy(zero_copy_only=False)
 
 
 @lru_cache(maxsize=2)
@@ -197,25 +196,25 @@ def _open(path: Path, changed: int) -> tuple[parquet.ParquetFile, np.ndarray]:
 
 def _episodes(folder: Path) -> dict[int, dict[str, Any]]:
     """What ``meta/episodes`` says of each episode, by its number, without the statistics."""
-    found: dict[int, dict[str, Any]] = {}
+    episodes: dict[int, dict[str, Any]] = {}
     for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
         try:
             names = parquet.read_schema(path).names
-            rows = parquet.read_table(path, columns=[one for one in names if not one.startswith("stats/")]).to_pylist()
-            found |= {int(row["episode_index"]): row for row in rows}
+            rows = parquet.read_table(path, columns=[key for key in names if not key.startswith("stats/")]).to_pylist()
+            episodes |= {int(row["episode_index"]): row for row in rows}
         except _DAMAGE as error:
             raise damaged(path, "", error) from error
-    return dict(sorted(found.items()))
+    return dict(sorted(episodes.items()))
 
 
 def _json(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(found.get("features"), dict):
+        info = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(info.get("features"), dict):
             raise DemonstrationsError(f"{path}: says nothing of features; is it LeRobot's?")
     except (OSError, ValueError, AttributeError, RecursionError) as error:
         raise damaged(path, "", error) from error
-    return found
+    return info
 
 
 @contextmanager

@@ -51,7 +51,7 @@ class Minari:
             raise DemonstrationsError(
                 f"{self.folder}: {name}: actions are {what}, they have to be one array of numbers"
             )
-        observations = {key: of_array(one[:steps]) for key, one in _leaves(episode["observations"], "")}
+        observations = {key: of_array(array[:steps]) for key, array in _leaves(episode["observations"], "")}
         seed = facts.get("seed")
         known: dict[str, Attribute] = {"episode_index": index}
         if seed is not None:

@@ -133,7 +133,7 @@ def robomimic_file(
             (data if name == ENVIRONMENT else file).attrs[name] = value
         data.attrs[ALL_STEPS] = sum(len(group["actions"]) for group in data.values())
         for name, members in masks.items():
-            file.create_dataset(f"mask/{name}", data=np.array([one.encode() for one in members], dtype=np.bytes_))
+            file.create_dataset(f"mask/{name}", data=np.array([member.encode() for member in members], dtype=np.bytes_))
 
 
 def write_recording(data: h5py.Group, recording: Recording) -> None:

@@ -54,8 +54,8 @@ def _frames(path: Path, start: float, steps: int, frequency: float, size: tuple[
     try:
         for frame in islice(frames(path, max(start - 0.5 / frequency, 0)), steps):  # the frame meant is the next one
             if frame.shape[:2] != size:
-                found, told = (" x ".join(map(str, one)) for one in (frame.shape[:2], size))
-                raise DemonstrationsError(f"{path}: is {found}, and meta/info.json says {told}")
+                actual, told = (" x ".join(map(str, shape)) for shape in (frame.shape[:2], size))
+                raise DemonstrationsError(f"{path}: is {actual}, and meta/info.json says {told}")
             seen += 1
             yield frame
     except (av.FFmpegError, IndexError) as error:
