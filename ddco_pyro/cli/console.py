@@ -187,10 +187,10 @@ def log_likelihoods(metrics: Mapping[str, Any]) -> None:
     _show(table)
 
 
-def _difference(found: Mapping[str, float]) -> str:
-    error = found["standard_error"]
+def _difference(paired: Mapping[str, float]) -> str:
+    error = paired["standard_error"]
     shown = f"{error:.3f}" if math.isfinite(error) else "unknown (one held out)"
-    return f"{found['nats_per_step']:+.3f} ± {shown}"
+    return f"{paired['nats_per_step']:+.3f} ± {shown}"
 
 
 def selection(choice: Choice, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -226,27 +226,27 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 
-def warnings(found: Sequence[tuple[str, str]]) -> None:
+def warnings(signs: Sequence[tuple[str, str]]) -> None:
     """Signs of a degenerate solution, each in words and with what usually helps."""
     console = Console()
-    for what, advice in found:
+    for what, advice in signs:
         console.print(Text(f"warning: {what} {advice}"), soft_wrap=True)
 
 
 def successes(results: Mapping[str, Any]) -> None:
     """What came of each method's rollouts."""
     methods: Mapping[str, Any] = results["methods"]
-    measures = list(dict.fromkeys(name for one in methods.values() for name in one["measures"]))
+    measures = list(dict.fromkeys(name for result in methods.values() for name in result["measures"]))
     table = Table("method", *measures, title=f"{results['episodes']} episodes each", show_edge=False)
-    for name, one in methods.items():
-        table.add_row(name, *(_measure(one["measures"].get(measure)) for measure in measures))
+    for name, result in methods.items():
+        table.add_row(name, *(_measure(result["measures"].get(measure)) for measure in measures))
     _show(table)
 
 
-def _measure(one: Mapping[str, Any] | None) -> str:
-    if one is None or one["trials"] == 0:
+def _measure(summary: Mapping[str, Any] | None) -> str:
+    if summary is None or summary["trials"] == 0:
         return "-"
-    if "successes" in one:
-        low, high = one["interval"]
-        return f"{one['successes']}/{one['trials']} [{low:.0%}, {high:.0%}]"
-    return f"{one['mean']:.2f}" + (f" ± {one['std']:.2f}" if one["std"] is not None else "")
+    if "successes" in summary:
+        low, high = summary["interval"]
+        return f"{summary['successes']}/{summary['trials']} [{low:.0%}, {high:.0%}]"
+    return f"{summary['mean']:.2f}" + (f" ± {summary['std']:.2f}" if summary["std"] is not None else "")

@@ -15,20 +15,20 @@ WIDTH = 160
 """Columns where there is no terminal: names in a file that is read by a program are not to be cut."""
 
 
-def show(found: Inspection) -> None:
+def show(facts: Inspection) -> None:
     """Print what was found in a file, as a few lines and a table."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDTH)
-    lines = [f"{found.path}: {found.format}, {_lengths(found)}", f"control frequency: {_frequency(found)}"]
-    lines += [f"mask/{name}: {len(names)} demonstrations" for name, names in found.masks.items()]
+    lines = [f"{facts.path}: {facts.format}, {_lengths(facts)}", f"control frequency: {_frequency(facts)}"]
+    lines += [f"mask/{name}: {len(names)} demonstrations" for name, names in facts.masks.items()]
     for line in lines:
         console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
     table = Table("", "a step", "type", "range", "notes", show_edge=False)
-    for one in found.fields.values():
-        table.add_row(*map(_plain, (one.place, str(list(one.shape)), one.dtype, _range(one), _notes(one))))
+    for field in facts.fields.values():
+        table.add_row(*map(_plain, (field.place, str(list(field.shape)), field.dtype, _range(field), _notes(field))))
     console.print(table)
-    for line in (*found.notes, *(f"problem: {problem}" for problem in found.problems)):
+    for line in (*facts.notes, *(f"problem: {problem}" for problem in facts.problems)):
         console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
 
 
@@ -36,34 +36,34 @@ def _plain(text: str) -> str:
     return escape(printable(text))
 
 
-def _lengths(found: Inspection) -> str:
-    steps = np.array(list(found.lengths.values()) or [0])
-    text = f"{len(found.lengths)} demonstrations"
+def _lengths(facts: Inspection) -> str:
+    steps = np.array(list(facts.lengths.values()) or [0])
+    text = f"{len(facts.lengths)} demonstrations"
     return f"{text} of {steps.min()} to {steps.max()} steps (median {np.median(steps):g}, {steps.sum()} in all)"
 
 
-def _frequency(found: Inspection) -> str:
-    return f"{found.frequency:g} Hz" if found.frequency else "not in the file"
+def _frequency(facts: Inspection) -> str:
+    return f"{facts.frequency:g} Hz" if facts.frequency else "not in the file"
 
 
-def _range(one: Field) -> str:
-    low, high = one.minimum[np.isfinite(one.minimum)], one.maximum[np.isfinite(one.maximum)]
+def _range(field: Field) -> str:
+    low, high = field.minimum[np.isfinite(field.minimum)], field.maximum[np.isfinite(field.maximum)]
     if not len(low) or not len(high):
         return "-"
     return f"{float(low.min()) + 0.0:.4g} to {float(high.max()) + 0.0:.4g}"  # + 0.0: no minus zero
 
 
-def _notes(one: Field) -> str:
-    notes = ["video" if one.video else "image"] if one.image else []
-    if one.nan or one.infinite:
-        notes.append(f"{one.nan} NaN, {one.infinite} infinite")
-    if one.huge:
-        notes.append(f"{one.huge} beyond ±{LARGEST:g}")
-    constant = one.constant
-    if constant and len(constant) == len(one.minimum):
+def _notes(field: Field) -> str:
+    notes = ["video" if field.video else "image"] if field.image else []
+    if field.nan or field.infinite:
+        notes.append(f"{field.nan} NaN, {field.infinite} infinite")
+    if field.huge:
+        notes.append(f"{field.huge} beyond ±{LARGEST:g}")
+    constant = field.constant
+    if constant and len(constant) == len(field.minimum):
         notes.append("constant")
-    elif constant and not one.image:
+    elif constant and not field.image:
         notes.append(f"constant: {', '.join(map(str, constant))}")
-    elif one.still and not one.video:
+    elif field.still and not field.video:
         notes.append("one value per demonstration")
     return "; ".join(notes)

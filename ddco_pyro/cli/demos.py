@@ -39,15 +39,15 @@ def collect(
     allow_code: AllowCode = False,
 ) -> None:
     """Record demonstrations of the task's supervisor, unless they are there already."""
-    found = load_spec(spec, overrides, allow_code)
-    if found.demonstrated_task is None:
+    loaded = load_spec(spec, overrides, allow_code)
+    if loaded.demonstrated_task is None:
         raise SpecError(f"{spec}: names no task, so there is no supervisor to record")
     from ddco_pyro.cli import console
     from ddco_pyro.simulation.collect import collect as record
 
-    own = found.demonstrations.path
+    own = loaded.demonstrations.path
     with console.Progress() as progress:
-        path = record(found.demonstrated_task, found.demonstrations, out or (Path(own) if own else None), progress)
+        path = record(loaded.demonstrated_task, loaded.demonstrations, out or (Path(own) if own else None), progress)
     print(path)
 
 
@@ -61,18 +61,18 @@ def inspect(
     from ddco_pyro.data.inspection import inspect as look
     from ddco_pyro.data.starting import starting_spec
 
-    found = look(file, form.value if form else None)
+    facts = look(file, form.value if form else None)
     if as_json:
-        print(json.dumps(found.as_json(), indent=1))
+        print(json.dumps(facts.as_json(), indent=1))
         return
     from ddco_pyro.cli.console_inspection import show
 
-    show(found)
-    if found.format != "robomimic":
+    show(facts)
+    if facts.format != "robomimic":
         print(f"\nto fit to it, import it first: ddco-pyro import {file} --out demos.hdf5")
         return
     try:
-        print(f"\n{starting_spec(found, file)}\nnext: ddco-pyro init {quote(str(file))} --out {quote(file.stem)}.yaml")
+        print(f"\n{starting_spec(facts, file)}\nnext: ddco-pyro init {quote(str(file))} --out {quote(file.stem)}.yaml")
     except DemonstrationsError as error:
         print(f"\nno spec to start with: {str(error).removeprefix(f'{file}: ')}")
 
@@ -89,10 +89,10 @@ def init(
 
     if out.exists() and not force:
         raise BadInput(f"{out}: is there already; choose another --out, or replace it with --force")
-    found = look(file)
-    if found.format != "robomimic":
-        raise BadInput(f"{file}: is a {found.format} dataset; first: ddco-pyro import {file} --out demos.hdf5")
-    text = starting_spec(found, file).replace("THIS_FILE", str(out))
+    facts = look(file)
+    if facts.format != "robomimic":
+        raise BadInput(f"{file}: is a {facts.format} dataset; first: ddco-pyro import {file} --out demos.hdf5")
+    text = starting_spec(facts, file).replace("THIS_FILE", str(out))
     write_text(out, text)
     print(f"{out}: fit it with: ddco-pyro fit {out} --out runs/{out.stem}")
 
@@ -121,9 +121,9 @@ def import_(
     size = (image_size, image_size) if image_size else None
     choice = Choice(tuple(observations), mask, videos, size, skip_broken)
     with console.Progress("importing") as progress:
-        found = import_demonstrations(
+        imported = import_demonstrations(
             source, out, form.value if form else None, choice, lambda *done: progress(DemonstrationsDone(*done))
         )
-    for name, reason in found.left_out.items():
+    for name, reason in imported.left_out.items():
         print(f"left out {name}: {reason}", file=sys.stderr)
-    print(f"{out}: {len(found.names)} demonstrations")
+    print(f"{out}: {len(imported.names)} demonstrations")

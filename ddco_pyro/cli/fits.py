@@ -40,15 +40,15 @@ def check(
         return
     if spec is None:
         raise SpecError("name a spec, such as: ddco-pyro check specs/needle.yaml")
-    found = load_spec(spec, overrides, allow_code)
+    loaded = load_spec(spec, overrides, allow_code)
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.building import baselines, check_networks
     from ddco_pyro.fitting.prepare import dimensions
 
-    size = dimensions(found)
-    hierarchy = check_networks(found, size)
-    print(dump_spec(found), end="")
-    console.dimensions(found, size, hierarchy, baselines(found, size))
+    size = dimensions(loaded)
+    hierarchy = check_networks(loaded, size)
+    print(dump_spec(loaded), end="")
+    console.dimensions(loaded, size, hierarchy, baselines(loaded, size))
     console.control(size, hierarchy)
 
 
@@ -63,23 +63,23 @@ def fit(
 
     An unfinished run of this very spec in --out is continued.
     """
-    found = load_spec(spec, overrides, allow_code)
+    loaded = load_spec(spec, overrides, allow_code)
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.run import fit_run
     from ddco_pyro.report import write_report
 
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     with (
-        _continued(f"fit {folder / 'spec.yaml'} --out {folder} --resume{_allowed(found)}", folder),
+        _continued(f"fit {folder / 'spec.yaml'} --out {folder} --resume{_allowed(loaded)}", folder),
         console.Progress() as progress,
     ):
-        fitted = fit_run(found, None, folder, progress, resume)
+        fitted = fit_run(loaded, None, folder, progress, resume)
     console.log_likelihoods(fitted.metrics)
     _warn(fitted)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
-    if found.hierarchy and found.demonstrations.path:
-        file = shlex.quote(found.demonstrations.path)
-        print(f"next: ddco-pyro segment {shlex.quote(str(folder))} {file} --html segments.html{_allowed(found)}")
+    if loaded.hierarchy and loaded.demonstrations.path:
+        file = shlex.quote(loaded.demonstrations.path)
+        print(f"next: ddco-pyro segment {shlex.quote(str(folder))} {file} --html segments.html{_allowed(loaded)}")
 
 
 def select(
@@ -100,7 +100,7 @@ def select(
     so far puts it below the best so far (one-sided, p < 0.001), or where a fold of it has failed.
     """
     number = [] if folds is None else [f"selection.folds={folds}"]
-    found = load_spec(spec, [*overrides, *number], allow_code)
+    loaded = load_spec(spec, [*overrides, *number], allow_code)
     if (backend is Backend.DASK) != (scheduler is not None):
         raise SpecError("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
     from ddco_pyro import selection
@@ -111,17 +111,17 @@ def select(
     from ddco_pyro.selection.table import HEAD, cells
 
     workers = selection.Workers(jobs, scheduler)
-    demos = selection.known_demonstrations(found)
-    selection.check(found, workers, demos)  # before anything is collected, trained or written
+    demos = selection.known_demonstrations(loaded)
+    selection.check(loaded, workers, demos)  # before anything is collected, trained or written
     folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"
-    claim(folder, found, resume)
+    claim(folder, loaded, resume)
     early = " --stop-early" * stop_early
-    again = f"select {folder / 'spec.yaml'} --out {folder} --resume{early}{_allowed(found)}"
+    again = f"select {folder / 'spec.yaml'} --out {folder} --resume{early}{_allowed(loaded)}"
     with _continued(again, folder), console.Progress() as progress:
-        made = selection.select(found, folder, progress, workers, stop_early, demos)
+        made = selection.select(loaded, folder, progress, workers, stop_early, demos)
         progress.end()
         assert made.choice.chosen is not None  # or it would have failed
-        final = selection.final_spec(found, made.choice.chosen.candidate)
+        final = selection.final_spec(loaded, made.choice.chosen.candidate)
         fitted = fit_run(final, seen(final, made.demos), folder / "fit", progress)
     console.selection(made.choice, HEAD, [cells(row, made.choice) for row in made.choice.rows])
     _warn(fitted)

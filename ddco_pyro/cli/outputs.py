@@ -76,21 +76,21 @@ def segment(
         if labelled and source.format != "robomimic":
             raise BadInput(f"{demos}: labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot")
         if lerobot:
-            found = _annotate(fit, source, lerobot, (level, lerobot_format.value), progress)
+            segmented = _annotate(fit, source, lerobot, (level, lerobot_format.value), progress)
         else:
-            found = segments(fit, source, progress)
+            segmented = segments(fit, source, progress)
     if csv:
-        write_csv(csv, found)
+        write_csv(csv, segmented)
         print(csv)
     if parquet:
-        write_parquet(parquet, found)
+        write_parquet(parquet, segmented)
         print(parquet)
     if html:
-        write_page(html, found, str(run), str(demos))
+        write_page(html, segmented, str(run), str(demos))
         print(html)
     if labelled:
-        write_labels(demos, labelled, found)
-        print(f"{labelled}: labels/{', labels/'.join(found.counts)}")
+        write_labels(demos, labelled, segmented)
+        print(f"{labelled}: labels/{', labels/'.join(segmented.counts)}")
 
 
 def _labelled(demos: Path, out: Path | None, in_place: bool) -> Path | None:
@@ -120,15 +120,15 @@ def _annotate(fit: Fit, source: Source, out: Path, how: tuple[str | None, str], 
 
     assert isinstance(source, LeRobot)
     level, form = how[0], FORMS[how[1]]
-    counts = {one.name: one.count for one in fit.spec.hierarchy.levels} if fit.spec.hierarchy else {}
+    counts = {options.name: options.count for options in fit.spec.hierarchy.levels} if fit.spec.hierarchy else {}
     if level is not None and level not in counts:
         raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(counts)})")
     chosen = level or next(iter(counts), "")
     check_target(source, out, subtask_names(chosen, counts.get(chosen, 0)), form)
-    found = segments(fit, source, on_event)
-    annotate(source, out, found, chosen, form)
+    segmented = segments(fit, source, on_event)
+    annotate(source, out, segmented, chosen, form)
     print(out)
-    return found
+    return segmented
 
 
 def export(

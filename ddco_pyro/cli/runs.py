@@ -28,12 +28,12 @@ def compare(
     from ddco_pyro.cli import console
     from ddco_pyro.comparison import page
 
-    found = comparison.compare(runs, allow_code)
-    console.comparison(page.HEAD, [page.cells(row) for row in found.rows])
-    if found.rollouts:
-        console.comparison(page.ROLLOUT_HEAD, page.rollout_cells(found))
-    print(page.verdict(found))
-    print(f"comparison: {comparison.write(found, out or Path('runs') / time.strftime('compare-%Y%m%d-%H%M%S'))}")
+    compared = comparison.compare(runs, allow_code)
+    console.comparison(page.HEAD, [page.cells(row) for row in compared.rows])
+    if compared.rollouts:
+        console.comparison(page.ROLLOUT_HEAD, page.rollout_cells(compared))
+    print(page.verdict(compared))
+    print(f"comparison: {comparison.write(compared, out or Path('runs') / time.strftime('compare-%Y%m%d-%H%M%S'))}")
 
 
 def rollout(

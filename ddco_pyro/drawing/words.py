@@ -72,10 +72,10 @@ def p_value(value: float) -> str:
     return "< 0.001" if value < 0.001 else f"{value:.2g}"
 
 
-def rate(found: Mapping[str, Any], of: str = "") -> str:
+def rate(result: Mapping[str, Any], of: str = "") -> str:
     """``41 of 50 (69 to 90 %)``: successes, trials (``of`` what) and the 95 % interval of the rate."""
-    text = f"{found['successes']} of {found['trials']} {of}".rstrip()
-    return text if found["interval"] is None else f"{text} ({interval(found['interval'], 100, 0)} %)"
+    text = f"{result['successes']} of {result['trials']} {of}".rstrip()
+    return text if result["interval"] is None else f"{text} ({interval(result['interval'], 100, 0)} %)"
 
 
 def measure(name: str) -> str:
@@ -114,7 +114,7 @@ def _explained(metrics: Mapping[str, Any]) -> str:
         return (
             f"{name} gives held-out demonstrations {value} nats per step; no other model was trained to compare with."
         )
-    differences = {method(other): one["difference"] for other, one in metrics["comparison"].items()}
+    differences = {method(other): comparison["difference"] for other, comparison in metrics["comparison"].items()}
     return explains(name, differences, held_out)
 
 
@@ -146,14 +146,14 @@ RAISE = "Raise training.epochs: it is the budget of every model that is compared
 
 def unconverged(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Every model of which the budget ended a stage too early, in words with the numbers, and what to do."""
-    found = []
+    verdicts = []
     for name, training in trainings(metrics).items():
         stages = [_too_short(stage) for stage in training["stages"] if not stage["converged"]]
         if stages:
             who = method(name)
             verdict = f"Earlier stages of {who} had" if training["converged"] else f"{_capital(who)} has"
-            found.append((f"{verdict} not converged: the budget ended {_listed(stages)}.", RAISE))
-    return found
+            verdicts.append((f"{verdict} not converged: the budget ended {_listed(stages)}.", RAISE))
+    return verdicts
 
 
 def _too_short(stage: Mapping[str, Any]) -> str:
@@ -180,11 +180,11 @@ def _listed(items: list[str]) -> str:
 def success(metrics: Mapping[str, Any]) -> str:
     """One sentence on rollouts; empty where there are none."""
     methods = metrics.get("rollouts", {}).get("methods", {})
-    rates = {name: one["measures"].get("success") for name, one in methods.items()}
-    rates = {name: one for name, one in rates.items() if one and "successes" in one}
+    rates = {name: results["measures"].get("success") for name, results in methods.items()}
+    rates = {name: summary for name, summary in rates.items() if summary and "successes" in summary}
     ours = metrics["model"]
     if ours not in rates:
         return ""
-    others = [f"{method(name)} in {rate(one)}" for name, one in rates.items() if name != ours]
+    others = [f"{method(name)} in {rate(summary)}" for name, summary in rates.items() if name != ours]
     text = f"In rollouts {method(ours)} succeeds in {rate(rates[ours], 'episodes')}"
     return f"{text}{'; ' if others else ''}{_listed(others) if others else ''}."

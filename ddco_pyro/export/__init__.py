@@ -91,15 +91,15 @@ def _compare(folder: Path, forms: list[str]) -> Exported:
     """How each form in the folder, loaded from there, acts in the episodes that were recorded."""
     with np.load(folder / "check.npz") as file:
         episodes = {name: file[name] for name in file.files}
-    found = {}
+    replayed = {}
     for form in forms:
         with _reported(f"as {form} it cannot be run"):
-            found[form] = runner.replay(runner.Runner(folder, form), episodes)
-        difference = found[form][0]
+            replayed[form] = runner.replay(runner.Runner(folder, form), episodes)
+        difference = replayed[form][0]
         if not difference < TOLERANCE:
             what = f"as {form} it differs from the run by {difference:.1e}"
             raise ExportError(f"nothing was written: {what}; with networks of this library that is a defect: report it")
-    return found
+    return replayed
 
 
 @contextmanager
@@ -117,7 +117,7 @@ def _reported(what: str) -> Iterator[None]:
 def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
     """What the runner has to know beside the weights."""
     encoder = hierarchy.encoder
-    vectors = {one.key: one for one in encoder.specs}
+    vectors = {spec.key: spec for spec in encoder.specs}
     scaling = hierarchy.scaling
     scale, shift = scaling.scale.numpy(), scaling.shift.numpy()
     return {
@@ -147,7 +147,7 @@ def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
 def _state(program: StepProgram) -> list[dict[str, Any]]:
     """The state before the first step."""
     tensors = [tensor.numpy() for tensor in program.initial_state()]
-    return [{"kind": str(one.dtype), "shape": list(one.shape), "values": one.ravel().tolist()} for one in tensors]
+    return [{"kind": str(part.dtype), "shape": list(part.shape), "values": part.ravel().tolist()} for part in tensors]
 
 
 def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
@@ -178,10 +178,10 @@ def _programs(program: StepProgram, onnx: bool) -> dict[str, bytes]:
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, which nothing here needs
         exported = torch.export.export(program, inputs)
         torch.export.save(exported, content)
-        found = {"controller.pt2": content.getvalue()}
+        files = {"controller.pt2": content.getvalue()}
         if onnx:
-            found["controller.onnx"] = _onnx(exported, inputs, *program.onnx_names())
-    return found
+            files["controller.onnx"] = _onnx(exported, inputs, *program.onnx_names())
+    return files
 
 
 def _onnx(
@@ -189,8 +189,8 @@ def _onnx(
 ) -> bytes:
     made = torch.onnx.export(program, inputs, input_names=given, output_names=names, dynamo=True, verbose=False)
     assert made is not None
-    found: bytes = made.model_proto.SerializeToString()
-    return found
+    content: bytes = made.model_proto.SerializeToString()
+    return content
 
 
 def record(controller: Controller, hierarchy: Hierarchy) -> dict[str, np.ndarray]:
@@ -201,52 +201,52 @@ def record(controller: Controller, hierarchy: Hierarchy) -> dict[str, np.ndarray
     ``choices_<episode>`` [T, D], and the runner's outputs as ``<output>_<episode>`` [T, ...].
     """
     random = np.random.default_rng(0)
-    found: dict[str, np.ndarray] = {"seeds": np.arange(EPISODES)}
+    arrays: dict[str, np.ndarray] = {"seeds": np.arange(EPISODES)}
     for episode in range(EPISODES):
         steps = STEPS if episode or hierarchy.encoder.images else max(STEPS, hierarchy.steps + 1)
         seen = _episode(hierarchy.encoder, steps, random)
         controller.reset(episode)
         acted = [
-            (controller.act({key: one[step] for key, one in seen.items()}), controller.choices) for step in range(steps)
+            (controller.act({key: obs[step] for key, obs in seen.items()}), controller.choices) for step in range(steps)
         ]
-        found |= {f"observation_{episode}_{key}": one for key, one in seen.items()}
-        found[f"controls_{episode}"] = np.stack([control for control, _ in acted])
-        found[f"choices_{episode}"] = np.array([choices for _, choices in acted], dtype=int).reshape(steps, -1)
-        found |= {f"{name}_{episode}": values for name, values in _said(hierarchy, seen).items()}
-    return found
+        arrays |= {f"observation_{episode}_{key}": obs for key, obs in seen.items()}
+        arrays[f"controls_{episode}"] = np.stack([control for control, _ in acted])
+        arrays[f"choices_{episode}"] = np.array([choices for _, choices in acted], dtype=int).reshape(steps, -1)
+        arrays |= {f"{name}_{episode}": values for name, values in _said(hierarchy, seen).items()}
+    return arrays
 
 
 def _said(hierarchy: Hierarchy, episode: dict[str, np.ndarray]) -> runner.Outputs:
     """The runner's outputs at every step, [T, ...], from one pass over the episode, as in training."""
-    found: runner.Outputs = {}
+    out: runner.Outputs = {}
     with torch.no_grad():
         said = hierarchy(hierarchy.encoder.inputs([episode]))
     for level, caller in enumerate(said.callers):
         if caller.selection is not None:
-            found[f"selection_{level}"] = caller.selection[0].numpy()
+            out[f"selection_{level}"] = caller.selection[0].numpy()
         if caller.emission is not None:
-            found[f"control_{level}"] = caller.emission.numbers[0].numpy()
-    return found | {f"termination_{level}": log[0, :, :, 1].exp().numpy() for level, log in enumerate(said.termination)}
+            out[f"control_{level}"] = caller.emission.numbers[0].numpy()
+    return out | {f"termination_{level}": log[0, :, :, 1].exp().numpy() for level, log in enumerate(said.termination)}
 
 
 def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generator) -> dict[str, np.ndarray]:
     """Observations with the mean and spread that were fitted to, and with differences as large where those matter."""
-    found: dict[str, np.ndarray] = {}
+    observations: dict[str, np.ndarray] = {}
     at = 0
     for spec, size in zip(encoder.specs, encoder.sizes, strict=True):
         if spec.key == STEP:
             at += size
             continue
         shape = encoder.shapes[spec.key]
-        mean, std = (one[at : at + size].numpy() for one in (encoder.mean, encoder.std))
+        mean, std = (statistic[at : at + size].numpy() for statistic in (encoder.mean, encoder.std))
         length = int(np.prod(shape))
         values = mean[:length] + std[:length] * random.normal(size=(steps, length))
         if spec.differences:
             differences = mean[length:] + std[length:] * random.normal(size=values.shape)
             values = _walk(values[0], differences, mean[:length], std[:length])
-        found[spec.key] = values.reshape(steps, *shape)
+        observations[spec.key] = values.reshape(steps, *shape)
         at += size
-    return found | {
+    return observations | {
         key: random.integers(0, 256, (steps, *shape), dtype=np.uint8) for key, shape in encoder.images.items()
     }
 

@@ -33,15 +33,15 @@ class StepProgram(nn.Module):
         vectors = self.hierarchy.encoder.standardized(features.reshape(1, 1, -1))
         pictures = {key: image.reshape(1, 1, *image.shape) for key, image in zip(self.keys, images, strict=True)}
         said, states = self.hierarchy.advance(Inputs(vectors, pictures, step), states)
-        found = {}
+        outputs = {}
         for level, caller in enumerate(said.callers):
             if caller.selection is not None:
-                found[f"selection_{level}"] = caller.selection[0, 0]
+                outputs[f"selection_{level}"] = caller.selection[0, 0]
             if caller.emission is not None:
-                found[f"control_{level}"] = caller.emission.numbers[0, 0]
+                outputs[f"control_{level}"] = caller.emission.numbers[0, 0]
         for level, log in enumerate(said.termination):
-            found[f"termination_{level}"] = log[0, 0, :, 1].double().exp()
-        return found, [tensor for state in states.values() for tensor in state]
+            outputs[f"termination_{level}"] = log[0, 0, :, 1].double().exp()
+        return outputs, [tensor for state in states.values() for tensor in state]
 
     def forward(self, features: Tensor, step: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
         """The outputs, in the order of ``names``, and the next state."""

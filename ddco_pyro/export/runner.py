@@ -61,7 +61,7 @@ class Runner:
         self.terminations: tuple[float, ...] = ()
         self.outputs: Outputs = {}
         self._last: dict[str, np.ndarray] | None = None
-        self._state = [np.array(one["values"], one["kind"]).reshape(one["shape"]) for one in self.about["state"]]
+        self._state = [np.array(part["values"], part["kind"]).reshape(part["shape"]) for part in self.about["state"]]
 
     def act(self, observation: Mapping[str, Any]) -> np.ndarray:
         """The control [A], in the control's own units.
@@ -71,9 +71,9 @@ class Runner:
         built_in = self.about["step"]
         if built_in:
             observation = {**observation, built_in["key"]: np.array([self.time / built_in["longest"]])}
-        now = {one["key"]: _checked(observation, one) for one in self.about["observations"]}
+        now = {spec["key"]: _checked(observation, spec) for spec in self.about["observations"]}
         features = self._features(now, self._last or now)
-        images = {one["key"]: now[one["key"]] for one in self.about["observations"] if one["image"]}
+        images = {spec["key"]: now[spec["key"]] for spec in self.about["observations"] if spec["image"]}
         self.outputs, self._state = self._networks(features, self.time, images, self._state)
         outputs = self.outputs
         generator = np.random.default_rng([self.seed, self.time])
@@ -87,12 +87,12 @@ class Runner:
 
     def _features(self, now: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray]) -> np.ndarray:
         parts = [np.zeros(0)]
-        for one in self.about["observations"]:
-            if not one["image"]:
-                value = now[one["key"]].astype(np.float64).ravel()
+        for spec in self.about["observations"]:
+            if not spec["image"]:
+                value = now[spec["key"]].astype(np.float64).ravel()
                 parts.append(value)
-                if one["differences"]:
-                    parts.append(value - before[one["key"]].astype(np.float64).ravel())
+                if spec["differences"]:
+                    parts.append(value - before[spec["key"]].astype(np.float64).ravel())
         return np.concatenate(parts)
 
     def _choose(self, outputs: Outputs, generator: np.random.Generator) -> tuple[int, ...]:
@@ -104,7 +104,7 @@ class Runner:
                 psi = float(outputs[f"termination_{level}"][choice - 1]) if choice else 1.0
                 ends = self._pick(np.array([1 - psi, psi] if below else [1.0, 0.0]), generator)
                 terminated[level] = below = bool(ends)
-        found, caller = [0] * depth, 0
+        choices, caller = [0] * depth, 0
         for level in reversed(range(depth)):
             table = outputs[f"selection_{level + 1}"]
             if level < depth - 1 and caller == 0:
@@ -113,8 +113,8 @@ class Runner:
                 probabilities = np.exp(table[caller - 1 if level < depth - 1 else 0].astype(np.float64))
             if not terminated[level]:
                 probabilities = np.eye(len(probabilities))[self.choices[level]]
-            caller = found[level] = self._pick(probabilities, generator)
-        return tuple(found)
+            caller = choices[level] = self._pick(probabilities, generator)
+        return tuple(choices)
 
     def _pick(self, probabilities: np.ndarray, generator: np.random.Generator) -> int:
         if self.about["options"] == "most_likely":
@@ -155,7 +155,7 @@ def _continuous(part: Part, mean: np.ndarray, std: np.ndarray, z: np.ndarray | N
 
 def _binary(part: Part, logits: np.ndarray, _: np.ndarray, z: np.ndarray | None) -> np.ndarray:
     """The position of each switch."""
-    on = logits > 0 if z is None else np.array([_phi(one) for one in z]) < 1 / (1 + np.exp(-logits))
+    on = logits > 0 if z is None else np.array([_phi(value) for value in z]) < 1 / (1 + np.exp(-logits))
     low, high = (np.array(ends) for ends in part["ends"])
     return np.where(on, high, low)
 
@@ -182,18 +182,18 @@ KINDS: dict[str, Callable[[Part, np.ndarray, np.ndarray, np.ndarray | None], np.
 }
 
 
-def _checked(observation: Mapping[str, Any], one: Mapping[str, Any]) -> np.ndarray:
-    key, shape = one["key"], tuple(one["shape"])
+def _checked(observation: Mapping[str, Any], spec: Mapping[str, Any]) -> np.ndarray:
+    key, shape = spec["key"], tuple(spec["shape"])
     if key not in observation:
         raise ValueError(f"the observation has no {key!r} (it has: {', '.join(sorted(observation))})")
-    value = np.asarray(observation[key])
-    if value.shape != shape:
-        raise ValueError(f"observation {key!r} has shape {value.shape}, the demonstrations had {shape}")
-    if value.dtype.kind not in "fiub" or (one["image"] and value.dtype != np.uint8):
-        raise ValueError(f"observation {key!r} is {value.dtype}, it has to be {'uint8' if one['image'] else 'numbers'}")
-    if not np.isfinite(value).all():
+    data = np.asarray(observation[key])
+    if data.shape != shape:
+        raise ValueError(f"observation {key!r} has shape {data.shape}, the demonstrations had {shape}")
+    if data.dtype.kind not in "fiub" or (spec["image"] and data.dtype != np.uint8):
+        raise ValueError(f"observation {key!r} is {data.dtype}, it has to be {'uint8' if spec['image'] else 'numbers'}")
+    if not np.isfinite(data).all():
         raise ValueError(f"observation {key!r} is not finite")
-    return value
+    return data
 
 
 class NumpyNetworks:
@@ -218,26 +218,26 @@ class NumpyNetworks:
         self._seen = {key: vector[first:end] for key, first, end in zip(sizes, ends, ends[1:], strict=False)}
         self._images, self._step = images, step
         self._before, self._after = iter(state), []
-        found: Outputs = {}
-        for level, one in enumerate(self._about["callers"]):
+        outputs: Outputs = {}
+        for level, caller in enumerate(self._about["callers"]):
             if level < depth and self._about["trunks"][level]:
                 self._features = self._evaluate(self._about["trunks"][level], f"trunk_{level}")
-            out = self._evaluate(one["network"], f"caller_{level}")
-            logits, mean = out[:, : one["logits"]], out[:, one["logits"] :]
-            if one["choices"]:
-                found[f"selection_{level}"] = _selection(logits, one)
+            out = self._evaluate(caller["network"], f"caller_{level}")
+            logits, mean = out[:, : caller["logits"]], out[:, caller["logits"] :]
+            if caller["choices"]:
+                outputs[f"selection_{level}"] = _selection(logits, caller)
             if mean.shape[1]:
-                found[f"control_{level}"] = mean
+                outputs[f"control_{level}"] = mean
             if level < depth:
                 raw = self._evaluate(self._about["terminations"][level], f"end_{level}")[:, 0]
                 bound = np.float32(self._about["termination_bound"])
-                found[f"termination_{level}"] = 1 / (1 + np.exp(-(bound * np.tanh(raw / bound)).astype(np.float64)))
-        return found, self._after
+                outputs[f"termination_{level}"] = 1 / (1 + np.exp(-(bound * np.tanh(raw / bound)).astype(np.float64)))
+        return outputs, self._after
 
     def _evaluate(self, node: Mapping[str, Any], name: str) -> np.ndarray:
         """What a part of a network gives for each of K copies, [K, features]; ``name`` begins those of its arrays."""
-        found: np.ndarray = getattr(self, f"_{node['kind']}")(node, name)
-        return found
+        values: np.ndarray = getattr(self, f"_{node['kind']}")(node, name)
+        return values
 
     def _vectors(self, node: Mapping[str, Any], _: str) -> np.ndarray:
         vector = np.concatenate([np.zeros(0, np.float32), *(self._seen[key] for key in node["keys"])])
@@ -271,7 +271,7 @@ class NumpyNetworks:
             take, keep, new, give = np.split(values @ weight + bias + h @ recurrent, 4, axis=2)
             c = _sigmoid(keep) * c + _sigmoid(take) * np.tanh(new)
             values = _sigmoid(give) * np.tanh(c)
-            self._after += [one.transpose(1, 0, 2) for one in (values, c)]
+            self._after += [state.transpose(1, 0, 2) for state in (values, c)]
         return values[:, 0]
 
     def _convolutions(self, node: Mapping[str, Any], name: str) -> np.ndarray:
@@ -293,8 +293,8 @@ def _convolved(maps: np.ndarray, weight: np.ndarray, bias: np.ndarray, layer: Ma
     padded = np.pad(maps, ((0, 0), (0, 0), pad, pad))
     windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(2, 3))[:, :, ::stride, ::stride]
     own = weight.reshape(len(maps), -1, *weight.shape[1:])
-    found = np.einsum("kchwij,kfcij->kfhw", windows, own, optimize=True)
-    return np.maximum(found + bias.reshape(len(maps), -1, 1, 1), 0)
+    convolved = np.einsum("kchwij,kfcij->kfhw", windows, own, optimize=True)
+    return np.maximum(convolved + bias.reshape(len(maps), -1, 1, 1), 0)
 
 
 def _means(maps: np.ndarray, pooled: int) -> np.ndarray:
@@ -322,13 +322,13 @@ def _fields(length: int, number: int) -> list[tuple[int, int]]:
     return [(i * length // number, -((i + 1) * length // -number)) for i in range(number)]
 
 
-def _selection(logits: np.ndarray, one: Mapping[str, Any]) -> np.ndarray:
+def _selection(logits: np.ndarray, caller: Mapping[str, Any]) -> np.ndarray:
     """Log-probabilities of control and of each option; -inf for what this caller does not emit."""
-    if not one["logits"]:
-        return np.array([[0.0] + [-np.inf] * one["choices"]] * len(logits))
+    if not caller["logits"]:
+        return np.array([[0.0] + [-np.inf] * caller["choices"]] * len(logits))
     shifted = logits - logits.max(1, keepdims=True)
-    found = shifted - np.log(np.exp(shifted).sum(1, keepdims=True))
-    return found if one["hybrid"] else np.insert(found, 0, -np.inf, axis=1)
+    log_probabilities = shifted - np.log(np.exp(shifted).sum(1, keepdims=True))
+    return log_probabilities if caller["hybrid"] else np.insert(log_probabilities, 0, -np.inf, axis=1)
 
 
 class TorchNetworks:
@@ -350,10 +350,10 @@ class TorchNetworks:
         self._torch.set_num_threads(1)  # networks are small: more threads only wait for one another
         try:
             with self._torch.no_grad():
-                values = self._program(*(self._torch.tensor(one) for one in given))
+                values = self._program(*(self._torch.tensor(array) for array in given))
         finally:
             self._torch.set_num_threads(threads)
-        return _divided(self._outputs, [one.numpy() for one in values])
+        return _divided(self._outputs, [tensor.numpy() for tensor in values])
 
 
 class OnnxNetworks:
@@ -365,7 +365,7 @@ class OnnxNetworks:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
         self._session = onnxruntime.InferenceSession(str(folder / "controller.onnx"), options)
-        self._inputs = {one.name for one in self._session.get_inputs()}
+        self._inputs = {argument.name for argument in self._session.get_inputs()}
         self._outputs = about["outputs"]
 
     def __call__(
@@ -374,8 +374,8 @@ class OnnxNetworks:
         """The outputs of every network for one observation, and the next state."""
         given = {"features": features, "step": np.array([step], np.int64)}
         given |= {f"image_{number}": image for number, image in enumerate(images.values())}
-        given |= {f"state_{number}": one for number, one in enumerate(state)}
-        values = self._session.run(None, {name: one for name, one in given.items() if name in self._inputs})
+        given |= {f"state_{number}": array for number, array in enumerate(state)}
+        values = self._session.run(None, {name: array for name, array in given.items() if name in self._inputs})
         return _divided(self._outputs, values)
 
 
@@ -403,7 +403,7 @@ def replay(controller: Runner, episodes: Mapping[str, np.ndarray]) -> tuple[floa
         controller.reset(int(seed))
         for step in range(len(episodes[f"controls_{number}"])):
             prefix = f"observation_{number}_"
-            seen = {key.removeprefix(prefix): one[step] for key, one in episodes.items() if key.startswith(prefix)}
+            seen = {key.removeprefix(prefix): rows[step] for key, rows in episodes.items() if key.startswith(prefix)}
             start = time.perf_counter()
             control = controller.act(seen)
             seconds.append(time.perf_counter() - start)
@@ -424,8 +424,8 @@ def _difference(about: Mapping[str, Any], name: str, value: np.ndarray, original
         varying = about["varying"]
         distance = np.abs(original[..., varying] - np.array(about["shift"]))
         unit[..., varying] = np.maximum(np.maximum(1.0, about["scale"]), distance)
-    found = float((np.abs(value - original) / unit).max())
-    return found if np.isfinite(found) else np.inf
+    difference = float((np.abs(value - original) / unit).max())
+    return difference if np.isfinite(difference) else np.inf
 
 
 def main() -> None:

@@ -17,20 +17,20 @@ def weights_and_networks(hierarchy: Hierarchy) -> tuple[Arrays, dict[str, Any]]:
     encoder = hierarchy.encoder
     arrays: Arrays = {"mean": encoder.mean.numpy(), "deviation": encoder.std.numpy()}
     levels = hierarchy.option_levels()
-    networks = {f"caller_{number}": one.network for number, one in enumerate(hierarchy.callers())}
-    networks |= {f"end_{number}": one.termination for number, one in enumerate(levels)}
-    networks |= {f"trunk_{number}": one.trunk for number, one in enumerate(levels) if one.trunk is not None}
+    networks = {f"caller_{number}": caller.network for number, caller in enumerate(hierarchy.callers())}
+    networks |= {f"end_{number}": level.termination for number, level in enumerate(levels)}
+    networks |= {f"trunk_{number}": level.trunk for number, level in enumerate(levels) if level.trunk is not None}
     forms = {name: form for name, network in networks.items() if (form := numpy_form(network)) is not None}
     facts = {name: about for name, (about, _) in forms.items()}
     arrays |= {f"{name}.{key}": array for name, (_, each) in forms.items() for key, array in each.items()}
     callers = [
         {
             "network": facts.get(f"caller_{number}"),
-            "logits": one.sizes[0],
-            "choices": one.options,
-            "hybrid": one.emits_control and one.emits_options,
+            "logits": caller.sizes[0],
+            "choices": caller.options,
+            "hybrid": caller.emits_control and caller.emits_options,
         }
-        for number, one in enumerate(hierarchy.callers())
+        for number, caller in enumerate(hierarchy.callers())
     ]
     terminations = [facts.get(f"end_{number}") for number in range(len(levels))]
     trunks = [facts.get(f"trunk_{number}") for number in range(len(levels))]

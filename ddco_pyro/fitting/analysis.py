@@ -37,12 +37,12 @@ class OptionUse:
 
 def option_use(posterior: Posterior) -> list[list[OptionUse]]:
     """For each level, lowest first, the use of every choice."""
-    found = []
+    uses = []
     for u, v in zip(posterior.u, posterior.v, strict=True):
         active, selected = u.sum((0, 1)).numpy(), v.sum(1).numpy()
         total = float(active.sum())
-        found.append([_use(choice, float(active[choice]), selected[:, choice], total) for choice in range(len(active))])
-    return found
+        uses.append([_use(choice, float(active[choice]), selected[:, choice], total) for choice in range(len(active))])
+    return uses
 
 
 def _use(choice: int, active: float, selected: np.ndarray, total: float) -> OptionUse:
@@ -54,7 +54,7 @@ def _use(choice: int, active: float, selected: np.ndarray, total: float) -> Opti
 
 def as_rows(use: Sequence[Sequence[OptionUse]]) -> list[list[dict[str, float | int | None]]]:
     """The same as plain data."""
-    return [[asdict(one) for one in level] for level in use]
+    return [[asdict(choice) for choice in level] for level in use]
 
 
 def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[dict[str, Any]]]:

@@ -52,13 +52,13 @@ def branch_use(hierarchy: Hierarchy, pieces: Iterable[Inferred]) -> list[dict[st
 
 def _branched(hierarchy: Hierarchy) -> dict[int, Branches]:
     """The branches that each level's policies read, by level; the meta-policy's is the last."""
-    found: dict[int, Branches] = {}
+    by_level: dict[int, Branches] = {}
     for place, network in hierarchy.networks().items():
         level = hierarchy.depth if place == "meta_policy" else int(place.split(".")[1])
         inside = [module for module in network.modules() if isinstance(module, Branches)]
         if inside and not place.endswith("termination"):
-            found.setdefault(level, inside[0])
-    return dict(sorted(found.items()))
+            by_level.setdefault(level, inside[0])
+    return dict(sorted(by_level.items()))
 
 
 def _rows(sums: dict[tuple[int, int], Tensor], level: int, branches: int, what: int) -> list[list[float | None]]:

@@ -43,7 +43,7 @@ class Dimensions:
         :raises DemonstrationsError: every dimension of the control is constant.
         """
         control = control_dimensions(demo.actions for demo in demonstrations)
-        constant = {one.number: one.minimum for one in control if one.constant}
+        constant = {dimension.number: dimension.minimum for dimension in control if dimension.constant}
         if len(constant) == len(control):
             raise DemonstrationsError(all_constant(control))
         shapes, size = demonstrations.observation_shapes, demonstrations.control_size
@@ -144,15 +144,15 @@ def baselines(spec: Spec, dimensions: Dimensions) -> list[tuple[Spec, Hierarchy]
 
     :raises SpecError: a baseline's network does not fit the observations.
     """
-    found = []
+    built = []
     for number, baseline in enumerate(spec.compare_with):
         try:
             beside = baseline_spec(spec, baseline, dimensions)
-            found.append((beside, build_hierarchy(beside, dimensions)))
+            built.append((beside, build_hierarchy(beside, dimensions)))
         except SpecError as error:  # what it shares with the spec is in order: it is about its own network
             problems = (problem.removeprefix("baseline.") for problem in error.problems)
             raise SpecError(*(f"compare_with.{number}.{problem}" for problem in problems)) from error
-    return found
+    return built
 
 
 def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:

@@ -32,9 +32,9 @@ class Clusters:
 
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
-        found = torch.zeros(batch.inputs.batch, dtype=torch.long)
-        found[_alive(batch)] = torch.as_tensor(self._kmeans.predict(self._rows(batch)), dtype=torch.long) + 1
-        return found
+        choices = torch.zeros(batch.inputs.batch, dtype=torch.long)
+        choices[_alive(batch)] = torch.as_tensor(self._kmeans.predict(self._rows(batch)), dtype=torch.long) + 1
+        return choices
 
     def _rows(self, batch: Batch) -> np.ndarray:
         seen = _observations(batch)

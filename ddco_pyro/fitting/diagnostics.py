@@ -69,37 +69,37 @@ def diagnose(options: Sequence[Use], divergences: Sequence[Alike] = ()) -> list[
     redundant where they differ by less than 0.1 nats per step over the time that one of them is active. A caller is
     high-fitting where it emits the control itself in more than half of the time that it acts.
     """
-    found: list[Finding] = []
+    findings: list[Finding] = []
     for level, use in enumerate(options, start=1):
-        for one in use[1:]:
-            found += _of_option(level, one, alone=len(use) == 2)
-        found += _of_pairs(level, use, divergences[level - 1] if divergences else ())
+        for option in use[1:]:
+            findings += _of_option(level, option, alone=len(use) == 2)
+        findings += _of_pairs(level, use, divergences[level - 1] if divergences else ())
         above = options[level] if level < len(options) else None
-        found += _of_caller(level, float(use[0]["share"]), float(above[0]["share"]) if above else 0.0)
-    return found
+        findings += _of_caller(level, float(use[0]["share"]), float(above[0]["share"]) if above else 0.0)
+    return findings
 
 
 def _of_option(level: int, use: Mapping[str, Any], alone: bool) -> list[Finding]:
     choice, share, duration = int(use["choice"]), float(use["share"]), use["duration"]
     if share < UNUSED_SHARE:
         return [Finding("unused", level, choice, share)]
-    found = []
+    findings = []
     if share > DOMINATING_SHARE and not alone:
-        found.append(Finding("dominating", level, choice, share))
+        findings.append(Finding("dominating", level, choice, share))
     within = float(use.get("demonstrations", 0.0))  # runs of before do not have it
     selections = float(use["selected"]) / within if within else 0.0
     if duration is not None and duration < SHORTEST_DURATION and selections >= AGAIN_AND_AGAIN:
-        found.append(Finding("never_persisting", level, choice, float(duration), selections=selections))
-    return found
+        findings.append(Finding("never_persisting", level, choice, float(duration), selections=selections))
+    return findings
 
 
 def _of_pairs(level: int, use: Use, alike: Alike) -> list[Finding]:
-    used = {int(one["choice"]) for one in use if float(one["share"]) >= UNUSED_SHARE}
+    used = {int(row["choice"]) for row in use if float(row["share"]) >= UNUSED_SHARE}
     return [
-        Finding("redundant", level, second, float(one["divergence"]), first)
-        for one in alike
-        for first, second in [one["options"]]
-        if {first, second} <= used and one["divergence"] is not None and one["divergence"] < SMALLEST_DIVERGENCE
+        Finding("redundant", level, second, float(pair["divergence"]), first)
+        for pair in alike
+        for first, second in [pair["options"]]
+        if {first, second} <= used and pair["divergence"] is not None and pair["divergence"] < SMALLEST_DIVERGENCE
     ]
 
 

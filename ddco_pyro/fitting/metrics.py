@@ -63,30 +63,30 @@ def _finite(fit: Fit, piece: Inferred) -> np.ndarray:
     return piece.log_likelihood
 
 
-def evaluate(found: Fit, parts: dict[str, Demonstrations], demos: Demonstrations) -> dict[str, Any]:
+def evaluate(fitted: Fit, parts: dict[str, Demonstrations], demos: Demonstrations) -> dict[str, Any]:
     """What ``metrics.json`` says of a model: log-likelihood in nats per step of each part of the data and of each
     demonstration, its paired difference to every baseline, and with options their use, divergences and agreement with
     labels.
 
     :raises NotFinite: a log-likelihood is NaN or infinite.
     """
-    ours = {name: _Part.of(found, part) for name, part in parts.items()}
-    by_method = {found.name: {name: part.values for name, part in ours.items()}}
-    for method, fit in found.baselines.items():
+    ours = {name: _Part.of(fitted, part) for name, part in parts.items()}
+    by_method = {fitted.name: {name: part.values for name, part in ours.items()}}
+    for method, fit in fitted.baselines.items():
         by_method[method] = {
             name: np.concatenate([_finite(fit, piece) for piece in fit.infer(part)]) for name, part in parts.items()
         }
-    values = by_method[found.name]
+    values = by_method[fitted.name]
     per_step = {name: float(v.sum() / sum(parts[name].lengths)) for name, v in values.items()}
     metrics: dict[str, Any] = {
-        "model": found.name,
+        "model": fitted.name,
         "log_likelihood_per_step": {"train": per_step["train"], "valid": per_step.get("valid")},
         "log_likelihood_by_dimension": {
-            name: _by_dimension(found, ours[name].each, parts[name]) if name in parts else None
+            name: _by_dimension(fitted, ours[name].each, parts[name]) if name in parts else None
             for name in ("train", "valid")
         },
         "valid": _each(parts["valid"], values["valid"]) if "valid" in parts else [],
-        "demonstrations_by_likelihood": _worst_first(found.name, parts, by_method),
+        "demonstrations_by_likelihood": _worst_first(fitted.name, parts, by_method),
         "comparison": {
             name: {
                 "log_likelihood_per_step": fit.metrics["log_likelihood_per_step"],
@@ -94,24 +94,24 @@ def evaluate(found: Fit, parts: dict[str, Demonstrations], demos: Demonstrations
                 "parameters": fit.metrics["parameters"],
                 "training": fit.metrics["training"],
             }
-            for name, fit in found.baselines.items()
+            for name, fit in fitted.baselines.items()
         },
     }
-    if uses := branch_use(found.hierarchy, found.infer(parts.get("valid", demos))):
+    if uses := branch_use(fitted.hierarchy, fitted.infer(parts.get("valid", demos))):
         metrics["branches"] = uses
-    if found.hierarchy.depth:
-        metrics |= _options(found, demos)
-        if found.spec.demonstrations.labels:
-            metrics["agreement"] = _agreement(found.spec.demonstrations.labels, ours, parts)
+    if fitted.hierarchy.depth:
+        metrics |= _options(fitted, demos)
+        if fitted.spec.demonstrations.labels:
+            metrics["agreement"] = _agreement(fitted.spec.demonstrations.labels, ours, parts)
     return metrics
 
 
-def _options(found: Fit, demos: Demonstrations) -> dict[str, Any]:
+def _options(fit: Fit, demos: Demonstrations) -> dict[str, Any]:
     """How options are used, and how differently they act."""
     sums: list[Posterior] = []
 
     def pieces() -> Iterator[tuple[Outputs, Posterior]]:
-        for piece in found.infer(demos):
+        for piece in fit.infer(demos):
             sums.append(Posterior(*(tuple(h.sum(1, keepdim=True) for h in kind) for kind in piece.posterior)))
             yield piece.outputs, piece.posterior
 
@@ -148,11 +148,11 @@ def _worst_first(
     return sorted(rows, key=lambda row: row["log_likelihood_per_step"][ours])
 
 
-def _by_dimension(found: Fit, each: Decomposition, demos: Demonstrations) -> dict[str, Any]:
+def _by_dimension(fit: Fit, each: Decomposition, demos: Demonstrations) -> dict[str, Any]:
     """What each control dimension (None for constant ones, which are no part of the model) and choosing options add to
     the log-likelihood per step.
     """
-    scaling, steps = found.hierarchy.scaling, sum(demos.lengths)
+    scaling, steps = fit.hierarchy.scaling, sum(demos.lengths)
     values: list[float | None] = [None] * scaling.size
     for dimension, value in zip(scaling.varying.tolist(), each.dimensions.sum(0).tolist(), strict=True):
         values[dimension] = value / steps

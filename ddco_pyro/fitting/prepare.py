@@ -45,7 +45,7 @@ def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
     task = find_task(spec.demonstrated_task)
     environment = task.load(spec.demonstrations.seed)
     try:
-        shapes = {name: tuple(one.shape) for name, one in environment.observation_spec().items()}
+        shapes = {name: tuple(array.shape) for name, array in environment.observation_spec().items()}
         size = Dimensions(shapes, environment.action_spec().shape[0], task.steps)
     finally:
         environment.close()
@@ -103,7 +103,7 @@ def outline(spec: Spec) -> Demonstrations:
     keys = spec.observed
     with opened(path) as file:
         return replace(
-            controls, demonstrations=tuple(_outlined(file[f"data/{one.name}"], one, keys) for one in controls)
+            controls, demonstrations=tuple(_outlined(file[f"data/{demo.name}"], demo, keys) for demo in controls)
         )
 
 
@@ -146,13 +146,13 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
 
 def digest(demos: Demonstrations) -> str:
     """SHA-256 of names, controls and observations."""
-    found = hashlib.sha256()
+    sha256 = hashlib.sha256()
     for demo in demos:
         keys = sorted(demo.observations)
-        found.update(json.dumps([demo.name, *demo.actions.shape, *keys]).encode())
+        sha256.update(json.dumps([demo.name, *demo.actions.shape, *keys]).encode())
         for array in (demo.actions, *(demo.observations[key] for key in keys)):
-            found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()
+            sha256.update(np.ascontiguousarray(array).tobytes())
+    return sha256.hexdigest()
 
 
 def _labels(spec: Spec) -> tuple[str, ...]:
@@ -185,15 +185,15 @@ def memory_needed(spec: Spec, path: Path) -> float:
 
     :raises DemonstrationsError: the file cannot be read or does not hold what the spec names.
     """
-    found = extent(path, spec.observed, spec.demonstrations.exclude)
-    shapes = {place.removeprefix("obs/"): shape for place, shape in found.shapes.items() if place != "actions"}
-    size = Dimensions(shapes, math.prod(found.shapes["actions"]), max(1, *found.lengths))
+    stored = extent(path, spec.observed, spec.demonstrations.exclude)
+    shapes = {place.removeprefix("obs/"): shape for place, shape in stored.shapes.items() if place != "actions"}
+    size = Dimensions(shapes, math.prod(stored.shapes["actions"]), max(1, *stored.lengths))
     try:
         with torch.random.fork_rng(devices=[]):
             works = [_work(*model, size) for model in ((spec, build_hierarchy(spec, size)), *baselines(spec, size))]
     except SpecError:  # it is said where networks are checked
         works = [Work(spec.training.batch_size, STEPS_AT_ONCE, 0, 0)]
-    return found.fit(works, {f"obs/{one.key}" for one in spec.observations if one.differences})
+    return stored.fit(works, {f"obs/{observation.key}" for observation in spec.observations if observation.differences})
 
 
 def _work(spec: Spec, hierarchy: Hierarchy, dimensions: Dimensions) -> Work:

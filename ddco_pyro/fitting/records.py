@@ -42,7 +42,7 @@ def read_table(path: Path, row: Callable[[dict[str, str]], T], remedy: str) -> l
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            return [row(one) for one in csv.DictReader(file)]
+            return [row(fields) for fields in csv.DictReader(file)]
     except (csv.Error, KeyError, TypeError, ValueError) as error:
         raise Damaged(path, f"{type(error).__name__}: {error}", remedy) from error
 
@@ -71,11 +71,11 @@ def read_metrics(folder: Path, counts: Sequence[int]) -> dict[str, Any]:
     :raises Damaged: it cannot be read, or lacks something that a reader needs.
     """
     path, remedy = folder / "metrics.json", refit(folder)
-    found = read_record(path, Metrics, remedy)
-    levels = [[use.choice for use in level] for level in found.options]
-    scores = [found.agreement.train, found.agreement.valid] if found.agreement else []
-    each_level = [one for one in (*scores, found.divergences or None) if one is not None]
-    if levels != [list(range(1 + count)) for count in counts] or {len(one) for one in each_level} - {len(counts)}:
+    metrics = read_record(path, Metrics, remedy)
+    levels = [[use.choice for use in level] for level in metrics.options]
+    scores = [metrics.agreement.train, metrics.agreement.valid] if metrics.agreement else []
+    each_level = [values for values in (*scores, metrics.divergences or None) if values is not None]
+    if levels != [list(range(1 + count)) for count in counts] or {len(values) for values in each_level} - {len(counts)}:
         raise Damaged(path, f"is not about levels with {', '.join(map(str, counts)) or 'no'} options", remedy)
     data: dict[str, Any] = json.loads(path.read_bytes())
     return data

@@ -37,7 +37,7 @@ def policies(fit: Fit) -> dict[str, Policy | str]:
             f"rollout.policies: task {fit.spec.task!r} has no {', '.join(unknown)} (it has: {', '.join(known)})"
         )
     scripted: dict[str, Policy | str] = {name: name for name in fit.spec.rollout.policies}
-    return scripted | {name: one.controller() for name, one in fit.baselines.items()} | {fit.name: fit.controller()}
+    return scripted | {name: other.controller() for name, other in fit.baselines.items()} | {fit.name: fit.controller()}
 
 
 def roll_out(
@@ -76,12 +76,12 @@ def roll_out(
                 write_film(_film(fit, name, episode.seed), episode)
             on_event(EpisodeEnded(name, total))
         rolled.keep(name, outcomes)
-    found = {name: rolled.outcomes[name] for name in methods}
-    write_text(folder / "rollouts.csv", _table(found, seeds))
+    by_method = {name: rolled.outcomes[name] for name in methods}
+    write_text(folder / "rollouts.csv", _table(by_method, seeds))
     results = {
         "seed": seeds.start,
         "episodes": episodes,
-        "methods": _methods(find_task(str(fit.spec.task)), found, fit.name),
+        "methods": _methods(find_task(str(fit.spec.task)), by_method, fit.name),
     }
     fit.metrics["rollouts"] = results
     write_metrics(folder, fit.metrics)
@@ -120,30 +120,30 @@ class _Unfinished:
         self._path.unlink(missing_ok=True)
 
 
-def _methods(task: Task, found: Outcomes, ours: str) -> dict[str, Any]:
+def _methods(task: Task, by_method: Outcomes, ours: str) -> dict[str, Any]:
     def successes(name: str) -> list[float]:
-        return [outcome[SUCCESS] for outcome in found[name]]
+        return [outcome[SUCCESS] for outcome in by_method[name]]
 
     methods: dict[str, Any] = {}
-    for name, outcomes in found.items():
+    for name, outcomes in by_method.items():
         methods[name] = {"measures": summarize(task, outcomes)}
         if name != ours and all(SUCCESS in outcome for outcome in outcomes):
             methods[name]["against"] = paired_difference(successes(ours), successes(name))
     return methods
 
 
-def _table(found: Mapping[str, Sequence[Mapping[str, float]]], seeds: Sequence[int]) -> str:
+def _table(by_method: Mapping[str, Sequence[Mapping[str, float]]], seeds: Sequence[int]) -> str:
     text = io.StringIO()
-    measures = list(dict.fromkeys(key for outcomes in found.values() for one in outcomes for key in one))
+    measures = list(dict.fromkeys(key for outcomes in by_method.values() for outcome in outcomes for key in outcome))
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["method", "seed", *measures])
-    writer.writerows(_rows(found, seeds, measures))
+    writer.writerows(_rows(by_method, seeds, measures))
     return text.getvalue()
 
 
 def _rows(
-    found: Mapping[str, Sequence[Mapping[str, float]]], seeds: Sequence[int], measures: Sequence[str]
+    by_method: Mapping[str, Sequence[Mapping[str, float]]], seeds: Sequence[int], measures: Sequence[str]
 ) -> Iterator[list[Any]]:
-    for name, outcomes in found.items():
+    for name, outcomes in by_method.items():
         for seed, outcome in zip(seeds, outcomes, strict=True):
             yield [name, seed, *(outcome.get(measure) for measure in measures)]

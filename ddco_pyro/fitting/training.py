@@ -261,8 +261,8 @@ class _Objective:
             assert hierarchy is not None  # only levels are clamped
             seed = trainer._seed(trainer.progress.restart, trainer.progress.stage)
             options = hierarchy.levels[stage.clamped - 1].count
-            found = Clusters(trainer.train, options, seed, trainer.spec.training.initialize == "vq_controls")
-            self.clusters = found.choices(trainer.train), found.choices(trainer.tune)
+            clusters = Clusters(trainer.train, options, seed, trainer.spec.training.initialize == "vq_controls")
+            self.clusters = clusters.choices(trainer.train), clusters.choices(trainer.tune)
 
     def ascend(self, model: Hierarchy, rows: Tensor) -> float:
         """Add the gradient of the loss of some training demonstrations to the parameters'; their log-likelihood.

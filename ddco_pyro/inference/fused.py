@@ -55,11 +55,11 @@ class _Eliminate(torch.autograd.Function):
     def forward(ctx: Any, lengths: Tensor, depth: int, *leaves: Tensor | None) -> Tensor:
         tables = Tables.of(depth, leaves)
         ctx.evidence = ctx.needs_input_grad[3 + 3 * depth :]
-        found = eliminate(tables, lengths, any(ctx.evidence), tables.control[0].dtype)
-        posteriors = *found.tables.leaves(), *found.marginals
+        elimination = eliminate(tables, lengths, any(ctx.evidence), tables.control[0].dtype)
+        posteriors = *elimination.tables.leaves(), *elimination.marginals
         ctx.posteriors = len(posteriors)
         ctx.save_for_backward(*posteriors, *leaves)
-        return found.value
+        return elimination.value
 
     @staticmethod
     @once
@@ -82,14 +82,14 @@ def eliminate(
     rows = _rows(tables.selection).exp_(), _rows(tables.termination).exp_(), densities.exp_()
     value, exact, results, choices = run(structure_of(tables), rows, _weight(tables), lengths, marginals, dtype)
     groups = zip(results, (tables.selection, tables.termination, tables.control), strict=True)
-    found = Elimination(
+    elimination = Elimination(
         value.add_(shift),
         Tables(*(_unrows(*group) for group in groups)),
         choices.split([table.shape[-1] for table in tables.selection], dim=-1) if marginals else (),
     )
     for n in torch.nonzero(~exact).flatten():
-        _again(tables, int(n), int(lengths[n]), found)
-    return found
+        _again(tables, int(n), int(lengths[n]), elimination)
+    return elimination
 
 
 Rows = tuple[Tensor, Tensor, Tensor]
@@ -147,8 +147,8 @@ def _weight(tables: Tables) -> Tensor:
     return joint.detach().exp().flatten(2)
 
 
-def _again(tables: Tables, n: int, length: int, found: Elimination) -> None:
-    """Do trajectory ``n`` in log space, and write what it gives into ``found``."""
+def _again(tables: Tables, n: int, length: int, elimination: Elimination) -> None:
+    """Do trajectory ``n`` in log space, and write what it gives into ``elimination``."""
     alone = tables.trajectory(n, length)
     leaves = [None if leaf is None else leaf.detach().double().requires_grad_() for leaf in alone.leaves()]
     ends = torch.tensor([length])
@@ -159,10 +159,10 @@ def _again(tables: Tables, n: int, length: int, found: Elimination) -> None:
         assert chain.emission is not None  # it has just been scored
         gradients = torch.autograd.grad(value.sum(), [*present, chain.emission], allow_unused=True)
     *own, joint = gradients
-    found.value[n] = value.detach()[0]
-    for table, gradient in zip(found.tables.leaves(), own, strict=False):
+    elimination.value[n] = value.detach()[0]
+    for table, gradient in zip(elimination.tables.leaves(), own, strict=False):
         assert table is not None
         table[n, :length] = 0.0 if gradient is None else gradient[0]
-    for level, marginal in enumerate(found.marginals, start=1):
+    for level, marginal in enumerate(elimination.marginals, start=1):
         assert joint is not None
         marginal[n, :length] = logspace.marginal(joint, level)[0]

@@ -91,11 +91,11 @@ def _act(
             first *= select[n, t, row]
             for j in range(1, c):
                 kept = messages[t, below + j] * end[n, t, 2 * j - 2]
-                found = (mass * select[n, t, row + j] + kept) * emission[n, t, j - 1]
+                message = (mass * select[n, t, row + j] + kept) * emission[n, t, j - 1]
                 if weighted:
-                    found *= weight[n, t, below + j]
-                messages[t + 1, below + j] = found
-                total += found
+                    message *= weight[n, t, below + j]
+                messages[t + 1, below + j] = message
+                total += message
         messages[t + 1, below] = first
         total += first
         below += c
@@ -205,11 +205,11 @@ def _adjoint_up(
 
 
 @jit
-def _hand_out(found: Array, n: int, t: int, rows: Array) -> None:
+def _hand_out(sums: Array, n: int, t: int, rows: Array) -> None:
     """Write what was summed up for a step where it belongs, and begin anew."""
-    for column in range(len(found)):
-        rows[n, t, column] = found[column]
-        found[column] = 0.0
+    for column in range(len(sums)):
+        rows[n, t, column] = sums[column]
+        sums[column] = 0.0
 
 
 @jit

@@ -22,11 +22,11 @@ def once(backward: Callable[..., Gradients]) -> Callable[..., Gradients]:
     @wraps(backward)
     def guarded(ctx: Any, *upstream: Tensor) -> Gradients:
         with torch.no_grad():
-            found = backward(ctx, *upstream)
+            gradients = backward(ctx, *upstream)
         if not torch.is_grad_enabled():
-            return found
-        inputs = [one for one in (*upstream, *ctx.saved_tensors) if one is not None and one.requires_grad]
-        return tuple(None if one is None else _Refuse.apply(one, *inputs) for one in found)
+            return gradients
+        inputs = [tensor for tensor in (*upstream, *ctx.saved_tensors) if tensor is not None and tensor.requires_grad]
+        return tuple(None if gradient is None else _Refuse.apply(gradient, *inputs) for gradient in gradients)
 
     return guarded
 

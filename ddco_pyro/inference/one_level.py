@@ -18,15 +18,15 @@ jit = numba.njit(cache=True, error_model="numpy")
 def _likelihood(emission: Array, weight: Array) -> Array:
     """What each choice makes of a step's control, [T, C]: the meta-policy acts where the choice is 0."""
     steps, c = emission.shape
-    found = np.empty((steps, c))
+    likelihood = np.empty((steps, c))
     for t in range(steps):
-        found[t, 0] = emission[t, c - 1]
+        likelihood[t, 0] = emission[t, c - 1]
         for j in range(1, c):
-            found[t, j] = emission[t, j - 1]
+            likelihood[t, j] = emission[t, j - 1]
         if weight.shape[1]:
             for j in range(c):
-                found[t, j] *= weight[t, j]
-    return found
+                likelihood[t, j] *= weight[t, j]
+    return likelihood
 
 
 @jit
@@ -46,9 +46,9 @@ def _forward(select: Array, end: Array, likelihood: Array, messages: Array, scal
         messages[t + 1, 0] = total
         for j in range(1, c):
             kept = messages[t, j] * before * end[t, 2 * j - 2]
-            found = (mass * select[t, j] + kept) * likelihood[t, j]
-            messages[t + 1, j] = found
-            total += found
+            message = (mass * select[t, j] + kept) * likelihood[t, j]
+            messages[t + 1, j] = message
+            total += message
         value += np.log(total) if total > 0.0 else np.nan
         before = 1.0 / total
         scale[t] = before

@@ -80,5 +80,5 @@ def _path(structure: Structure, joint: np.ndarray, terminated: np.ndarray) -> Pa
 
 def _rows(tables: Sequence[Tensor]) -> np.ndarray:
     """Each level's table, flattened and side by side, float64 [N, T, ...]."""
-    found: np.ndarray = torch.cat([table.detach().flatten(2).double() for table in tables], dim=-1).numpy()
-    return found
+    rows: np.ndarray = torch.cat([table.detach().flatten(2).double() for table in tables], dim=-1).numpy()
+    return rows

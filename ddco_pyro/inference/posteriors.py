@@ -31,13 +31,13 @@ def posterior(tables: Tables, lengths: Tensor) -> Posterior:
     """The E-step: u, v and w of every level (§4.1)."""
     if not tables.depth:
         return Posterior((), (), ())
-    found = fused.eliminate(tables, lengths, marginals=True)
-    u = found.marginals
+    result = fused.eliminate(tables, lengths, marginals=True)
+    u = result.marginals
     v = tuple(
         torch.cat([u_d[..., :1], selected.sum(2)[..., 1:]], dim=-1)  # choice 0 lasts one step: it is always selected
-        for u_d, selected in zip(u, found.tables.selection, strict=True)
+        for u_d, selected in zip(u, result.tables.selection, strict=True)
     )
-    w = tuple(_not_ending(u_d, ended[..., 1], lengths) for u_d, ended in zip(u, found.tables.termination, strict=True))
+    w = tuple(_not_ending(u_d, ended[..., 1], lengths) for u_d, ended in zip(u, result.tables.termination, strict=True))
     return Posterior(u, v, w)
 
 

@@ -46,11 +46,11 @@ class Structure:
 
     def digits(self, joint: np.ndarray) -> tuple[np.ndarray, ...]:
         """The choice of each level, lowest first, in joint choices of any shape."""
-        found = []
+        choices = []
         for size in self.sizes:
-            found.append(joint % size)
+            choices.append(joint % size)
             joint = joint // size
-        return tuple(found)
+        return tuple(choices)
 
 
 def structure_of(tables: Tables) -> Structure:

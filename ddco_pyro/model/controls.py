@@ -188,7 +188,7 @@ def _declared(
             if part.kind == "binary":
                 shift[at], scale[at] = part.low[place], part.high[place] - part.low[place]
             elif part.continuous:
-                named = next((one for one in spec.parts if dimension in one.dims and one.name in own), None)
+                named = next((scaled for scaled in spec.parts if dimension in scaled.dims and scaled.name in own), None)
                 declared = own[named.name] if named else spec.scale
                 standardized[at] = declared == "standardize"
                 if isinstance(declared, tuple):

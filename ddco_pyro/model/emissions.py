@@ -136,9 +136,9 @@ class Gaussian(Kind):
         """Mean of both divergences; ½ Σ (μ_i - μ_j)² / σ² where callers share σ."""
         mean, std = self.mean.double(), self.std.double()
         apart = (mean[..., i, :] - mean[..., j, :]).square()
-        one, two = (std, std) if std.dim() == 1 else (std[i], std[j])
-        one, two = one.square(), two.square()
-        return 0.25 * ((one + apart) / two + (two + apart) / one - 2).sum(-1)
+        first, second = (std, std) if std.dim() == 1 else (std[i], std[j])
+        first, second = first.square(), second.square()
+        return 0.25 * ((first + apart) / second + (second + apart) / first - 2).sum(-1)
 
 
 @dataclass(frozen=True)
@@ -228,8 +228,8 @@ class Binary(Kind):
 
     def divergence(self, i: int, j: int) -> Tensor:
         """Mean of both divergences, ½ Σ (p_i - p_j)(y_i - y_j)."""
-        one, two = self.logits[..., i, :].double(), self.logits[..., j, :].double()
-        return 0.5 * ((one.sigmoid() - two.sigmoid()) * (one - two)).sum(-1)
+        first, second = self.logits[..., i, :].double(), self.logits[..., j, :].double()
+        return 0.5 * ((first.sigmoid() - second.sigmoid()) * (first - second)).sum(-1)
 
 
 @dataclass(frozen=True)
@@ -275,8 +275,8 @@ class Categorical(Kind):
 
     def divergence(self, i: int, j: int) -> Tensor:
         """Mean of both divergences."""
-        one, two = (self.logits[..., caller, :].double().log_softmax(-1) for caller in (i, j))
-        return 0.5 * ((one.exp() - two.exp()) * (one - two)).sum(-1)
+        first, second = (self.logits[..., caller, :].double().log_softmax(-1) for caller in (i, j))
+        return 0.5 * ((first.exp() - second.exp()) * (first - second)).sum(-1)
 
     def _action(self, index: Tensor) -> Tensor:
         actions = one_hot(index, self.logits.shape[-1]) if bool(self.rows) else index.unsqueeze(-1)

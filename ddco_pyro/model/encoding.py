@@ -124,8 +124,8 @@ class ObservationEncoder(nn.Module):
         :meth:`features`.
         """
         sequences = list(observations)
-        vectors = [(self.features(one, times) - self.mean.numpy()) / self.std.numpy() for one in sequences]
-        images = {key: _pad([np.asarray(one[key]) for one in sequences]) for key in self.images}
+        vectors = [(self.features(sequence, times) - self.mean.numpy()) / self.std.numpy() for sequence in sequences]
+        images = {key: _pad([np.asarray(sequence[key]) for sequence in sequences]) for key in self.images}
         vector = _pad(vectors).float()
         by_key = dict(zip(self.keys, vector.split(self.sizes, -1), strict=True))
         return Inputs(by_key, images, torch.arange(vector.shape[1]))
@@ -170,4 +170,4 @@ def refuse_unusable(demonstrations: Demonstrations, encoder: ObservationEncoder,
 
 def _pad(sequences: Sequence[np.ndarray]) -> Tensor:
     """[T_n, ...] arrays to one [N, max T_n, ...] tensor, zeros at the end."""
-    return nn.utils.rnn.pad_sequence([torch.as_tensor(one) for one in sequences], batch_first=True)
+    return nn.utils.rnn.pad_sequence([torch.as_tensor(sequence) for sequence in sequences], batch_first=True)

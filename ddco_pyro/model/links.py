@@ -84,8 +84,8 @@ class _Compiled(torch.autograd.Function):
         link, saved, wanted = ctx.link, ctx.saved_tensors, ctx.needs_input_grad[1:]
         inputs, kept = saved[: ctx.inputs], saved[ctx.inputs :]
         if not torch.is_grad_enabled() and not any(wanted[link.differentiable :]):
-            found = link.backward(wanted, upstream.contiguous(), *inputs, *kept)
-            return None, *found, *(None,) * (ctx.inputs - len(found))
+            derivatives = link.backward(wanted, upstream.contiguous(), *inputs, *kept)
+            return None, *derivatives, *(None,) * (ctx.inputs - len(derivatives))
         with torch.enable_grad():
             value = link.formula(*inputs)
         leaves = [tensor for tensor, needed in zip(inputs, wanted, strict=True) if needed]
@@ -97,9 +97,9 @@ def _selection_forward(logits: Tensor, control: Tensor) -> tuple[Tensor, Tensor]
     *batch, size = logits.shape
     value = logits.new_empty(*batch, len(control) + size)
     shares = torch.empty(value.numel() // max(value.shape[-1], 1), size, dtype=torch.float64)
-    rows, found = _rows(logits, 1), _rows(value, 1)
+    rows, out = _rows(logits, 1), _rows(value, 1)
     _below_largest(rows, shares.numpy())
-    _normalise(rows, shares.exp_().numpy(), found)
+    _normalise(rows, shares.exp_().numpy(), out)
     return value, shares
 
 

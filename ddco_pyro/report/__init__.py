@@ -29,7 +29,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
         page = {
             "header": sections.header(fit, metrics),
             "likelihood": sections.likelihood(fit, metrics),
-            "dimensions": dimensions.section(metrics, {name: one.metrics for name, one in fit.baselines.items()}),
+            "dimensions": dimensions.section(metrics, {name: other.metrics for name, other in fit.baselines.items()}),
             "rollouts": sections.rollouts(fit, metrics),
             "learning": sections.learning(fit),
             "options": sections.options(fit, demos, active, metrics) if active else None,
@@ -37,7 +37,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             "warnings": sections.warnings(fit, metrics),
             "films": sections.films(fit),
             "particulars": sections.particulars(fit, metrics),
-            "demonstrations": demonstration_list.listed(metrics, {one.anchor for one in timelines}),
+            "demonstrations": demonstration_list.listed(metrics, {timeline.anchor for timeline in timelines}),
             "timelines": timelines,
         }
     write_text(path, render("report/report.html.j2", page))

@@ -46,36 +46,36 @@ def listed(metrics: Mapping[str, Any], anchors: Collection[str]) -> Demonstratio
 
     :param anchors: those of the timelines that are there.
     """
-    found = metrics.get("demonstrations_by_likelihood")
-    if not found:
+    entries = metrics.get("demonstrations_by_likelihood")
+    if not entries:
         return None
-    methods = list(found[0]["log_likelihood_per_step"])
+    methods = list(entries[0]["log_likelihood_per_step"])
     rows = [
         ListedDemonstration(
-            one["name"], place if (place := anchor(one["name"])) in anchors else None, one["part"] == "valid",
-            (str(one["steps"]), *(number(one["log_likelihood_per_step"][name]) for name in methods)),
+            entry["name"], place if (place := anchor(entry["name"])) in anchors else None, entry["part"] == "valid",
+            (str(entry["steps"]), *(number(entry["log_likelihood_per_step"][name]) for name in methods)),
         )
-        for one in found
+        for entry in entries
     ]  # fmt: skip
     head = ("Demonstration", "", "Steps", *map(method, methods))
     return DemonstrationList(method(metrics["model"]), head, rows[:SHOWN], rows[SHOWN:])
 
 
-def timelines(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> list[Timeline]:
+def timelines(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mapping[str, Any]) -> list[Timeline]:
     """The segments of the listed demonstrations, in the order of the list."""
     rows = metrics.get("demonstrations_by_likelihood", ())
     places = {name: row for row, name in enumerate(demos.names)}
-    known = [one for one in rows if one["name"] in places]
-    segments = tuple(_segments(fit, demos, places[one["name"]], found, one) for one in known)
-    counts = {level.name: level.active.shape[2] - 1 for level in found.levels}
+    known = [entry for entry in rows if entry["name"] in places]
+    segments = tuple(_segments(fit, demos, places[entry["name"]], activity, entry) for entry in known)
+    counts = {level.name: level.active.shape[2] - 1 for level in activity.levels}
     return drawn(Segmented(segments, counts, None), MOST_BOXES) if segments else []
 
 
-def _segments(fit: Fit, demos: Demonstrations, row: int, found: Activity, listed: Mapping[str, Any]) -> Segments:
+def _segments(fit: Fit, demos: Demonstrations, row: int, activity: Activity, listed: Mapping[str, Any]) -> Segments:
     demo, truth = demos[row], fit.spec.demonstrations.labels
     levels = {
         level.name: LevelLabels.of(*(array[row, : len(demo)] for array in (level.path, level.ended, level.active)))
-        for level in found.levels
+        for level in activity.levels
     }
     labels = {truth: demo.labels[truth]} if truth else {}
     value = listed["log_likelihood_per_step"][fit.name]

@@ -25,12 +25,12 @@ class Dimensions:
 def section(metrics: Mapping[str, Any], baselines: Mapping[str, Mapping[str, Any]]) -> Dimensions | None:
     """The section of a run, from its ``metrics.json`` and its baselines'; None for runs of before."""
     by_method = {metrics["model"]: metrics, **baselines}
-    known = {name: one["log_likelihood_by_dimension"] for name, one in by_method.items() if _KEY in one}
+    known = {name: record["log_likelihood_by_dimension"] for name, record in by_method.items() if _KEY in record}
     if metrics["model"] not in known:
         return None
     part = "valid" if known[metrics["model"]]["valid"] else "train"
-    values = {name: one[part] for name, one in known.items()}
-    control = [ControlDimension(**one) for one in metrics["control_dimensions"]]
+    values = {name: parts[part] for name, parts in known.items()}
+    control = [ControlDimension(**fields) for fields in metrics["control_dimensions"]]
     return Dimensions(
         _table(control, values, metrics.get("measure", {})), "held-out" if part == "valid" else "training"
     )
@@ -44,12 +44,12 @@ def _table(
 ) -> Table:
     rows = [
         [
-            str(one.number),
-            *(number(value["by_dimension"][one.number]) for value in values.values()),
-            str(measure.get(str(one.number), [""])[0]),
-            one.note,
+            str(dimension.number),
+            *(number(value["by_dimension"][dimension.number]) for value in values.values()),
+            str(measure.get(str(dimension.number), [""])[0]),
+            dimension.note,
         ]
-        for one in control
+        for dimension in control
     ]
     totals = [sum(filter(None, value["by_dimension"])) + value["options"] for value in values.values()]
     return Table(

@@ -40,14 +40,14 @@ def films(folder: Path, first: str) -> list[Film]:
     """The films in a run folder, those of the method ``first`` before the others."""
     paths = sorted((folder / "videos").glob("*.mp4"), key=lambda path: _key(path, first))
     outcomes = {key: "success" if value == 1 else "failure" for key, value in read_successes(folder).items()}
-    left, found = MOST_BYTES, []
+    left, clips = MOST_BYTES, []
     for path in paths:
         method, seed = _name(path)
         size = path.stat().st_size
         uri = data_uri(path.read_bytes(), "video/mp4") if size <= left else None
         left -= size if uri else 0
-        found.append(Film(method, seed, f"videos/{path.name}", uri, outcomes.get((method, seed), "")))
-    return found
+        clips.append(Film(method, seed, f"videos/{path.name}", uri, outcomes.get((method, seed), "")))
+    return clips
 
 
 def draw_strip(path: Path) -> Figure:

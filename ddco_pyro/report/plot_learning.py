@@ -36,15 +36,15 @@ class Stage:
 
 def stages(histories: Mapping[str, Path]) -> list[Stage]:
     """The stages in ``history.csv`` of each model, in the order in which they were trained."""
-    found = []
+    trained = []
     for model, path in histories.items():
         rows = read_table(path, _epoch, refit(path.parent, "it and metrics.json"))
         for stage in dict.fromkeys(stage for stage, _, _ in rows):
             own = [(restart, values) for name, restart, values in rows if name == stage]
             numbers = dict.fromkeys(restart for restart, _ in own)
             curves = [np.array([values for restart, values in own if restart == number]) for number in numbers]
-            found.append(Stage(model, stage, curves))
-    return found
+            trained.append(Stage(model, stage, curves))
+    return trained
 
 
 def _epoch(row: Mapping[str, str]) -> tuple[str, int, list[float]]:
@@ -52,15 +52,15 @@ def _epoch(row: Mapping[str, str]) -> tuple[str, int, list[float]]:
     return row["stage"], int(row["restart"]), [float(row[key]) for key in ("epoch", "train", "tune")]
 
 
-def draw(found: Sequence[Stage]) -> Figure:
+def draw(stages: Sequence[Stage]) -> Figure:
     """A panel for each stage, a pair of lines for each restart."""
-    columns = min(COLUMNS, len(found))
-    rows = -(-len(found) // columns)
+    columns = min(COLUMNS, len(stages))
+    rows = -(-len(stages) // columns)
     figure = blank(0.4 + 2.1 * rows)
     panels = figure.subplots(rows, columns, squeeze=False)
-    for axes, stage in zip(panels.flat, found, strict=False):
+    for axes, stage in zip(panels.flat, stages, strict=False):
         _panel(axes, stage)
-    for axes in panels.flat[len(found) :]:
+    for axes in panels.flat[len(stages) :]:
         axes.set_visible(False)
     for axes in panels[:, 0]:
         axes.set_ylabel("nats per step")

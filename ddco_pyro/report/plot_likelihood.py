@@ -37,13 +37,13 @@ def likelihoods(metrics: Mapping[str, Any], baselines: Mapping[str, Mapping[str,
     """The model and what it was compared with, from its ``metrics.json`` and those of its baselines."""
     own = metrics["log_likelihood_per_step"]
     valid = np.nan if own["valid"] is None else own["valid"]
-    found = [Likelihood(metrics["model"], own["train"], valid, **_effort(metrics))]
-    for name, one in metrics["comparison"].items():
-        values, difference = one["log_likelihood_per_step"], one["difference"]
+    likelihoods = [Likelihood(metrics["model"], own["train"], valid, **_effort(metrics))]
+    for name, other in metrics["comparison"].items():
+        values, difference = other["log_likelihood_per_step"], other["difference"]
         each = _each(metrics["valid"], baselines.get(name, {}).get("valid", ()))
         mean_and_error = (difference["nats_per_step"], difference["standard_error"])
-        found.append(Likelihood(name, values["train"], values["valid"], mean_and_error, each, **_effort(one)))
-    return found
+        likelihoods.append(Likelihood(name, values["train"], values["valid"], mean_and_error, each, **_effort(other)))
+    return likelihoods
 
 
 def _effort(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -51,8 +51,8 @@ def _effort(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _each(ours: Sequence[Mapping[str, Any]], theirs: Sequence[Mapping[str, Any]]) -> tuple[float, ...]:
-    other = {one["name"]: one["log_likelihood"] for one in theirs}
-    return tuple((one["log_likelihood"] - other[one["name"]]) / one["steps"] for one in ours if one["name"] in other)
+    other = {row["name"]: row["log_likelihood"] for row in theirs}
+    return tuple((row["log_likelihood"] - other[row["name"]]) / row["steps"] for row in ours if row["name"] in other)
 
 
 def draw(rows: Sequence[Likelihood]) -> Figure:

@@ -27,27 +27,27 @@ class Example:
     labels: np.ndarray | None = None
 
 
-def draw(found: Activity, examples: Sequence[Example]) -> Figure:
+def draw(activity: Activity, examples: Sequence[Example]) -> Figure:
     """Two demonstrations side by side; for each level u_t stacked, with the most likely path under it."""
     rows = -(-len(examples) // 2)
     labelled = examples[0].labels is not None
-    figure = blank(0.35 + rows * (0.55 + 1.25 * len(found.levels) + 0.2 * labelled))
+    figure = blank(0.35 + rows * (0.55 + 1.25 * len(activity.levels) + 0.2 * labelled))
     parts = figure.subfigures(rows, 2, squeeze=False)
     for part, example in zip(parts.flat, examples, strict=False):
-        _example(part, found, example)
-    choices = sorted({choice for level in found.levels for choice in level.choices})
+        _example(part, activity, example)
+    choices = sorted({choice for level in activity.levels for choice in level.choices})
     figure.legend(handles=legend(choices), loc="outside lower center", ncols=min(len(choices), 11), handlelength=1)
     return figure
 
 
-def _example(figure: SubFigure, found: Activity, example: Example) -> None:
-    length = int(found.lengths[example.row])
-    heights = [*([5, 0.8] * len(found.levels)), *([0.9] if example.labels is not None else [])]
+def _example(figure: SubFigure, activity: Activity, example: Example) -> None:
+    length = int(activity.lengths[example.row])
+    heights = [*([5, 0.8] * len(activity.levels)), *([0.9] if example.labels is not None else [])]
     panels = figure.subplots(len(heights), 1, height_ratios=heights, gridspec_kw={"hspace": 0.02})
-    for depth, level in enumerate(reversed(found.levels)):
+    for depth, level in enumerate(reversed(activity.levels)):
         stack, strip = panels[2 * depth], panels[2 * depth + 1]
         _stack(stack, level, example.row, length)
-        stack.set_ylabel(f"{level.name}\nprobability" if len(found.levels) > 1 else "probability")
+        stack.set_ylabel(f"{level.name}\nprobability" if len(activity.levels) > 1 else "probability")
         draw_path(strip, level.path[example.row, :length])
         strip.set_ylabel("path", rotation=0, ha="right", va="center", fontsize=7.5)
     if example.labels is not None:

@@ -13,20 +13,20 @@ from ddco_pyro.report.activity import Activity
 from ddco_pyro.report.strips import colour_image, label_image, legend
 
 
-def order(found: Activity) -> np.ndarray:
+def order(activity: Activity) -> np.ndarray:
     """Rows by length, then by when the option of the lowest level first changes."""
-    path = found.levels[0].path
+    path = activity.levels[0].path
     changed = np.diff(path, axis=1) != 0
     first = np.where(changed.any(1), changed.argmax(1), path.shape[1])
-    return np.lexsort((first, found.lengths))
+    return np.lexsort((first, activity.lengths))
 
 
-def draw(found: Activity, labels: Sequence[np.ndarray] | None) -> Figure:
+def draw(activity: Activity, labels: Sequence[np.ndarray] | None) -> Figure:
     """A panel for each level, the highest first, and one for the labels where there are any."""
-    rows = order(found)
-    images = [(f"level “{level.name}”", colour_image(level.path[rows])) for level in reversed(found.levels)]
+    rows = order(activity)
+    images = [(f"level “{level.name}”", colour_image(level.path[rows])) for level in reversed(activity.levels)]
     if labels is not None:
-        images.append(("ground-truth labels", label_image([labels[row] for row in rows], found.lengths.max())))
+        images.append(("ground-truth labels", label_image([labels[row] for row in rows], activity.lengths.max())))
     figure = blank(float(np.clip(0.9 + 0.045 * len(rows), 2.2, 7)))
     panels = figure.subplots(1, len(images), sharey=True, squeeze=False)[0]
     for axes, (title, image) in zip(panels, images, strict=True):
@@ -37,6 +37,6 @@ def draw(found: Activity, labels: Sequence[np.ndarray] | None) -> Figure:
         axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
     panels[0].set_ylabel("demonstration")
-    choices = sorted({choice for level in found.levels for choice in level.choices})
+    choices = sorted({choice for level in activity.levels for choice in level.choices})
     figure.legend(handles=legend(choices), loc="outside lower center", ncols=min(len(choices), 11), handlelength=1)
     return figure

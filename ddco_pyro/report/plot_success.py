@@ -16,10 +16,10 @@ def draw(rates: Mapping[str, Mapping[str, Any]]) -> Figure:
     """The success rate of each method in percent and its 95 % interval."""
     figure = blank(0.9 + 0.32 * len(rates))
     axes = figure.subplots()
-    for place, one in enumerate(rates.values()):
-        low, high = (100 * end for end in one["interval"])
+    for place, rate in enumerate(rates.values()):
+        low, high = (100 * end for end in rate["interval"])
         axes.plot([low, high], [place, place], color=INK, linewidth=1.6, solid_capstyle="butt")
-        axes.scatter(100 * one["rate"], place, color=INK, zorder=3)
+        axes.scatter(100 * rate["rate"], place, color=INK, zorder=3)
     axes.set_yticks(np.arange(len(rates)), [method(name) for name in rates])
     axes.set(xlim=(-1, 101), ylim=(len(rates) - 0.5, -0.5), xlabel="success rate (%), 95 % interval")
     axes.grid(axis="x", color="#e4e4e4")

@@ -15,19 +15,19 @@ LEAST_SHARE = 0.01
 """A termination is shown where its option is active in at least this part of the demonstrations."""
 
 
-def draw(found: Activity) -> Figure:
+def draw(activity: Activity) -> Figure:
     """For each level, the highest first: share of each choice and termination probability of each option, over time."""
-    gathered = bins(found.lengths)
-    figure = blank(0.5 + 2.1 * len(found.levels))
-    panels = figure.subplots(len(found.levels), 2, sharex=True, squeeze=False)
-    for (left, right), level in zip(panels, reversed(found.levels), strict=True):
+    gathered = bins(activity.lengths)
+    figure = blank(0.5 + 2.1 * len(activity.levels))
+    panels = figure.subplots(len(activity.levels), 2, sharex=True, squeeze=False)
+    for (left, right), level in zip(panels, reversed(activity.levels), strict=True):
         _shares(left, level, gathered)
         _terminations(right, level, gathered)
         left.set_title(f"share of each choice, level “{level.name}”")
         right.set_title(f"probability of ending, level “{level.name}”")
     for axes in panels[-1]:
         axes.set_xlabel(gathered.axis)
-    choices = sorted({choice for level in found.levels for choice in level.choices})
+    choices = sorted({choice for level in activity.levels for choice in level.choices})
     figure.legend(handles=legend(choices), loc="outside lower center", ncols=min(len(choices), 11), handlelength=1)
     return figure
 
@@ -46,12 +46,12 @@ def terminations(level: LevelActivity, gathered: Bins) -> np.ndarray:
     before = np.zeros_like(level.active[..., 1:])
     before[:, 1:] = level.active[:, :-1, 1:]
     steps = gathered.total(np.ones(gathered.index.shape))
-    found = []
+    means = []
     for option in range(before.shape[2]):
         weights = before[..., option]
         mean = gathered.mean(level.termination[..., option], weights)
-        found.append(np.where(gathered.total(weights) >= LEAST_SHARE * steps, mean, np.nan))
-    return np.stack(found, axis=1)
+        means.append(np.where(gathered.total(weights) >= LEAST_SHARE * steps, mean, np.nan))
+    return np.stack(means, axis=1)
 
 
 def _shares(axes: Axes, level: LevelActivity, gathered: Bins) -> None:

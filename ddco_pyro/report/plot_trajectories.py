@@ -44,11 +44,11 @@ def movement(values: Sequence[np.ndarray]) -> float:
     - The part of the numbers that is drawn, 3 / n.
     """
     points = [array[:, :3].astype(float) for array in values]
-    reach = float(np.mean([_reach(one) for one in points]))
+    reach = float(np.mean([_reach(path) for path in points]))
     if reach == 0:
         return 0.0
-    within = np.mean([one.var(0).sum() for one in points])
-    between = np.array([one.mean(0) for one in points]).var(0).sum()
+    within = np.mean([path.var(0).sum() for path in points])
+    between = np.array([path.mean(0) for path in points]).var(0).sum()
     return float(np.sqrt(within / (within + between))) * reach * 3 / values[0].shape[1]
 
 
@@ -59,17 +59,17 @@ def _reach(points: np.ndarray) -> float:
     return float(np.linalg.norm(np.ptp(points, axis=0)) / length) if length > 0 else 0.0
 
 
-def draw(found: Activity, positions: Sequence[np.ndarray], key: str) -> Figure:
+def draw(activity: Activity, positions: Sequence[np.ndarray], key: str) -> Figure:
     """The positions [T_n, 3] of each demonstration, once for each level; a single level is seen from two sides."""
-    figure = blank(0.55 + 4.2 * -(-max(2, len(found.levels)) // 2))
+    figure = blank(0.55 + 4.2 * -(-max(2, len(activity.levels)) // 2))
     figure.set_layout_engine("none")  # it does not know how much room labels in space take
-    turns = (0.0, TURN) if len(found.levels) == 1 else (0.0,)
-    panels = [(level, turn) for level in reversed(found.levels) for turn in turns]
+    turns = (0.0, TURN) if len(activity.levels) == 1 else (0.0,)
+    panels = [(level, turn) for level in reversed(activity.levels) for turn in turns]
     for place, (level, turn) in zip(_places(len(panels), figure.get_figheight()), panels, strict=True):
         axes = figure.add_axes(place, projection="3d", proj_type="ortho")
         panel(axes, level, positions, key, turn)
         axes.set_title(f"level “{level.name}”" + (f", turned by {turn:.0f}°" if turn else ""))
-    choices = sorted({choice for level in found.levels for choice in level.choices})
+    choices = sorted({choice for level in activity.levels for choice in level.choices})
     figure.legend(handles=legend(choices), loc="lower center", ncols=min(len(choices), 11), handlelength=1)
     return figure
 

@@ -108,7 +108,7 @@ def header(fit: Fit, metrics: Mapping[str, Any]) -> Header:
 
 def likelihood(fit: Fit, metrics: Mapping[str, Any]) -> Figures:
     """Held-out log-likelihood."""
-    rows = plot_likelihood.likelihoods(metrics, {name: one.metrics for name, one in fit.baselines.items()})
+    rows = plot_likelihood.likelihoods(metrics, {name: baseline.metrics for name, baseline in fit.baselines.items()})
     alt = "; ".join(f"{words.method(row.name)}: {words.number(row.valid)} nats per step held out" for row in rows)
     caption = (
         "Left: log-likelihood of each method. Right: the model’s minus each baseline’s on the same held-out "
@@ -120,24 +120,24 @@ def likelihood(fit: Fit, metrics: Mapping[str, Any]) -> Figures:
 
 def rollouts(fit: Fit, metrics: Mapping[str, Any]) -> Rollouts | None:
     """Success in the task."""
-    found = metrics.get("rollouts")
-    if not found:
+    record = metrics.get("rollouts")
+    if not record:
         return None
-    methods = found["methods"]
-    success = {name: one["measures"].get("success", {}) for name, one in methods.items()}
-    rates = {name: one for name, one in success.items() if one.get("interval") and "rate" in one}
+    methods = record["methods"]
+    success = {name: results["measures"].get("success", {}) for name, results in methods.items()}
+    rates = {name: rate for name, rate in success.items() if rate.get("interval") and "rate" in rate}
     picture = None
     if rates:
-        alt = "; ".join(f"{words.method(name)}: {words.rate(one)}" for name, one in rates.items())
+        alt = "; ".join(f"{words.method(name)}: {words.rate(rate)}" for name, rate in rates.items())
         caption = "Success rate of each method with its Wilson 95 % interval."
         picture = keep(plot_success.draw(rates), fit.run_folder / "figures" / "success.png", f"Success. {alt}", caption)
     against = tables.against(methods, metrics["model"])
-    return Rollouts(found["episodes"], found["seed"], tables.measures(methods), against, picture)
+    return Rollouts(record["episodes"], record["seed"], tables.measures(methods), against, picture)
 
 
 def learning(fit: Fit) -> Figures | None:
     """Learning curves of the model and its baselines."""
-    folders = {fit.name: fit.run_folder} | {name: one.run_folder for name, one in fit.baselines.items()}
+    folders = {fit.name: fit.run_folder} | {name: baseline.run_folder for name, baseline in fit.baselines.items()}
     paths = {name: folder / "history.csv" for name, folder in folders.items()}
     stages = plot_learning.stages({name: path for name, path in paths.items() if path.exists()})
     if not stages:
@@ -184,11 +184,11 @@ def branches(fit: Fit, metrics: Mapping[str, Any]) -> Figures | None:
     return Figures([picture], tables.branches(uses, names))
 
 
-def options(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Figures:
+def options(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mapping[str, Any]) -> Figures:
     """Which option is active when."""
     assert fit.spec.hierarchy is not None  # or there is no activity
     makers = (_posteriors, _rows, _trajectories, _timing)
-    pictures = [picture for make in makers if (picture := make(fit, demos, found, metrics)) is not None]
+    pictures = [picture for make in makers if (picture := make(fit, demos, activity, metrics)) is not None]
     names = [level.name for level in fit.spec.hierarchy.levels]
     table = tables.option_use(names, metrics["options"], sum(metrics["demonstrations"][part] for part in PARTS))
     text = _agreement(metrics, names)
@@ -204,8 +204,8 @@ CHOSEN = (
 )
 
 
-def _posteriors(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture:
-    held_out = [one["name"] for one in metrics["valid"] if one["name"] in demos.names]
+def _posteriors(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mapping[str, Any]) -> Picture:
+    held_out = [demo["name"] for demo in metrics["valid"] if demo["name"] in demos.names]
     names = (held_out or list(demos.names))[:EXAMPLES]
     examples = [
         plot_posterior.Example(demos.names.index(name), name, _labels(fit, demos[demos.names.index(name)]))
@@ -220,13 +220,13 @@ def _posteriors(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mappi
         caption += f" Boxes: ground-truth label “{fit.spec.demonstrations.labels}”."
     path = fit.run_folder / "figures" / "posterior.png"
     alt = f"Stacked probabilities of the options over time in {', '.join(names)}"
-    return keep(plot_posterior.draw(found, examples), path, alt, caption)
+    return keep(plot_posterior.draw(activity, examples), path, alt, caption)
 
 
-def _rows(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture:
+def _rows(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mapping[str, Any]) -> Picture:
     del metrics
     labels = [_labels(fit, demo) for demo in demos]
-    known = [one for one in labels if one is not None]
+    known = [array for array in labels if array is not None]
     caption = (
         f"Most likely options of all {len(demos)} demonstrations, one row each, sorted by length, then by when the "
         "option first changes."
@@ -234,16 +234,16 @@ def _rows(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str
     if known:
         caption += " Ground-truth labels in shades of grey."
     alt = f"Rows of colour: the most likely option at each step of {len(demos)} demonstrations"
-    return keep(plot_rows.draw(found, known or None), fit.run_folder / "figures" / "segments.png", alt, caption)
+    return keep(plot_rows.draw(activity, known or None), fit.run_folder / "figures" / "segments.png", alt, caption)
 
 
-def _trajectories(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture | None:
+def _trajectories(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mapping[str, Any]) -> Picture | None:
     del metrics
     named = fit.spec.report.trajectory
     key = named or plot_trajectories.position_key(demos)
     if key is None:
         return None
-    figure = plot_trajectories.draw(found, [demo.observations[key][:, :3] for demo in demos], key)
+    figure = plot_trajectories.draw(activity, [demo.observations[key][:, :3] for demo in demos], key)
     shown = min(len(demos), plot_trajectories.MOST_TRAJECTORIES)
     caption = (
         f"{shown} demonstrations in space, coloured by the most likely option: first three numbers of observation "
@@ -254,16 +254,16 @@ def _trajectories(fit: Fit, demos: Demonstrations, found: Activity, metrics: Map
     return keep(figure, fit.run_folder / "figures" / "trajectories.png", alt, caption)
 
 
-def _timing(fit: Fit, demos: Demonstrations, found: Activity, metrics: Mapping[str, Any]) -> Picture:
+def _timing(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mapping[str, Any]) -> Picture:
     del metrics
     caption = (
         "Left: mean probability of each option over all demonstrations. Right: how likely an active option is to end "
         "at a step (its termination condition, ψ in the paper); left out where it is hardly ever active before."
     )
-    if len(found.levels) > 1:
+    if len(activity.levels) > 1:
         caption += " Above the lowest level an option can end only where the one below it ends."
     alt = f"Share of each option and termination probabilities over time, {len(demos)} demonstrations"
-    return keep(plot_timing.draw(found), fit.run_folder / "figures" / "timing.png", alt, caption)
+    return keep(plot_timing.draw(activity), fit.run_folder / "figures" / "timing.png", alt, caption)
 
 
 def _labels(fit: Fit, demo: Demonstration) -> Any:
@@ -272,19 +272,19 @@ def _labels(fit: Fit, demo: Demonstration) -> Any:
 
 
 def _agreement(metrics: Mapping[str, Any], levels: list[str]) -> str:
-    found = metrics.get("agreement")
-    if not found:
+    agreement = metrics.get("agreement")
+    if not agreement:
         return ""
-    scores = [f"{_scores(found, number)} demonstrations (level “{level}”)" for number, level in enumerate(levels)]
+    scores = [f"{_scores(agreement, number)} demonstrations (level “{level}”)" for number, level in enumerate(levels)]
     return (
-        f"Normalised mutual information with the ground-truth label “{found['labels']}”: {'; '.join(scores)}. "
+        f"Normalised mutual information with the ground-truth label “{agreement['labels']}”: {'; '.join(scores)}. "
         "0 is no agreement, 1 the same segments under other names."
     )
 
 
-def _scores(found: Mapping[str, Any], level: int) -> str:
-    held_out = f"{words.number(found['valid'][level])} on held-out and " if "valid" in found else ""
-    return f"{held_out}{words.number(found['train'][level])} on training"
+def _scores(agreement: Mapping[str, Any], level: int) -> str:
+    held_out = f"{words.number(agreement['valid'][level])} on held-out and " if "valid" in agreement else ""
+    return f"{held_out}{words.number(agreement['train'][level])} on training"
 
 
 def warnings(fit: Fit, metrics: Mapping[str, Any]) -> Warnings | None:
@@ -300,28 +300,28 @@ def degeneracies(spec: Spec, metrics: Mapping[str, Any]) -> list[tuple[str, str]
     if spec.hierarchy is None:
         return []
     names = [level.name for level in spec.hierarchy.levels]
-    found = diagnose(metrics["options"], metrics.get("divergences", ()))  # runs of before have no divergences
-    return [(warning(one, names[one.level - 1]), one.advice) for one in found]
+    findings = diagnose(metrics["options"], metrics.get("divergences", ()))  # runs of before have no divergences
+    return [(warning(finding, names[finding.level - 1]), finding.advice) for finding in findings]
 
 
 def films(fit: Fit) -> Films | None:
     """Filmed rollouts, the model's first."""
-    found = film.films(fit.run_folder, first=fit.name)
-    if not found:
+    clips = film.films(fit.run_folder, first=fit.name)
+    if not clips:
         return None
     strip = None
-    if found[0].method == fit.name:
-        one = found[0]
-        outcome = f" ({one.outcome})" if one.outcome else ""
+    if clips[0].method == fit.name:
+        clip = clips[0]
+        outcome = f" ({clip.outcome})" if clip.outcome else ""
         caption = (
-            f"Frames of {words.method(one.method)}, seed {one.seed}{outcome}. The border has the colour of the lowest "
-            "level’s option; h1 is its number."
+            f"Frames of {words.method(clip.method)}, seed {clip.seed}{outcome}. The border has the colour of the "
+            "lowest level’s option; h1 is its number."
         )
-        figure = film.draw_strip(fit.run_folder / one.link)
+        figure = film.draw_strip(fit.run_folder / clip.link)
         strip = keep(
-            figure, fit.run_folder / "figures" / "film.png", f"Film strip of one rollout, seed {one.seed}", caption
+            figure, fit.run_folder / "figures" / "film.png", f"Film strip of one rollout, seed {clip.seed}", caption
         )
-    return Films(strip, found)
+    return Films(strip, clips)
 
 
 def particulars(fit: Fit, metrics: Mapping[str, Any]) -> Particulars:

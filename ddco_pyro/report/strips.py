@@ -20,17 +20,17 @@ LABEL_SHADES = ("#ffffff", "#d4d4d4")
 def colour_image(path: np.ndarray) -> np.ndarray:
     """Choices [N, T] as colours [N, T, 3]; white where there is none (-1)."""
     palette = np.array([to_rgb(option_colour(choice)) for choice in range(max(int(path.max()), 0) + 1)] + [(1, 1, 1)])
-    found: np.ndarray = palette[path]  # -1 is the last entry
-    return found
+    image: np.ndarray = palette[path]  # -1 is the last entry
+    return image
 
 
 def label_image(labels: Sequence[np.ndarray], steps: int) -> np.ndarray:
     """Labels [T_n] of N demonstrations as shades of grey [N, steps, 3]; white past the end."""
-    values = sorted({int(value) for one in labels for value in np.unique(one)})
+    values = sorted({int(value) for array in labels for value in np.unique(array)})
     shades = np.linspace(0.86, 0.1, len(values))
     image = np.ones((len(labels), steps, 3))
-    for row, one in zip(image, labels, strict=True):
-        row[: len(one)] = shades[np.searchsorted(values, one), None]
+    for row, array in zip(image, labels, strict=True):
+        row[: len(array)] = shades[np.searchsorted(values, array), None]
     return image
 
 

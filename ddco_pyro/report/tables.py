@@ -24,27 +24,27 @@ class Table:
 
 def measures(methods: Mapping[str, Mapping[str, Any]]) -> Table:
     """Every measure of every method, as in the paper's table."""
-    names = list(dict.fromkeys(name for one in methods.values() for name in one["measures"]))
-    rows = [[method(key), *(_cell(one["measures"].get(name)) for name in names)] for key, one in methods.items()]
+    names = list(dict.fromkeys(name for entry in methods.values() for name in entry["measures"]))
+    rows = [[method(key), *(_cell(entry["measures"].get(name)) for name in names)] for key, entry in methods.items()]
     return Table(["Method", *map(measure, names)], rows)
 
 
-def _cell(found: Mapping[str, Any] | None) -> str:
-    if found is None:
+def _cell(summary: Mapping[str, Any] | None) -> str:
+    if summary is None:
         return "–"
-    if "mean" not in found:
-        return rate(found)
-    if not found["trials"]:
+    if "mean" not in summary:
+        return rate(summary)
+    if not summary["trials"]:
         return "– (n = 0)"
-    spread = "" if found["std"] is None else f" ± {number(found['std'])} [{interval(found['interval'])}]"
-    return f"{number(found['mean'])}{spread}, n = {found['trials']}"
+    spread = "" if summary["std"] is None else f" ± {number(summary['std'])} [{interval(summary['interval'])}]"
+    return f"{number(summary['mean'])}{spread}, n = {summary['trials']}"
 
 
 def against(methods: Mapping[str, Mapping[str, Any]], ours: str) -> Table | None:
     """The paired comparison of success on the same initial states; None where there is none."""
     rows = [
-        [method(name), str(one["only_ours"]), str(one["only_theirs"]), str(one["trials"]), p_value(one["p_value"])]
-        for name, one in ((name, found["against"]) for name, found in methods.items() if "against" in found)
+        [method(name), str(pair["only_ours"]), str(pair["only_theirs"]), str(pair["trials"]), p_value(pair["p_value"])]
+        for name, pair in ((name, results["against"]) for name, results in methods.items() if "against" in results)
     ]
     head = [f"{method(ours)} against", f"Only {method(ours)} succeeds", "Only the other succeeds", "Episodes", "p"]
     return Table(head, rows) if rows else None
@@ -54,25 +54,25 @@ def option_use(levels: Sequence[str], options: Sequence[Sequence[Mapping[str, An
     """How each choice of each level is used, the highest level first; control only where it is chosen."""
     rows, colours = [], []
     for level, use in reversed(list(zip(levels, options, strict=True))):
-        for one in use:
-            if one["choice"] or one["share"] > 0:
-                each = one["selected"] / demonstrations
-                last = [percent(one["share"], 1), number(one["selected"], 1), number(each), number(one["duration"], 1)]
-                rows.append([level, choice_name(one["choice"]), *last])
-                colours.append(option_colour(one["choice"]))
+        for row in use:
+            if row["choice"] or row["share"] > 0:
+                each = row["selected"] / demonstrations
+                last = [percent(row["share"], 1), number(row["selected"], 1), number(each), number(row["duration"], 1)]
+                rows.append([level, choice_name(row["choice"]), *last])
+                colours.append(option_colour(row["choice"]))
     head = ["Level", "Choice", "Share of steps", "Selections", "Selections per demonstration", "Expected steps"]
     return Table(head, rows, colours)
 
 
-def likelihood(found: Sequence[Likelihood]) -> Table:
+def likelihood(compared: Sequence[Likelihood]) -> Table:
     """Log-likelihood per step of each method, the differences with their standard errors, and what they took."""
     rows = []
-    for one in found:
-        difference = "" if one.difference is None else f"{signed(one.difference[0])} ± {number(one.difference[1])}"
-        size = "–" if one.parameters is None else str(one.parameters)
-        likelihoods = [number(one.valid), number(one.train), difference]
-        rows.append([method(one.name), *likelihoods, size, effort(one.training)])
-    ours = f"{method(found[0].name)} minus it, held out"
+    for row in compared:
+        difference = "" if row.difference is None else f"{signed(row.difference[0])} ± {number(row.difference[1])}"
+        size = "–" if row.parameters is None else str(row.parameters)
+        likelihoods = [number(row.valid), number(row.train), difference]
+        rows.append([method(row.name), *likelihoods, size, effort(row.training)])
+    ours = f"{method(compared[0].name)} minus it, held out"
     return Table(["Method", "Held out", "Training", ours, "Parameters", "Gradient steps"], rows)
 
 

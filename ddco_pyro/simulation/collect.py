@@ -69,5 +69,5 @@ def _summary(task: Task, parts: Parts) -> dict[str, Any]:
     facts = parts.attributes()
     return summarize(
         task,
-        [{name: float(value) for name, value in one.items() if name not in ("seed", "num_samples")} for one in facts],
+        [{name: float(value) for name, value in demo.items() if name not in ("seed", "num_samples")} for demo in facts],
     )

@@ -43,7 +43,7 @@ class TaskEnvironment(gymnasium.Env[Observation, np.ndarray]):
         self.render_mode = render_mode
         self._environment = self.task.load(0)
         shapes = self._environment.observation_spec()
-        boxes: Any = spaces.Dict({name: _box(one) for name, one in shapes.items()})
+        boxes: Any = spaces.Dict({name: _box(spec) for name, spec in shapes.items()})
         self.observation_space = boxes
         self.action_space = _box(self._environment.action_spec())
 

@@ -52,9 +52,9 @@ def run_episode(task: Task, policy: Policy | str, seed: int, film: bool = False)
         environment.close()
     record = Demonstration(
         name=f"demo_{seed}",
-        observations={key: np.stack([one[key] for one in seen]) for key in seen[0]},
+        observations={key: np.stack([observation[key] for observation in seen]) for key in seen[0]},
         actions=np.stack(controls),
-        labels={key: np.array([one[key] for one in labels]) for key in labels[0]},
+        labels={key: np.array([annotation[key] for annotation in labels]) for key in labels[0]},
         attributes={"seed": seed, **outcome},
     )
     return Episode(seed, record, outcome, np.array(choices, dtype=int).reshape(len(controls), -1), frames)
@@ -68,8 +68,8 @@ def run_episodes(
     :param task: the task's name, as :func:`ddco_pyro.simulation.task.find_task` takes it.
     """
     calls = (delayed(_run_named)(task, policy, seed, number < film) for number, seed in enumerate(seeds))
-    found: Iterable[Episode] = Parallel(n_jobs=jobs, return_as="generator")(calls)
-    return found
+    episodes: Iterable[Episode] = Parallel(n_jobs=jobs, return_as="generator")(calls)
+    return episodes
 
 
 def _run_named(task: str, policy: Policy | str, seed: int, film: bool) -> Episode:
@@ -81,12 +81,12 @@ def summarize(task: Task, outcomes: Sequence[Mapping[str, float]]) -> dict[str, 
 
     NaN (does not apply to this episode) is left out of ``trials``.
     """
-    found = {}
+    summary = {}
     for name in dict.fromkeys(name for outcome in outcomes for name in outcome):
         values = np.array([outcome.get(name, np.nan) for outcome in outcomes])
         values = values[~np.isnan(values)]
-        found[name] = rate(int(values.sum()), len(values)) if task.kind(name) == "rate" else mean(values)
-    return found
+        summary[name] = rate(int(values.sum()), len(values)) if task.kind(name) == "rate" else mean(values)
+    return summary
 
 
 def mean(values: np.ndarray) -> dict[str, Any]:

@@ -84,15 +84,15 @@ class Task:
 
         :raises OutcomeError: it has other measures than were declared, or a rate that is not 0, 1 or NaN.
         """
-        found = {name: float(value) for name, value in self.outcome(environment).items()}
-        if self.measures and found.keys() != self.measures.keys():
-            names = f"{', '.join(found)}, and its measures are {', '.join(self.measures)}"
+        outcome = {name: float(value) for name, value in self.outcome(environment).items()}
+        if self.measures and outcome.keys() != self.measures.keys():
+            names = f"{', '.join(outcome)}, and its measures are {', '.join(self.measures)}"
             raise self._wrong(f"its outcome has {names}; declare all of them")
-        for name, value in found.items():
+        for name, value in outcome.items():
             if self.kind(name) == "rate" and not (value in (0.0, 1.0) or math.isnan(value)):
                 why = "a rate is 0 or 1 in every episode"
                 raise self._wrong(f"{name} is {value:g}, and {why}; make it a mean, which {SUCCESS} cannot be")
-        return found
+        return outcome
 
     def _wrong(self, what: str) -> OutcomeError:
         return OutcomeError(f"task {self.name!r}: {what}")
@@ -113,16 +113,16 @@ def find_task(name: str) -> Task:
     """
     registered = {point.name: point for point in entry_points(group=TASKS)}
     if name in registered:
-        found: Any = registered[name].load()
+        task: Any = registered[name].load()
     elif ":" in name:
         module, _, attribute = name.partition(":")
         try:
-            found = getattr(importlib.import_module(module), attribute)
+            task = getattr(importlib.import_module(module), attribute)
         except Exception as error:  # whatever the user's code raises
             raise UnknownTask(f"task {name!r} cannot be loaded: {error}") from error
     else:
         known = ", ".join(sorted(registered)) or "none"
         raise UnknownTask(f"no task is registered as {name!r} (registered: {known}); module:name works too")
-    if not isinstance(found, Task):
-        raise UnknownTask(f"task {name!r} leads to a {type(found).__name__}, not to a ddco_pyro.simulation.task.Task")
-    return found
+    if not isinstance(task, Task):
+        raise UnknownTask(f"task {name!r} leads to a {type(task).__name__}, not to a ddco_pyro.simulation.task.Task")
+    return task

@@ -118,9 +118,9 @@ def named(place: str) -> Iterator[None]:
 def _imported(name: str) -> type[nn.Module]:
     module, _, attribute = name.partition(":")
     try:
-        found = getattr(importlib.import_module(module), attribute)
+        network_class = getattr(importlib.import_module(module), attribute)
     except Exception as error:  # whatever the user's code raises
         raise ShapeError(f"network {name!r} cannot be imported: {error}") from error
-    if not (isinstance(found, type) and issubclass(found, nn.Module)):
+    if not (isinstance(network_class, type) and issubclass(network_class, nn.Module)):
         raise ShapeError(f"network {name!r} is not a torch.nn.Module class")
-    return found
+    return network_class
