@@ -11,8 +11,8 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from ddco_pyro.acting.window import Window
+from ddco_pyro.model.actor import Acting
 from ddco_pyro.model.ahmm import Tabulated, choose
-from ddco_pyro.model.emissions import Acting
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks.state import States
 from ddco_pyro.model.tables import complete

@@ -177,16 +177,9 @@ def _adjoint_down(
 
 @jit
 def _adjoint_up(
-    n: int,
-    t: int,
-    messages: Array,
-    back: Array,
-    end: Array,
-    ended: Array,
-    sizes: Choices,
-    starts: Choices,
+    n: int, t: int, messages: Array, back: Array, end: Array, ended: Array, sizes: Choices, starts: Choices,
     ends: Choices,
-) -> None:
+) -> None:  # fmt: skip
     """Adjoint of :func:`_up` and of what :func:`_down` keeps: ``back`` becomes the adjoint of row t of ``messages``."""
     for d in range(len(sizes) - 1, -1, -1):
         c = sizes[d]
@@ -224,20 +217,9 @@ def _marginals(alpha: Array, beta: Array, actors: Array, choices: Array, to_choi
 
 @jit
 def _forward(
-    n: int,
-    select: Array,
-    end: Array,
-    emission: Array,
-    weight: Array,
-    messages: Array,
-    spread: Array,
-    scale: Array,
-    sizes: Choices,
-    starts: Choices,
-    selects: Choices,
-    ends: Choices,
-    actors: Array,
-) -> float:
+    n: int, select: Array, end: Array, emission: Array, weight: Array, messages: Array, spread: Array, scale: Array,
+    sizes: Choices, starts: Choices, selects: Choices, ends: Choices, actors: Array,
+) -> float:  # fmt: skip
     """Fill ``messages``, ``spread`` and ``scale`` [T]; the log-likelihood, NaN where a step leaves no mass."""
     messages[0] = 0.0
     messages[0, starts[-1]] = 1.0  # at t = 0 everything is selected: all mass has terminated, none is kept
@@ -256,25 +238,10 @@ def _forward(
 
 @jit
 def _backward(
-    n: int,
-    select: Array,
-    end: Array,
-    emission: Array,
-    weight: Array,
-    messages: Array,
-    spread: Array,
-    scale: Array,
-    to_select: Array,
-    to_end: Array,
-    to_emission: Array,
-    to_choice: Array,
-    sizes: Choices,
-    starts: Choices,
-    selects: Choices,
-    ends: Choices,
-    actors: Array,
-    choices: Array,
-) -> bool:
+    n: int, select: Array, end: Array, emission: Array, weight: Array, messages: Array, spread: Array, scale: Array,
+    to_select: Array, to_end: Array, to_emission: Array, to_choice: Array, sizes: Choices, starts: Choices,
+    selects: Choices, ends: Choices, actors: Array, choices: Array,
+) -> bool:  # fmt: skip
     """Fill the posteriors; whether Σ_s α_t(s) β_t(s) = 1 at every step: so it is but for what underflow has lost."""
     back = np.ones(starts[-1] + 1)  # level 1: β
     selected, ended, emitted = np.zeros(select.shape[2]), np.zeros(end.shape[2]), np.zeros(emission.shape[2])
@@ -315,24 +282,10 @@ def subtract_largest(rows: Array, lengths: Array, shift: Array) -> None:
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def forward_backward(
-    select: Array,
-    end: Array,
-    emission: Array,
-    weight: Array,
-    lengths: Array,
-    value: Array,
-    exact: Array,
-    to_select: Array,
-    to_end: Array,
-    to_emission: Array,
-    to_choice: Array,
-    sizes: Choices,
-    starts: Choices,
-    selects: Choices,
-    ends: Choices,
-    actors: Array,
-    choices: Array,
-) -> None:
+    select: Array, end: Array, emission: Array, weight: Array, lengths: Array, value: Array, exact: Array,
+    to_select: Array, to_end: Array, to_emission: Array, to_choice: Array, sizes: Choices, starts: Choices,
+    selects: Choices, ends: Choices, actors: Array, choices: Array,
+) -> None:  # fmt: skip
     """Fill log-likelihoods ``value`` [N], whether they are ``exact`` [N], and the posteriors ``to_...``.
 
     :param select: selection probabilities [N, T, Σ callers·C_d].

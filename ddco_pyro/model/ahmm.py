@@ -17,7 +17,8 @@ from torch import Tensor
 from torch.distributions import constraints
 from torch.nn.functional import one_hot
 
-from ddco_pyro.model.emissions import Acting, Steps
+from ddco_pyro.model.actor import Acting
+from ddco_pyro.model.emissions import Steps
 from ddco_pyro.model.tables import NEVER, Chain, Step
 
 

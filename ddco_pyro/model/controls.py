@@ -14,7 +14,8 @@ from torch.nn.functional import softplus
 from ddco_pyro.data.control_dimensions import number
 from ddco_pyro.data.control_parts import ControlPart
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
-from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Emission, Gaussian, Product
+from ddco_pyro.model.discrete import Binary, Categorical
+from ddco_pyro.model.emissions import Clipped, Emission, Gaussian, Product
 from ddco_pyro.spec import ControlSpec, LearnedStd
 
 INITIAL_STD = 0.5

@@ -12,14 +12,9 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Protocol, Self
 
 import torch
-from pyro.distributions import TorchDistribution
 from torch import Tensor
-from torch.distributions import constraints
-from torch.nn.functional import logsigmoid, one_hot, pad
-from torch.special import ndtr
 
 from ddco_pyro.model.links import weighted_squares
-from ddco_pyro.model.tables import NEVER
 
 LOG_2PI = math.log(2 * math.pi)
 
@@ -194,96 +189,6 @@ class Clipped(Kind):
 
 
 @dataclass(frozen=True)
-class Binary(Kind):
-    """Switches, each of them on (1) with probability logistic(y), off (0) otherwise.
-
-    :param logits: y, [..., K, A].
-    """
-
-    logits: Tensor
-
-    @property
-    def shape(self) -> torch.Size:
-        """[..., K, A]."""
-        return self.logits.shape
-
-    def by_dimension(self, actions: Tensor) -> Tensor:
-        """Logarithms of the probabilities of the switches' positions, [..., K, A]; -inf for anything but 0 and 1."""
-        actions = actions.unsqueeze(-2)
-        position = logsigmoid(torch.where(actions > 0.5, self.logits, -self.logits))
-        return torch.where((actions == 0) | (actions == 1), position, NEVER)
-
-    def log_density(self, actions: Tensor) -> Tensor:
-        """log π(a | s), [..., K]."""
-        return self.by_dimension(actions).sum(-1)
-
-    @property
-    def mode(self) -> Tensor:
-        """The more likely position."""
-        return (self.logits > 0).to(self.logits.dtype)
-
-    def draw(self, noise: Tensor) -> Tensor:
-        """On where Φ(z) is less than the probability of it."""
-        return (ndtr(noise).unsqueeze(-2) < self.logits.sigmoid()).to(self.logits.dtype)
-
-    def divergence(self, i: int, j: int) -> Tensor:
-        """Mean of both divergences, ½ Σ (p_i - p_j)(y_i - y_j)."""
-        first, second = self.logits[..., i, :].double(), self.logits[..., j, :].double()
-        return 0.5 * ((first.sigmoid() - second.sigmoid()) * (first - second)).sum(-1)
-
-
-@dataclass(frozen=True)
-class Categorical(Kind):
-    """One of C discrete actions, as its index (A = 1) or, where A = C, as a row with a single 1.
-
-    :param logits: [..., K, C].
-    :param rows: whether actions are rows; a tensor with one truth value.
-    """
-
-    logits: Tensor
-    rows: Tensor
-
-    @property
-    def shape(self) -> torch.Size:
-        """[..., K, A]."""
-        return torch.Size([*self.logits.shape[:-1], self.logits.shape[-1] if bool(self.rows) else 1])
-
-    def by_dimension(self, actions: Tensor) -> Tensor:
-        """log softmax(logits)[a], [..., K, A]: in the first dimension, 0 in the others; -inf for no such action."""
-        classes = self.logits.shape[-1]
-        index = actions.argmax(-1, keepdim=True) if bool(self.rows) else actions.clamp(0, classes - 1).long()
-        meant = one_hot(index.squeeze(-1), classes) if bool(self.rows) else index
-        possible = (actions == meant).all(-1, keepdim=True).unsqueeze(-2)
-        log_probs = self.logits.log_softmax(-1)
-        chosen = log_probs.gather(-1, index.unsqueeze(-2).expand(*log_probs.shape[:-1], 1))
-        return pad(torch.where(possible, chosen, NEVER), (0, self.shape[-1] - 1))
-
-    def log_density(self, actions: Tensor) -> Tensor:
-        """log π(a | s), [..., K]."""
-        return self.by_dimension(actions)[..., 0]
-
-    @property
-    def mode(self) -> Tensor:
-        """The most likely action."""
-        return self._action(self.logits.argmax(-1))
-
-    def draw(self, noise: Tensor) -> Tensor:
-        """The first action up to which the probabilities sum to more than Φ(z) of the first number."""
-        total = self.logits.double().softmax(-1).cumsum(-1)
-        uniform = ndtr(noise[..., :1].double()).unsqueeze(-2)
-        return self._action((total <= uniform * total[..., -1:]).sum(-1).clamp(max=total.shape[-1] - 1))
-
-    def divergence(self, i: int, j: int) -> Tensor:
-        """Mean of both divergences."""
-        first, second = (self.logits[..., caller, :].double().log_softmax(-1) for caller in (i, j))
-        return 0.5 * ((first.exp() - second.exp()) * (first - second)).sum(-1)
-
-    def _action(self, index: Tensor) -> Tensor:
-        actions = one_hot(index, self.logits.shape[-1]) if bool(self.rows) else index.unsqueeze(-1)
-        return actions.to(self.logits.dtype)
-
-
-@dataclass(frozen=True)
 class Product:
     """Groups of dimensions, each of its own kind, independent given the caller.
 
@@ -340,97 +245,6 @@ class Product:
         return torch.cat(list(values), dim=-1)[..., order]
 
 
-@dataclass(frozen=True)
-class Scored:
-    """Controls of which only log-densities [..., K] are known: they have no dimensions, and cannot be drawn.
-
-    With it the Pyro program of :mod:`ddco_pyro.model.ahmm` runs on :class:`ddco_pyro.model.tables.Tables`.
-    """
-
-    table: Tensor
-
-    @property
-    def shape(self) -> torch.Size:
-        """[..., K, 0]."""
-        return torch.Size([*self.table.shape, 0])
-
-    def log_density(self, actions: Tensor) -> Tensor:
-        """What is known, whatever the controls."""
-        return self.table
-
-    def steps(self) -> list[Scored]:
-        """The same at each step."""
-        return [Scored(table) for table in self.table.unbind(1)]
-
-
-class Acting(TorchDistribution):
-    """The control of whoever acts: the lowest level whose choice is not 0, else the meta-policy.
-
-    :param emissions: of each level's options at one step, lowest first, the meta-policy's last, [N, K, A]; None for
-        callers that emit no control, which the lowest level's always do.
-    :param choices: (h^1, ..., h^D), each [..., N].
-    """
-
-    arg_constraints: ClassVar = {}
-    support = constraints.real_vector
-
-    def __init__(
-        self,
-        emissions: tuple[Any, ...],
-        choices: tuple[Tensor, ...],
-        validate_args: bool | None = None,
-    ) -> None:
-        self.emissions, self.choices = emissions, choices
-        *batch, _, size = emissions[0].shape
-        shape = torch.broadcast_shapes(batch, *(choice.shape for choice in choices))
-        super().__init__(shape, torch.Size([size]), validate_args=validate_args)
-
-    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Acting:
-        """The same for choices of a larger batch."""
-        return Acting(self.emissions, tuple(choice.expand(batch_shape) for choice in self.choices), validate_args=False)
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        """log π(a | s) of who acts; -inf for joint choices that cannot be."""
-        control = torch.zeros((), dtype=torch.bool)
-        impossible = control
-        for choice in reversed(self.choices):
-            impossible = impossible | (control & (choice > 0))
-            control = control | (choice == 0)
-        densities = [
-            None if emission is None else emission.log_density(value).double().unsqueeze(-1)
-            for emission in self.emissions
-        ]
-        density = self._of_actor(densities, NEVER).squeeze(-1)
-        return torch.where(impossible, NEVER, density).expand(self.batch_shape)
-
-    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
-        """A control of who acts, [..., N, A] in scaled units."""
-        return self.draw(torch.randn(*sample_shape, *self.batch_shape, *self.event_shape))
-
-    def draw(self, noise: Tensor) -> Tensor:
-        """The control [..., N, A] that standard normal numbers of this shape stand for."""
-        with torch.no_grad():
-            draws = [None if emission is None else emission.draw(noise) for emission in self.emissions]
-            return self._of_actor(draws, torch.nan)
-
-    @property
-    def mode(self) -> Tensor:
-        """The most likely control of who acts, [..., N, A] in scaled units."""
-        return self._of_actor([None if emission is None else emission.mode for emission in self.emissions], torch.nan)
-
-    def _of_actor(self, values: Sequence[Tensor | None], missing: float) -> Tensor:
-        """Of values [..., N, K, E] of each level's callers those of who acts, [..., N, E]."""
-        acting = torch.tensor([missing], dtype=torch.float64) if values[-1] is None else values[-1][..., 0, :]
-        for own, choice in zip(reversed(values[:-1]), reversed(self.choices), strict=True):
-            option = (
-                torch.tensor([missing], dtype=torch.float64)
-                if own is None
-                else _of_caller(own, (choice - 1).clamp(min=0))
-            )
-            acting = torch.where((choice > 0).unsqueeze(-1), option, acting)
-        return acting
-
-
 def sum_of(values: Sequence[Tensor]) -> Tensor:
     """The sum of one or more tensors."""
     total = values[0]
@@ -450,10 +264,3 @@ def log_ndtr(values: Tensor) -> Tensor:
     r = tail.square().reciprocal()
     series = -0.5 * tail.square() - (-tail).log() - 0.5 * LOG_2PI + (-r * (1 - 3 * r * (1 - 5 * r))).log1p()
     return torch.where(x < TAIL, series, torch.special.log_ndtr(x.clamp(min=TAIL)))
-
-
-def _of_caller(values: Tensor, caller: Tensor) -> Tensor:
-    """Of values [..., K, E] those of one caller, [..., E]."""
-    shape = torch.broadcast_shapes(values.shape[:-2], caller.shape)
-    index = caller.expand(shape)[..., None, None].expand(*shape, 1, values.shape[-1])
-    return values.expand(*shape, *values.shape[-2:]).gather(-2, index).squeeze(-2)
