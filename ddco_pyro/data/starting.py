@@ -39,7 +39,7 @@ PATIENCE = 50
 
 
 def starting_spec(inspection: Inspection, path: str | Path) -> str:
-    """The text of a spec for what was found, commented, with ``path`` as its file.
+    """The text of a spec for the inspected demonstrations, commented, with ``path`` as its file.
 
     Demonstrations that cannot be read are left out, and those with values that cannot be used where they are few; else
     the observations with such values are. What was left out is said in a comment.
