@@ -16,7 +16,7 @@ from killing import HANGS
 
 ROOT = Path(__file__).parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-SMALL = "demonstrations.count=12 demonstrations.seed=0 training.epochs=8 selection.folds=2"
+SMALL = "demonstrations.count=12 demonstrations.seed=0 training.epochs=4 selection.folds=2"
 
 
 def sources(notebook):
