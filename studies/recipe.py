@@ -29,9 +29,13 @@ RECIPE = {
 }
 GRIDS: dict[str, dict[str, list[Any]]] = {
     "ddco": RECIPE,
-    "flat": {"training.restarts": [1, 3], "baseline.policy.hidden": [[64], [128], [609]]},
+    "flat": {
+        "training.restarts": [1, 3],
+        "training.optimizer.lr": [3e-3, 1e-3],
+        "baseline.policy.hidden": [[64], [128], [256], [609]],
+    },
 }
-"""Candidates of each model; a flat policy has what it can have of the recipe, and up to the hierarchy's parameters."""
+"""Sixteen candidates of each model; flat policies have up to the hierarchy's parameters."""
 OUT = Path("docs/results/recipe")
 
 

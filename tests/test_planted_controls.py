@@ -34,7 +34,6 @@ def test_options_with_saturated_controls_are_recovered(tmp_path):
     assert [part.kind for part in auto.first.scaling.parts] == ["clipped"]
     found = recovered(auto.run(), truth, *held_out)
     gaussian = recovered(make_trainer(learned("gaussian", 3), demos, tmp_path / "gaussian").run(), truth, *held_out)
-    print(f"NMI clipped {found['found nmi']}, gaussian {gaussian['found nmi']}, truth {found['truth nmi']}")
     assert found["found nmi"][0] > 0.98 * found["truth nmi"][0]
     assert found["found"] > found["truth"] - 0.1
     assert found["found nmi"][0] > gaussian["found nmi"][0] - 0.02

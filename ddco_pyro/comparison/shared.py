@@ -75,7 +75,7 @@ def _check_dimensions(first: Fit, second: Fit) -> None:
             f"likelihood of {scored} and not in that of {left}; fit both to the same demonstrations, "
             "with the same version"
         )
-    if different := difference(first.hierarchy.scaling.measure, second.hierarchy.scaling.measure):
+    if different := difference(first.hierarchy.scaling.parts, second.hierarchy.scaling.parts):
         raise NotShared(
             f"{first.folder} and {second.folder} measure different things: {different}; densities and probabilities "
             "cannot be ranked, so fit both with the same control.kind"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -71,12 +71,27 @@ def _listed(dims: Sequence[int]) -> str:
     return ("dimension " if len(dims) == 1 else "dimensions ") + ", ".join(texts)
 
 
-def difference(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
+def measure(parts: Sequence[ControlPart]) -> dict[str, list[Any]]:
+    """What a log-likelihood is about, by dimension; with another measure it cannot be compared.
+
+    A kind, then the bounds of a ``clipped`` dimension (None for none) or the values of a discrete one.
+    """
+    dimensions: dict[str, list[Any]] = {}
+    for part in parts:
+        for place, dimension in enumerate(part.dims):
+            ends = [part.low[place], part.high[place]] if part.low else []
+            about = [end if math.isfinite(end) else None for end in ends] or list(part.values)
+            dimensions[str(dimension)] = [part.kind, *about]
+    return dimensions
+
+
+def difference(ours: Sequence[ControlPart], theirs: Sequence[ControlPart]) -> str:
     """In which control dimension two measures differ, and how; nothing where they are the same."""
-    for dimension in sorted(set(ours) | set(theirs), key=int):
-        mine, yours = ours.get(dimension), theirs.get(dimension)
-        if mine != yours:
-            return f"control dimension {dimension} is {_told(mine)} in one and {_told(yours)} in the other"
+    first, second = measure(ours), measure(theirs)
+    for dimension in sorted(set(first) | set(second), key=int):
+        told = [_told(each.get(dimension)) for each in (first, second)]
+        if first.get(dimension) != second.get(dimension):
+            return f"control dimension {dimension} is {told[0]} in one and {told[1]} in the other"
     return ""
 
 

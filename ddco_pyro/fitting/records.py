@@ -207,6 +207,15 @@ class ControlRange(Record):
     steps: AtLeastOne
 
 
+class Branches(Record):
+    """Activation of each branch of a level's networks, and what is lost without its input, by option and branch."""
+
+    level: int
+    branches: Annotated[list[str], Field(min_length=1)]
+    activation: list[list[Finite | None]]
+    loss: list[list[Finite | None]]
+
+
 class Use(Record):
     """How a choice of a level is used."""
 
@@ -315,6 +324,8 @@ class Metrics(Record):
     engine_check: dict[str, float]
     demonstrations: Counts
     control_dimensions: list[ControlRange] = []
+    measure: dict[str, Annotated[list[Any], Field(min_length=1)]] = {}
+    branches: list[Branches] = []
     parameters: int
     training: Annotated[Training | None, NOT_NULL] = None
     seconds: dict[str, float]

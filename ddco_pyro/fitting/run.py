@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from ddco_pyro.data.control_parts import measure
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import leftovers, only_one, write_text
 from ddco_pyro.data.tensors import write_tensors
@@ -137,7 +138,7 @@ def _fit(
     metrics |= {
         "engine_check": trained.check._asdict(),
         "demonstrations": trained.demonstrations | {"valid": len(split.get("valid", ()))} | supervisor(demos),
-        "measure": trained.hierarchy.scaling.measure,
+        "measure": measure(trained.hierarchy.scaling.parts),
         "control_dimensions": [dimension.as_data() for dimension in dimensions.control],
         "parameters": parameters(trained.hierarchy),
         "training": trained.training,

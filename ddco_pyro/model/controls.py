@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -78,17 +77,6 @@ class ControlScaling(nn.Module):
         """The dimensions, of A', that have a σ: part after part."""
         both = zip(self.groups, self.parts, strict=True)
         return [dimension for dims, part in both if part.continuous for dimension in dims]
-
-    @property
-    def measure(self) -> dict[str, Any]:
-        """What a log-likelihood is about: densities, masses on bounds, probabilities. Others cannot be compared."""
-        measure: dict[str, Any] = {}
-        for part in self.parts:
-            for place, dimension in enumerate(part.dims):
-                ends = [part.low[place], part.high[place]] if part.low else []
-                about = [end if math.isfinite(end) else None for end in ends] or list(part.values)
-                measure[str(dimension)] = [part.kind, *about]
-        return measure
 
     def fit(self, demonstrations: Demonstrations) -> None:
         """Where the spec says ``standardize``: take mean and spread of these demonstrations' controls."""

@@ -22,20 +22,11 @@ class Binary(Kind):
 
     logits: Tensor
 
-    @property
-    def shape(self) -> torch.Size:
-        """[..., K, A]."""
-        return self.logits.shape
-
     def by_dimension(self, actions: Tensor) -> Tensor:
         """Logarithms of the probabilities of the switches' positions, [..., K, A]; -inf for anything but 0 and 1."""
         actions = actions.unsqueeze(-2)
         position = logsigmoid(torch.where(actions > 0.5, self.logits, -self.logits))
         return torch.where((actions == 0) | (actions == 1), position, NEVER)
-
-    def log_density(self, actions: Tensor) -> Tensor:
-        """log π(a | s), [..., K]."""
-        return self.by_dimension(actions).sum(-1)
 
     @property
     def mode(self) -> Tensor:

@@ -78,6 +78,19 @@ class Kind:
         numbers: Tensor = getattr(self, fields(self)[0].name)  # type: ignore[arg-type]
         return numbers
 
+    @property
+    def shape(self) -> torch.Size:
+        """[..., K, A]: a number for each dimension, unless a kind says otherwise."""
+        return self.numbers.shape
+
+    def by_dimension(self, actions: Tensor) -> Tensor:
+        """log π(a_d | s) of each caller and dimension, [..., K, A]."""
+        raise NotImplementedError
+
+    def log_density(self, actions: Tensor) -> Tensor:
+        """log π(a | s), [..., K]: dimensions are independent given the caller, unless a kind says otherwise."""
+        return self.by_dimension(actions).sum(-1)
+
     def steps(self) -> list[Self]:
         """The same at each step."""
         names = [field.name for field in fields(self)[: self.over_time]]  # type: ignore[arg-type]
@@ -101,11 +114,6 @@ class Gaussian(Kind):
     mean: Tensor
     std: Tensor
     log_scale: Tensor
-
-    @property
-    def shape(self) -> torch.Size:
-        """[..., K, A]."""
-        return self.mean.shape
 
     def by_dimension(self, actions: Tensor) -> Tensor:
         """log N(a_d; μ_d, σ_d²), [..., K, A]."""
@@ -153,11 +161,6 @@ class Clipped(Kind):
     low: Tensor
     high: Tensor
 
-    @property
-    def shape(self) -> torch.Size:
-        """[..., K, A]."""
-        return self.mean.shape
-
     def by_dimension(self, actions: Tensor) -> Tensor:
         """log N(a_d; μ_d, σ_d²) within the bounds, log Φ of what lies beyond on one of them, float64 [..., K, A]."""
         actions, mean, std = actions.double().unsqueeze(-2), self.mean.double(), self.std.double()
@@ -169,10 +172,6 @@ class Clipped(Kind):
         low, high, mean, std = (values.expand(inside.shape)[at] for values in (self.low, self.high, mean, std))
         beyond = torch.where(below.expand(inside.shape)[at], low - mean, mean - high) / std
         return inside.index_put(at, log_ndtr(beyond))
-
-    def log_density(self, actions: Tensor) -> Tensor:
-        """log π(a | s), float64 [..., K]."""
-        return self.by_dimension(actions).sum(-1)
 
     @property
     def mode(self) -> Tensor:

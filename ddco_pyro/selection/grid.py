@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from ddco_pyro.data.control_parts import difference
+from ddco_pyro.data.control_parts import control_parts, difference
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy, parameters
 from ddco_pyro.spec import Spec, SpecError, with_overrides
 from ddco_pyro.spec.messages import show
@@ -94,9 +94,9 @@ def _refuse_other_measures(grid: Mapping[str, Any], candidates: Sequence[Candida
 
     :raises SpecError: candidates model a control dimension as different kinds.
     """
-    measures = [build_hierarchy(candidate.spec, dimensions).scaling.measure for candidate in candidates]
-    for candidate, measure in zip(candidates[1:], measures[1:], strict=True):
-        if different := difference(measures[0], measure):
+    parts = [control_parts(candidate.spec.control, dimensions.control) for candidate in candidates]
+    for candidate, own in zip(candidates[1:], parts[1:], strict=True):
+        if different := difference(parts[0], own):
             raise SpecError(
                 f"selection.grid: {candidates[0].name} and {candidate.name} measure different things: {different}; "
                 "densities and probabilities cannot be ranked, so give all candidates the same control.kind"
