@@ -25,7 +25,7 @@ demo: opengl $(DEMO)
 	$(BIN)/ddco-pyro rollout runs/needle --episodes 50 --video --resume
 
 test: lint
-	$(BIN)/pytest -n 2 -q
+	$(BIN)/pytest -n 2 --dist worksteal -q
 
 # Ratios against other tools, measured side by side; writes benchmarks/latest.json and docs/performance.md.
 bench: $(DEMO)

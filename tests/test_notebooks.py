@@ -44,7 +44,6 @@ def test_a_notebook_holds_outputs_and_no_logic(path):
     assert not re.search(r"/(home|root|tmp|work)/", path.read_text())
 
 
-@pytest.mark.slow
 def test_all_run_on_small_data_from_a_fresh_clone(tmp_path, cache):
     """No data of anybody else's lies beside the repository; fits are made anew."""
     own = {"NOTEBOOK_RUNS": str(tmp_path / "runs"), "NOTEBOOK_METAWORLD": str(tmp_path / "none"), "MUJOCO_GL": "egl"}
