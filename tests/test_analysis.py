@@ -1,16 +1,15 @@
-"""Use of options, agreement with labels and paired differences, against counts made by hand."""
+"""Use of options and paired differences, against counts made by hand."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
 
 import numpy as np
 import pytest
 import torch
 from oracle import brute_force, random_tables
 
-from ddco_pyro.fitting.analysis import agreement, as_rows, divergences, option_use, paired
+from ddco_pyro.fitting.analysis import as_rows, divergences, option_use, paired
 from ddco_pyro.inference import Posterior, posterior
 from ddco_pyro.model.emissions import Gaussian
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
@@ -95,29 +94,6 @@ def test_divergences_of_policies_that_emit_one_kind_of_thing(hybrid):
     never = torch.zeros_like(u)
     (found,) = divergences([(Outputs((decision, decision), ()), Posterior((never,), (never,), (never,)))])
     assert found[0]["divergence"] is None
-
-
-def nmi(ours, theirs):
-    """2 I(X; Y) / (H(X) + H(Y)) from counts."""
-    n, joint, x, y = len(ours), Counter(zip(ours, theirs, strict=True)), Counter(ours), Counter(theirs)
-    information = sum(c / n * math.log(c * n / (x[a] * y[b])) for (a, b), c in joint.items())
-    entropy = [-sum(c / n * math.log(c / n) for c in counts.values()) for counts in (x, y)]
-    return 2 * information / sum(entropy)
-
-
-def test_agreement_is_the_normalised_mutual_information():
-    random = np.random.default_rng(0)
-    labels = [random.integers(0, 3, 20), random.integers(0, 3, 15)]
-    segments = [np.where(random.random(len(one)) < 0.7, one + 1, 2) for one in labels]
-    expected = nmi(np.concatenate(segments).tolist(), np.concatenate(labels).tolist())
-    assert 0.1 < expected < 0.9
-    assert agreement(segments, labels) == pytest.approx(expected)
-
-
-def test_planted_labels_agree_whatever_their_names():
-    labels = [np.array([0, 0, 1, 2]), np.array([2, 1, 1])]
-    assert agreement([np.array([7, 4, 9])[one] for one in labels], labels) == pytest.approx(1)
-    assert agreement([np.ones(4), np.ones(3)], labels) == pytest.approx(0)
 
 
 def test_a_paired_difference_is_the_ratio_of_sums():

@@ -143,7 +143,7 @@ def read_all(fit: Fit, metrics: dict[str, Any]) -> None:
 def _read_all(fit: Fit, metrics: dict[str, Any]) -> None:
     words.verdict(metrics), words.success(metrics)
     sections.degeneracies(fit.spec, metrics), sections.header(fit, metrics), sections.particulars(fit, metrics)
-    sections._agreement(metrics, ["option"])
+    sections.agreement(fit, metrics)
     rows = plot_likelihood.likelihoods(metrics, {name: one.metrics for name, one in fit.baselines.items()})
     tables.likelihood(rows)
     tables.option_use(["option"], metrics["options"], sum(metrics["demonstrations"][part] for part in sections.PARTS))

@@ -11,6 +11,7 @@ import toy_task
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing import words
+from ddco_pyro.fitting.agreement import MATCHED, UNMATCHED
 from ddco_pyro.fitting.fit import load
 from ddco_pyro.fitting.prepare import demonstrations, parts
 from ddco_pyro.fitting.run import fit, write_metrics
@@ -155,13 +156,11 @@ def test_figures_are_also_files(labelled, deep):
 
 
 def test_sections_are_there_where_they_apply(labelled, deep):
-    some = ["likelihood", "demonstrations", "dimensions", "learning", "options", "warnings", "particulars", "segments"]
-    assert ids(labelled[1]) == some
+    some = ["likelihood", "demonstrations", "dimensions", "learning", "options", "agreement", "warnings"]
+    assert ids(labelled[1]) == [*some, "particulars", "segments"]
     before, after = ["likelihood", "demonstrations", "dimensions", "rollouts", "learning"], ["options", "warnings"]
     assert ids(deep[1]) == [*before, *after, "films", "particulars", "segments"]
     assert "trajectories" not in {path.stem for path in (deep[0].folder / "figures").iterdir()}
-    assert "mutual information" in labelled[1]
-    assert "mutual information" not in deep[1]
 
 
 def test_a_baseline_has_no_options(labelled):
@@ -189,7 +188,17 @@ def test_numbers_are_those_of_the_metrics(labelled):
         assert f" {words.percent(use['share'], 1)} " in shown
         assert f" {words.number(use['duration'], 1)} " in shown
     for part in ("train", "valid"):
-        assert words.number(metrics["agreement"][part][0]) in shown
+        (scores,) = metrics["agreement"][part]
+        alone = [words.number(scores[name]) for name in UNMATCHED]
+        whole, each = (
+            [words.number(scores[way][name]) for name in MATCHED]
+            for way in ("matched_globally", "matched_per_demonstration")
+        )
+        assert " ".join([*alone, "one for all", *whole, "each its own", *each]) in shown
+    (table,) = metrics["agreement"]["confusion"]
+    for label, steps in zip(table["labels"], table["steps"], strict=True):
+        shares = [words.percent(count / sum(steps)) for count in steps if count]
+        assert " ".join([str(label), str(sum(steps)), *shares]) in shown
     assert f"{metrics['engine_check']['value']:.1e}" in shown
     assert metrics["versions"]["torch"] in shown
 
@@ -253,12 +262,18 @@ def test_a_long_list_is_folded_and_long_timelines_are_cut(labelled, monkeypatch)
     assert "ddco-pyro segment RUN FILE --html PAGE" in folded
 
 
-def test_runs_of_before_have_no_list(labelled, tmp_path):
+def test_runs_of_before_have_no_list_and_of_agreement_the_mutual_information(labelled, tmp_path):
     found, _, demos = labelled
     before = {key: value for key, value in found.metrics.items() if key != "demonstrations_by_likelihood"}
-    copy = replace(found, folder=shutil.copytree(found.folder, tmp_path / "before"), metrics=before)
-    page = write_report(copy, demos).read_text()
-    assert ids(page) == ["likelihood", "dimensions", "learning", "options", "warnings", "particulars"]
+    before["agreement"] = {"labels": "phase", "train": [0.123], "valid": [0.456]}
+    folder = shutil.copytree(found.folder, tmp_path / "before")
+    write_metrics(folder, before)
+    page = write_report(load(folder), demos).read_text()
+    assert ids(page) == ["likelihood", "dimensions", "learning", "options", "agreement", "warnings", "particulars"]
+    shown = text(page)
+    assert "held out 0.46 – –" in shown
+    assert "training 0.12 – –" in shown
+    assert "Where each label" not in shown
     assert 'href="#segments' not in page
 
 

@@ -187,7 +187,13 @@ def test_agreement_with_the_labels_can_be_computed_again(toy_run, parts):
         (segments,) = toy_run.segment(part)
         found = np.concatenate([row[: len(demo)] for row, demo in zip(segments, part, strict=True)])
         truth = np.concatenate([demo.labels["phase"] for demo in part])
-        assert toy_run.metrics["agreement"][name] == [pytest.approx(normalized_mutual_info_score(truth, found))]
+        (scores,) = toy_run.metrics["agreement"][name]
+        assert scores["nmi"] == pytest.approx(normalized_mutual_info_score(truth, found))
+        values, counts = np.unique(found, return_counts=True)
+        (table,) = toy_run.metrics["agreement"]["confusion"]  # of the part that comes last, which is held out
+        assert name == "train" or np.sum(table["steps"], 0).tolist() == counts.tolist()
+        assert name == "train" or table["options"] == values.tolist()
+    assert toy_run.metrics["agreement"]["labels"] == ["phase"]
 
 
 def test_the_use_of_options_can_be_computed_again(toy_run, demos):
@@ -226,7 +232,11 @@ def test_planted_skills_are_found(planted, tmp_path, toy_spec):
     }
     spec = with_overrides(toy_spec, given | {"compare_with": [], "training.epochs": 240} | LINEAR)
     found = fit(spec, out=tmp_path / "run")
-    assert found.metrics["agreement"]["valid"] == [pytest.approx(1)]
+    (scores,) = found.metrics["agreement"]["valid"]
+    assert (scores["nmi"], scores["boundary_f1_1"]) == (pytest.approx(1), 1)
+    assert scores["matched_globally"] == dict.fromkeys(scores["matched_globally"], 1)
+    (table,) = found.metrics["agreement"]["confusion"]
+    assert (table["labels"], sorted(table["matched"])) == ([2, 5], [2, 5])
     assert "supervisor" not in found.metrics["demonstrations"]
 
 

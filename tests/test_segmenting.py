@@ -196,10 +196,9 @@ def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy
         (path,) = toy_run.segment(part)
         found = np.concatenate([row[: len(demo)] for row, demo in zip(path, part, strict=True)])
         scores[name] = normalized_mutual_info_score(np.concatenate([demo.labels["phase"] for demo in part]), found)
-    assert (
-        f"label “phase”, as normalised mutual information: {scores['valid']:.2f} on 3 held-out demonstrations and "
-        f"{scores['train']:.2f} on 9 other demonstrations. 0 is no agreement"
-    ) in " ".join(text.split())
+    assert "Agreement with the label “phase”" in text
+    assert f"<td>options, 3 held out</td><td>{scores['valid']:.2f}</td>" in text
+    assert f"<td>options, 9 others</td><td>{scores['train']:.2f}</td>" in text
     assert "3 of 12 demonstrations were held out when it was fitted" in text
 
 
@@ -211,7 +210,7 @@ def test_other_demonstrations_of_the_same_names_are_not_marked(toy_run, toy_spec
     assert call("segment", toy_run.folder, file, "--html", page).status == 0
     text = page.read_text()
     assert marked(text) == set()
-    assert re.search(r"mutual information: \d\.\d\d on 12 demonstrations\. 0 is", text)
+    assert re.search(r"<td>options, 12 in all</td><td>\d\.\d\d</td>", text)
     assert "were held out" not in text
 
 
@@ -221,6 +220,7 @@ def test_without_labels_the_page_says_nothing_of_agreement(toy_run, file, tmp_pa
             del group["labels/phase"]
     page = tmp_path / "segments.html"
     assert call("segment", toy_run.folder, file, "--html", page).status == 0
+    assert "Agreement" not in page.read_text()
     assert "mutual information" not in page.read_text()
     assert marked(page.read_text())
 

@@ -195,17 +195,14 @@ def _difference(paired: Mapping[str, float]) -> str:
 
 def selection(choice: Choice, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """The candidates of a selection, with what has to be known to read the numbers."""
-    table = Table(*head, title="held-out log-likelihood by cross-validation, nats per step", show_edge=False)
-    for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
-    _show(table)
+    comparison(head, rows, "held-out log-likelihood by cross-validation, nats per step")
     for note in choice.notes:
         Console().print(Text(f"note: {note}"), soft_wrap=True)
 
 
-def comparison(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Runs, the best first."""
-    table = Table(*head, show_edge=False)
+def comparison(head: Sequence[str], rows: Sequence[Sequence[str]], title: str | None = None) -> None:
+    """What is compared, a row for each, the best first where there is a best."""
+    table = Table(*head, title=title, show_edge=False)
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     _show(table)

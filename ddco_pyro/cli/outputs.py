@@ -51,24 +51,38 @@ def segment(
     level: Annotated[
         str | None, typer.Option(help="The level that gives the subtasks; the lowest by default.", show_default=False)
     ] = None,
+    baselines: Annotated[
+        bool,
+        typer.Option(
+            "--baselines",
+            help="Measure agreement with the file's labels, beside k-means, mixtures, hidden Markov models, change "
+            "points, equal lengths and gripper changes (pip install 'ddco-pyro\\[segments]').",
+        ),
+    ] = False,
+    gripper: Annotated[
+        int, typer.Option(help="The control dimension of the gripper for --baselines, from 0; by default the last.")
+    ] = -1,
     allow_code: AllowCode = False,
 ) -> None:
     """Label every step of demonstrations with a run's options: as a page, a table, labels in HDF5, or subtasks.
 
     Only what is asked for is written; DEMOS is left as it is unless --in-place says otherwise.
     """
-    if not (out or in_place or csv or parquet or html or lerobot):
+    if not (out or in_place or csv or parquet or html or lerobot or baselines):
         raise BadInput(
             "name what to write: --html PAGE, --csv FILE or --parquet FILE; labels for each step go to --out FILE (a "
-            "copy) or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset"
+            "copy) or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset; "
+            "--baselines measures agreement with labels"
         )
     labelled = _labelled(demos, out, in_place)
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
+    from ddco_pyro.drawing.scores import HEAD
     from ddco_pyro.fitting.fit import load
     from ddco_pyro.segmenting import segments
     from ddco_pyro.segmenting.hdf5 import write_labels
     from ddco_pyro.segmenting.page import write_page
+    from ddco_pyro.segmenting.scores import baseline_scores, level_scores
     from ddco_pyro.segmenting.tables import write_csv, write_parquet
 
     fit = load(run, allow_code)
@@ -79,6 +93,10 @@ def segment(
             segmented = _annotate(fit, source, lerobot, (level, lerobot_format.value), progress)
         else:
             segmented = segments(fit, source, progress)
+        others = baseline_scores(fit, source, segmented, gripper) if baselines else {}
+    scores = level_scores(segmented, others)
+    for name, own in scores.items() if baselines else ():
+        console.comparison(HEAD, own.rows(), f"level {name}: agreement with the label {own.labels}")
     if csv:
         write_csv(csv, segmented)
         print(csv)
@@ -86,7 +104,7 @@ def segment(
         write_parquet(parquet, segmented)
         print(parquet)
     if html:
-        write_page(html, segmented, str(run), str(demos))
+        write_page(html, segmented, str(run), str(demos), scores)
         print(html)
     if labelled:
         write_labels(demos, labelled, segmented)

@@ -1,5 +1,5 @@
-"""What a fitted hierarchy says about demonstrations: who is active when, for how long, and whether it agrees with
-ground truth.
+"""What a fitted hierarchy says about demonstrations: who is active when, for how long, and how differently options
+act.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from sklearn.metrics import normalized_mutual_info_score
 from torch import Tensor
 
 from ddco_pyro.inference import Posterior
@@ -94,11 +93,6 @@ def _divergence(own: CallerOutputs, i: int, j: int, u: Tensor) -> Tensor:
         steps = steps + control * own.emission.divergence(i, j)
     weight = u[..., i + 1] + u[..., j + 1]
     return torch.stack([(weight * steps).sum(), weight.sum()])
-
-
-def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> float:
-    """Normalised mutual information between segments and labels over all steps of all demonstrations (SM 2.4)."""
-    return float(normalized_mutual_info_score(np.concatenate(list(labels)), np.concatenate(list(segments))))
 
 
 def paired(ours: np.ndarray, theirs: np.ndarray, lengths: np.ndarray) -> dict[str, float]:

@@ -28,7 +28,7 @@ class Clusters:
     def __init__(self, batch: Batch, options: int, seed: int, controls: bool = False) -> None:
         self._controls = controls
         rows = self._rows(batch)
-        self._kmeans = KMeans(_distinct(rows, options), n_init=10, random_state=seed).fit(rows)
+        self._kmeans = KMeans(distinct(rows, options), n_init=10, random_state=seed).fit(rows)
 
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
@@ -40,8 +40,12 @@ class Clusters:
         seen = _observations(batch)
         if not self._controls:
             return seen
-        actions = batch.actions[_alive(batch)].double().numpy()
-        return np.concatenate([seen, np.sqrt(seen.shape[1] / actions.shape[1]) * actions], axis=1)
+        return joined(seen, batch.actions[_alive(batch)].double().numpy())
+
+
+def joined(seen: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Observations [steps, F] and controls [steps, A], both standardised, as [steps, F + A] with equal weight on either."""
+    return np.concatenate([seen, np.sqrt(seen.shape[1] / actions.shape[1]) * actions], axis=1)
 
 
 def _alive(batch: Batch) -> Tensor:
@@ -56,13 +60,13 @@ def _observations(batch: Batch) -> np.ndarray:
     """Observations of every step, [steps, features]; pictures by their block means."""
     each = []
     for row, length in enumerate(batch.lengths.tolist()):
-        means = [_block_means(image[row, :length]) for image in batch.inputs.images.values()]
+        means = [block_means(image[row, :length]) for image in batch.inputs.images.values()]
         each.append(torch.cat([batch.inputs.vector[row, :length], *means], dim=-1))
     rows: np.ndarray = torch.cat(each).double().numpy()
     return rows
 
 
-def _block_means(frames: Tensor) -> Tensor:
+def block_means(frames: Tensor) -> Tensor:
     """uint8 [T, H, W, C] to [T, C · POOLED²], in [0, 1]: as many numbers as a convolutional network keeps of a map."""
     pooled = [
         torch.nn.functional.adaptive_avg_pool2d(block.permute(0, 3, 1, 2).float() / 255, POOLED).flatten(1)
@@ -71,7 +75,7 @@ def _block_means(frames: Tensor) -> Tensor:
     return torch.cat(pooled)
 
 
-def _distinct(rows: np.ndarray, most: int) -> int:
+def distinct(rows: np.ndarray, most: int) -> int:
     """How many different rows there are, counted up to ``most``."""
     seen: set[bytes] = set()
     for row in rows:

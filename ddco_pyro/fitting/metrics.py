@@ -13,6 +13,7 @@ import torch
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting import analysis
+from ddco_pyro.fitting.agreement import agreement, confusion
 from ddco_pyro.fitting.branch_use import branch_use
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.inferred import Inferred
@@ -31,12 +32,12 @@ class _Part:
 
     :param values: log p(ξ) of each, nats, [N].
     :param each: that in parts.
-    :param segments: the most likely options of all their steps, for each level.
+    :param segments: the most likely options [T] of each, for each level.
     """
 
     values: np.ndarray
     each: Decomposition
-    segments: list[np.ndarray]
+    segments: list[list[np.ndarray]]
 
     @classmethod
     def of(cls, fit: Fit, demos: Demonstrations) -> _Part:
@@ -45,7 +46,7 @@ class _Part:
             values.append(_finite(fit, piece))
             parts.append(piece.decomposition)
             paths.append(piece.path.choices)
-        segments = [np.concatenate([h[h >= 0].numpy() for h in level]) for level in zip(*paths, strict=True)]
+        segments = [[row[row >= 0].numpy() for h in level for row in h] for level in zip(*paths, strict=True)]
         return cls(np.concatenate(values), Decomposition.joined(parts), segments)
 
 
@@ -101,8 +102,8 @@ def evaluate(fitted: Fit, parts: dict[str, Demonstrations], demos: Demonstration
         metrics["branches"] = uses
     if fitted.hierarchy.depth:
         metrics |= _options(fitted, demos)
-        if fitted.spec.demonstrations.labels:
-            metrics["agreement"] = _agreement(fitted.spec.demonstrations.labels, ours, parts)
+        if names := fitted.spec.demonstrations.labels_by_level(fitted.hierarchy.depth):
+            metrics["agreement"] = _agreement(names, ours, parts)
     return metrics
 
 
@@ -163,12 +164,18 @@ def _difference(ours: np.ndarray, theirs: np.ndarray, valid: Demonstrations) -> 
     return analysis.paired(ours, theirs, np.array(valid.lengths, dtype=float))
 
 
-def _agreement(label: str, ours: dict[str, _Part], parts: dict[str, Demonstrations]) -> dict[str, Any]:
-    """NMI of each level's segments with the ground-truth labels."""
-    scores: dict[str, Any] = {"labels": label}
+def _agreement(names: tuple[str, ...], ours: dict[str, _Part], parts: dict[str, Demonstrations]) -> dict[str, Any]:
+    """All measures of each level's segments with its ground-truth labels, and in which options the steps of each label
+    lie, held out where there is such a part.
+    """
+    scores: dict[str, Any] = {"labels": list(names)}
     for name, part in parts.items():
-        truth = [demo.labels[label] for demo in part]
-        scores[name] = [analysis.agreement([level], truth) for level in ours[name].segments]
+        pairs = [
+            (level, [demo.labels[label] for demo in part])
+            for level, label in zip(ours[name].segments, names, strict=True)
+        ]
+        scores[name] = [agreement(*pair) for pair in pairs]
+        scores["confusion"] = [confusion(*pair) for pair in pairs]  # of the last part, which is held out
     return scores
 
 

@@ -11,9 +11,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from ddco_pyro.data.files import Damaged
+from ddco_pyro.fitting.agreement_record import Agreement, as_today, each_level_of
+from ddco_pyro.fitting.record_types import NOT_NULL, AtLeastOne, Finite, Record
 from ddco_pyro.spec.messages import invalid, lines
 
 T = TypeVar("T")
@@ -73,34 +75,18 @@ def read_metrics(folder: Path, counts: Sequence[int]) -> dict[str, Any]:
     path, remedy = folder / "metrics.json", refit(folder)
     metrics = read_record(path, Metrics, remedy)
     levels = [[use.choice for use in level] for level in metrics.options]
-    scores = [metrics.agreement.train, metrics.agreement.valid] if metrics.agreement else []
-    each_level = [values for values in (*scores, metrics.divergences or None) if values is not None]
+    each_level = [
+        values for values in (*each_level_of(metrics.agreement), metrics.divergences or None) if values is not None
+    ]
     if levels != [list(range(1 + count)) for count in counts] or {len(values) for values in each_level} - {len(counts)}:
         raise Damaged(path, f"is not about levels with {', '.join(map(str, counts)) or 'no'} options", remedy)
     data: dict[str, Any] = json.loads(path.read_bytes())
-    return data
+    return data | ({"agreement": as_today(data["agreement"], len(counts))} if "agreement" in data else {})
 
 
 def refit(folder: Path, remove: str = "it") -> str:
     """What to do about a damaged file of a run: what its checkpoint holds need not be trained again."""
     return f"remove {remove} and fit again: ddco-pyro fit {folder / 'spec.yaml'} --out {folder} --resume"
-
-
-def _not_null(value: Any) -> Any:
-    if value is None:
-        raise invalid(("", "must not be null; where there is none the key is left out"))
-    return value
-
-
-NOT_NULL = AfterValidator(_not_null)
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-AtLeastOne = Annotated[int, Field(ge=1)]
-
-
-class Record(BaseModel):
-    """Part of such a file."""
-
-    model_config = ConfigDict(extra="allow", frozen=True)
 
 
 class PerStep(Record):
@@ -298,15 +284,7 @@ class Counts(Record):
     train: AtLeastOne
     tune: int
     valid: int
-    supervisor: dict[str, Measure] = {}
-
-
-class Agreement(Record):
-    """NMI of each level with the labels so named."""
-
-    labels: str
-    train: list[Finite]
-    valid: Annotated[list[Finite] | None, NOT_NULL] = None
+    supervisor: dict[str, Measure] = Field(default_factory=dict)
 
 
 class Metrics(Record):
@@ -316,16 +294,16 @@ class Metrics(Record):
     log_likelihood_per_step: PerStep
     log_likelihood_by_dimension: Annotated[ByDimension | None, NOT_NULL] = None
     valid: list[HeldOut]
-    demonstrations_by_likelihood: list[Listed] = []
+    demonstrations_by_likelihood: list[Listed] = Field(default_factory=list)
     comparison: dict[str, Compared]
-    options: list[list[Use]] = []
-    divergences: list[list[Alike]] = []
+    options: list[list[Use]] = Field(default_factory=list)
+    divergences: list[list[Alike]] = Field(default_factory=list)
     agreement: Annotated[Agreement | None, NOT_NULL] = None
     engine_check: dict[str, float]
     demonstrations: Counts
-    control_dimensions: list[ControlRange] = []
-    measure: dict[str, Annotated[list[Any], Field(min_length=1)]] = {}
-    branches: list[Branches] = []
+    control_dimensions: list[ControlRange] = Field(default_factory=list)
+    measure: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
+    branches: list[Branches] = Field(default_factory=list)
     parameters: int
     training: Annotated[Training | None, NOT_NULL] = None
     seconds: dict[str, float]

@@ -33,6 +33,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             "rollouts": sections.rollouts(fit, metrics),
             "learning": sections.learning(fit),
             "options": sections.options(fit, demos, active, metrics) if active else None,
+            "agreement": sections.agreement(fit, metrics),
             "branches": sections.branches(fit, metrics),
             "warnings": sections.warnings(fit, metrics),
             "films": sections.films(fit),

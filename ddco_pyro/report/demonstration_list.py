@@ -72,11 +72,11 @@ def timelines(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mapp
 
 
 def _segments(fit: Fit, demos: Demonstrations, row: int, activity: Activity, listed: Mapping[str, Any]) -> Segments:
-    demo, truth = demos[row], fit.spec.demonstrations.labels
+    demo = demos[row]
     levels = {
         level.name: LevelLabels.of(*(array[row, : len(demo)] for array in (level.path, level.ended, level.active)))
         for level in activity.levels
     }
-    labels = {truth: demo.labels[truth]} if truth else {}
+    labels = {name: demo.labels[name] for name in fit.spec.demonstrations.label_names}
     value = listed["log_likelihood_per_step"][fit.name]
     return Segments(demo.name, levels, value, listed["part"] == "valid", labels)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,18 +20,18 @@ MOST_POINTS = 400
 
 @dataclass(frozen=True)
 class Example:
-    """A demonstration to show: its row in the activity, its name, and its labels [T] where there are any."""
+    """A demonstration to show: its row in the activity, its name, and its labels [T] by name."""
 
     row: int
     name: str
-    labels: np.ndarray | None = None
+    labels: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 def draw(activity: Activity, examples: Sequence[Example]) -> Figure:
     """Two demonstrations side by side; for each level u_t stacked, with the most likely path under it."""
     rows = -(-len(examples) // 2)
-    labelled = examples[0].labels is not None
-    figure = blank(0.35 + rows * (0.55 + 1.25 * len(activity.levels) + 0.2 * labelled))
+    labels = len(examples[0].labels)
+    figure = blank(0.35 + rows * (0.55 + 1.25 * len(activity.levels) + 0.2 * labels))
     parts = figure.subfigures(rows, 2, squeeze=False)
     for part, example in zip(parts.flat, examples, strict=False):
         _example(part, activity, example)
@@ -42,7 +42,7 @@ def draw(activity: Activity, examples: Sequence[Example]) -> Figure:
 
 def _example(figure: SubFigure, activity: Activity, example: Example) -> None:
     length = int(activity.lengths[example.row])
-    heights = [*([5, 0.8] * len(activity.levels)), *([0.9] if example.labels is not None else [])]
+    heights = [*([5, 0.8] * len(activity.levels)), *([0.9] * len(example.labels))]
     panels = figure.subplots(len(heights), 1, height_ratios=heights, gridspec_kw={"hspace": 0.02})
     for depth, level in enumerate(reversed(activity.levels)):
         stack, strip = panels[2 * depth], panels[2 * depth + 1]
@@ -50,9 +50,11 @@ def _example(figure: SubFigure, activity: Activity, example: Example) -> None:
         stack.set_ylabel(f"{level.name}\nprobability" if len(activity.levels) > 1 else "probability")
         draw_path(strip, level.path[example.row, :length])
         strip.set_ylabel("path", rotation=0, ha="right", va="center", fontsize=7.5)
-    if example.labels is not None:
-        draw_labels(panels[-1], example.labels)
-        panels[-1].set_ylabel("label", rotation=0, ha="right", va="center", fontsize=7.5)
+    for strip, (name, labels) in zip(panels[2 * len(activity.levels) :], example.labels.items(), strict=True):
+        draw_labels(strip, labels)
+        strip.set_ylabel(
+            "label" if len(example.labels) == 1 else name, rotation=0, ha="right", va="center", fontsize=7.5
+        )
     panels[0].set_title(example.name)
     _time_axis(panels[-1], length)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -21,12 +21,13 @@ def order(activity: Activity) -> np.ndarray:
     return np.lexsort((first, activity.lengths))
 
 
-def draw(activity: Activity, labels: Sequence[np.ndarray] | None) -> Figure:
-    """A panel for each level, the highest first, and one for the labels where there are any."""
+def draw(activity: Activity, labels: Mapping[str, Sequence[np.ndarray]]) -> Figure:
+    """A panel for each level, the highest first, and for each of the labels, by name."""
     rows = order(activity)
     images = [(f"level “{level.name}”", colour_image(level.path[rows])) for level in reversed(activity.levels)]
-    if labels is not None:
-        images.append(("ground-truth labels", label_image([labels[row] for row in rows], activity.lengths.max())))
+    for name, own in labels.items():
+        title = "ground-truth labels" if len(labels) == 1 else f"labels “{name}”"
+        images.append((title, label_image([own[row] for row in rows], activity.lengths.max())))
     figure = blank(float(np.clip(0.9 + 0.045 * len(rows), 2.2, 7)))
     panels = figure.subplots(1, len(images), sharey=True, squeeze=False)[0]
     for axes, (title, image) in zip(panels, images, strict=True):

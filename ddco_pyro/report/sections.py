@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.drawing import words
+from ddco_pyro.drawing import scores, words
 from ddco_pyro.drawing.pictures import Picture, keep
 from ddco_pyro.fitting.diagnostics import diagnose
 from ddco_pyro.fitting.fit import Fit
@@ -49,6 +49,19 @@ class Figures:
     pictures: list[Picture]
     table: tables.Table | None = None
     text: str = ""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Measures of all levels with ground-truth labels; for each level where the steps of each label lie, ``confusion``,
+    with what that is called, of ``part``.
+    """
+
+    labels: str
+    measures: tables.Table
+    explained: str
+    confusion: list[tuple[str, tables.Table]]
+    part: str
 
 
 @dataclass(frozen=True)
@@ -191,9 +204,8 @@ def options(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mappin
     pictures = [picture for make in makers if (picture := make(fit, demos, activity, metrics)) is not None]
     names = [level.name for level in fit.spec.hierarchy.levels]
     table = tables.option_use(names, metrics["options"], sum(metrics["demonstrations"][part] for part in PARTS))
-    text = _agreement(metrics, names)
-    if len(names) > 1:
-        text = f"{text} Each level numbers its own options: equal colours in two levels mean nothing.".strip()
+    several = "Each level numbers its own options: equal colours in two levels mean nothing."
+    text = several if len(names) > 1 else ""
     return Figures(pictures, table, text)
 
 
@@ -216,8 +228,8 @@ def _posteriors(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Ma
         "given the whole demonstration (u in the paper), stacked; under it the path: the most likely sequence of "
         "options."
     )
-    if examples[0].labels is not None:
-        caption += f" Boxes: ground-truth label “{fit.spec.demonstrations.labels}”."
+    if examples[0].labels:
+        caption += f" Boxes: ground-truth {_quoted(examples[0].labels)}."
     path = fit.run_folder / "figures" / "posterior.png"
     alt = f"Stacked probabilities of the options over time in {', '.join(names)}"
     return keep(plot_posterior.draw(activity, examples), path, alt, caption)
@@ -226,7 +238,7 @@ def _posteriors(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Ma
 def _rows(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mapping[str, Any]) -> Picture:
     del metrics
     labels = [_labels(fit, demo) for demo in demos]
-    known = [array for array in labels if array is not None]
+    known = {name: [own[name] for own in labels] for name in labels[0]}
     caption = (
         f"Most likely options of all {len(demos)} demonstrations, one row each, sorted by length, then by when the "
         "option first changes."
@@ -234,7 +246,7 @@ def _rows(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mapping[
     if known:
         caption += " Ground-truth labels in shades of grey."
     alt = f"Rows of colour: the most likely option at each step of {len(demos)} demonstrations"
-    return keep(plot_rows.draw(activity, known or None), fit.run_folder / "figures" / "segments.png", alt, caption)
+    return keep(plot_rows.draw(activity, known), fit.run_folder / "figures" / "segments.png", alt, caption)
 
 
 def _trajectories(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mapping[str, Any]) -> Picture | None:
@@ -266,25 +278,30 @@ def _timing(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mappin
     return keep(plot_timing.draw(activity), fit.run_folder / "figures" / "timing.png", alt, caption)
 
 
-def _labels(fit: Fit, demo: Demonstration) -> Any:
-    name = fit.spec.demonstrations.labels
-    return demo.labels.get(name) if name else None
+def _labels(fit: Fit, demo: Demonstration) -> dict[str, Any]:
+    return {name: demo.labels[name] for name in fit.spec.demonstrations.label_names if name in demo.labels}
 
 
-def _agreement(metrics: Mapping[str, Any], levels: list[str]) -> str:
-    agreement = metrics.get("agreement")
-    if not agreement:
-        return ""
-    scores = [f"{_scores(agreement, number)} demonstrations (level “{level}”)" for number, level in enumerate(levels)]
-    return (
-        f"Normalised mutual information with the ground-truth label “{agreement['labels']}”: {'; '.join(scores)}. "
-        "0 is no agreement, 1 the same segments under other names."
-    )
+def _quoted(names: Iterable[str]) -> str:
+    return "label " + " and ".join(f"“{name}”" for name in names)
 
 
-def _scores(agreement: Mapping[str, Any], level: int) -> str:
-    held_out = f"{words.number(agreement['valid'][level])} on held-out and " if "valid" in agreement else ""
-    return f"{held_out}{words.number(agreement['train'][level])} on training"
+def agreement(fit: Fit, metrics: Mapping[str, Any]) -> Agreement | None:
+    """How well the options agree with ground-truth labels; None where there are none."""
+    record = metrics.get("agreement")
+    if not record or fit.spec.hierarchy is None:
+        return None
+    names = [level.name for level in fit.spec.hierarchy.levels]
+    part = "valid" if "valid" in record else "train"
+    confusion = [
+        (f"level “{level}”, label “{labels}”", tables.confusion(own))
+        for level, labels, own in zip(names, record["labels"], record.get("confusion", ()), strict=False)
+    ]  # runs of before have none
+    labels = _quoted(dict.fromkeys(record["labels"]))
+    return Agreement(labels, tables.agreement(names, record), scores.EXPLAINED, confusion, PART_NAMES[part])
+
+
+PART_NAMES = {"valid": "held-out", "train": "training"}
 
 
 def warnings(fit: Fit, metrics: Mapping[str, Any]) -> Warnings | None:

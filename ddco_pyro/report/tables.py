@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ddco_pyro.drawing import scores
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.words import interval, measure, method, number, p_value, percent, rate, signed
 from ddco_pyro.fitting.convergence import effort
@@ -85,3 +86,27 @@ def branches(uses: Sequence[Mapping[str, Any]], names: Sequence[Sequence[str]]) 
         for column, branch in enumerate(use["branches"])
     ]
     return Table(["Option", "Branch", "Mean activation", "Nats per step lost"], rows)
+
+
+def agreement(levels: Sequence[str], record: Mapping[str, Any]) -> Table:
+    """All measures of each level's agreement with labels, held out and in training."""
+    parts = {"valid": "held out", "train": "training"}
+    rows = [
+        row
+        for place, level in enumerate(levels)
+        for part, words in parts.items()
+        if part in record
+        for row in scores.rows(f"{level}, {words}" if len(levels) > 1 else words, record[part][place])
+    ]
+    return Table(scores.HEAD, rows)
+
+
+def confusion(record: Mapping[str, Any]) -> Table:
+    """Share of each label's steps in each option; under the options, the label that each stands for."""
+    head = ["Label", "Steps", *map(choice_name, record["options"])]
+    rows = [
+        [str(label), str(sum(steps)), *(percent(count / sum(steps)) if count else "" for count in steps)]
+        for label, steps in zip(record["labels"], record["steps"], strict=True)
+    ]
+    matched = ["–" if label is None else str(label) for label in record["matched"]]
+    return Table(head, [*rows, ["stands for", "", *matched]])

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.data.demonstrations import Demonstration
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.memory import INFERENCE, PROGRAM, Extent, refuse_too_much
 from ddco_pyro.data.sources import Recording, Source
@@ -17,7 +17,7 @@ from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.inferred import Inferred
 
-__all__ = ["LevelLabels", "Segmented", "Segments", "segments"]
+__all__ = ["LevelLabels", "Segmented", "Segments", "demonstrations", "segments"]
 
 
 @dataclass(frozen=True)
@@ -65,14 +65,14 @@ class Segments:
 
 @dataclass(frozen=True)
 class Segmented:
-    """All demonstrations of a source. ``counts`` has the number of options of each level by name; ``truth`` is the name
-    of the labels that the run's spec compares with.
+    """All demonstrations of a source. ``counts`` has the number of options of each level by name; ``truth`` the name of
+    the labels that the run's spec compares a level with.
     """
 
     segments: tuple[Segments, ...]
     counts: dict[str, int]
     frequency: float | None
-    truth: str | None = None
+    truth: Mapping[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.segments)
@@ -89,13 +89,19 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
     if hierarchy is None:
         raise BadInput(f"{fit}: is a {fit.name} policy without options; name a run with a hierarchy")
     counts = {level.name: level.count for level in hierarchy.levels}
-    names = _names(source, fit)
+    chosen = _names(source, fit)
     labels: dict[str, dict[str, np.ndarray]] = {}
     segmented: list[Segments] = []
-    for piece in fit.infer(_demonstrations(source, names, fit, labels)):
+    for piece in fit.infer(_demonstrations(source, chosen, fit, labels)):
         segmented += _segments(fit, piece, tuple(counts), labels)
-        on_event(DemonstrationsDone(len(segmented), len(names)))
-    return Segmented(tuple(segmented), counts, source.frequency, fit.spec.demonstrations.labels)
+        on_event(DemonstrationsDone(len(segmented), len(chosen)))
+    names = fit.spec.demonstrations.labels_by_level(len(counts))
+    return Segmented(tuple(segmented), counts, source.frequency, dict(zip(counts, names, strict=bool(names))))
+
+
+def demonstrations(source: Source, names: Iterable[str], fit: Fit) -> Demonstrations:
+    """What a run's networks see of these demonstrations of a source, all in memory."""
+    return Demonstrations(tuple(_demonstration(source.recording(name), fit) for name in names))
 
 
 def _names(source: Source, fit: Fit) -> list[str]:

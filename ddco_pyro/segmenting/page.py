@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ddco_pyro.data.files import write_text
+from ddco_pyro.drawing import scores as measures
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.templates import render
-from ddco_pyro.fitting.analysis import agreement
-from ddco_pyro.segmenting import Segmented, Segments
+from ddco_pyro.segmenting import Segmented
+from ddco_pyro.segmenting.scores import LevelScores
 from ddco_pyro.segmenting.timeline import duration, option_name, timelines
 
 
-def write_page(path: Path, segmented: Segmented, run: str, file: str) -> None:
-    """Write the page, whole or not at all; whatever comes from files is escaped."""
+def write_page(path: Path, segmented: Segmented, run: str, file: str, scores: Mapping[str, LevelScores]) -> None:
+    """Write the page, whole or not at all; whatever comes from files is escaped.
+
+    :param scores: measures of each level's agreement with labels.
+    """
     page = {
         "run": run,
         "file": file,
         "levels": [_level(name, count, segmented) for name, count in segmented.counts.items()],
-        "truth": segmented.truth,
+        "scores": scores,
+        "score_head": measures.HEAD,
+        "explained": measures.EXPLAINED,
         "demonstrations": timelines(segmented),
         "held_out": sum(demo.held_out for demo in segmented.segments),
         "longest": duration(max(len(demo) for demo in segmented.segments), segmented.frequency),
@@ -30,7 +37,7 @@ def write_page(path: Path, segmented: Segmented, run: str, file: str) -> None:
 
 
 def _level(name: str, count: int, segmented: Segmented) -> dict[str, Any]:
-    """How much of the time each option of a level takes, how often, and for how long; its agreement with the labels."""
+    """How much of the time each option of a level takes, how often, and for how long."""
     runs = [run for demo in segmented.segments for run in demo.levels[name].runs()]
     total = sum(end - start for _, start, end in runs)
     options = []
@@ -48,24 +55,4 @@ def _level(name: str, count: int, segmented: Segmented) -> dict[str, Any]:
                     "in": sum(any(c == option for c, _, _ in demo.levels[name].runs()) for demo in segmented.segments),
                 }
             )
-    return {"name": name, "options": options, "agreement": _agreement(name, segmented)}
-
-
-def _agreement(level: str, segmented: Segmented) -> str:
-    """A level's normalised mutual information with the labels that the run's spec names; empty where there are none."""
-    labelled = [demo for demo in segmented.segments if segmented.truth in demo.labels]
-    groups = {
-        "held-out": [demo for demo in labelled if demo.held_out],
-        "other": [demo for demo in labelled if not demo.held_out],
-    }
-    if not groups["held-out"]:
-        groups = {"": labelled}
-    return " and ".join(
-        f"{_mutual_information(level, segmented.truth, group):.2f} on {f'{len(group)} {kind}'.strip()} demonstrations"
-        for kind, group in groups.items()
-        if segmented.truth and group
-    )
-
-
-def _mutual_information(level: str, truth: str, group: list[Segments]) -> float:
-    return agreement([demo.levels[level].options for demo in group], [demo.labels[truth] for demo in group])
+    return {"name": name, "options": options}

@@ -14,7 +14,8 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.fitting.prepare import digest
-from ddco_pyro.fitting.records import Record, read_record
+from ddco_pyro.fitting.record_types import Record
+from ddco_pyro.fitting.records import read_record
 
 
 class FoldError(BadInput):

@@ -10,6 +10,16 @@ from pydantic import Field, TypeAdapter, model_validator
 from ddco_pyro.spec.messages import invalid
 from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Seed, Share, TaskName, Text, bare, nested
 
+LabelNames = Annotated[Items[Text], Field(min_length=1)]
+Labels = Annotated[
+    Text | LabelNames,
+    nested(
+        (list, tuple),
+        TypeAdapter(LabelNames, config=Model.model_config).validate_python,
+        "a name, or a list with a name for each level",
+    ),
+]
+
 
 class DemonstrationsSpec(Model):
     """Where the demonstrations come from: a file, or the task's supervisor."""
@@ -28,8 +38,19 @@ class DemonstrationsSpec(Model):
     """Part of the demonstrations held out for validation, where the file has no ``mask/valid``; 0 for none."""
     exclude: Items[Text] = ()
     """Names of demonstrations that are left out, whatever they hold."""
-    labels: Text | None = None
-    """Name of ground-truth labels in the file; the discovered options are compared with them (NMI)."""
+    labels: Labels | None = None
+    """Ground-truth labels in the file with which the discovered options are compared: a name for every level, or a list
+    with a name for each, the lowest level first. Steps labelled −1 are left out."""
+
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """Names of all labels that the demonstrations have to hold, each once."""
+        names = (self.labels,) if isinstance(self.labels, str) else self.labels or ()
+        return tuple(dict.fromkeys(names))
+
+    def labels_by_level(self, levels: int) -> tuple[str, ...]:
+        """The name of each level's labels, lowest first; nothing where there are none."""
+        return (self.labels,) * levels if isinstance(self.labels, str) else self.labels or ()
 
 
 STEP = "step"

@@ -73,6 +73,7 @@ class Spec(Model):
             *self._nothing_observed(),
             *self._unknown_trajectory(),
             *self._nothing_held_out(),
+            *self._labels_of_other_levels(),
         ]
         if problems:
             raise invalid(*problems)
@@ -96,6 +97,15 @@ class Spec(Model):
     def _nothing_held_out(self) -> Iterator[tuple[str, str]]:
         if self.compare_with and self.demonstrations.valid_fraction == 0:
             yield "compare_with", "needs demonstrations held out to compare on; raise demonstrations.valid_fraction"
+
+    def _labels_of_other_levels(self) -> Iterator[tuple[str, str]]:
+        names = self.demonstrations.labels
+        if self.hierarchy and isinstance(names, tuple) and len(names) != len(self.hierarchy.levels):
+            levels = len(self.hierarchy.levels)
+            yield (
+                "demonstrations.labels",
+                f"must have a name for each of {levels} levels, or be one name for all, got {show([*names])}",
+            )
 
     def _repeated_observations(self) -> Iterator[tuple[str, str]]:
         keys = [observation.key for observation in self.observations]

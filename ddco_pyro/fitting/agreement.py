@@ -1,0 +1,211 @@
+"""How well segments agree with ground-truth labels, by the field's measures.
+
+NMI and ARI compare two ways to divide steps, boundary F1 compares where they divide; none of them asks what an option
+is called. For the other measures options are matched with labels, one with one, so that as many steps as possible agree
+(Hungarian assignment): *globally*, once for all demonstrations, or *per demonstration*. An option that is left over, or
+shares no step with its label, agrees with nothing.
+
+Steps labelled :data:`UNKNOWN` are left out as if they were not there. A segment is a maximal run of steps of the same
+option: selecting the same option anew is no boundary.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from sklearn.metrics import adjusted_rand_score, normalized_mutual_info_score
+
+UNKNOWN = -1
+"""The label of a step of which nothing is known."""
+
+TOLERANCES = (1, 3, 5)
+"""Steps by which a boundary may be off."""
+
+OVERLAPS = (10, 25, 50)
+"""Percent of intersection over union from which on two segments are the same."""
+
+UNMATCHED = ("nmi", "ari", *(f"boundary_f1_{steps}" for steps in TOLERANCES))
+MATCHED = ("accuracy", "iou", *(f"f1_{percent}" for percent in OVERLAPS), "edit")
+
+
+def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> dict[str, Any] | None:
+    """All measures over demonstrations, each at most 1, which is perfect; None where no step has a known label.
+
+    - ``nmi``: normalised mutual information, arithmetic mean of the entropies.
+    - ``ari``: adjusted Rand index, 0 by chance.
+    - ``boundary_f1_N``: F1 of the steps at which a segment begins (the first step is none), matched one to one within
+      ±N steps; 1 where neither has any.
+    - ``matched_globally`` and ``matched_per_demonstration``, for either matching: ``accuracy``, the share of steps that
+      agree (mean over frames, MoF); ``iou``, intersection over union of the steps, mean over labels; ``f1_P``,
+      segmental F1: a segment is right where its intersection over union with a segment of its label, not taken before,
+      is P % or more; ``edit``, 1 − Levenshtein distance of the sequences of segments divided by the longer one, mean
+      over demonstrations.
+
+    >>> found = agreement([np.array([7, 7, 3, 3])], [np.array([0, 0, 0, 1])])
+    >>> found["matched_globally"]["accuracy"], found["boundary_f1_1"]
+    (0.75, 1.0)
+
+    :param segments: options [T] of each demonstration, any integers.
+    :param labels: the true ones [T].
+    """
+    pairs = _known(segments, labels)
+    if not pairs:
+        return None
+    (_, ours), (names, truth) = (_numbered(side) for side in zip(*pairs, strict=True))
+    x, y = np.concatenate(ours), np.concatenate(truth)
+    scores = {"nmi": float(normalized_mutual_info_score(y, x)), "ari": float(adjusted_rand_score(y, x))}
+    scores |= {f"boundary_f1_{steps}": _boundary_f1(ours, truth, steps) for steps in TOLERANCES}
+    match = _matching(_counts(x, y))
+    each = [_matching(_counts(h, label)) for h, label in zip(ours, truth, strict=True)]
+    everywhere = [match[h] for h in ours]
+    by_itself = [own[h] for own, h in zip(each, ours, strict=True)]
+    return scores | {
+        "matched_globally": _matched(everywhere, truth, len(names)),
+        "matched_per_demonstration": _matched(by_itself, truth, len(names)),
+    }
+
+
+def confusion(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> dict[str, list[Any]]:
+    """``steps`` of each of ``labels`` (rows) in each of ``options`` (columns), and the label with which each option is
+    ``matched`` globally, None for one that is left over.
+    """
+    pairs = _known(segments, labels)
+    if not pairs:
+        return {"labels": [], "options": [], "steps": [], "matched": []}
+    (options, ours), (names, truth) = (_numbered(side) for side in zip(*pairs, strict=True))
+    counts = _counts(np.concatenate(ours), np.concatenate(truth))
+    matched = [int(names[label]) if label < len(names) else None for label in _matching(counts)]
+    columns, rows = np.argsort(options), np.argsort(names)
+    return {
+        "labels": names[rows].tolist(),
+        "options": options[columns].tolist(),
+        "steps": counts[np.ix_(rows, columns)].tolist(),
+        "matched": [matched[column] for column in columns],
+    }
+
+
+def _known(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Options and labels of the steps whose label is known, of each demonstration that has any."""
+    pairs = []
+    for options, label in zip(segments, labels, strict=True):
+        label = np.asarray(label)
+        known = label != UNKNOWN
+        if known.any():
+            pairs.append((np.asarray(options)[known], label[known]))
+    return pairs
+
+
+def _numbered(sequences: Sequence[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The values and, for each sequence, their numbers 0, 1, ... in the order in which they first appear.
+
+    Where two matchings are equally good, which one is taken then does not depend on names.
+    """
+    values, first, numbers = np.unique(np.concatenate(sequences), return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    places = np.argsort(order)
+    return values[order], np.split(places[numbers], np.cumsum([len(one) for one in sequences])[:-1])
+
+
+def _counts(ours: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Steps of each label in each option, [labels, options]."""
+    counts = np.zeros((truth.max() + 1, ours.max() + 1), dtype=int)
+    np.add.at(counts, (truth, ours), 1)
+    return counts
+
+
+def _matching(counts: np.ndarray) -> np.ndarray:
+    """The label of each option [options]; a number of its own, above all labels, for one without."""
+    match = LARGEST + np.arange(counts.shape[1])
+    for label, option in zip(*linear_sum_assignment(counts, maximize=True), strict=True):
+        if counts[label, option]:
+            match[option] = label
+    return match
+
+
+LARGEST = 2**32
+"""More labels than there can be."""
+
+
+def _matched(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], labels: int) -> dict[str, float]:
+    x, y = np.concatenate(ours), np.concatenate(truth)
+    steps = [((x == label) & (y == label), (x == label) | (y == label)) for label in range(labels)]
+    scores = {
+        "accuracy": float((x == y).mean()),
+        "iou": float(np.mean([both.sum() / either.sum() for both, either in steps])),
+    }
+    scores |= {f"f1_{percent}": _overlap_f1(ours, truth, percent / 100) for percent in OVERLAPS}
+    edits = [_edit(h[_starts(h)], label[_starts(label)]) for h, label in zip(ours, truth, strict=True)]
+    return scores | {"edit": float(np.mean(edits))}
+
+
+def _starts(sequence: np.ndarray) -> np.ndarray:
+    """The first step of each segment."""
+    return np.concatenate([[0], _boundaries(sequence)])
+
+
+def _boundaries(sequence: np.ndarray) -> np.ndarray:
+    return np.flatnonzero(np.diff(sequence)) + 1
+
+
+def _f1(right: int, ours: int, theirs: int) -> float:
+    """2 PR / (P + R) of so many right ones; 1 where there are none on either side."""
+    return 2 * right / (ours + theirs) if ours + theirs else 1.0
+
+
+def _boundary_f1(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], tolerance: int) -> float:
+    pairs = [(_boundaries(h), _boundaries(label)) for h, label in zip(ours, truth, strict=True)]
+    right = sum(_within(a, b, tolerance) for a, b in pairs)
+    return _f1(right, sum(len(a) for a, _ in pairs), sum(len(b) for _, b in pairs))
+
+
+def _within(ours: np.ndarray, theirs: np.ndarray, tolerance: int) -> int:
+    """How many pairs of sorted steps at most ``tolerance`` apart can be made, each step in one pair."""
+    i = j = pairs = 0
+    while i < len(ours) and j < len(theirs):
+        if abs(ours[i] - theirs[j]) <= tolerance:
+            i, j, pairs = i + 1, j + 1, pairs + 1
+        elif ours[i] < theirs[j]:
+            i += 1
+        else:
+            j += 1
+    return pairs
+
+
+def _overlap_f1(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], overlap: float) -> float:
+    right = segments = 0
+    for h, label in zip(ours, truth, strict=True):
+        a, b = _starts(h), _starts(label)
+        right += _overlapping((h, a), (label, b), overlap)
+        segments += len(a) + len(b)
+    return 2 * right / segments
+
+
+def _overlapping(ours: tuple[np.ndarray, np.ndarray], theirs: tuple[np.ndarray, np.ndarray], overlap: float) -> int:
+    """Segments of ours that overlap enough with the true segment of their label with which they overlap most.
+
+    :param ours: the labels of all steps, and where segments start; ``theirs`` likewise.
+    """
+    (h, starts), (label, begins) = ours, theirs
+    ends, closes = np.append(starts[1:], len(h)), np.append(begins[1:], len(label))
+    taken = np.zeros(len(begins), dtype=bool)
+    for start, end in zip(starts, ends, strict=True):
+        both = np.minimum(end, closes) - np.maximum(start, begins)
+        either = np.maximum(end, closes) - np.minimum(start, begins)
+        ratio = np.where(label[begins] == h[start], both / either, 0.0)
+        best = int(ratio.argmax())
+        taken[best] |= ratio[best] >= overlap
+    return int(taken.sum())
+
+
+def _edit(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """1 − Levenshtein distance / the longer length."""
+    distances = np.arange(len(theirs) + 1)
+    for number, segment in enumerate(ours, 1):
+        diagonal, distances[0] = distances[0], number
+        for place, other in enumerate(theirs, 1):
+            cost = min(distances[place] + 1, distances[place - 1] + 1, diagonal + (segment != other))
+            diagonal, distances[place] = distances[place], cost
+    return 1 - float(distances[-1]) / max(len(ours), len(theirs))

@@ -1,0 +1,172 @@
+"""Segmentation without a hierarchy of options, to compare with: clusters, hidden Markov models, change points, rules.
+
+>>> names = baselines.segment("hmm", train, valid, count=2, seed=0)  # [T] for each demonstration of ``valid``
+>>> len(names) == len(valid), len(names[0]) == len(valid[0])
+(True, True)
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from sklearn.cluster import KMeans
+from sklearn.mixture import GaussianMixture
+
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.fitting.clusters import block_means, distinct, joined
+from ddco_pyro.model.encoding import ObservationEncoder
+from ddco_pyro.spec import ObservationSpec
+
+PIECES = 2
+"""Pieces into which change points divide a demonstration, for each of the segments asked for."""
+
+RESTARTS = 3
+"""Of hidden Markov models and mixtures; the likeliest is kept."""
+
+SPREAD = 1e-3
+"""Least variance, in standardised units, of mixtures and hidden Markov models."""
+
+
+def segment(
+    name: str,
+    train: Demonstrations,
+    valid: Demonstrations,
+    count: int,
+    seed: int,
+    observations: Sequence[ObservationSpec] | None = None,
+    gripper: int = -1,
+) -> list[np.ndarray]:
+    """What a baseline, fitted to ``train``, says of every step of ``valid``: which of ``count`` kinds it is, [T] each.
+
+    Clusters, mixtures, hidden Markov models and change points see observations and controls, standardised by ``train``,
+    with as much weight on either; pictures by their block means.
+
+    :param name: one of :data:`BASELINES`.
+    :param observations: what they see; all that ``train`` has if None.
+    :param gripper: the control dimension whose changes divide, for ``gripper``; counted from the end if negative.
+    :raises BadInput: there is no such baseline or control dimension, or it needs a package that is not installed.
+    """
+    if name not in BASELINES:
+        raise BadInput(f"there is no baseline {name!r}{nearest(name, BASELINES)}; there is: {', '.join(BASELINES)}")
+    if name == "equal":
+        return [np.arange(len(demo)) * count // len(demo) for demo in valid]
+    if name == "gripper":
+        return _gripper(train, valid, gripper)
+    rows = _rows_of(train, observations)
+    return METHODS[name]([rows(demo) for demo in train], [rows(demo) for demo in valid], count, seed)
+
+
+def _rows_of(
+    train: Demonstrations, observations: Sequence[ObservationSpec] | None
+) -> Callable[[Demonstration], np.ndarray]:
+    """How a demonstration is seen: a row of features for each step, standardised by the training demonstrations."""
+    shapes = train.observation_shapes
+    encoder = ObservationEncoder(observations or [ObservationSpec(key=key) for key in shapes], shapes)
+    encoder.fit(train)
+    mean, std = encoder.mean.numpy(), encoder.std.numpy()
+    controls = np.concatenate([demo.actions for demo in train])
+    middle, spread = controls.mean(0), controls.std(0)
+    varying = spread > 1e-9 * np.maximum(np.abs(controls).max(0), 1e-9)
+
+    def rows(demo: Demonstration) -> np.ndarray:
+        vector = (encoder.features(demo.observations) - mean) / std
+        images = [block_means(torch.as_tensor(demo.observations[key])).double().numpy() for key in encoder.images]
+        seen = np.concatenate([vector, *images], axis=1)
+        scaled = (demo.actions - middle)[:, varying] / spread[varying]
+        return joined(seen, scaled) if varying.any() else seen
+
+    return rows
+
+
+Rows = list[np.ndarray]
+
+
+def _kmeans(train: Rows, valid: Rows, count: int, seed: int) -> Rows:
+    rows = np.concatenate(train)
+    fitted = KMeans(distinct(rows, count), n_init=10, random_state=seed).fit(rows)
+    return [fitted.predict(own) for own in valid]
+
+
+def _mixture(train: Rows, valid: Rows, count: int, seed: int) -> Rows:
+    rows = np.concatenate(train)
+    count = distinct(rows, count)
+    fitted = GaussianMixture(count, reg_covar=SPREAD, n_init=RESTARTS, max_iter=300, random_state=seed).fit(rows)
+    return [fitted.predict(own) for own in valid]
+
+
+def _hidden_markov(train: Rows, valid: Rows, count: int, seed: int) -> Rows:
+    """Gaussian emissions with diagonal covariances; the most likely path."""
+    try:
+        from hmmlearn.hmm import GaussianHMM
+    except ImportError:
+        raise _missing("hmm", "hmmlearn") from None
+    logging.getLogger("hmmlearn").setLevel(logging.ERROR)  # restarts that do not converge do not matter
+    rows, lengths = np.concatenate(train), [len(own) for own in train]
+    count = distinct(rows, count)
+    # A count of 0.1 more of everything: no state is impossible to begin with or to leave for.
+    fitted = [
+        GaussianHMM(count, "diag", SPREAD, 1.1, 1.1, n_iter=100, random_state=seed + 7919 * restart).fit(rows, lengths)
+        for restart in range(RESTARTS)
+    ]
+    best = max(fitted, key=lambda model: model.monitor_.history[-1])
+    return [best.predict(own) for own in valid]
+
+
+def _change_points(train: Rows, valid: Rows, count: int, seed: int) -> Rows:
+    """Pieces within which the features vary the least (exact, by dynamic programming), clustered by their means."""
+    try:
+        import ruptures
+    except ImportError:
+        raise _missing("change_points", "ruptures") from None
+
+    def divided(rows: np.ndarray) -> list[np.ndarray]:
+        changes = min(PIECES * count, len(rows)) - 1
+        if changes < 1:
+            return [rows]
+        ends = ruptures.KernelCPD(kernel="linear", min_size=1).fit(rows).predict(n_bkps=changes)
+        return np.split(rows, ends[:-1])
+
+    pieces = [piece for rows in train for piece in divided(rows)]
+    means = np.array([piece.mean(0) for piece in pieces])
+    clusters = KMeans(distinct(means, count), n_init=10, random_state=seed)
+    clusters.fit(means, sample_weight=[len(piece) for piece in pieces])
+    return [
+        np.concatenate([np.full(len(piece), clusters.predict(piece.mean(0)[None])[0]) for piece in divided(rows)])
+        for rows in valid
+    ]
+
+
+def _gripper(train: Demonstrations, valid: Demonstrations, dimension: int) -> Rows:
+    """Pieces between the steps at which a control crosses the middle of its range, numbered in their order."""
+    if not -train.control_size <= dimension < train.control_size:
+        raise BadInput(f"there is no control dimension {dimension}; there are {train.control_size}, counted from 0")
+    values = np.concatenate([demo.actions[:, dimension] for demo in train])
+    middle = (values.min() + values.max()) / 2
+    sides = [demo.actions[:, dimension] > middle for demo in valid]
+    return [np.cumsum(np.diff(side, prepend=side[:1])) for side in sides]
+
+
+def _missing(name: str, package: str) -> BadInput:
+    return BadInput(f"the baseline {name} needs {package}; install it with: pip install 'ddco-pyro[segments]'")
+
+
+METHODS: dict[str, Callable[[Rows, Rows, int, int], Rows]] = {
+    "kmeans": _kmeans,
+    "gmm": _mixture,
+    "hmm": _hidden_markov,
+    "change_points": _change_points,
+}
+
+BASELINES = {
+    "kmeans": "k-means",
+    "gmm": "Gaussian mixture",
+    "hmm": "Gaussian HMM",
+    "change_points": "change points, clustered",
+    "equal": "equal lengths",
+    "gripper": "gripper changes",
+}
+"""What each is called in tables."""

@@ -1,0 +1,222 @@
+"""Measures of segments, against scikit-learn, counts of sets of steps, every matching in turn, and cases by hand."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from itertools import groupby, permutations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import maximum_bipartite_matching
+from sklearn.metrics import adjusted_rand_score, jaccard_score, normalized_mutual_info_score
+
+from ddco_pyro.fitting.agreement import MATCHED, UNKNOWN, UNMATCHED, agreement, confusion
+
+WAYS = ("matched_globally", "matched_per_demonstration")
+
+
+def array(text):
+    """``0011`` as integers; ``.`` is not known."""
+    return np.array([UNKNOWN if one == "." else int(one) for one in text])
+
+
+def measured(ours, truth):
+    return agreement([array(one) for one in ours.split()], [array(one) for one in truth.split()])
+
+
+def noisy(seed, options=4):
+    """Three demonstrations of long segments, and options that mostly follow them."""
+    random = np.random.default_rng(seed)
+    labels = [np.repeat(random.integers(0, 3, 8), random.integers(1, 9, 8)) for _ in range(3)]
+    wrong = [np.repeat(random.integers(0, options, len(one)), 3)[: len(one)] for one in labels]
+    keep = [np.repeat(random.random(len(one)) < 0.7, 3)[: len(one)] for one in labels]
+    return [np.where(k, one, w) for k, one, w in zip(keep, labels, wrong, strict=True)], labels
+
+
+# --- NMI, ARI, accuracy and IoU ---------------------------------------------------------------------------------------
+
+
+def nmi(ours, theirs):
+    """2 I(X; Y) / (H(X) + H(Y)) from counts."""
+    n, joint, x, y = len(ours), Counter(zip(ours, theirs, strict=True)), Counter(ours), Counter(theirs)
+    information = sum(c / n * math.log(c * n / (x[a] * y[b])) for (a, b), c in joint.items())
+    entropy = [-sum(c / n * math.log(c / n) for c in counts.values()) for counts in (x, y)]
+    return 2 * information / sum(entropy)
+
+
+@pytest.mark.parametrize("options", [2, 3, 5])
+def test_measures_of_steps_are_those_of_scikit_learn_under_the_best_of_all_matchings(options):
+    segments, labels = noisy(options, options)
+    x, y = np.concatenate(segments), np.concatenate(labels)
+    found = agreement(segments, labels)
+    assert found["nmi"] == pytest.approx(nmi(x.tolist(), y.tolist()))
+    assert found["nmi"] == pytest.approx(normalized_mutual_info_score(y, x))
+    assert found["ari"] == pytest.approx(adjusted_rand_score(y, x))
+    used = max(3, options)
+    names = [0, 1, 2, *range(10, 10 + options)]  # 10 and above: matched with nothing
+    mapped = max((np.array(way)[x] for way in permutations(names, used)), key=lambda one: (one == y).mean())
+    assert found["matched_globally"]["accuracy"] == pytest.approx((mapped == y).mean())
+    jaccard = jaccard_score(y, mapped, labels=np.unique(y), average="macro")
+    assert found["matched_globally"]["iou"] == pytest.approx(jaccard)
+    right = sum(
+        max((np.array(way)[h] == label).sum() for way in permutations(names, used))
+        for h, label in zip(segments, labels, strict=True)
+    )
+    assert found["matched_per_demonstration"]["accuracy"] == pytest.approx(right / len(y))
+
+
+def test_the_matching_is_one_for_all_demonstrations_or_one_for_each():
+    """Option 5 is label 0 in the first, 1 in the second. For both it is best as 1, with 7 as 0: 3 + 3 of 10 steps."""
+    found = measured("5555 777555", "0000 000111")
+    whole, each = (found[way] for way in WAYS)
+    assert whole["accuracy"] == pytest.approx(0.6)
+    assert each == dict.fromkeys(MATCHED, 1.0)
+
+
+# --- segments, by hand ------------------------------------------------------------------------------------------------
+
+
+def test_overlap_f1_by_hand():
+    """Label 0 for 10 steps, then 1 for 10. Segments of 6, 2, 2 and 10 steps: of label 0, a third option, 0 and 1.
+
+    With label 0 they overlap by 6, -, 2 of 10 steps; the second of them comes too late at every threshold: the true
+    segment is taken, or, where the first fell short, it does too. So 2 of 4 segments are right, of 2.
+    """
+    found = measured("00000022001111111111", "00000000001111111111")["matched_globally"]
+    assert [found[f"f1_{percent}"] for percent in (10, 25, 50)] == pytest.approx([2 * 2 / (4 + 2)] * 3)
+    found = measured("00002222221111111111", "00000000001111111111")["matched_globally"]
+    assert found["accuracy"] == pytest.approx(16 / 20)  # option 2 is label 0: it has 6 of its steps
+    assert [found[f"f1_{percent}"] for percent in (10, 25, 50)] == pytest.approx([2 * 2 / (3 + 2)] * 3)
+    found = measured("00222233331111111111", "00000000001111111111")["matched_globally"]
+    assert [found[f"f1_{percent}"] for percent in (10, 25, 50)] == pytest.approx([4 / 6, 4 / 6, 2 / 6])  # 4 of 10
+
+
+def literal_f1(segments, labels, overlap):
+    """Segmental F1 from sets of steps, under the matching that is given with them."""
+    right, wrong, missed = 0, 0, 0
+    for ours, theirs in zip(segments, labels, strict=True):
+        a, b = (
+            [(key, {step for step, _ in run}) for key, run in groupby(enumerate(one), key=lambda pair: pair[1])]
+            for one in (ours, theirs)
+        )
+        free = set(range(len(b)))
+        for label, steps in a:
+            ratios = [len(steps & other) / len(steps | other) * (label == name) for name, other in b]
+            best = max(range(len(b)), key=ratios.__getitem__)
+            if ratios[best] >= overlap and best in free:
+                free.remove(best)
+                right += 1
+            else:
+                wrong += 1
+        missed += len(free)
+    return 2 * right / (2 * right + wrong + missed)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_overlap_f1_and_boundaries_from_sets_of_steps(seed):
+    segments, labels = noisy(seed)
+    table = confusion(segments, labels)
+    names = {
+        option: 100 + option if label is None else label
+        for option, label in zip(table["options"], table["matched"], strict=True)
+    }
+    mapped = [[names[option] for option in one] for one in segments]
+    found = agreement(segments, labels)
+    for percent in (10, 25, 50):
+        expected = literal_f1(mapped, [one.tolist() for one in labels], percent / 100)
+        assert found["matched_globally"][f"f1_{percent}"] == pytest.approx(expected)
+    for tolerance in (1, 3, 5):
+        pairs, total = 0, 0
+        for ours, theirs in zip(segments, labels, strict=True):
+            a, b = ([t for t in range(1, len(one)) if one[t] != one[t - 1]] for one in (ours, theirs))
+            near = csr_array([[abs(i - j) <= tolerance for j in b] for i in a])
+            pairs += (maximum_bipartite_matching(near) >= 0).sum()
+            total += len(a) + len(b)
+        assert found[f"boundary_f1_{tolerance}"] == pytest.approx(2 * pairs / total)
+
+
+def test_boundaries_by_hand():
+    """True ones at 4 and 8; ours at 5, 7 and 11."""
+    found = measured("000001122223", "000011112222")
+    assert [found[f"boundary_f1_{steps}"] for steps in (1, 3, 5)] == pytest.approx([4 / 5] * 3)
+    found = measured("000000001111", "000011111111")  # four steps late
+    assert [found[f"boundary_f1_{steps}"] for steps in (1, 3, 5)] == [0, 0, 1]
+    assert measured("0000", "1111")["boundary_f1_1"] == 1  # there are none, and none are said to be
+    assert measured("0011", "1111")["boundary_f1_1"] == 0
+
+
+def test_edit_score_by_hand():
+    """Segments A B A C for A B C: one deletion of 4. B C for A B C: one insertion of 3; A B C once more: none."""
+    assert measured("0001112000222222", "0001111111222222")["matched_globally"]["edit"] < 1
+    found = measured("000111022222 11111222222 001122", "000111112222 00011112222 001122")
+    assert found["matched_globally"]["edit"] == pytest.approx(np.mean([3 / 4, 2 / 3, 1]))
+
+
+# --- what is not known, and what is left over -------------------------------------------------------------------------
+
+
+def test_steps_of_unknown_label_are_left_out():
+    known = measured("0011 01", "0011 00")
+    assert measured("007611 01 555", "00..11 00 ...") == known
+    assert agreement([array("012")], [array("...")]) is None
+    assert confusion([array("012")], [array("...")])["steps"] == []
+
+
+def test_options_that_are_left_over_agree_with_nothing():
+    found = measured("0123", "0000")["matched_globally"]
+    assert found["accuracy"] == found["iou"] == pytest.approx(1 / 4)
+    assert found["edit"] == pytest.approx(1 / 4)
+    found = measured("000000", "001122")["matched_globally"]
+    assert (found["accuracy"], found["iou"]) == (pytest.approx(1 / 3), pytest.approx(1 / 9))
+
+
+def test_the_table_says_where_each_label_went():
+    assert confusion([array("99922"), array("2220")], [array("11144"), array("4441")]) == {
+        "labels": [1, 4],
+        "options": [0, 2, 9],
+        "steps": [[1, 0, 3], [0, 5, 0]],
+        "matched": [None, 4, 1],
+    }
+
+
+# --- properties -------------------------------------------------------------------------------------------------------
+
+demonstrations = st.lists(
+    st.lists(st.tuples(st.integers(0, 3), st.integers(-1, 2)), min_size=1, max_size=12), min_size=1, max_size=4
+)
+
+
+def sides(pairs):
+    return [[np.array([pair[side] for pair in demo]) for demo in pairs] for side in (0, 1)]
+
+
+@given(demonstrations, st.permutations(range(4)), st.permutations(range(3)))
+def test_names_do_not_matter(pairs, options, labels):
+    segments, truth = sides(pairs)
+    options, labels = np.array(options) * 3 - 4, np.array([*labels, UNKNOWN - 5]) + 5  # -1, not known, stays what it is
+    renamed = agreement([options[h] for h in segments], [np.where(one < 0, one, labels[one]) for one in truth])
+    found = agreement(segments, truth)
+    if found is None:
+        assert renamed is None
+        return
+    for way in WAYS:
+        assert renamed.pop(way) == pytest.approx(found.pop(way))
+    assert renamed == pytest.approx(found)
+
+
+@given(demonstrations)
+def test_every_measure_is_at_most_1_which_is_perfect_and_a_matching_for_each_is_no_worse(pairs):
+    segments, truth = sides(pairs)
+    found = agreement(segments, truth)
+    if found is not None:
+        scores = [found[name] for name in UNMATCHED] + [found[way][name] for way in WAYS for name in MATCHED]
+        assert max(scores) <= 1 + 1e-12
+        assert min(scores) >= -1
+        assert found[WAYS[1]]["accuracy"] >= found[WAYS[0]]["accuracy"]
+        perfect = agreement(truth, truth)
+        assert [perfect[name] for name in UNMATCHED] == pytest.approx([1] * len(UNMATCHED))
+        assert [perfect[way] for way in WAYS] == [dict.fromkeys(MATCHED, 1.0)] * 2
