@@ -88,7 +88,7 @@ Image(mine.folder / "figures" / "segments.png")
 # %%
 agreement = mine.metrics["agreement"]
 print("normalised mutual information with the expert's phases:",
-      *(f"{name} {values[0]:.2f}" for name, values in agreement.items() if name != "labels"))  # fmt: skip
+      *(f"{part} {agreement[part][0]['nmi']:.2f}" for part in ("train", "valid")))  # fmt: skip
 
 # %% [markdown]
 # As a policy that acts, one observation at a time:

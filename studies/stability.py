@@ -24,11 +24,12 @@ from joblib import Parallel, delayed
 from matplotlib.axes import Axes
 from provenance import Record, record, sentence, text
 from scipy import stats
+from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing.pictures import FAINT, INK, blank, keep, style
-from ddco_pyro.fitting.analysis import agreement, divergences, option_use
+from ddco_pyro.fitting.analysis import divergences, option_use
 from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.fitting.diagnostics import DOMINATING_SHARE, HIGH_FITTING_SHARE, SMALLEST_DIVERGENCE
 from ddco_pyro.fitting.fit import Fit
@@ -123,7 +124,7 @@ def summarize(found: list[dict[str, Any]]) -> dict[str, Any]:
     for setting in (name_of(*one) for one in SETTINGS):
         own = sorted((one for one in found if one["setting"] == setting), key=lambda one: one["seed"])
         values = {key: [one[key] for one in own] for key in REPORTED}
-        pairs = [agreement(a["segments"], b["segments"]) for a, b in combinations(own, 2)]
+        pairs = [_nmi(a["segments"], b["segments"]) for a, b in combinations(own, 2)]
         summary[setting] = {
             "seeds": [one["seed"] for one in own],
             "values": values,
@@ -139,6 +140,10 @@ def summarize(found: list[dict[str, Any]]) -> dict[str, Any]:
     for one in summary.values():
         one["against_first"] = {key: _against(one, first, key) for key in ("valid", "train")}
     return summary
+
+
+def _nmi(ours: list[list[int]], theirs: list[list[int]]) -> float:
+    return float(normalized_mutual_info_score(np.concatenate(ours), np.concatenate(theirs)))
 
 
 def _against(one: dict[str, Any], first: dict[str, Any], key: str) -> dict[str, float | None]:

@@ -177,7 +177,7 @@ def test_a_baseline_has_no_options(labelled):
 
 def test_numbers_are_those_of_the_metrics(labelled):
     found, page, _ = labelled
-    metrics, shown = found.metrics, text(page)
+    metrics, shown = found.metrics, " ".join(text(page).split())
     for one in (metrics["log_likelihood_per_step"], metrics["comparison"]["flat"]["log_likelihood_per_step"]):
         assert f" {words.number(one['valid'])} " in shown
         assert f" {words.number(one['train'])} " in shown
@@ -270,7 +270,7 @@ def test_runs_of_before_have_no_list_and_of_agreement_the_mutual_information(lab
     write_metrics(folder, before)
     page = write_report(load(folder), demos).read_text()
     assert ids(page) == ["likelihood", "dimensions", "learning", "options", "agreement", "warnings", "particulars"]
-    shown = text(page)
+    shown = " ".join(text(page).split())
     assert "held out 0.46 – –" in shown
     assert "training 0.12 – –" in shown
     assert "Where each label" not in shown

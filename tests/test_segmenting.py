@@ -22,9 +22,12 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.fitting.prepare import demonstrations, parts
+from ddco_pyro.fitting.agreement import agreement
+from ddco_pyro.fitting.prepare import demonstrations
+from ddco_pyro.fitting.prepare import parts as split_in_parts
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
+from ddco_pyro.segmenting.baselines import BASELINES, segment
 from ddco_pyro.segmenting.lerobot import annotate
 from ddco_pyro.segmenting.lerobot_forms import FORMS
 from ddco_pyro.spec import parse_spec
@@ -86,7 +89,8 @@ def test_a_page_or_a_table_leaves_the_file_alone(toy_run, file, tmp_path, option
 
 NOTHING = (
     "ddco-pyro: name what to write: --html PAGE, --csv FILE or --parquet FILE; labels for each step go to --out FILE "
-    "(a copy) or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset\n"
+    "(a copy) or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset; --baselines "
+    "measures agreement with labels\n"
 )
 
 
@@ -189,7 +193,7 @@ def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy
     page = tmp_path / "segments.html"
     assert call("segment", toy_run.folder, file, "--html", page).status == 0
     text = page.read_text()
-    split = parts(toy_spec, demonstrations(toy_spec))
+    split = split_in_parts(toy_spec, demonstrations(toy_spec))
     assert marked(text) == set(split["valid"].names)
     scores = {}
     for name, part in split.items():
@@ -200,6 +204,29 @@ def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy
     assert f"<td>options, 3 held out</td><td>{scores['valid']:.2f}</td>" in text
     assert f"<td>options, 9 others</td><td>{scores['train']:.2f}</td>" in text
     assert "3 of 12 demonstrations were held out when it was fitted" in text
+
+
+def test_baselines_stand_beside_the_options_on_what_was_held_out(toy_run, file, tmp_path):
+    parts, page = split_in_parts(toy_run.spec, demonstrations(toy_run.spec)), tmp_path / "segments.html"
+    ended = call("segment", toy_run.folder, file, "--baselines", "--gripper", 0, "--html", page)
+    assert ended.status == 0, ended.err
+    shown = " ".join(ended.out.split())
+    assert "level option: agreement with the label phase" in shown
+    truth = [demo.labels["phase"] for demo in parts["valid"]]
+    for name, words in BASELINES.items():
+        found = agreement(segment(name, parts["train"], parts["valid"], 2, 0, toy_run.spec.observations, 0), truth)
+        assert f"<td>{words}, 3 held out</td><td>{found['nmi']:.2f}</td>" in page.read_text()
+        assert f"{words}, 3 held out" in shown
+
+
+def test_baselines_need_labels(toy_run, file, tmp_path):
+    with h5py.File(file, "r+") as opened:
+        for group in opened["data"].values():
+            del group["labels/phase"]
+    message = "--baselines: the demonstrations have no labels/phase, with which baselines are compared\n"
+    ended = call("segment", toy_run.folder, file, "--baselines")
+    assert (ended.status, ended.out) == (2, "")
+    assert ended.err.endswith(f"\nddco-pyro: {message}")
 
 
 def test_other_demonstrations_of_the_same_names_are_not_marked(toy_run, toy_spec, file, tmp_path):

@@ -44,7 +44,7 @@ class Clusters:
 
 
 def joined(seen: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Observations [steps, F] and controls [steps, A], both standardised, as [steps, F + A] with equal weight on either."""
+    """Observations [steps, F] and controls [steps, A], standardised, as [steps, F + A] with equal weight on either."""
     return np.concatenate([seen, np.sqrt(seen.shape[1] / actions.shape[1]) * actions], axis=1)
 
 
