@@ -60,7 +60,7 @@ def table(rows: list[dict[str, Any]], made_by: str) -> str:
         "Held-out nats per step are densities for `gaussian`; for `auto`, masses on the bounds and densities within. "
         "Between kinds they are not to be compared.",
         "",
-        "| kind | decided | options | σ | NMI with the phases, held out: mean ± sd (range) | accuracy | held-out nats/step |",
+        "| kind | decided | options | σ | NMI with the phases, held out: mean ± sd (range) | accuracy | nats/step |",
         "|---|---|---|---|---|---|---|",
     ]
     for kind, network, own in VARIANTS:

@@ -54,7 +54,7 @@ def table(rows: list[dict[str, Any]], made_by: str) -> str:
     lines = [
         made_by,
         "",
-        "Mean ± sd (range) over seeds; agreement with the phases held out, options matched once for all demonstrations.",
+        "Mean ± sd (range) over seeds; agreement with the phases held out, options matched globally.",
         "",
         f"| initialise | {' | '.join(MEASURES)} |",
         "|---|" + "---|" * len(MEASURES),
