@@ -70,7 +70,10 @@ def test_a_spec_says_them_again_as_it_was_given_them():
 @pytest.mark.parametrize(
     ("labels", "problem"),
     [
-        (["phase"], r"demonstrations.labels: must be one name, or a name for each of 2 levels, got \['phase'\]"),
+        (
+            ["phase"],
+            r"demonstrations.labels: must have a name for each of 2 levels, or be one name for all, got \['phase'\]",
+        ),
         ([], r"demonstrations.labels: must have at least 1 item"),
         (3, "demonstrations.labels: must be a name, or a list with a name for each level, got 3"),
     ],
