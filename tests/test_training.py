@@ -11,7 +11,8 @@ from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plan
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.fitting.convergence import RISING, StageEnd
-from ddco_pyro.fitting.training import TrainingError, plan
+from ddco_pyro.fitting.objective import TrainingError
+from ddco_pyro.fitting.stages import plan
 from ddco_pyro.spec import parse_spec
 
 

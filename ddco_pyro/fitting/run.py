@@ -23,9 +23,10 @@ from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, ignore
 from ddco_pyro.fitting.building import Dimensions, baseline_spec, check_networks, named_baselines, parameters
 from ddco_pyro.fitting.fit import Fit, RunError, is_finished, load, model_name
 from ddco_pyro.fitting.metrics import evaluate, supervisor
+from ddco_pyro.fitting.objective import TrainingError
 from ddco_pyro.fitting.prepare import demonstrations as read_demonstrations
 from ddco_pyro.fitting.prepare import digest, dimensions, known_demonstrations, parts, seen
-from ddco_pyro.fitting.training import Trainer, TrainingError
+from ddco_pyro.fitting.training import Trainer
 from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.model.encoding import refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy

@@ -22,62 +22,18 @@ from torch import Tensor, nn
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.tensors import read_tensors, write_tensors
-from ddco_pyro.errors import Failed
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy
-from ddco_pyro.fitting.clusters import Clusters
 from ddco_pyro.fitting.convergence import StageEnd, share, summary
-from ddco_pyro.inference import log_likelihood, total_log_likelihood
-from ddco_pyro.model.encoding import Batch, encode
+from ddco_pyro.fitting.objective import Objective
+from ddco_pyro.fitting.stages import WHOLE, Stage, plan
+from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import OptimizerSpec, Spec
 
 SAVE_EVERY = 1.0  # s between checkpoints, at least: an epoch of a small model takes less time than its checkpoint
 
 State = dict[str, Tensor]
-
-
-class TrainingError(Failed):
-    """Training cannot go on: the message names the trajectory or the checkpoint and says what to do."""
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One stage of training.
-
-    :param discovering: train levels 1 to d under a uniform meta-policy; None for the whole hierarchy.
-    :param clamped: the level whose choices are clamped to clusters of the observations; None for no level.
-    :param trained: prefixes of the names of the parameters that are trained.
-    """
-
-    name: str
-    discovering: int | None
-    clamped: int | None
-    trained: tuple[str, ...]
-
-
-WHOLE = Stage("whole", None, None, ())
-"""The whole hierarchy, as it is."""
-
-
-def plan(spec: Spec, depth: int) -> list[Stage]:
-    """The stages of training for D levels: from the lowest level up, the meta-policy last."""
-    training = spec.training
-    everything = ("levels.", "meta_policy.")
-    if depth == 0:
-        return [Stage("policy", None, None, everything)]
-    stages: list[Stage] = []
-    for level in range(1, depth + 1):
-        own = (f"levels.{level - 1}.",)
-        if training.initialize != "random":
-            stages.append(Stage(f"vq-{level}", level, level, own))
-        if training.layerwise:
-            stages.append(Stage(f"level-{level}", level, None, own))
-    if training.layerwise:
-        stages.append(Stage("meta-policy", None, None, ("meta_policy.",)))
-    if not training.layerwise or training.lower_levels == "fine_tuned":
-        stages.append(Stage("joint", None, None, everything))
-    return stages
 
 
 @dataclass
@@ -169,7 +125,7 @@ class Trainer:
     def _run_stage(self, model: Hierarchy, stage: Stage, stages_left: int) -> None:
         now, training = self.progress, self.spec.training
         cap = share(training.epochs, sum(end["epochs"] for end in now.ended), stages_left)
-        objective = _Objective(self, stage)
+        objective = Objective(self, stage)
         parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
         optimizer = _optimizer(training.optimizer, parameters)
         if now.epoch > 0:
@@ -192,7 +148,7 @@ class Trainer:
         now.epoch = 0
 
     def _epoch(
-        self, model: Hierarchy, optimizer: torch.optim.Optimizer, parameters: list[nn.Parameter], objective: _Objective
+        self, model: Hierarchy, optimizer: torch.optim.Optimizer, parameters: list[nn.Parameter], objective: Objective
     ) -> float:
         """One pass over the training demonstrations; the log-likelihood per step seen on the way."""
         now, total = self.progress, 0.0
@@ -222,7 +178,7 @@ class Trainer:
 
     def _finish_restart(self, model: Hierarchy) -> None:
         now = self.progress
-        value = _Objective(self, WHOLE).tune(model)
+        value = Objective(self, WHOLE).tune(model)
         if "winner" not in self._saved or value > now.winner:
             now.winner, now.winner_ended = value, now.ended
             self._saved["winner"] = _copy(model)
@@ -248,61 +204,6 @@ class Trainer:
         for name, value in tensors.items():
             part, _, rest = name.partition("/")
             self._saved.setdefault(part, {})[rest] = value
-
-
-class _Objective:
-    """What a stage maximises: the log-likelihood, with the choices of one level clamped where the stage says so."""
-
-    def __init__(self, trainer: Trainer, stage: Stage) -> None:
-        self.trainer, self.stage = trainer, stage
-        self.clusters: tuple[Tensor, Tensor] | None = None
-        if stage.clamped is not None:
-            hierarchy = trainer.spec.hierarchy
-            assert hierarchy is not None  # only levels are clamped
-            seed = trainer._seed(trainer.progress.restart, trainer.progress.stage)
-            options = hierarchy.levels[stage.clamped - 1].count
-            clusters = Clusters(trainer.train, options, seed, trainer.spec.training.initialize == "vq_controls")
-            self.clusters = clusters.choices(trainer.train), clusters.choices(trainer.tune)
-
-    def ascend(self, model: Hierarchy, rows: Tensor) -> float:
-        """Add the gradient of the loss of some training demonstrations to the parameters'; their log-likelihood.
-
-        The loss is minus the log-likelihood per step. A batch that is long is processed in parts.
-        """
-        batch, total = self.trainer.train.select(rows), 0.0
-        for part, piece in batch.pieces(model.steps_at_once):
-            value = self._total(model, piece, None if self.clusters is None else self.clusters[0][rows[part]])
-            if not bool(torch.isfinite(value.detach())):
-                raise self._not_finite(model, piece, rows[part])
-            (-value / batch.steps).backward()
-            total += float(value.detach())
-        return total
-
-    def tune(self, model: Hierarchy) -> float:
-        """Log-likelihood per step of the tuning demonstrations."""
-        choices = None if self.clusters is None else self.clusters[1]
-        with torch.no_grad():
-            values = [
-                float(self._total(model, piece, None if choices is None else choices[part]))
-                for part, piece in self.trainer.tune.pieces(model.steps_at_once)
-            ]
-        return sum(values) / self.trainer.tune.steps
-
-    def _total(self, model: Hierarchy, batch: Batch, choices: Tensor | None) -> Tensor:
-        tables = model.tabulate(batch, self.stage.discovering)
-        if choices is not None and self.stage.clamped is not None:
-            tables = tables.clamp(self.stage.clamped, choices[:, : batch.inputs.batch[1]])
-        return total_log_likelihood(tables, batch.lengths, self.trainer.spec.inference.engine)
-
-    def _not_finite(self, model: Hierarchy, batch: Batch, rows: Tensor) -> TrainingError:
-        with torch.no_grad():
-            values = log_likelihood(model.tabulate(batch, self.stage.discovering), batch.lengths)
-        bad = [self.trainer.names[int(row)] for row, ok in zip(rows, torch.isfinite(values), strict=True) if not ok]
-        where = ", ".join(bad) or "this minibatch (no trajectory alone)"
-        return TrainingError(
-            f"stage {self.stage.name}, epoch {self.trainer.progress.epoch + 1}: the log-likelihood of {where} is not "
-            "finite; look at these demonstrations, raise control.std, or lower training.optimizer.lr"
-        )
 
 
 def learning_rate(spec: OptimizerSpec, epoch: int, cap: int | None) -> float:
