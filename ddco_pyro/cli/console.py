@@ -23,6 +23,7 @@ from ddco_pyro.events import (
     EpochEnded,
     Event,
     FoldScored,
+    RestartStopped,
     SelectionBegan,
     TrainingBegan,
     TrainingEnded,
@@ -121,6 +122,8 @@ class Progress(_Bar):
             case EpochEnded():
                 note = f"{event.stage}: training {event.train:.3f}, tuning {event.tune:.3f} nats/step"
                 self.advance(self._done + 1, note)
+            case RestartStopped(restart, epochs):
+                self._say(f"restart {restart} stopped after {epochs} epochs of its last stage: others are better")
             case TrainingEnded():
                 self.end()
             case SelectionBegan(total, kept):

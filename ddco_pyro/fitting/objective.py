@@ -15,7 +15,7 @@ from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 
 if TYPE_CHECKING:
-    from ddco_pyro.fitting.training import Trainer
+    from ddco_pyro.fitting.training import Training
 
 
 class TrainingError(Failed):
@@ -25,7 +25,7 @@ class TrainingError(Failed):
 class Objective:
     """What a stage maximises: the log-likelihood, with the choices of one level clamped where the stage says so."""
 
-    def __init__(self, trainer: Trainer, stage: Stage) -> None:
+    def __init__(self, trainer: Training, stage: Stage) -> None:
         self.trainer, self.stage = trainer, stage
         self.clusters: tuple[Tensor, Tensor] | None = None
         if stage.clamped is not None:
