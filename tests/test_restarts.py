@@ -8,6 +8,7 @@ import torch
 from planted import make_spec, make_trainer
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.drawing import words
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import EpochEnded, RestartStopped
 from ddco_pyro.fitting import restarts as restarting
@@ -211,3 +212,22 @@ def test_what_is_told_of_restarts_adds_up(undisturbed):
     stopped = {event.restart: event.epochs for event in told if isinstance(event, RestartStopped)}
     assert stopped
     assert {n: each["stopped"] for n, each in enumerate(restarts["each"]) if each["stopped"]} == stopped
+
+
+def test_restarts_in_words(undisturbed):
+    training = undisturbed[0].summary
+    training = training | {
+        "restarts": {
+            "best": 1,
+            "spent": {"epochs": 45, "gradient_steps": 90},
+            "each": [{"epochs": 10, "stopped": 8}, {"epochs": 30, "stopped": None}, {"epochs": 5, "stopped": None}],
+        }
+    }
+    assert words.restarts(training) == (
+        "restart 1 was the best of 3 (0 to 2; stopped early, with their epochs of the last stage: 0 after 8), which took "
+        "45 epochs (90 gradient steps) together"
+    )
+    assert words.spent(training).endswith("; " + words.restarts(training))
+    del training["restarts"]
+    assert words.restarts(training) == ""
+    assert not words.spent(training).endswith(";")
