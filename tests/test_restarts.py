@@ -224,8 +224,8 @@ def test_restarts_in_words(undisturbed):
         }
     }
     assert words.restarts(training) == (
-        "restart 1 was the best of 3 (0 to 2; stopped early, with their epochs of the last stage: 0 after 8), which took "
-        "45 epochs (90 gradient steps) together"
+        "restart 1 was the best of 3 (0 to 2; stopped early, with their epochs of the last stage: 0 after 8), "
+        "which took 45 epochs (90 gradient steps) together"
     )
     assert words.spent(training).endswith("; " + words.restarts(training))
     del training["restarts"]

@@ -152,8 +152,8 @@ def restarts(training: Mapping[str, Any]) -> str:
     stopped = [(number, each["stopped"]) for number, each in enumerate(told["each"]) if each["stopped"] is not None]
     early = ", ".join(f"{number} after {epochs}" for number, epochs in stopped) or "none"
     return (
-        f"restart {told['best']} was the best of {len(told['each'])} (0 to {len(told['each']) - 1}; stopped early, with "
-        f"their epochs of the last stage: {early}), which took {told['spent']['epochs']} epochs "
+        f"restart {told['best']} was the best of {len(told['each'])} (0 to {len(told['each']) - 1}; stopped early, "
+        f"with their epochs of the last stage: {early}), which took {told['spent']['epochs']} epochs "
         f"({told['spent']['gradient_steps']} gradient steps) together"
     )
 
