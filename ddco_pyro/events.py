@@ -34,6 +34,14 @@ class EpochEnded:
 
 
 @dataclass(frozen=True)
+class RestartStopped:
+    """A restart has been stopped after so many epochs of its last stage: others are better."""
+
+    restart: int
+    epochs: int
+
+
+@dataclass(frozen=True)
 class TrainingEnded:
     """A model has been trained."""
 
@@ -77,6 +85,7 @@ Event = (
     DemonstrationsDone
     | TrainingBegan
     | EpochEnded
+    | RestartStopped
     | TrainingEnded
     | SelectionBegan
     | FoldScored

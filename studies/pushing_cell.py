@@ -6,6 +6,7 @@ What a cell gives is kept in a small JSON of its own, so that a study can be sto
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -139,11 +140,11 @@ def held_out(folder: Path, spec: Spec, development: bool = False) -> Demonstrati
     return demonstrations(folder, spec.demonstrations.supervisor, HELD_OUT_SEED + 1000 * development, HELD_OUT)
 
 
-def fit(spec: Spec, demos: Demonstrations, checkpoint: Path) -> tuple[Hierarchy, float]:
+def fit(spec: Spec, demos: Demonstrations, checkpoints: Path) -> tuple[Hierarchy, float]:
     """The fitted hierarchy, and the seconds that it took."""
     start = time.perf_counter()
-    hierarchy = train(spec, Dimensions.of(demos), demos, checkpoint=checkpoint).hierarchy
-    checkpoint.unlink(missing_ok=True)
+    hierarchy = train(spec, Dimensions.of(demos), demos, checkpoints=checkpoints).hierarchy
+    shutil.rmtree(checkpoints, ignore_errors=True)
     return hierarchy, time.perf_counter() - start
 
 
@@ -162,7 +163,7 @@ def fitted(cell: Cell, folder: Path, made_by: Record) -> Hierarchy:
         hierarchy = build_hierarchy(spec, Dimensions.of(demos))
         hierarchy.load_state_dict(read_tensors(path)[0])
         return hierarchy.eval()
-    hierarchy, seconds = fit(spec, demos, path.with_suffix(".checkpoint"))
+    hierarchy, seconds = fit(spec, demos, path.with_suffix(".checkpoints"))
     found = Fit(spec, hierarchy)
     likelihood = {"train": per_step(found, demos), "held_out": per_step(found, held_out(folder, spec))}
     numbers = {

@@ -267,7 +267,7 @@ def same(
     )
 
 
-@pytest.mark.parametrize("name", ["model.safetensors", "checkpoints/latest.safetensors"])
+@pytest.mark.parametrize("name", ["model.safetensors", "checkpoints/restart-0.safetensors"])
 def test_a_flipped_bit_is_refused_or_makes_no_difference(toy_run: Fit, tmp_path: Path, name: str) -> None:
     """Of every 37th byte, in the header too."""
     path, content = tmp_path / "file", (toy_run.folder / name).read_bytes()
@@ -299,7 +299,7 @@ def test_a_damaged_model_is_refused(run: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_damaged_checkpoint_is_refused(run: Path) -> None:
-    path = run / "checkpoints" / "latest.safetensors"
+    path = run / "checkpoints" / "restart-0.safetensors"
     content = path.read_bytes()
     path.write_bytes(content[:-3] + bytes([content[-3] ^ 1]) + content[-2:])
     (run / "metrics.json").unlink()

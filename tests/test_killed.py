@@ -87,9 +87,9 @@ def written(paths: Iterable[Path]) -> set[object]:
 def epochs(folder: Path) -> set[object]:
     """The epochs of every model that need not be trained again."""
     found: set[object] = set()
-    for path in folder.rglob("checkpoints/latest.safetensors"):
+    for path in folder.rglob("checkpoints/restart-*.safetensors"):
         history = json.loads(read_tensors(path)[1]["progress"])["history"]
-        found |= {(path.parts[-3], number) for number in range(len(history))}
+        found |= {(path.parts[-3], path.name, number) for number in range(len(history))}
     return found
 
 

@@ -56,7 +56,7 @@ class Interrupting:
 
 # --- contents ---------------------------------------------------------------------------------------------------------
 
-FILES = {"spec.yaml", "model.safetensors", "metrics.json", "history.csv", "checkpoints/latest.safetensors"}
+FILES = {"spec.yaml", "model.safetensors", "metrics.json", "history.csv", "checkpoints/restart-0.safetensors"}
 
 
 def test_the_folder_holds_what_it_promises(toy_run):

@@ -10,8 +10,10 @@ import torch
 from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plant, recovered
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.fitting.checkpoint import Restart
 from ddco_pyro.fitting.convergence import RISING, StageEnd
-from ddco_pyro.fitting.training import TrainingError, plan
+from ddco_pyro.fitting.objective import TrainingError
+from ddco_pyro.fitting.stages import plan
 from ddco_pyro.spec import parse_spec
 
 
@@ -84,7 +86,7 @@ def test_learning_rates_warm_up_and_fall_along_half_a_cosine(tmp_path, monkeypat
 
 def epochs_of(trainer, restart=0):
     """The number of epochs of each stage that made some."""
-    return Counter(row["stage"] for row in trainer.progress.history if row["restart"] == restart)
+    return Counter(row["stage"] for row in trainer.history if row["restart"] == restart)
 
 
 def out_of_patience(tune, patience):
@@ -100,7 +102,7 @@ def test_stages_share_the_budget_and_what_one_leaves_goes_to_the_later_ones(tmp_
     left, taken = 62, epochs_of(trainer)
     for number, stage in enumerate(plan(spec, 2)):
         cap = left // (6 - number)
-        tune = [row["tune"] for row in trainer.progress.history if row["stage"] == stage.name]
+        tune = [row["tune"] for row in trainer.history if row["stage"] == stage.name]
         assert taken[stage.name] == cap or out_of_patience(tune, 3)
         assert taken[stage.name] <= cap
         assert trainer.summary["stages"][number]["cap"] == cap
@@ -132,7 +134,7 @@ def test_the_training_that_is_told_is_that_of_the_best_restart(tmp_path):
     joint = {"initialize": "random", "layerwise": False, "patience": 2, "restarts": 3}
     trainer = make_trainer(make_spec((2,), 4, **joint, **QUICK), random_demonstrations(), tmp_path)
     trainer.run()
-    best = max(trainer.progress.history, key=lambda row: row["tune"])["restart"]
+    best = max(trainer.history, key=lambda row: row["tune"])["restart"]
     counts = [epochs_of(trainer, restart)["joint"] for restart in range(3)]
     assert best != 2  # not simply the last
     assert counts.count(counts[best]) == 1
@@ -143,7 +145,7 @@ def test_without_a_budget_every_stage_trains_until_its_patience(tmp_path):
     trainer = make_trainer(make_spec((2,), epochs=None, patience=2, **QUICK), random_demonstrations(), tmp_path)
     trainer.run()
     for stage in trainer.summary["stages"]:
-        tune = [row["tune"] for row in trainer.progress.history if row["stage"] == stage["stage"]]
+        tune = [row["tune"] for row in trainer.history if row["stage"] == stage["stage"]]
         assert out_of_patience(tune, 2)
         assert (stage["cap"], stage["rising"], stage["converged"]) == (None, 0.0, True)
     assert trainer.summary["budget"] == {"epochs": None, "gradient_steps": None}
@@ -163,8 +165,8 @@ def test_resuming_gives_the_same_bits(tmp_path, optimizer, training, rows):
     demos = random_demonstrations()
     whole = make_trainer(spec, demos, tmp_path / "whole")
     expected = whole.run().state_dict()
-    assert rows in (None, len(whole.progress.history))
-    rows = len(whole.progress.history)
+    assert rows in (None, len(whole.history))
+    rows = len(whole.history)
     for stop in range(1, rows, max(4, rows // 9)):
         folder = tmp_path / f"stop-{stop}"
         seen = []
@@ -178,25 +180,26 @@ def test_resuming_gives_the_same_bits(tmp_path, optimizer, training, rows):
             make_trainer(spec, demos, folder, interrupt).run()
         resumed = make_trainer(spec, demos, folder)
         found = resumed.run().state_dict()
-        assert resumed.progress.history == whole.progress.history
+        assert resumed.history == whole.history
         assert resumed.summary == whole.summary
         assert all(torch.equal(found[name], value) for name, value in expected.items())
 
 
-def test_frozen_levels_stay_as_they_were_discovered(tmp_path):
-    snapshots = {}
+def test_frozen_levels_stay_as_they_were_discovered(tmp_path, monkeypatch):
+    monkeypatch.setattr("ddco_pyro.fitting.training.SAVE_EVERY", 0.0)
+    before = {}
     spec = make_spec((2,), lower_levels="frozen", epochs=15)
-    trainer = make_trainer(spec, random_demonstrations(), tmp_path)
 
     def keep(row):
-        snapshots[row.stage] = {name: t.clone() for name, t in trainer._saved["best"].items()}
+        """What the checkpoint of the epoch before has: at the first of a stage, the best of the stage before."""
+        if row.stage == "meta-policy" and not before:
+            before.update(Restart.read(tmp_path / "restart-0.safetensors").states["best"])
 
-    trainer.on_event = keep
-    final = trainer.run().state_dict()
+    final = make_trainer(spec, random_demonstrations(), tmp_path, keep).run().state_dict()
     lower = [name for name in final if name.startswith("levels.")]
     meta = [name for name in final if name.startswith("meta_policy.network")]
-    assert all(torch.equal(final[name], snapshots["level-1"][name]) for name in lower)
-    assert any(not torch.equal(final[name], snapshots["level-1"][name]) for name in meta)
+    assert all(torch.equal(final[name], before[name]) for name in lower)
+    assert any(not torch.equal(final[name], before[name]) for name in meta)
 
 
 def test_both_engines_train_to_the_same_model(tmp_path):
@@ -212,7 +215,9 @@ def test_both_engines_train_to_the_same_model(tmp_path):
 
 def test_what_is_not_finite_names_the_demonstration(tmp_path):
     trainer = make_trainer(make_spec(), random_demonstrations(), tmp_path)
-    trainer.train.actions[trainer.names.index("demo_0")] *= 1e30  # its square is more than float32 can hold
+    trainer.material.train.actions[trainer.material.names.index("demo_0")] *= (
+        1e30  # its square is more than float32 can hold
+    )
     with pytest.raises(TrainingError, match=r"demo_0 is not finite"):
         trainer.run()
 
@@ -258,7 +263,7 @@ def test_what_is_called_converged_is_at_the_optimum(tmp_path):
     for epochs in (15, 400):
         trainer = make_trainer(flat(epochs=epochs, patience=None, batch_size=8), demos, tmp_path / str(epochs))
         trainer.run()
-        below[trainer.summary["converged"]] = optimum - trainer.progress.winner
+        below[trainer.summary["converged"]] = optimum - trainer.restarts[0].progress.best
     assert below[True] < RISING
     assert below[False] > 10 * RISING
 

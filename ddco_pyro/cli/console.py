@@ -16,6 +16,7 @@ from rich.text import Text
 
 from ddco_pyro.data.control_dimensions import notes
 from ddco_pyro.data.control_parts import described
+from ddco_pyro.drawing import words
 from ddco_pyro.events import (
     CandidateGivenUp,
     DemonstrationsDone,
@@ -23,6 +24,7 @@ from ddco_pyro.events import (
     EpochEnded,
     Event,
     FoldScored,
+    RestartStopped,
     SelectionBegan,
     TrainingBegan,
     TrainingEnded,
@@ -121,6 +123,8 @@ class Progress(_Bar):
             case EpochEnded():
                 note = f"{event.stage}: training {event.train:.3f}, tuning {event.tune:.3f} nats/step"
                 self.advance(self._done + 1, note)
+            case RestartStopped(restart, epochs):
+                self._say(f"restart {restart} stopped after {epochs} epochs of its last stage: others are better")
             case TrainingEnded():
                 self.end()
             case SelectionBegan(total, kept):
@@ -185,6 +189,9 @@ def log_likelihoods(metrics: Mapping[str, Any]) -> None:
         numbers = [_number(values[part]) for part in ("train", "valid")]
         table.add_row(name, *numbers, shown, effort(row.get("training")))
     _show(table)
+    for name, training in words.trainings(metrics).items():
+        if beside := words.restarts(training):
+            Console().print(Text(f"{name}: {beside}"), soft_wrap=True)
 
 
 def _difference(paired: Mapping[str, float]) -> str:

@@ -56,6 +56,7 @@ def fit(
     spec: SpecPath,
     out: Annotated[Path | None, typer.Option(help="The run folder; by default runs/SPEC-TIME.")] = None,
     overrides: Overrides = [],  # noqa: B006
+    jobs: Annotated[int, typer.Option(help="Processes that train restarts; -1 is one for each core.")] = -1,
     resume: Annotated[bool, typer.Option("--resume", help="Where --out holds this run whole, show it again.")] = False,
     allow_code: AllowCode = False,
 ) -> None:
@@ -73,7 +74,7 @@ def fit(
         _continued(f"fit {folder / 'spec.yaml'} --out {folder} --resume{_allowed(loaded)}", folder),
         console.Progress() as progress,
     ):
-        fitted = fit_run(loaded, None, folder, progress, resume)
+        fitted = fit_run(loaded, None, folder, progress, jobs, resume)
     console.log_likelihoods(fitted.metrics)
     _warn(fitted)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
@@ -122,7 +123,7 @@ def select(
         progress.end()
         assert made.choice.chosen is not None  # or it would have failed
         final = selection.final_spec(loaded, made.choice.chosen.candidate)
-        fitted = fit_run(final, seen(final, made.demos), folder / "fit", progress)
+        fitted = fit_run(final, seen(final, made.demos), folder / "fit", progress, jobs)
     console.selection(made.choice, HEAD, [cells(row, made.choice) for row in made.choice.rows])
     _warn(fitted)
     print(f"selection: {folder / 'selection.json'}")

@@ -135,10 +135,27 @@ def trainings(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 
 
 def spent(training: Mapping[str, Any]) -> str:
-    """Epochs and gradient steps, and how many were allowed."""
+    """Epochs and gradient steps, how many were allowed, and what restarts took."""
     took, allowed = training["spent"], training["budget"]
+    beside = restarts(training)
     of = "" if allowed["epochs"] is None else f" of at most {allowed['epochs']} ({allowed['gradient_steps']})"
-    return f"{took['epochs']} epochs ({took['gradient_steps']} gradient steps){of}"
+    return f"{took['epochs']} epochs ({took['gradient_steps']} gradient steps){of}{'; ' * bool(beside)}{beside}"
+
+
+def restarts(training: Mapping[str, Any]) -> str:
+    """Which of several restarts was the best, which were stopped early, and what all of them took; nothing where there
+    was a single restart, or in runs of before.
+    """
+    told = training.get("restarts")
+    if told is None or len(told["each"]) == 1:
+        return ""
+    stopped = [(number, each["stopped"]) for number, each in enumerate(told["each"]) if each["stopped"] is not None]
+    early = ", ".join(f"{number} after {epochs}" for number, epochs in stopped) or "none"
+    return (
+        f"restart {told['best']} was the best of {len(told['each'])} (0 to {len(told['each']) - 1}; stopped early, "
+        f"with their epochs of the last stage: {early}), which took {told['spent']['epochs']} epochs "
+        f"({told['spent']['gradient_steps']} gradient steps) together"
+    )
 
 
 RAISE = "Raise training.epochs: it is the budget of every model that is compared, whatever its number of stages."

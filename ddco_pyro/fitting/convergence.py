@@ -52,10 +52,20 @@ def share(budget: int | None, spent: int, stages_left: int) -> int | None:
     return None if budget is None else (budget - spent) // stages_left
 
 
-def summary(training: TrainingSpec, ends: Sequence[StageEnd], updates: int) -> dict[str, Any]:
-    """What ``metrics.json`` says of the training of a restart.
+def summary(
+    training: TrainingSpec,
+    ends: Sequence[StageEnd],
+    updates: int,
+    best: int,
+    epochs: Sequence[int],
+    stopped: Mapping[int, int],
+) -> dict[str, Any]:
+    """What ``metrics.json`` says of the training of the best restart, and of what all restarts took.
 
     :param updates: gradient steps in an epoch.
+    :param best: the restart that the stages are of.
+    :param epochs: of each restart, in all its stages.
+    :param stopped: restarts that were stopped early, to their epochs of the last stage.
     """
     spent = sum(end.epochs for end in ends)
     return {
@@ -63,6 +73,11 @@ def summary(training: TrainingSpec, ends: Sequence[StageEnd], updates: int) -> d
         "spent": _effort(spent, updates),
         "stages": [asdict(end) | {"converged": end.converged} for end in ends],
         "converged": ends[-1].converged,  # the last stage trains what acts in the end
+        "restarts": {
+            "best": best,
+            "spent": _effort(sum(epochs), updates),
+            "each": [{"epochs": count, "stopped": stopped.get(number)} for number, count in enumerate(epochs)],
+        },
     }
 
 

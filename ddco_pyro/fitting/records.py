@@ -142,6 +142,21 @@ class Stage(Record):
     converged: bool
 
 
+class Restart(Record):
+    """What a restart took, and after how many epochs of its last stage it was stopped early; None where it was not."""
+
+    epochs: int
+    stopped: int | None
+
+
+class Restarts(Record):
+    """Which restart was the best, and what all of them took."""
+
+    best: int
+    spent: Spent
+    each: Annotated[list[Restart], Field(min_length=1)]
+
+
 class Training(Record):
     """What training spent of its budget, and whether it had converged then."""
 
@@ -149,6 +164,7 @@ class Training(Record):
     spent: Spent
     stages: Annotated[list[Stage], Field(min_length=1)]
     converged: bool
+    restarts: Annotated[Restarts | None, NOT_NULL] = None
 
 
 class Compared(Record):

@@ -23,10 +23,13 @@ from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, ignore
 from ddco_pyro.fitting.building import Dimensions, baseline_spec, check_networks, named_baselines, parameters
 from ddco_pyro.fitting.fit import Fit, RunError, is_finished, load, model_name
 from ddco_pyro.fitting.metrics import evaluate, supervisor
+from ddco_pyro.fitting.objective import TrainingError
 from ddco_pyro.fitting.prepare import demonstrations as read_demonstrations
 from ddco_pyro.fitting.prepare import digest, dimensions, known_demonstrations, parts, seen
-from ddco_pyro.fitting.training import Trainer, TrainingError
+from ddco_pyro.fitting.processes import check_jobs
+from ddco_pyro.fitting.restarts import Trainer
 from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_engines
+from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.encoding import refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, dump_spec, load_spec, with_overrides
@@ -39,6 +42,7 @@ def fit(
     demonstrations: Demonstrations | str | Path | None = None,
     out: str | Path | None = None,
     on_event: OnEvent = ignore,
+    jobs: int = 1,
 ) -> Fit:
     """Fit a spec's hierarchy and its baselines to demonstrations, and evaluate them.
 
@@ -60,6 +64,9 @@ def fit(
     :param out: the run folder, as ``ddco-pyro fit`` makes it, with demonstrations from memory kept in it; None to write
         nothing. A folder that holds part of this run is continued; one that holds all of it is left as it is.
     :param on_event: is told how it goes on.
+    :param jobs: processes that train restarts, -1 for one on each core; the result is the same for any number. In a
+        script, more than one needs the usual ``if __name__ == "__main__":``.
+    :raises BackendError: ``jobs`` is not a number of processes.
     :raises SpecError: something in the spec does not fit the demonstrations.
     :raises DemonstrationsError: they cannot be used.
     :raises RunError: the folder holds something else.
@@ -68,9 +75,11 @@ def fit(
     spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else Path(out)
     if isinstance(demonstrations, Demonstrations):
         path = {"demonstrations.path": str(folder / "demonstrations.hdf5")} if folder else {}
-        return fit_run(with_overrides(spec, path), seen(spec, demonstrations), folder, on_event, keep=demonstrations)
+        return fit_run(
+            with_overrides(spec, path), seen(spec, demonstrations), folder, on_event, jobs, keep=demonstrations
+        )
     path = {} if demonstrations is None else {"demonstrations.path": str(demonstrations)}
-    return fit_run(with_overrides(spec, path), None, folder, on_event)
+    return fit_run(with_overrides(spec, path), None, folder, on_event, jobs)
 
 
 def fit_run(
@@ -78,6 +87,7 @@ def fit_run(
     demos: Demonstrations | None,
     folder: Path | None,
     on_event: OnEvent = ignore,
+    jobs: int = 1,
     resume: bool = True,
     keep: Demonstrations | None = None,
 ) -> Fit:
@@ -87,12 +97,13 @@ def fit_run(
     :param resume: whether the folder may hold all of this run already.
     :param keep: demonstrations that the run is to have a copy of, in the file that the spec names.
     """
+    check_jobs(jobs)
     clock = _Clock()
     with clock("demonstrations"):
         demos = known_demonstrations(spec) if demos is None else demos
         check_networks(spec, dimensions(spec, demos))
     if folder is None:
-        return _fit(spec, demos or read_demonstrations(spec, on_event), None, on_event, clock)
+        return _fit(spec, demos or read_demonstrations(spec, on_event), None, on_event, jobs, clock)
     claim(folder, spec, resume)
     with only_one(folder):
         if keep is not None:
@@ -104,7 +115,7 @@ def fit_run(
                 old.unlink()
         with clock("demonstrations"):
             demos = demos or read_demonstrations(spec, on_event)
-        return _fit(spec, demos, folder, on_event, clock)
+        return _fit(spec, demos, folder, on_event, jobs, clock)
 
 
 def _keep(demos: Demonstrations, path: Path) -> None:
@@ -116,20 +127,26 @@ def _keep(demos: Demonstrations, path: Path) -> None:
 
 
 def _fit(
-    spec: Spec, demos: Demonstrations, folder: Path | None, on_event: OnEvent, clock: _Clock, name: str | None = None
+    spec: Spec,
+    demos: Demonstrations,
+    folder: Path | None,
+    on_event: OnEvent,
+    jobs: int,
+    clock: _Clock,
+    name: str | None = None,
 ) -> Fit:
     """:param name: what the model is called in events."""
     split = parts(spec, demos)
     dimensions = Dimensions.of(demos)
     with clock("training"):
-        checkpoint = folder / "checkpoints" / "latest.safetensors" if folder else None
-        trained = train(spec, dimensions, split["train"], on_event, checkpoint, split.get("valid"), name)
+        checkpoints = folder / "checkpoints" if folder else None
+        trained = train(spec, dimensions, split["train"], on_event, checkpoints, split.get("valid"), name, jobs)
     if folder:
         _write_history(folder, trained.history)
         _write_model(folder, trained.hierarchy, dimensions)
     with clock("baselines"):
         beside = {
-            name: _baseline(baseline_spec(spec, baseline, dimensions), demos, folder, on_event, name)
+            name: _baseline(baseline_spec(spec, baseline, dimensions), demos, folder, on_event, jobs, name)
             for name, baseline in named_baselines(spec).items()
         }
     fitted = Fit(spec, trained.hierarchy, {}, folder, demos, beside)
@@ -150,14 +167,14 @@ def _fit(
     return replace(fitted, metrics=json.loads(json.dumps(metrics)))  # as they are read back
 
 
-def _baseline(spec: Spec, demos: Demonstrations, run: Path | None, on_event: OnEvent, name: str) -> Fit:
+def _baseline(spec: Spec, demos: Demonstrations, run: Path | None, on_event: OnEvent, jobs: int, name: str) -> Fit:
     """A baseline trained beside, in a folder of its own where the run has one; nothing where it was done before."""
     folder = run / "baselines" / name if run else None
     if folder:
         claim(folder, spec)
         if is_finished(folder):
             return load(folder, allow_code=True)
-    return _fit(spec, demos, folder, on_event, _Clock(), name)
+    return _fit(spec, demos, folder, on_event, jobs, _Clock(), name)
 
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
@@ -208,22 +225,24 @@ def train(
     dimensions: Dimensions,
     demos: Demonstrations,
     on_event: OnEvent = ignore,
-    checkpoint: Path | None = None,
+    checkpoints: Path | None = None,
     held_out: Demonstrations | None = None,
     name: str | None = None,
+    jobs: int = 1,
 ) -> Trained:
     """Train the spec's model on these demonstrations, of which ``training.tune_fraction`` are used to tune.
 
-    :param checkpoint: where training is kept to be continued; None for nowhere.
+    :param checkpoints: the folder where training is kept to be continued; None for nowhere.
     :param held_out: demonstrations that will be evaluated; whether they can be is known before training.
     :param name: what the model is called in events.
+    :param jobs: processes that train restarts; -1 is one for each core.
     :raises DemonstrationsError: a number is too large for networks.
     :raises TrainingError: a log-likelihood is not finite, or the engines disagree.
     """
     name, budget = name or model_name(spec), spec.training
     kept, tune = demos.split(budget.tune_fraction, spec.seed)
     with one_thread():
-        trainer = Trainer(spec, dimensions, kept, tune, checkpoint, on_event)
+        trainer = Trainer(spec, dimensions, kept, tune, checkpoints, on_event, jobs)
         if held_out is not None:
             refuse_unusable(held_out, trainer.first.encoder, trainer.first.scaling)
         check = _check_engines(trainer)
@@ -231,7 +250,7 @@ def train(
         hierarchy = trainer.run()
     on_event(TrainingEnded(name))
     counts = {"train": len(kept), "tune": len(tune)}
-    return Trained(hierarchy, check, trainer.progress.history, counts, trainer.summary)
+    return Trained(hierarchy, check, trainer.history, counts, trainer.summary)
 
 
 def _check_engines(trainer: Trainer) -> EngineCheck:
@@ -239,7 +258,7 @@ def _check_engines(trainer: Trainer) -> EngineCheck:
 
     :raises TrainingError: they disagree, or the networks give no numbers.
     """
-    first, batch = trainer.first, trainer.train
+    first, batch = trainer.first, trainer.material.train
     few = batch.select(torch.arange(min(len(batch), TRAJECTORIES)), STEPS)
     with torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(trainer.spec.seed)
@@ -275,17 +294,6 @@ def _write_history(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
     writer.writeheader()
     writer.writerows(rows)
     write_text(folder / "history.csv", text.getvalue())
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Inside, torch works on one thread: faster than on several where networks are small, and the same everywhere."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 class _Clock:

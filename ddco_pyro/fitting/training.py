@@ -1,198 +1,144 @@
-"""Expectation-gradient training (paper §4.1) in stages (SM 2.2, SM 2.3), with restarts, early stopping and checkpoints.
+"""Expectation-gradient training (paper §4.1) of a restart, in stages (SM 2.2, SM 2.3), with early stopping.
 
 The gradient of the marginal log-likelihood *is* the expectation-gradient step: the E-step's posteriors weight the
 networks' gradients. A gradient step sees a minibatch of whole trajectories.
 
-Everything random in an epoch is seeded by (seed, restart, stage, epoch), so a run that was interrupted and resumed from
-the end of any epoch gives the same result, bit for bit, as one that was not. Checkpoints are of ends of epochs.
+Everything random in an epoch is seeded by (seed, restart, stage, epoch), so a restart that was interrupted and resumed
+from the end of any epoch, in this process or another, gives the same result, bit for bit, as without interruption.
+Checkpoints are of ends of epochs.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import time
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.tensors import read_tensors, write_tensors
-from ddco_pyro.errors import Failed
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy
-from ddco_pyro.fitting.clusters import Clusters
-from ddco_pyro.fitting.convergence import StageEnd, share, summary
-from ddco_pyro.inference import log_likelihood, total_log_likelihood
-from ddco_pyro.model.encoding import Batch, encode
+from ddco_pyro.fitting.checkpoint import Restart, State, copy_of, optimizer_state, restore_optimizer
+from ddco_pyro.fitting.convergence import StageEnd, share
+from ddco_pyro.fitting.objective import Objective
+from ddco_pyro.fitting.stages import Stage, plan
+from ddco_pyro.inference.threads import one_thread
+from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import OptimizerSpec, Spec
 
 SAVE_EVERY = 1.0  # s between checkpoints, at least: an epoch of a small model takes less time than its checkpoint
 
-State = dict[str, Tensor]
-
-
-class TrainingError(Failed):
-    """Training cannot go on: the message names the trajectory or the checkpoint and says what to do."""
-
 
 @dataclass(frozen=True)
-class Stage:
-    """One stage of training.
+class Material:
+    """What all restarts share: demonstrations to train and to tune on, and how they were encoded and scaled.
 
-    :param discovering: train levels 1 to d under a uniform meta-policy; None for the whole hierarchy.
-    :param clamped: the level whose choices are clamped to clusters of the observations; None for no level.
-    :param trained: prefixes of the names of the parameters that are trained.
+    :param names: of the training demonstrations.
     """
 
-    name: str
-    discovering: int | None
-    clamped: int | None
-    trained: tuple[str, ...]
+    spec: Spec
+    dimensions: Dimensions
+    train: Batch
+    tune: Batch
+    names: Sequence[str]
+    encoder: State
+    scaling: State
 
-
-WHOLE = Stage("whole", None, None, ())
-"""The whole hierarchy, as it is."""
-
-
-def plan(spec: Spec, depth: int) -> list[Stage]:
-    """The stages of training for D levels: from the lowest level up, the meta-policy last."""
-    training = spec.training
-    everything = ("levels.", "meta_policy.")
-    if depth == 0:
-        return [Stage("policy", None, None, everything)]
-    stages: list[Stage] = []
-    for level in range(1, depth + 1):
-        own = (f"levels.{level - 1}.",)
-        if training.initialize != "random":
-            stages.append(Stage(f"vq-{level}", level, level, own))
-        if training.layerwise:
-            stages.append(Stage(f"level-{level}", level, None, own))
-    if training.layerwise:
-        stages.append(Stage("meta-policy", None, None, ("meta_policy.",)))
-    if not training.layerwise or training.lower_levels == "fine_tuned":
-        stages.append(Stage("joint", None, None, everything))
-    return stages
-
-
-@dataclass
-class Progress:
-    """Where training stands at the end of an epoch; with the tensors of a checkpoint it is all that is needed.
-
-    ``start`` is the tuning log-likelihood per step from before this stage, ``best`` that of its best epoch, ``winner``
-    that of the best finished restart. ``ended`` has a :class:`StageEnd` for each stage of this restart that has ended,
-    ``winner_ended`` those of the best finished restart.
-    """
-
-    restart: int = 0
-    stage: int = 0
-    epoch: int = 0
-    stale: int = 0
-    start: float = -np.inf
-    best: float = -np.inf
-    winner: float = -np.inf
-    ended: list[dict[str, Any]] = field(default_factory=list)
-    winner_ended: list[dict[str, Any]] = field(default_factory=list)
-    history: list[dict[str, Any]] = field(default_factory=list)
-
-
-class Trainer:
-    """Trains a spec's hierarchy on ``train``, stopping and choosing among restarts by ``tune``.
-
-    ``first`` is the hierarchy before any training.
-
-    :param checkpoint: where the state is kept at the end of epochs; None for a training too short to be continued.
-    :raises DemonstrationsError: a number is too large for networks.
-    """
-
-    def __init__(
-        self,
-        spec: Spec,
-        dimensions: Dimensions,
-        train: Demonstrations,
-        tune: Demonstrations,
-        checkpoint: Path | None = None,
-        on_event: OnEvent = ignore,
-    ) -> None:
-        self.spec, self.dimensions, self.checkpoint, self.on_event = spec, dimensions, checkpoint, on_event
-        self.progress = Progress()
-        self._saved: dict[str, State] = {}
-        self._saved_at = -np.inf  # the first epoch is saved
+    def hierarchy(self, restart: int) -> Hierarchy:
+        """A restart's hierarchy before any training, in evaluation mode."""
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(spec.seed)
-            self.first = build_hierarchy(spec, dimensions)  # its encoder and scaling are those of all restarts
-        self.first.encoder.fit(train)
-        self.first.scaling.fit(train)
-        self.names = train.names
-        self.train, self.tune = (encode(part, self.first.encoder, self.first.scaling) for part in (train, tune))
-
-    def run(self) -> Hierarchy:
-        """The best restart's hierarchy, in evaluation mode.
-
-        :raises TrainingError: where a log-likelihood is not finite.
-        """
-        self._load()
-        model = self._fresh()
-        stages = plan(self.spec, model.depth)
-        while self.progress.restart < self.spec.training.restarts:
-            if self.progress.stage == 0 and self.progress.epoch == 0:
-                model = self._fresh()
-            while self.progress.stage < len(stages):
-                self._run_stage(model, stages[self.progress.stage], len(stages) - self.progress.stage)
-                self.progress.stage += 1
-            self._finish_restart(model)
-        model.load_state_dict(self._saved["winner"])
-        return model.eval()
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        """How the best restart was trained, for ``metrics.json``."""
-        ends = [StageEnd(**end) for end in self.progress.winner_ended]
-        return summary(self.spec.training, ends, math.ceil(len(self.train) / self.spec.training.batch_size))
-
-    def _fresh(self) -> Hierarchy:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self._seed(self.progress.restart))
+            torch.manual_seed(self.seed(restart))
             hierarchy = build_hierarchy(self.spec, self.dimensions)
-        hierarchy.encoder.load_state_dict(self.first.encoder.state_dict())
-        hierarchy.scaling.load_state_dict(self.first.scaling.state_dict())
+        hierarchy.encoder.load_state_dict(self.encoder)
+        hierarchy.scaling.load_state_dict(self.scaling)
         return hierarchy.eval()
 
-    def _seed(self, *where: int) -> int:
+    def seed(self, *where: int) -> int:
+        """A seed for a restart, one of its stages, or an epoch of a stage."""
         return int(np.random.SeedSequence([self.spec.seed, *where]).generate_state(1)[0])
 
-    def _run_stage(self, model: Hierarchy, stage: Stage, stages_left: int) -> None:
-        now, training = self.progress, self.spec.training
+
+def advance(
+    material: Material,
+    restart: Restart,
+    until: int | None,
+    seconds: float = math.inf,
+    checkpoint: Path | None = None,
+    on_event: OnEvent = ignore,
+) -> tuple[Restart, bool]:
+    """Train a restart further, on one thread; the restart, and whether it came as far as it was to.
+
+    :param until: so many epochs of the last stage; None for all that patience and budget allow.
+    :param seconds: about how long it may take; an epoch of each stage that it comes to is made in any case.
+    :param checkpoint: where it is kept at the end of epochs.
+    :raises TrainingError: a log-likelihood is not finite.
+    """
+    with one_thread():
+        return restart, Training(material, restart, checkpoint, on_event).run(until, time.monotonic() + seconds)
+
+
+class Training:
+    """A restart in training."""
+
+    def __init__(self, material: Material, restart: Restart, checkpoint: Path | None, on_event: OnEvent) -> None:
+        self.spec, self.train, self.tune, self.names = material.spec, material.train, material.tune, material.names
+        self.progress, self._seed = restart.progress, material.seed
+        self._material, self._restart, self._checkpoint, self._on_event = material, restart, checkpoint, on_event
+        self._saved_at = -np.inf  # the first epoch is saved
+
+    def run(self, until: int | None, deadline: float) -> bool:
+        """Whether it came as far as it was to, before the deadline."""
+        now, model = self.progress, self._material.hierarchy(self.progress.restart)
+        if "model" in self._restart.states:
+            model.load_state_dict(self._restart.states["model"])
+        stages = plan(self.spec, model.depth)
+        while not now.done:
+            last = now.stage == len(stages) - 1
+            if not self._run_stage(
+                model, stages[now.stage], len(stages) - now.stage, until if last else None, deadline
+            ):
+                return until is not None and last and now.epoch >= until
+            if last:
+                now.done, self._restart.states = True, {"best": self._restart.states["best"]}
+            else:
+                now.stage, now.epoch = now.stage + 1, 0
+        return True
+
+    def _run_stage(self, model: Hierarchy, stage: Stage, stages_left: int, until: int | None, deadline: float) -> bool:
+        """Whether it has ended, rather than come to the epoch ``until`` or the deadline."""
+        now, training, states = self.progress, self.spec.training, self._restart.states
         cap = share(training.epochs, sum(end["epochs"] for end in now.ended), stages_left)
-        objective = _Objective(self, stage)
+        objective = Objective(self, stage)
         parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
         optimizer = _optimizer(training.optimizer, parameters)
         if now.epoch > 0:
-            model.load_state_dict(self._saved["model"])
-            _restore_optimizer(optimizer, self._saved["optimizer"])
+            restore_optimizer(optimizer, states["optimizer"])
         else:
             now.start, now.stale = objective.tune(model), 0
             now.best = now.start
-            self._saved["best"] = _copy(model)
+            states["best"] = copy_of(model)
+        first = now.epoch
         while (cap is None or now.epoch < cap) and (training.patience is None or now.stale < training.patience):
+            over = now.epoch > first and time.monotonic() > deadline
+            if over or (until is not None and now.epoch >= until):
+                self._keep(model, optimizer)
+                return False
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate(training.optimizer, now.epoch, cap)
             train = self._epoch(model, optimizer, parameters, objective)
             self._record(stage, train, objective.tune(model), model)
-            if time.monotonic() - self._saved_at > SAVE_EVERY:
-                self._save(model, optimizer)
-        model.load_state_dict(self._saved["best"])
-        tune = [now.start, *(row["tune"] for row in now.history[len(now.history) - now.epoch :])]
-        now.ended.append(asdict(StageEnd.of(stage.name, cap, tune, training.patience)))
-        now.epoch = 0
+            self._save(model, optimizer)
+        model.load_state_dict(states["best"])
+        now.ended.append(asdict(StageEnd.of(stage.name, cap, now.tune, training.patience)))
+        return True
 
     def _epoch(
-        self, model: Hierarchy, optimizer: torch.optim.Optimizer, parameters: list[nn.Parameter], objective: _Objective
+        self, model: Hierarchy, optimizer: torch.optim.Optimizer, parameters: list[nn.Parameter], objective: Objective
     ) -> float:
         """One pass over the training demonstrations; the log-likelihood per step seen on the way."""
         now, total = self.progress, 0.0
@@ -213,96 +159,23 @@ class Trainer:
         now.epoch += 1
         if tune > now.best:
             now.best, now.stale = tune, 0
-            self._saved["best"] = _copy(model)
+            self._restart.states["best"] = copy_of(model)
         else:
             now.stale += 1
         row = EpochEnded(now.restart, stage.name, now.epoch, train, tune)
         now.history.append(asdict(row))
-        self.on_event(row)
+        self._on_event(row)
 
-    def _finish_restart(self, model: Hierarchy) -> None:
-        now = self.progress
-        value = _Objective(self, WHOLE).tune(model)
-        if "winner" not in self._saved or value > now.winner:
-            now.winner, now.winner_ended = value, now.ended
-            self._saved["winner"] = _copy(model)
-        now.restart, now.stage, now.epoch, now.ended = now.restart + 1, 0, 0, []
-        self._save(model, None)
+    def _keep(self, model: Hierarchy, optimizer: torch.optim.Optimizer) -> None:
+        self._restart.states["model"] = copy_of(model)
+        self._restart.states["optimizer"] = optimizer_state(optimizer)
 
-    def _save(self, model: Hierarchy, optimizer: torch.optim.Optimizer | None) -> None:
-        if self.checkpoint is None:
-            return
-        self._saved_at = time.monotonic()
-        self._saved["model"] = _copy(model)
-        self._saved["optimizer"] = {} if optimizer is None else _optimizer_state(optimizer)
-        tensors = {f"{part}/{name}": value for part, state in self._saved.items() for name, value in state.items()}
-        write_tensors(self.checkpoint, tensors, {"progress": json.dumps(asdict(self.progress))})
-
-    def _load(self) -> None:
-        if self.checkpoint is None or not self.checkpoint.exists():
-            return
-        remedy = "remove it and do the same again: training begins anew"
-        tensors, metadata = read_tensors(self.checkpoint, remedy)
-        self.progress = Progress(**json.loads(metadata["progress"]))
-        self._saved = {"optimizer": {}}
-        for name, value in tensors.items():
-            part, _, rest = name.partition("/")
-            self._saved.setdefault(part, {})[rest] = value
-
-
-class _Objective:
-    """What a stage maximises: the log-likelihood, with the choices of one level clamped where the stage says so."""
-
-    def __init__(self, trainer: Trainer, stage: Stage) -> None:
-        self.trainer, self.stage = trainer, stage
-        self.clusters: tuple[Tensor, Tensor] | None = None
-        if stage.clamped is not None:
-            hierarchy = trainer.spec.hierarchy
-            assert hierarchy is not None  # only levels are clamped
-            seed = trainer._seed(trainer.progress.restart, trainer.progress.stage)
-            options = hierarchy.levels[stage.clamped - 1].count
-            clusters = Clusters(trainer.train, options, seed, trainer.spec.training.initialize == "vq_controls")
-            self.clusters = clusters.choices(trainer.train), clusters.choices(trainer.tune)
-
-    def ascend(self, model: Hierarchy, rows: Tensor) -> float:
-        """Add the gradient of the loss of some training demonstrations to the parameters'; their log-likelihood.
-
-        The loss is minus the log-likelihood per step. A batch that is long is processed in parts.
-        """
-        batch, total = self.trainer.train.select(rows), 0.0
-        for part, piece in batch.pieces(model.steps_at_once):
-            value = self._total(model, piece, None if self.clusters is None else self.clusters[0][rows[part]])
-            if not bool(torch.isfinite(value.detach())):
-                raise self._not_finite(model, piece, rows[part])
-            (-value / batch.steps).backward()
-            total += float(value.detach())
-        return total
-
-    def tune(self, model: Hierarchy) -> float:
-        """Log-likelihood per step of the tuning demonstrations."""
-        choices = None if self.clusters is None else self.clusters[1]
-        with torch.no_grad():
-            values = [
-                float(self._total(model, piece, None if choices is None else choices[part]))
-                for part, piece in self.trainer.tune.pieces(model.steps_at_once)
-            ]
-        return sum(values) / self.trainer.tune.steps
-
-    def _total(self, model: Hierarchy, batch: Batch, choices: Tensor | None) -> Tensor:
-        tables = model.tabulate(batch, self.stage.discovering)
-        if choices is not None and self.stage.clamped is not None:
-            tables = tables.clamp(self.stage.clamped, choices[:, : batch.inputs.batch[1]])
-        return total_log_likelihood(tables, batch.lengths, self.trainer.spec.inference.engine)
-
-    def _not_finite(self, model: Hierarchy, batch: Batch, rows: Tensor) -> TrainingError:
-        with torch.no_grad():
-            values = log_likelihood(model.tabulate(batch, self.stage.discovering), batch.lengths)
-        bad = [self.trainer.names[int(row)] for row, ok in zip(rows, torch.isfinite(values), strict=True) if not ok]
-        where = ", ".join(bad) or "this minibatch (no trajectory alone)"
-        return TrainingError(
-            f"stage {self.stage.name}, epoch {self.trainer.progress.epoch + 1}: the log-likelihood of {where} is not "
-            "finite; look at these demonstrations, raise control.std, or lower training.optimizer.lr"
-        )
+    def _save(self, model: Hierarchy, optimizer: torch.optim.Optimizer) -> None:
+        """Keep it as a checkpoint, unless that was done just before."""
+        if self._checkpoint is not None and time.monotonic() - self._saved_at > SAVE_EVERY:
+            self._saved_at = time.monotonic()
+            self._keep(model, optimizer)
+            self._restart.write(self._checkpoint)
 
 
 def learning_rate(spec: OptimizerSpec, epoch: int, cap: int | None) -> float:
@@ -321,26 +194,3 @@ def _optimizer(spec: OptimizerSpec, parameters: list[nn.Parameter]) -> torch.opt
     if spec.name == "adam":
         return torch.optim.Adam(parameters, lr=spec.lr, weight_decay=spec.weight_decay)
     return torch.optim.SGD(parameters, lr=spec.lr, momentum=spec.momentum, weight_decay=spec.weight_decay)
-
-
-def _copy(model: nn.Module) -> State:
-    return {name: value.detach().clone() for name, value in model.state_dict().items()}
-
-
-def _optimizer_state(optimizer: torch.optim.Optimizer) -> State:
-    """The optimiser's tensors by ``<parameter>.<name>``."""
-    state = optimizer.state_dict()["state"]
-    return {
-        f"{index}.{name}": torch.as_tensor(value).clone()
-        for index, values in state.items()
-        for name, value in values.items()
-        if value is not None
-    }
-
-
-def _restore_optimizer(optimizer: torch.optim.Optimizer, state: State) -> None:
-    nested: dict[int, State] = {}
-    for key, value in state.items():
-        index, _, name = key.partition(".")
-        nested.setdefault(int(index), {})[name] = value
-    optimizer.load_state_dict({**optimizer.state_dict(), "state": nested})

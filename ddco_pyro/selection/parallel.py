@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 
-from joblib import Parallel, delayed, parallel_config
+from joblib import Parallel, parallel_config
 
-from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.fitting import processes
+from ddco_pyro.fitting.processes import ALL_CORES, BackendError
 from ddco_pyro.selection.folds import Folds
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.selection.scoring import Score, score
@@ -20,10 +20,6 @@ Pending = Sequence[tuple[Candidate, int]]
 CONNECT_SECONDS = 10
 
 
-class BackendError(BadInput):
-    """The folds cannot be run where it was asked for."""
-
-
 @dataclass(frozen=True)
 class Workers:
     """Who runs the folds: ``jobs`` processes here (-1: one for each core), or the workers of a dask ``scheduler``.
@@ -31,12 +27,11 @@ class Workers:
     :raises BackendError: no process at all.
     """
 
-    jobs: int = -1
+    jobs: int = ALL_CORES
     scheduler: str | None = None
 
     def __post_init__(self) -> None:
-        if self.jobs != -1 and self.jobs < 1:
-            raise BackendError(f"--jobs {self.jobs}: give a number of processes, or -1 for one on each core")
+        processes.check_jobs(self.jobs)
 
     def check(self) -> None:
         """See that they are there.
@@ -54,13 +49,11 @@ def pool(workers: Workers) -> Iterator[Parallel]:
 
     :raises BackendError: dask is not installed, no scheduler answers, or it has no workers.
     """
-    # One task at a time: a fold takes long, and whatever has been scored shall be kept at once.
-    settings = {"n_jobs": workers.jobs, "return_as": "generator_unordered", "batch_size": 1}
     if workers.scheduler is None:
-        with Parallel(**settings) as parallel:
+        with processes.pool(workers.jobs) as parallel:
             yield parallel
         return
-    with _client(workers.scheduler), parallel_config(backend="dask"), Parallel(**settings) as parallel:
+    with _client(workers.scheduler), parallel_config(backend="dask"), processes.pool(workers.jobs) as parallel:
         yield parallel
 
 
@@ -90,11 +83,10 @@ def scores(parallel: Parallel, folds: Folds, pending: Pending) -> Iterator[Score
     """
     # The demonstrations travel inside the function: as an argument dask would keep them with a worker, and lose them
     # with it.
-    calls = [delayed(partial(score, folds, candidate))(fold) for candidate, fold in pending]
-    try:
-        yield from parallel(calls)
-    except BrokenProcessPool as error:
-        raise Failed(
-            "a process that trained a fold was ended from outside (too little memory?); what was scored is kept: "
-            "continue with --resume, with fewer --jobs if memory was short"
-        ) from error
+    calls = [partial(score, folds, candidate, fold) for candidate, fold in pending]
+    yield from processes.results(
+        parallel,
+        calls,
+        "a process that trained a fold was ended from outside (too little memory?); what was scored is kept: "
+        "continue with --resume, with fewer --jobs if memory was short",
+    )

@@ -8,13 +8,12 @@ import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from threadpoolctl import threadpool_limits
-
 from ddco_pyro.data.files import Damaged, write_text
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.records import read_record
-from ddco_pyro.fitting.run import one_thread, train
+from ddco_pyro.fitting.run import train
+from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.selection.folds import Folds
 from ddco_pyro.selection.grid import Candidate
 
@@ -57,7 +56,7 @@ def score(folds: Folds, candidate: Candidate, fold: int) -> Score:
     training, held_out = folds.split(fold)
     empty = Score(candidate.number, fold, held_out.names, held_out.lengths)
     try:
-        with threadpool_limits(1), one_thread():
+        with one_thread():
             trained = train(candidate.spec, folds.dimensions, training, held_out=held_out)
             values = tuple(Fit(candidate.spec, trained.hierarchy).log_likelihood(held_out).tolist())
     except (BadInput, Failed) as error:

@@ -196,6 +196,9 @@ class TrainingSpec(Model):
     """Trajectories in each gradient step."""
     restarts: Count = 1
     """Independent initialisations; the best on the tuning demonstrations is kept."""
+    halving: Count | None = 50
+    """With more restarts: epochs of the last stage after which the worse half of them, on the tuning demonstrations, is
+    stopped; of those that are left again after twice as many, and so on. Null: all are trained to the end."""
     tune_fraction: Fraction = 0.1
     """Part of the training demonstrations set aside for tuning: to stop early and to choose among restarts."""
     patience: Count | None = 20

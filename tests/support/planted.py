@@ -8,7 +8,7 @@ from sklearn.metrics import normalized_mutual_info_score
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import ignore
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy
-from ddco_pyro.fitting.training import Trainer
+from ddco_pyro.fitting.restarts import Trainer
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.actor import Acting
 from ddco_pyro.model.ahmm import choose
@@ -38,9 +38,9 @@ def make_spec(counts=(2,), seed=0, control=None, **training):
     )
 
 
-def make_trainer(spec, demos, path, on_event=ignore):
+def make_trainer(spec, demos, path, on_event=ignore, jobs=1):
     train, tune = demos.split(0.2, 0)
-    return Trainer(spec, Dimensions.of(demos), train, tune, path / "latest.safetensors", on_event)
+    return Trainer(spec, Dimensions.of(demos), train, tune, path, on_event, jobs)
 
 
 def plant(truth, number, steps, seed):

@@ -1,0 +1,170 @@
+"""Restarts: independent initialisations, trained side by side, of which the worse half is stopped again and again.
+
+Successive halving on tuning likelihood: all train until ``training.halving`` epochs of the last stage, the better half
+until twice as many, and so on; the last alone trains until patience or budget end it. Earlier stages are trained whole,
+since what they maximise cannot be compared. Who goes on follows from the histories alone, so that neither the number of
+processes nor an interruption changes it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.events import EpochEnded, OnEvent, RestartStopped, ignore
+from ddco_pyro.fitting.building import Dimensions, build_hierarchy
+from ddco_pyro.fitting.checkpoint import Progress, Restart
+from ddco_pyro.fitting.convergence import StageEnd, summary
+from ddco_pyro.fitting.processes import pool, results, useful_jobs
+from ddco_pyro.fitting.training import Material, advance
+from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.spec import Spec
+
+SLICE = 10.0
+"""Seconds that a process trains a restart before it tells how it went, and is given the next."""
+
+DEAD = (
+    "a process that trained a restart was ended from outside (too little memory?); what was trained is kept in a run "
+    "folder: continue with the same command, with fewer --jobs if memory was short"
+)
+
+
+class Trainer:
+    """Trains a spec's hierarchy on ``train``, stopping and choosing among restarts by ``tune``.
+
+    ``first`` is the hierarchy before any training.
+
+    :param checkpoints: the folder in which each restart is kept at the end of epochs; None for nowhere.
+    :param jobs: processes that train restarts; -1 is one for each core. The result is the same for any number.
+    :raises DemonstrationsError: a number is too large for networks.
+    """
+
+    def __init__(
+        self,
+        spec: Spec,
+        dimensions: Dimensions,
+        train: Demonstrations,
+        tune: Demonstrations,
+        checkpoints: Path | None = None,
+        on_event: OnEvent = ignore,
+        jobs: int = 1,
+    ) -> None:
+        self.spec, self.checkpoints, self.on_event = spec, checkpoints, on_event
+        self.jobs = useful_jobs(jobs, spec.training.restarts)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(spec.seed)
+            self.first = build_hierarchy(spec, dimensions)  # its encoder and scaling are those of all restarts
+        self.first.encoder.fit(train)
+        self.first.scaling.fit(train)
+        encoder, scaling = self.first.encoder, self.first.scaling
+        encoded = encode(train, encoder, scaling), encode(tune, encoder, scaling)
+        fitted = encoder.state_dict(), scaling.state_dict()
+        self.material = Material(spec, dimensions, *encoded, train.names, *fitted)
+        self.restarts: list[Restart] = []
+        self.stopped: dict[int, int] = {}
+
+    def run(self) -> Hierarchy:
+        """The best restart's hierarchy, in evaluation mode.
+
+        :raises TrainingError: where a log-likelihood is not finite.
+        """
+        self.restarts = [self._begun(number) for number in range(self.spec.training.restarts)]
+        left, epochs = list(range(len(self.restarts))), self.spec.training.halving
+        while epochs is not None and len(left) > 1:
+            self._train(left, epochs)
+            better = better_half({number: best_until(self.restarts[number].progress, epochs) for number in left})
+            self._stop([number for number in left if number not in better])
+            left, epochs = better, 2 * epochs
+        self._train(left, None)
+        model = self.material.hierarchy(self.best)
+        model.load_state_dict(self.restarts[self.best].states["best"])
+        return model.eval()
+
+    @property
+    def best(self) -> int:
+        """The restart with the best tuning log-likelihood; the first of equals."""
+        return ranked({restart.progress.restart: restart.progress.best for restart in self._whole})[0]
+
+    @property
+    def history(self) -> list[dict[str, Any]]:
+        """A row for each epoch, restart after restart."""
+        return [row for restart in self.restarts for row in restart.progress.history]
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """How the best restart was trained, and what all of them took, for ``metrics.json``."""
+        ends = [StageEnd(**end) for end in self.restarts[self.best].progress.ended]
+        updates = math.ceil(len(self.material.train) / self.spec.training.batch_size)
+        spent = [len(restart.progress.history) for restart in self.restarts]
+        return summary(self.spec.training, ends, updates, self.best, spent, self.stopped)
+
+    @property
+    def _whole(self) -> list[Restart]:
+        return [restart for restart in self.restarts if restart.progress.restart not in self.stopped]
+
+    def _begun(self, number: int) -> Restart:
+        """A restart as it was kept, or as it begins.
+
+        :raises Damaged: it does not hold what was written.
+        """
+        path = self._path(number)
+        return Restart.read(path) if path is not None and path.exists() else Restart(Progress(number))
+
+    def _path(self, number: int) -> Path | None:
+        return None if self.checkpoints is None else self.checkpoints / f"restart-{number}.safetensors"
+
+    def _stop(self, numbers: Sequence[int]) -> None:
+        """Those that are done need not be stopped."""
+        for number in numbers:
+            progress = self.restarts[number].progress
+            if not progress.done:
+                self.stopped[number] = progress.epoch
+                self.on_event(RestartStopped(number, progress.epoch))
+
+    def _train(self, numbers: Sequence[int], until: int | None) -> None:
+        """Train these restarts until so many epochs of the last stage, None for to the end; processes in slices."""
+        left = [number for number in numbers if not self.restarts[number].progress.done]
+        if self.jobs == 1 or len(left) < 2:
+            for number in left:
+                path = self._path(number)
+                self._keep(advance(self.material, self.restarts[number], until, math.inf, path, self.on_event)[0])
+            return
+        with pool(self.jobs) as parallel:
+            while left:
+                calls = [partial(advance, self.material, self.restarts[number], until, SLICE) for number in left]
+                for restart, arrived in results(parallel, calls, DEAD):
+                    before = self.restarts[restart.progress.restart].progress
+                    self._keep(restart)
+                    for row in restart.progress.history[len(before.history) :]:
+                        self.on_event(EpochEnded(**row))
+                    if arrived:
+                        left.remove(restart.progress.restart)
+
+    def _keep(self, restart: Restart) -> None:
+        number = restart.progress.restart
+        self.restarts[number] = restart
+        path = self._path(number)
+        if path is not None:
+            restart.write(path)
+
+
+def best_until(progress: Progress, epochs: int) -> float:
+    """The best tuning log-likelihood per step before and in the first epochs of the last stage."""
+    return max(progress.tune[: epochs + 1])
+
+
+def ranked(values: Mapping[int, float]) -> list[int]:
+    """Restarts, the best first; what is not a number is worst, and the first of equals is the better."""
+    return sorted(values, key=lambda number: (-values[number] if values[number] > -math.inf else math.inf, number))
+
+
+def better_half(values: Mapping[int, float]) -> list[int]:
+    """The restarts that go on, in order; of an odd number the larger part."""
+    return sorted(ranked(values)[: (len(values) + 1) // 2])

@@ -1,0 +1,233 @@
+"""Restarts: the same bits in any number of processes and after an interruption, and which of them are stopped."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from planted import make_spec, make_trainer
+
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.drawing import words
+from ddco_pyro.errors import BadInput
+from ddco_pyro.events import EpochEnded, RestartStopped
+from ddco_pyro.fitting import restarts as restarting
+from ddco_pyro.fitting import training
+from ddco_pyro.fitting.checkpoint import Progress, Restart
+from ddco_pyro.fitting.run import fit
+
+QUICK = {"initialize": "random", "layerwise": False, "epochs": 14, "patience": 5, "optimizer": {"lr": 0.05}}
+"""Some restarts of it end by patience, others by their budget."""
+
+
+@pytest.fixture(scope="module")
+def demos():
+    random = np.random.default_rng(0)
+    return Demonstrations(
+        tuple(
+            Demonstration(f"demo_{n}", {"state": random.normal(size=(6, 3))}, random.normal(size=(6, 2)))
+            for n in range(10)
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def spec():
+    return make_spec((2,), restarts=5, halving=3, control={"std": 1.0}, **QUICK)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(spec, demos, tmp_path_factory):
+    """The trainer, its model, and what was told, in one process without interruption."""
+    told = []
+    folder = tmp_path_factory.mktemp("undisturbed")
+    trainer = make_trainer(spec, demos, folder, told.append)
+    return trainer, trainer.run().state_dict(), told, checkpoints(folder)
+
+
+def checkpoints(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def assert_same(trainer, model, folder, undisturbed):
+    expected, state, _, files = undisturbed
+    assert (trainer.history, trainer.summary) == (expected.history, expected.summary)
+    assert all(torch.equal(model[name], value) for name, value in state.items())
+    assert checkpoints(folder) == files
+
+
+class Interrupting:
+    """Ctrl-C at so many epochs."""
+
+    def __init__(self, epochs):
+        self.left = epochs
+
+    def __call__(self, event):
+        self.left -= isinstance(event, EpochEnded)
+        if self.left == 0:
+            raise KeyboardInterrupt
+
+
+# --- processes --------------------------------------------------------------------------------------------------------
+
+
+def test_two_processes_give_the_same_bits_also_where_one_had_begun(undisturbed, spec, demos, tmp_path, monkeypatch):
+    """Interrupted in the middle of the second rung, continued in slices of a single epoch each by two processes."""
+    monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
+    monkeypatch.setattr(restarting, "SLICE", 0.0)
+    with pytest.raises(KeyboardInterrupt):
+        make_trainer(spec, demos, tmp_path, Interrupting(5 * 3 + 2)).run()
+    kept = [Restart.read(path).progress for path in sorted(tmp_path.iterdir())]
+    assert len({progress.epoch for progress in kept}) > 1
+    told = []
+    trainer = make_trainer(spec, demos, tmp_path, told.append, jobs=2)
+    assert_same(trainer, trainer.run().state_dict(), tmp_path, undisturbed)
+    missing = len(trainer.history) - sum(len(progress.history) for progress in kept)
+    assert len([event for event in told if isinstance(event, EpochEnded)]) == missing > 0
+
+
+@pytest.mark.parametrize("jobs", [0, -2])
+def test_what_is_no_number_of_processes_is_refused(spec, demos, jobs):
+    with pytest.raises(BadInput, match=f"^--jobs {jobs}: give a number of processes"):
+        fit(spec, demos, jobs=jobs)
+
+
+# --- going on ---------------------------------------------------------------------------------------------------------
+
+
+def test_an_interruption_changes_nothing(undisturbed, spec, demos, tmp_path, monkeypatch):
+    """In the first rung, at its end, in the middle of later ones, again and again until it is done."""
+    monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
+    interruptions = 0
+    while True:
+        trainer = make_trainer(spec, demos, tmp_path, Interrupting(4))
+        try:
+            model = trainer.run().state_dict()
+        except KeyboardInterrupt:
+            interruptions += 1
+        else:
+            break
+    assert interruptions >= len(undisturbed[0].history) // 4
+    assert_same(trainer, model, tmp_path, undisturbed)
+
+
+# --- who goes on ------------------------------------------------------------------------------------------------------
+
+
+def allowed(curves, first):
+    """The epochs that each restart may make, by the rule in words: a restart takes part in a rung when fewer than half
+    of those of the rung before, rounded up, were better there.
+    """
+    limits = [0] * len(curves)
+    going, rung = set(range(len(curves))), first
+    while len(going) > 1:
+        for number in going:
+            limits[number] = rung
+        places = -(-len(going) // 2)
+        tops = {number: max(curves[number][: rung + 1]) for number in going}
+        going = {
+            number
+            for number in going
+            if sum(tops[rival] > tops[number] or (tops[rival] == tops[number] and rival < number) for rival in going)
+            < places
+        }
+        rung *= 2
+    limits[going.pop()] = 10**9
+    return limits
+
+
+class Scripted:
+    """Restarts whose tuning values were written down before; each curve begins with that from before training."""
+
+    def __init__(self, curves):
+        self.curves = curves
+
+    def __call__(self, material, restart, until, seconds=0.0, checkpoint=None, on_event=None):
+        progress = restart.progress
+        curve = self.curves[progress.restart]
+        progress.start = curve[0]
+        while progress.epoch < len(curve) - 1 and (until is None or progress.epoch < until):
+            progress.epoch += 1
+            progress.history.append({"restart": progress.restart, "tune": curve[progress.epoch]})
+        progress.best = max(curve[: progress.epoch + 1])
+        progress.done = progress.epoch == len(curve) - 1
+        if progress.done:
+            progress.ended = [{"stage": "joint", "epochs": 1, "cap": 1, "rising": 0.0, "over": 1}]
+        restart.states = {"best": material.hierarchy(progress.restart).state_dict()}
+        return restart, True
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_worse_half_is_stopped_at_each_rung(demos, tmp_path, monkeypatch, seed):
+    random = np.random.default_rng(seed)
+    number, first = int(random.integers(1, 10)), int(random.integers(1, 4))
+    curves = [random.integers(0, 30, random.integers(2, 30)).astype(float).tolist() for _ in range(number)]  # with ties
+    monkeypatch.setattr(restarting, "advance", Scripted(curves))
+    told = []
+    trainer = make_trainer(make_spec(restarts=number, halving=first), demos, tmp_path, told.append)
+    model = trainer.run().state_dict()
+    limits = allowed(curves, first)
+    made = [min(limit, len(curve) - 1) for limit, curve in zip(limits, curves, strict=True)]
+    assert [each["epochs"] for each in trainer.summary["restarts"]["each"]] == made
+    stopped = {n: made[n] for n in range(number) if made[n] < len(curves[n]) - 1}
+    assert {n: each["stopped"] for n, each in enumerate(trainer.summary["restarts"]["each"])} == {
+        n: stopped.get(n) for n in range(number)
+    }
+    assert {(event.restart, event.epochs) for event in told} == set(stopped.items())
+    tops = [max(curve[: count + 1]) for curve, count in zip(curves, made, strict=True)]
+    best = trainer.summary["restarts"]["best"]
+    assert tops[best] == max(tops)
+    expected = trainer.material.hierarchy(best).state_dict()
+    assert all(torch.equal(model[name], value) for name, value in expected.items())
+
+
+def test_without_halving_all_are_trained_and_the_best_is_kept(demos, tmp_path, undisturbed, spec):
+    """Each as a training of its own would be, which knows nothing of restarts."""
+    told = []
+    off = spec.model_copy(update={"training": spec.training.model_copy(update={"halving": None})})
+    trainer = make_trainer(off, demos, tmp_path, told.append)
+    model = trainer.run().state_dict()
+    assert not any(isinstance(event, RestartStopped) for event in told)
+    alone = []
+    for number in range(5):
+        restart, arrived = training.advance(trainer.material, Restart(Progress(number)), None)
+        assert arrived
+        alone.append(restart)
+    rows = [row for restart in alone for row in restart.progress.history]
+    assert trainer.history == rows
+    winner = max(alone, key=lambda restart: restart.progress.best)
+    assert all(torch.equal(model[name], value) for name, value in winner.states["best"].items())
+    shorter = undisturbed[0].history
+    assert all(row in rows for row in shorter)  # halving stops restarts, and changes nothing else
+    assert len(shorter) < len(rows)
+
+
+def test_what_is_told_of_restarts_adds_up(undisturbed):
+    trainer, _, told, _ = undisturbed
+    restarts = trainer.summary["restarts"]
+    epochs = [sum(row["restart"] == number for row in trainer.history) for number in range(5)]
+    assert [each["epochs"] for each in restarts["each"]] == epochs
+    assert restarts["spent"] == {"epochs": sum(epochs), "gradient_steps": sum(epochs)}  # a single minibatch
+    assert trainer.summary["spent"]["epochs"] == epochs[restarts["best"]]
+    stopped = {event.restart: event.epochs for event in told if isinstance(event, RestartStopped)}
+    assert stopped
+    assert {n: each["stopped"] for n, each in enumerate(restarts["each"]) if each["stopped"]} == stopped
+
+
+def test_restarts_in_words(undisturbed):
+    training = undisturbed[0].summary
+    training = training | {
+        "restarts": {
+            "best": 1,
+            "spent": {"epochs": 45, "gradient_steps": 90},
+            "each": [{"epochs": 10, "stopped": 8}, {"epochs": 30, "stopped": None}, {"epochs": 5, "stopped": None}],
+        }
+    }
+    assert words.restarts(training) == (
+        "restart 1 was the best of 3 (0 to 2; stopped early, with their epochs of the last stage: 0 after 8), "
+        "which took 45 epochs (90 gradient steps) together"
+    )
+    assert words.spent(training).endswith("; " + words.restarts(training))
+    del training["restarts"]
+    assert words.restarts(training) == ""
+    assert not words.spent(training).endswith(";")
