@@ -9,7 +9,7 @@ import pytest
 import torch
 from sklearn.metrics import adjusted_rand_score
 
-from ddco_pyro.fitting.clusters import Clusters
+from ddco_pyro.fitting.clusters import Clusters, EqualParts
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.conv import POOLED
@@ -70,6 +70,11 @@ def test_padding_belongs_to_no_cluster_and_makes_none():
         padding = torch.arange(7) >= torch.tensor(LENGTHS)[:, None]
         assert (choices[padding] == 0).all()
         assert (choices[~padding] > 0).all()
+
+
+def test_equal_parts_cut_each_demonstration_for_itself():
+    batch = make_batch(random_rows(0, 3), random_rows(1, 2))
+    assert EqualParts(3).choices(batch).tolist() == [[1, 1, 1, 2, 2, 3, 3], [1, 1, 2, 3, 0, 0, 0], [1, 1, 2, 2, 3, 3, 0]]
 
 
 def test_steps_that_look_alike_are_told_apart_by_their_controls_alone_if_asked_to():

@@ -49,6 +49,7 @@ def flat(kind="flat", network="linear", lr=0.03, **training):
     [
         ({}, 1, ["vq-1", "level-1", "meta-policy", "joint"]),
         ({}, 2, ["vq-1", "level-1", "vq-2", "level-2", "meta-policy", "joint"]),
+        ({"initialize": "equal_parts", "layerwise": False}, 2, ["parts-1", "parts-2", "joint"]),
         ({"initialize": "random"}, 2, ["level-1", "level-2", "meta-policy", "joint"]),
         ({"lower_levels": "frozen"}, 1, ["vq-1", "level-1", "meta-policy"]),
         ({"layerwise": False}, 2, ["vq-1", "vq-2", "joint"]),

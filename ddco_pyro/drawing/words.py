@@ -35,7 +35,8 @@ def stage(name: str) -> str:
     """What a stage of training is called in the page: ``vq-1`` is ``level 1 from clusters``."""
     kind, _, level = name.partition("-")
     whole = {"meta-policy": "meta-policy alone", "joint": "all together"}
-    return {"vq": f"level {level} from clusters", "level": f"level {level} alone"}.get(kind) or whole.get(name, name)
+    how = {"vq": "from clusters", "parts": "from equal parts", "level": "alone"}.get(kind)
+    return f"level {level} {how}" if how else whole.get(name, name)
 
 
 def method(name: str) -> str:

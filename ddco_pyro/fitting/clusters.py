@@ -48,6 +48,21 @@ def joined(seen: np.ndarray, actions: np.ndarray) -> np.ndarray:
     return np.concatenate([seen, np.sqrt(seen.shape[1] / actions.shape[1]) * actions], axis=1)
 
 
+class EqualParts:
+    """Every trajectory cut into ``options`` parts of equal length, in order named as the options 1 to k.
+
+    The uniform segmentation that training of left-to-right hidden Markov models starts from.
+    """
+
+    def __init__(self, options: int) -> None:
+        self.options = options
+
+    def choices(self, batch: Batch) -> Tensor:
+        """The part of each step, [N, T], 1 to k; 0 where there is padding."""
+        part = batch.inputs.time * self.options // batch.lengths[:, None] + 1
+        return torch.where(_alive(batch), part, 0)
+
+
 def _alive(batch: Batch) -> Tensor:
     return batch.inputs.time < batch.lengths[:, None]
 

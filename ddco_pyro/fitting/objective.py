@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.errors import Failed
-from ddco_pyro.fitting.clusters import Clusters
+from ddco_pyro.fitting.clusters import Clusters, EqualParts
 from ddco_pyro.fitting.stages import Stage
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
 from ddco_pyro.model.encoding import Batch
@@ -32,8 +32,12 @@ class Objective:
             hierarchy = trainer.spec.hierarchy
             assert hierarchy is not None  # only levels are clamped
             seed = trainer._seed(trainer.progress.restart, trainer.progress.stage)
-            options = hierarchy.levels[stage.clamped - 1].count
-            clusters = Clusters(trainer.train, options, seed, trainer.spec.training.initialize == "vq_controls")
+            options, kind = hierarchy.levels[stage.clamped - 1].count, trainer.spec.training.initialize
+            clusters = (
+                EqualParts(options)
+                if kind == "equal_parts"
+                else Clusters(trainer.train, options, seed, kind == "vq_controls")
+            )
             self.clusters = clusters.choices(trainer.train), clusters.choices(trainer.tune)
 
     def ascend(self, model: Hierarchy, rows: Tensor) -> float:

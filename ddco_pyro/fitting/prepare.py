@@ -200,5 +200,5 @@ def _work(spec: Spec, hierarchy: Hierarchy, dimensions: Dimensions) -> Work:
     """What training a model takes."""
     features = len(hierarchy.encoder.mean) + sum(shape[-1] * POOLED**2 for shape in hierarchy.encoder.images.values())
     kind = spec.training.initialize if hierarchy.depth else "random"
-    clustered = {"random": 0, "vq": features, "vq_controls": features + dimensions.control_size}[kind]
+    clustered = {"random": 0, "equal_parts": 0, "vq": features, "vq_controls": features + dimensions.control_size}[kind]
     return Work(spec.training.batch_size, hierarchy.steps_at_once, hierarchy.step_bytes, clustered)

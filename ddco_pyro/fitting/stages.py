@@ -12,7 +12,7 @@ class Stage:
     """One stage of training.
 
     :param discovering: train levels 1 to d under a uniform meta-policy; None for the whole hierarchy.
-    :param clamped: the level whose choices are clamped to clusters of the observations; None for no level.
+    :param clamped: the level whose choices are clamped to clusters or parts of the demonstrations; None for no level.
     :param trained: prefixes of the names of the parameters that are trained.
     """
 
@@ -36,7 +36,8 @@ def plan(spec: Spec, depth: int) -> list[Stage]:
     for level in range(1, depth + 1):
         own = (f"levels.{level - 1}.",)
         if training.initialize != "random":
-            stages.append(Stage(f"vq-{level}", level, level, own))
+            kind = "parts" if training.initialize == "equal_parts" else "vq"
+            stages.append(Stage(f"{kind}-{level}", level, level, own))
         if training.layerwise:
             stages.append(Stage(f"level-{level}", level, None, own))
     if training.layerwise:

@@ -170,6 +170,8 @@ def learning(fit: Fit) -> Figures | None:
 STAGES = {
     "vq": "“From clusters” trains each option of a level on a cluster of steps of its own, so that options differ from "
     "the beginning; it maximises another quantity, to be compared within its panel only.",
+    "parts": "“From equal parts” trains each option of a level on a part of every demonstration, all parts equally long; "
+    "it maximises another quantity, to be compared within its panel only.",
     "level": "“Alone” trains a level’s options before anything selects among them: each is as likely as any other.",
     "meta": "“Meta-policy alone” then trains the policy that selects the options.",
     "joint": "“All together” trains everything once more.",

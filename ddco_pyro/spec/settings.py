@@ -179,9 +179,10 @@ class OptimizerSpec(Model):
 class TrainingSpec(Model):
     """How the model is trained."""
 
-    initialize: Literal["vq", "vq_controls", "random"] = "vq"
+    initialize: Literal["vq", "vq_controls", "equal_parts", "random"] = "vq"
     """``vq``: by vector quantisation of the observations (SM 2.2); ``vq_controls``: of observations and controls;
-    ``random``: random weights."""
+    ``equal_parts``: each demonstration cut into as many parts of equal length as there are options, for skills that
+    follow one another; ``random``: random weights."""
     layerwise: bool = True
     """Discover level after level, lowest first, rather than all at once."""
     lower_levels: Literal["fine_tuned", "frozen"] = "fine_tuned"
