@@ -156,7 +156,9 @@ def digest(demos: Demonstrations) -> str:
 
 
 def _labels(spec: Spec) -> tuple[str, ...]:
-    return (spec.demonstrations.labels,) if spec.demonstrations.labels else ()
+    trained = spec.training.labels
+    names = (spec.demonstrations.labels, trained.source if trained else None)
+    return tuple(dict.fromkeys(name for name in names if name))
 
 
 def _needed(spec: Spec) -> str:

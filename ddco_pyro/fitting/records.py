@@ -325,6 +325,14 @@ class Agreement(Record):
     valid: Annotated[list[Finite] | None, NOT_NULL] = None
 
 
+class TrainedLabels(Record):
+    """The labels that the options 1, 2, ... of a level stand for."""
+
+    level: str
+    labels: str
+    values: list[int]
+
+
 class Metrics(Record):
     """What ``metrics.json`` has to have for those who read it."""
 
@@ -337,6 +345,7 @@ class Metrics(Record):
     options: list[list[Use]] = []
     divergences: list[list[Alike]] = []
     agreement: Annotated[Agreement | None, NOT_NULL] = None
+    trained_labels: Annotated[TrainedLabels | None, NOT_NULL] = None
     engine_check: dict[str, float]
     demonstrations: Counts
     control_dimensions: list[ControlRange] = []

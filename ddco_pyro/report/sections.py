@@ -11,6 +11,7 @@ from ddco_pyro.drawing import words
 from ddco_pyro.drawing.pictures import Picture, keep
 from ddco_pyro.fitting.diagnostics import diagnose
 from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.labels import option_labels
 from ddco_pyro.report import (
     film,
     plot_branches,
@@ -190,7 +191,8 @@ def options(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mappin
     makers = (_posteriors, _rows, _trajectories, _timing)
     pictures = [picture for make in makers if (picture := make(fit, demos, activity, metrics)) is not None]
     names = [level.name for level in fit.spec.hierarchy.levels]
-    table = tables.option_use(names, metrics["options"], sum(metrics["demonstrations"][part] for part in PARTS))
+    number = sum(metrics["demonstrations"][part] for part in PARTS)
+    table = tables.option_use(names, metrics["options"], number, option_labels(metrics))
     text = _agreement(metrics, names)
     if len(names) > 1:
         text = f"{text} Each level numbers its own options: equal colours in two levels mean nothing.".strip()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.inferred import Inferred
+from ddco_pyro.fitting.labels import option_labels
 
 __all__ = ["LevelLabels", "Segmented", "Segments", "segments"]
 
@@ -66,13 +67,15 @@ class Segments:
 @dataclass(frozen=True)
 class Segmented:
     """All demonstrations of a source. ``counts`` has the number of options of each level by name; ``truth`` is the name
-    of the labels that the run's spec compares with.
+    of the labels that the run's spec compares with; ``option_labels`` has the label that each option stands for, by
+    level, where the run was trained from labels.
     """
 
     segments: tuple[Segments, ...]
     counts: dict[str, int]
     frequency: float | None
     truth: str | None = None
+    option_labels: Mapping[str, Mapping[int, int]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.segments)
@@ -95,7 +98,8 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
     for piece in fit.infer(_demonstrations(source, names, fit, labels)):
         segmented += _segments(fit, piece, tuple(counts), labels)
         on_event(DemonstrationsDone(len(segmented), len(names)))
-    return Segmented(tuple(segmented), counts, source.frequency, fit.spec.demonstrations.labels)
+    truth = fit.spec.demonstrations.labels
+    return Segmented(tuple(segmented), counts, source.frequency, truth, option_labels(fit.metrics))
 
 
 def _names(source: Source, fit: Fit) -> list[str]:
