@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.prepare import parts
 from ddco_pyro.fitting.stages import Stage
 from ddco_pyro.spec import LevelSpec, Spec, SpecError
@@ -74,13 +75,20 @@ def used(spec: Spec, demos: Demonstrations) -> Labels | None:
     return Labels.of(spec, *parts(spec, demos)["train"].split(spec.training.tune_fraction, spec.seed))
 
 
-def as_data(spec: Spec, demos: Demonstrations) -> dict[str, Any]:
-    """What ``metrics.json`` says of the labels that a fit used; nothing where it used none."""
-    labels, own = used(spec, demos), spec.training.labels
+def trained_labels(fit: Fit, demos: Demonstrations) -> dict[str, Any]:
+    """What ``metrics.json`` says of the labels that a fit used; nothing where it used none.
+
+    ``agreement`` is the part of the labelled steps whose most likely option, as if they had no label, is the label's.
+    """
+    labels, own = used(fit.spec, demos), fit.spec.training.labels
     if labels is None or own is None:
         return {}
+    labelled = demos.select(labels.demonstrations)
+    segments = torch.as_tensor(fit.segment(labelled)[labels.level - 1])
+    known = _choices(labelled, own.source, labels.values, labelled.names)
+    agreement = float((segments == known)[known >= 0].double().mean())
     said = {"level": own.level, "labels": own.source, "values": labels.values, "demonstrations": labels.demonstrations}
-    return {"trained_labels": said}
+    return {"trained_labels": {**said, "agreement": agreement}}
 
 
 def option_labels(metrics: Mapping[str, Any]) -> dict[str, dict[int, int]]:

@@ -326,11 +326,12 @@ class Agreement(Record):
 
 
 class TrainedLabels(Record):
-    """The labels that the options 1, 2, ... of a level stand for."""
+    """The labels that the options 1, 2, ... of a level stand for, and how much of the labelled steps has them."""
 
     level: str
     labels: str
     values: list[int]
+    agreement: Finite
 
 
 class Metrics(Record):

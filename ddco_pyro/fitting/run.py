@@ -162,7 +162,7 @@ def _fit(
         "control_dimensions": [dimension.as_data() for dimension in dimensions.control],
         "parameters": parameters(trained.hierarchy),
         "training": trained.training,
-        **labels.as_data(spec, demos),
+        **labels.trained_labels(fitted, demos),
         "seconds": clock.seconds,
         "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
     }

@@ -116,7 +116,7 @@ class Spec(Model):
         if not levels:
             yield "training.duration", "a baseline has no options that last; leave it out"
         elif isinstance(duration.mean, tuple) and len(duration.mean) != levels:
-            yield "training.duration.mean", f"has {len(duration.mean)} numbers, but there are {levels} levels"
+            yield "training.duration.mean", f"has {len(duration.mean)} numbers, but the number of levels is {levels}"
 
     @property
     def _levels(self) -> tuple[LevelSpec, ...]:
