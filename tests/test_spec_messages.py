@@ -133,6 +133,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"training.labels": {"level": "option", "form": "phase"}},
+        "training.labels.from: missing; it has to be given\n"
         "training.labels.form: unknown key; did you mean training.labels.from?",
     ),
     (
