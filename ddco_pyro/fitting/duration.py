@@ -13,9 +13,9 @@ from ddco_pyro.spec import DurationSpec
 def log_duration_prior(termination: Sequence[Tensor], lengths: Tensor, prior: DurationSpec) -> Tensor:
     """Σ_d Σ_h Σ_n Σ_t w (log ψ_h(s_t) + (m_d - 1) log(1 - ψ_h(s_t))), nats, a scalar in float64.
 
-    ψ is that of option h of level d, w the prior's weight, m_d its mean. Divided by the number of steps this is the mean
-    over states of the log-density of Beta distributions of ψ with mean 1/m_d and w terminations, each as a density of
-    the logit of ψ and up to a constant.
+    ψ is that of option h of level d, w the prior's weight, m_d its mean. Divided by the number of steps this is the
+    mean over states of the log-density of Beta distributions of ψ with mean 1/m_d and w terminations, each as a
+    density of the logit of ψ and up to a constant.
 
     :param termination: (log(1 - ψ), log ψ) of each level, lowest first, [N, T, k, 2].
     :param lengths: steps of each trajectory, [N].
