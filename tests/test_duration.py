@@ -11,9 +11,12 @@ from planted import make_spec, make_trainer, make_truth, plant
 from scipy import integrate, stats
 
 import ddco_pyro
+from ddco_pyro.events import ignore
+from ddco_pyro.fitting.checkpoint import Progress, Restart
 from ddco_pyro.fitting.duration import log_duration_prior
 from ddco_pyro.fitting.objective import Objective
-from ddco_pyro.fitting.stages import WHOLE
+from ddco_pyro.fitting.stages import plan
+from ddco_pyro.fitting.training import Training
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.links import log_termination
@@ -96,7 +99,11 @@ def test_all_training_demonstrations_together_have_it_once(demos, tmp_path):
     """Whatever the minibatches; the tuning demonstrations in the same proportion to their likelihood."""
     spec = make_spec((2,), duration={"mean": 20, "weight": 3})
     trainer = make_trainer(spec, demos, tmp_path)
-    model, objective = trainer._fresh(), Objective(trainer, WHOLE)
+    trainer = Training(trainer.material, Restart(Progress(0)), None, ignore)
+    model, objective = (
+        trainer._material.hierarchy(0),
+        Objective(trainer, plan(trainer.spec, len(trainer.spec.hierarchy.levels))[-1]),
+    )
     for batch in (trainer.train, trainer.tune):
         with torch.no_grad():
             tables = model.tabulate(batch)

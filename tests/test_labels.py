@@ -18,12 +18,15 @@ from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.events import ignore
 from ddco_pyro.fitting.building import Dimensions
+from ddco_pyro.fitting.checkpoint import Progress, Restart
 from ddco_pyro.fitting.clusters import Clusters
 from ddco_pyro.fitting.labels import Labels
 from ddco_pyro.fitting.objective import Objective
-from ddco_pyro.fitting.stages import WHOLE, plan
-from ddco_pyro.fitting.training import Trainer
+from ddco_pyro.fitting.restarts import Trainer
+from ddco_pyro.fitting.stages import plan
+from ddco_pyro.fitting.training import Training
 from ddco_pyro.inference import segment
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.spec import SpecError, dump_spec, parse_spec
@@ -53,7 +56,13 @@ def labelled(level=1, counts=(2,), training=(), **own):
 
 
 def make(spec, demos):
-    return Trainer(spec, Dimensions.of(demos), *demos.split(0.2, 0))
+    """A restart before any training."""
+    trainer = Trainer(spec, Dimensions.of(demos), *demos.split(0.2, 0))
+    return Training(trainer.material, Restart(Progress(0)), None, ignore)
+
+
+def fresh(trainer):
+    return trainer._material.hierarchy(0)
 
 
 def options(labels):
@@ -69,8 +78,8 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
     """Against the sum over all paths, one after another."""
     demos = random_demonstrations(LABELS[: 5 if len(counts) == 1 else 3])
     trainer = make(labelled(level, counts), demos)
-    model = trainer._fresh()
-    objective = Objective(trainer, WHOLE)
+    model = fresh(trainer)
+    objective = Objective(trainer, plan(trainer.spec, len(trainer.spec.hierarchy.levels))[-1])
     values = {}
     for name, batch in (("train", trainer.train), ("tune", trainer.tune)):
         names = trainer.names if name == "train" else [n for n in demos.names if n not in trainer.names]
@@ -92,10 +101,13 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
 
 def test_its_gradient_is_that_of_finite_differences():
     trainer = make(labelled(), random_demonstrations())
-    model = trainer._fresh()
+    model = fresh(trainer)
     assert model.step_bytes > 0  # counted while it is as it was built
     model = model.double()
-    objective, rows = Objective(trainer, WHOLE), torch.arange(len(trainer.train))
+    objective, rows = (
+        Objective(trainer, plan(trainer.spec, len(trainer.spec.hierarchy.levels))[-1]),
+        torch.arange(len(trainer.train)),
+    )
     trainer.train = replace(trainer.train, inputs=trainer.train.inputs.map(torch.Tensor.double, torch.arange(STEPS)))
     parameter = model.levels[0].termination.layers[0].weight
     objective.ascend(model, rows)
