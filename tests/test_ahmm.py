@@ -177,20 +177,41 @@ def test_what_cannot_happen_is_never_drawn():
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("level", [1, 2])
-def test_a_clamped_level_has_the_choices_it_is_given(level):
-    tables = random_tables((2, 2), (True, True), trajectories=2, steps=3, seed=11)
-    lengths, choices = torch.tensor([3, 2]), torch.tensor([[2, 0, 1], [2, 2, 0]])  # the last is past the end
-    clamped = tables.clamp(level, choices)
-    assert tables.evidence == ()
-    for n, length in enumerate(lengths.tolist()):
-        given = tuple(choices[n, :length].tolist())
-        every = [(path, probability) for path, _, probability in paths(tables, n, length, [3, 3])]
-        truth = sum(probability for path, probability in every if tuple(h[level - 1] for h in path) == given)
-        assert 0 < truth < 0.9 * sum(probability for _, probability in every)
-        for engine in ("fused", "enumerate"):
-            found = log_likelihood(clamped, lengths, engine)[n]
-            assert float(found) == pytest.approx(np.log(truth), abs=1e-9)
+@pytest.mark.parametrize("counts", [(2,), (2, 2)])
+@pytest.mark.parametrize(
+    "choices", [[[2, 0, 1], [2, 2, 0]], [[-1, 2, -1], [2, -1, 0]], [[-1, -1, 1], [-1, -1, -1]]]
+)  # the last of the second trajectory is past the end
+def test_a_clamped_level_has_the_choices_it_is_given_and_is_free_elsewhere(counts, choices):
+    tables = random_tables(counts, (True,) * len(counts), trajectories=2, steps=3, seed=11)
+    lengths, choices = torch.tensor([3, 2]), torch.tensor(choices)
+    for level in range(1, len(counts) + 1):
+        clamped = tables.clamp(level, choices)
+        assert tables.evidence == ()
+        for n, length in enumerate(lengths.tolist()):
+            given = choices[n, :length].tolist()
+            every = [(path, probability) for path, _, probability in paths(tables, n, length, [3] * len(counts))]
+            truth = sum(
+                probability
+                for path, probability in every
+                if all(known in (-1, h[level - 1]) for known, h in zip(given, path, strict=True))
+            )
+            share = truth / sum(probability for _, probability in every)
+            assert 0 < share < 0.9 or (set(given) == {-1} and share == 1)
+            for engine in ("fused", "enumerate"):
+                found = log_likelihood(clamped, lengths, engine)[n]
+                assert float(found) == pytest.approx(np.log(truth), abs=1e-9)
+
+
+@pytest.mark.parametrize("counts", [(2,), (2, 2)])
+def test_the_gradient_where_some_choices_are_known_is_that_of_finite_differences(counts):
+    tables = random_tables(counts, (True,) * len(counts), trajectories=2, steps=3, seed=14)
+    lengths, choices = torch.tensor([3, 2]), torch.tensor([[-1, 2, -1], [1, -1, 0]])
+    leaves = [table.clone().requires_grad_() for table in tables.leaves()]
+
+    def value(*leaves):
+        return log_likelihood(Tables.of(len(counts), leaves).clamp(1, choices), lengths)
+
+    assert torch.autograd.gradcheck(value, leaves)
 
 
 def test_where_every_choice_is_known_only_terminations_are_summed_over():

@@ -74,7 +74,11 @@ def test_padding_belongs_to_no_cluster_and_makes_none():
 
 def test_equal_parts_cut_each_demonstration_for_itself():
     batch = make_batch(random_rows(0, 3), random_rows(1, 2))
-    assert EqualParts(3).choices(batch).tolist() == [[1, 1, 1, 2, 2, 3, 3], [1, 1, 2, 3, 0, 0, 0], [1, 1, 2, 2, 3, 3, 0]]
+    assert EqualParts(3).choices(batch).tolist() == [
+        [1, 1, 1, 2, 2, 3, 3],
+        [1, 1, 2, 3, 0, 0, 0],
+        [1, 1, 2, 2, 3, 3, 0],
+    ]
 
 
 def test_steps_that_look_alike_are_told_apart_by_their_controls_alone_if_asked_to():

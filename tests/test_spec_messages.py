@@ -127,6 +127,38 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"training.epochs": None, "training.patience": None},
         "training.epochs: null trains until training.patience, which is null too; give one of them",
     ),
+    (
+        {"training.labels": {"level": "optoin", "from": "phase"}},
+        "training.labels.level: there is no level 'optoin' (did you mean 'option'?); there is: option",
+    ),
+    (
+        {"training.labels": {"level": "option", "form": "phase"}},
+        "training.labels.from: missing; it has to be given\n"
+        "training.labels.form: unknown key; did you mean training.labels.from?",
+    ),
+    (
+        {"hierarchy": None, "baseline": "flat", "training.labels": {"level": "option", "from": "phase"}},
+        "training.labels.level: there is no level 'option'; a baseline has none; leave training.labels out",
+    ),
+    (
+        {"hierarchy.meta_policy.emits": ["control"], "training.labels": {"level": "option", "from": "phase"}},
+        "training.labels.level: nothing selects the options of 'option'; let what is above emit options",
+    ),
+    (
+        {"training": {"initialize": "random", "labels": {"level": "option", "from": "phase", "hold": False}}},
+        "training.labels.hold: false uses labels in initialisation alone, which is random; say vq there",
+    ),
+    (
+        {"training.duration.mean": 0.5},
+        "training.duration.mean: must be a number of steps, at least 1, or a list of them, got 0.5",
+    ),
+    ({"training.duration.mean": [20, 0]}, "training.duration.mean.1: must be at least 1, got 0"),
+    ({"training.duration.mean": [20, 2]}, "training.duration.mean: has 2 numbers, but the number of levels is 1"),
+    ({"training.duration": {"mean": 20, "weight": -1}}, "training.duration.weight: must be at least 0, got -1"),
+    (
+        {"hierarchy": None, "baseline": "flat", "training.duration.mean": 20},
+        "training.duration: a baseline has no options that last; leave it out",
+    ),
     ({"compare_with": [3]}, "compare_with.0: must be a mapping (key: value), got 3"),
     ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),
     ({"task": ""}, "task: must not be empty, got ''"),

@@ -33,6 +33,7 @@ from ddco_pyro.fitting.convergence import effort
 
 if TYPE_CHECKING:
     from ddco_pyro.fitting.building import Dimensions
+    from ddco_pyro.fitting.labels import Labels
     from ddco_pyro.model.hierarchy import Hierarchy
     from ddco_pyro.selection import Choice
     from ddco_pyro.spec import Spec
@@ -176,6 +177,18 @@ def control(size: Dimensions, hierarchy: Hierarchy) -> None:
     unknown = ["control: its kinds are decided once demonstrations have been collected (ddco-pyro collect)"]
     for note in (*notes(size.control), *(described(hierarchy.scaling.parts) if size.control else unknown)):
         Console().print(Text(note), soft_wrap=True)
+
+
+def labels(spec: Spec, used: Labels | None) -> None:
+    """For which label each option stands, where training uses labels."""
+    from ddco_pyro.drawing.words import option_name
+
+    own = spec.training.labels
+    if used is None or own is None:
+        return
+    names = ", ".join(f"{value} is {option_name(option)}" for option, value in enumerate(used.values, start=1))
+    text = f"labels/{own.source}, level {own.level!r}: {names}; used of {len(used.demonstrations)} demonstrations"
+    Console().print(Text(text), soft_wrap=True)
 
 
 def log_likelihoods(metrics: Mapping[str, Any]) -> None:

@@ -43,13 +43,17 @@ def check(
     loaded = load_spec(spec, overrides, allow_code)
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.building import baselines, check_networks
-    from ddco_pyro.fitting.prepare import dimensions
+    from ddco_pyro.fitting.labels import used
+    from ddco_pyro.fitting.prepare import dimensions, in_file, outline
 
-    size = dimensions(loaded)
+    demos = outline(loaded) if in_file(loaded) else None
+    size = dimensions(loaded, demos)
     hierarchy = check_networks(loaded, size)
+    labels = used(loaded, demos) if demos else None
     print(dump_spec(loaded), end="")
     console.dimensions(loaded, size, hierarchy, baselines(loaded, size))
     console.control(size, hierarchy)
+    console.labels(loaded, labels)
 
 
 def fit(

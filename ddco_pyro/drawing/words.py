@@ -44,6 +44,12 @@ def method(name: str) -> str:
     return METHODS.get(name, name.replace("_", " "))
 
 
+def option_name(option: int, labels: Mapping[int, int] | None = None) -> str:
+    """``control``, ``option h``, or ``option h (label l)`` where ``labels`` says for which label it stands."""
+    stands = f" (label {labels[option]})" if labels and option in labels else ""
+    return f"option {option}{stands}" if option else "control"
+
+
 def number(value: float | None, digits: int = 2) -> str:
     """A number with a fixed number of digits after the point and a real minus sign; a dash where there is none."""
     if value is None or not math.isfinite(value):

@@ -170,7 +170,9 @@ def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) ->
     :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
     """
     grid = spec.selection.model_copy(update={"grid": {}})  # it is about the hierarchy
-    alone = spec.model_copy(update={"hierarchy": None, "baseline": baseline, "compare_with": (), "selection": grid})
+    training = spec.training.model_copy(update={"labels": None, "duration": None})  # they are about options
+    model = {"hierarchy": None, "baseline": baseline, "compare_with": ()}
+    alone = spec.model_copy(update={**model, "training": training, "selection": grid})
     if baseline.kind != "flat_equal":
         return alone
 

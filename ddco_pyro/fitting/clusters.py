@@ -2,7 +2,7 @@
 
 The paper clones one policy from each cluster. Here the whole model is trained with the choices of a level clamped to
 the clusters, which clones those policies and starts the terminations from the clusters' boundaries in the same way,
-at any level.
+at any level. Where some steps have labels, clusters start from the means of those (seeded k-means, Basu et al. 2002).
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from sklearn.cluster import KMeans
+from sklearn.metrics import euclidean_distances
 from torch import Tensor
 
 from ddco_pyro.model.encoding import Batch
@@ -21,14 +22,19 @@ class Clusters:
 
     :param controls: cluster observations and controls together, with as much weight on the controls as on the
         observations: steps that look alike but are acted on differently are then told apart.
+    :param labels: the options of the steps that have one, 1 to m, -1 for the others, [N, T]: the clusters of these
+        options start from the means of their steps, the others as k-means++ does from there.
 
     Fewer than ``options`` clusters are found where there are fewer distinct observations.
     """
 
-    def __init__(self, batch: Batch, options: int, seed: int, controls: bool = False) -> None:
+    def __init__(
+        self, batch: Batch, options: int, seed: int, controls: bool = False, labels: Tensor | None = None
+    ) -> None:
         self._controls = controls
         rows = self._rows(batch)
-        self._kmeans = KMeans(distinct(rows, options), n_init=10, random_state=seed).fit(rows)
+        start = "k-means++" if labels is None else _Start(labels[_alive(batch)].numpy())
+        self._kmeans = KMeans(distinct(rows, options), init=start, n_init=10, random_state=seed).fit(rows)
 
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
@@ -61,6 +67,21 @@ class EqualParts:
         """The part of each step, [N, T], 1 to k; 0 where there is padding."""
         part = batch.inputs.time * self.options // batch.lengths[:, None] + 1
         return torch.where(_alive(batch), part, 0)
+
+
+class _Start:
+    """Where k-means starts: from the mean of each labelled option's rows, and from rows drawn far from all before."""
+
+    def __init__(self, labels: np.ndarray) -> None:
+        self.labels = labels
+
+    def __call__(self, rows: np.ndarray, clusters: int, random_state: np.random.RandomState) -> np.ndarray:
+        labelled = [option for option in np.unique(self.labels) if 0 < option <= clusters]
+        means = {option: rows[self.labels == option].mean(0) for option in labelled}
+        for option in set(range(1, clusters + 1)) - set(labelled):
+            far = euclidean_distances(rows, np.stack(list(means.values())), squared=True).min(1)
+            means[option] = rows[random_state.choice(len(rows), p=far / far.sum())]
+        return np.stack([means[option] for option in range(1, clusters + 1)])
 
 
 def _alive(batch: Batch) -> Tensor:

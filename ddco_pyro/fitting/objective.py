@@ -9,10 +9,12 @@ from torch import Tensor
 
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.clusters import Clusters, EqualParts
+from ddco_pyro.fitting.duration import log_duration_prior
 from ddco_pyro.fitting.stages import Stage
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.tables import Tables
 
 if TYPE_CHECKING:
     from ddco_pyro.fitting.training import Training
@@ -22,57 +24,78 @@ class TrainingError(Failed):
     """Training cannot go on: the message names the trajectory or the checkpoint and says what to do."""
 
 
+Known = dict[int, Tensor]
+"""By level: the choice of each step that is known, [N, T]; -1 where it is free."""
+
+
 class Objective:
-    """What a stage maximises: the log-likelihood, with the choices of one level clamped where the stage says so."""
+    """What a stage maximises: the log-likelihood with the choices that are known, and the log-prior of durations."""
 
     def __init__(self, trainer: Training, stage: Stage) -> None:
         self.trainer, self.stage = trainer, stage
-        self.clusters: tuple[Tensor, Tensor] | None = None
+        self.known: tuple[Known, Known] = {}, {}
+        labels = trainer.labels
+        if labels is not None and labels.matter_in(stage):
+            self.known = {labels.level: labels.train}, {labels.level: labels.tune}
         if stage.clamped is not None:
-            hierarchy = trainer.spec.hierarchy
-            assert hierarchy is not None  # only levels are clamped
+            self._clamp_to_start(stage.clamped)
+
+    def _clamp_to_start(self, level: int) -> None:
+        """Where a step has no label its cluster, or the part of the demonstration it is in, is its choice."""
+        trainer, hierarchy = self.trainer, self.trainer.spec.hierarchy
+        assert hierarchy is not None  # only levels are clamped
+        kind, count = trainer.spec.training.initialize, hierarchy.levels[level - 1].count
+        if kind == "equal_parts":
+            start: EqualParts | Clusters = EqualParts(count)
+        else:
             seed = trainer._seed(trainer.progress.restart, trainer.progress.stage)
-            options, kind = hierarchy.levels[stage.clamped - 1].count, trainer.spec.training.initialize
-            clusters = (
-                EqualParts(options)
-                if kind == "equal_parts"
-                else Clusters(trainer.train, options, seed, kind == "vq_controls")
-            )
-            self.clusters = clusters.choices(trainer.train), clusters.choices(trainer.tune)
+            start = Clusters(trainer.train, count, seed, kind == "vq_controls", self.known[0].get(level))
+        for known, batch in zip(self.known, (trainer.train, trainer.tune), strict=True):
+            choices = start.choices(batch)
+            labelled = known.get(level, choices)
+            known[level] = torch.where(labelled < 0, choices, labelled)
 
     def ascend(self, model: Hierarchy, rows: Tensor) -> float:
-        """Add the gradient of the loss of some training demonstrations to the parameters'; their log-likelihood.
+        """Add the gradient of the loss of some training demonstrations to the parameters'; what they add to what is
+        maximised.
 
-        The loss is minus the log-likelihood per step. A batch that is long is processed in parts.
+        The loss is minus that per step. A batch that is long is processed in parts.
         """
         batch, total = self.trainer.train.select(rows), 0.0
         for part, piece in batch.pieces(model.steps_at_once):
-            value = self._total(model, piece, None if self.clusters is None else self.clusters[0][rows[part]])
+            tables = self._tables(model, piece, self.known[0], rows[part])
+            value = self._total(tables, piece)
             if not bool(torch.isfinite(value.detach())):
-                raise self._not_finite(model, piece, rows[part])
+                raise self._not_finite(tables, piece, rows[part])
             (-value / batch.steps).backward()
             total += float(value.detach())
         return total
 
     def tune(self, model: Hierarchy) -> float:
-        """Log-likelihood per step of the tuning demonstrations."""
-        choices = None if self.clusters is None else self.clusters[1]
+        """What is maximised of the tuning demonstrations, per step."""
         with torch.no_grad():
             values = [
-                float(self._total(model, piece, None if choices is None else choices[part]))
+                float(self._total(self._tables(model, piece, self.known[1], part), piece))
                 for part, piece in self.trainer.tune.pieces(model.steps_at_once)
             ]
         return sum(values) / self.trainer.tune.steps
 
-    def _total(self, model: Hierarchy, batch: Batch, choices: Tensor | None) -> Tensor:
+    def _tables(self, model: Hierarchy, batch: Batch, known: Known, rows: Tensor) -> Tables:
         tables = model.tabulate(batch, self.stage.discovering)
-        if choices is not None and self.stage.clamped is not None:
-            tables = tables.clamp(self.stage.clamped, choices[:, : batch.inputs.batch[1]])
-        return total_log_likelihood(tables, batch.lengths, self.trainer.spec.inference.engine)
+        for level, choices in known.items():
+            tables = tables.clamp(level, choices[rows, : batch.inputs.batch[1]])
+        return tables
 
-    def _not_finite(self, model: Hierarchy, batch: Batch, rows: Tensor) -> TrainingError:
+    def _total(self, tables: Tables, batch: Batch) -> Tensor:
+        value = total_log_likelihood(tables, batch.lengths, self.trainer.spec.inference.engine)
+        prior = self.trainer.spec.training.duration
+        if prior is None:
+            return value
+        return value + log_duration_prior(tables.termination, batch.lengths, prior) / self.trainer.train.steps
+
+    def _not_finite(self, tables: Tables, batch: Batch, rows: Tensor) -> TrainingError:
         with torch.no_grad():
-            values = log_likelihood(model.tabulate(batch, self.stage.discovering), batch.lengths)
+            values = log_likelihood(tables, batch.lengths)
         bad = [self.trainer.names[int(row)] for row, ok in zip(rows, torch.isfinite(values), strict=True) if not ok]
         where = ", ".join(bad) or "this minibatch (no trajectory alone)"
         return TrainingError(

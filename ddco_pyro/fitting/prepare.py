@@ -88,7 +88,7 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
     else:
         path = collect(str(spec.demonstrated_task), own, Path(own.path) if own.path else None, on_event)
     _refuse_what_cannot_be_read(spec, path)
-    return Demonstrations.read(path, spec.observed, spec.demonstrations.label_names, own.exclude)
+    return Demonstrations.read(path, spec.observed, _labels(spec), own.exclude)
 
 
 def outline(spec: Spec) -> Demonstrations:
@@ -99,7 +99,7 @@ def outline(spec: Spec) -> Demonstrations:
     """
     path = Path(str(spec.demonstrations.path))
     _refuse_what_cannot_be_read(spec, path)
-    controls = Demonstrations.read(path, [], spec.demonstrations.label_names, spec.demonstrations.exclude)
+    controls = Demonstrations.read(path, [], _labels(spec), spec.demonstrations.exclude)
     keys = spec.observed
     with opened(path) as file:
         return replace(
@@ -120,7 +120,7 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
 
     :raises DemonstrationsError: they lack one of them.
     """
-    keys, labels, exclude = spec.observed, spec.demonstrations.label_names, set(spec.demonstrations.exclude)
+    keys, labels, exclude = spec.observed, _labels(spec), set(spec.demonstrations.exclude)
     first = demos[0]
     if (first.observations.keys(), first.labels.keys(), exclude) == ({*keys}, {*labels}, set()):
         return demos
@@ -155,13 +155,15 @@ def digest(demos: Demonstrations) -> str:
     return sha256.hexdigest()
 
 
+def _labels(spec: Spec) -> tuple[str, ...]:
+    """Names of the labels to compare with and to train from."""
+    trained = spec.training.labels
+    return tuple(dict.fromkeys((*spec.demonstrations.label_names, *([trained.source] if trained else []))))
+
+
 def _needed(spec: Spec) -> str:
     """What to do about a file that is not there."""
-    read = [
-        "actions",
-        *(f"obs/{key}" for key in spec.observed),
-        *(f"labels/{name}" for name in spec.demonstrations.label_names),
-    ]
+    read = ["actions", *(f"obs/{key}" for key in spec.observed), *(f"labels/{name}" for name in _labels(spec))]
     return (
         "put it there, or fit to another with --set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, "
         f"with {', '.join(read)} in each data/<demonstration>"

@@ -303,6 +303,15 @@ class Counts(Record):
     supervisor: dict[str, Measure] = Field(default_factory=dict)
 
 
+class TrainedLabels(Record):
+    """The labels that the options 1, 2, ... of a level stand for, and how much of the labelled steps has them."""
+
+    level: str
+    labels: str
+    values: list[int]
+    agreement: Finite
+
+
 class Metrics(Record):
     """What ``metrics.json`` has to have for those who read it."""
 
@@ -315,6 +324,7 @@ class Metrics(Record):
     options: list[list[Use]] = Field(default_factory=list)
     divergences: list[list[Alike]] = Field(default_factory=list)
     agreement: Annotated[Agreement | None, NOT_NULL] = None
+    trained_labels: Annotated[TrainedLabels | None, NOT_NULL] = None
     engine_check: dict[str, float]
     demonstrations: Counts
     control_dimensions: list[ControlRange] = Field(default_factory=list)

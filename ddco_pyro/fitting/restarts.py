@@ -21,6 +21,7 @@ from ddco_pyro.events import EpochEnded, OnEvent, RestartStopped, ignore
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.checkpoint import Progress, Restart
 from ddco_pyro.fitting.convergence import StageEnd, summary
+from ddco_pyro.fitting.labels import Labels
 from ddco_pyro.fitting.processes import pool, results, useful_jobs
 from ddco_pyro.fitting.training import Material, advance
 from ddco_pyro.model.encoding import encode
@@ -44,6 +45,7 @@ class Trainer:
     :param checkpoints: the folder in which each restart is kept at the end of epochs; None for nowhere.
     :param jobs: processes that train restarts; -1 is one for each core. The result is the same for any number.
     :raises DemonstrationsError: a number is too large for networks.
+    :raises SpecError: there are no labels where the spec names some, or more than options.
     """
 
     def __init__(
@@ -66,7 +68,8 @@ class Trainer:
         encoder, scaling = self.first.encoder, self.first.scaling
         encoded = encode(train, encoder, scaling), encode(tune, encoder, scaling)
         fitted = encoder.state_dict(), scaling.state_dict()
-        self.material = Material(spec, dimensions, *encoded, train.names, *fitted)
+        labels = Labels.of(spec, train, tune)
+        self.material = Material(spec, dimensions, *encoded, train.names, *fitted, labels)
         self.restarts: list[Restart] = []
         self.stopped: dict[int, int] = {}
 

@@ -20,6 +20,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import leftovers, only_one, write_text
 from ddco_pyro.data.tensors import write_tensors
 from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, ignore
+from ddco_pyro.fitting import labels
 from ddco_pyro.fitting.building import Dimensions, baseline_spec, check_networks, named_baselines, parameters
 from ddco_pyro.fitting.fit import Fit, RunError, is_finished, load, model_name
 from ddco_pyro.fitting.metrics import evaluate, supervisor
@@ -102,6 +103,8 @@ def fit_run(
     with clock("demonstrations"):
         demos = known_demonstrations(spec) if demos is None else demos
         check_networks(spec, dimensions(spec, demos))
+        if demos is not None:
+            labels.used(spec, demos)
     if folder is None:
         return _fit(spec, demos or read_demonstrations(spec, on_event), None, on_event, jobs, clock)
     claim(folder, spec, resume)
@@ -159,6 +162,7 @@ def _fit(
         "control_dimensions": [dimension.as_data() for dimension in dimensions.control],
         "parameters": parameters(trained.hierarchy),
         "training": trained.training,
+        **labels.trained_labels(fitted, demos),
         "seconds": clock.seconds,
         "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
     }

@@ -24,6 +24,7 @@ from ddco_pyro.events import EpochEnded, OnEvent, ignore
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.checkpoint import Restart, State, copy_of, optimizer_state, restore_optimizer
 from ddco_pyro.fitting.convergence import StageEnd, share
+from ddco_pyro.fitting.labels import Labels
 from ddco_pyro.fitting.objective import Objective
 from ddco_pyro.fitting.stages import Stage, plan
 from ddco_pyro.inference.threads import one_thread
@@ -39,6 +40,7 @@ class Material:
     """What all restarts share: demonstrations to train and to tune on, and how they were encoded and scaled.
 
     :param names: of the training demonstrations.
+    :param labels: the labels that say which options are active; None where there are none.
     """
 
     spec: Spec
@@ -48,6 +50,7 @@ class Material:
     names: Sequence[str]
     encoder: State
     scaling: State
+    labels: Labels | None = None
 
     def hierarchy(self, restart: int) -> Hierarchy:
         """A restart's hierarchy before any training, in evaluation mode."""
@@ -87,7 +90,7 @@ class Training:
 
     def __init__(self, material: Material, restart: Restart, checkpoint: Path | None, on_event: OnEvent) -> None:
         self.spec, self.train, self.tune, self.names = material.spec, material.train, material.tune, material.names
-        self.progress, self._seed = restart.progress, material.seed
+        self.progress, self._seed, self.labels = restart.progress, material.seed, material.labels
         self._material, self._restart, self._checkpoint, self._on_event = material, restart, checkpoint, on_event
         self._saved_at = -np.inf  # the first epoch is saved
 

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import one_hot
 
 NEVER = -torch.inf
 """Log-probability of what cannot happen: a true zero, never a small number."""
@@ -74,10 +73,12 @@ class Tables:
         return None if total is None else total.expand(*total.shape[:2], *reversed(sizes))
 
     def clamp(self, level: int, choices: Tensor) -> Tables:
-        """These tables where the choices of one level (1 is the lowest) are known to be ``choices``, [N, T]."""
+        """These tables where the choices of one level (1 is the lowest) are known to be ``choices``, [N, T]; -1 leaves
+        that of a step free.
+        """
         evidence = list(self.evidence or (None,) * self.depth)
-        size = self.selection[level - 1].shape[-1]
-        evidence[level - 1] = torch.where(one_hot(choices, size).bool(), 0.0, NEVER)
+        each, choices = torch.arange(self.selection[level - 1].shape[-1]), choices.unsqueeze(-1)
+        evidence[level - 1] = torch.where((choices == each) | (choices < 0), 0.0, NEVER)
         return replace(self, evidence=tuple(evidence))
 
     def trajectory(self, n: int, length: int) -> Tables:

@@ -9,6 +9,7 @@ from typing import Any
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.words import method, number
 from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.labels import option_labels
 from ddco_pyro.report.activity import Activity
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
 from ddco_pyro.segmenting.timeline import Timeline, anchor
@@ -68,7 +69,8 @@ def timelines(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mapp
     known = [entry for entry in rows if entry["name"] in places]
     segments = tuple(_segments(fit, demos, places[entry["name"]], activity, entry) for entry in known)
     counts = {level.name: level.active.shape[2] - 1 for level in activity.levels}
-    return drawn(Segmented(segments, counts, None), MOST_BOXES) if segments else []
+    segmented = Segmented(segments, counts, None, option_labels=option_labels(metrics))
+    return drawn(segmented, MOST_BOXES) if segments else []
 
 
 def _segments(fit: Fit, demos: Demonstrations, row: int, activity: Activity, listed: Mapping[str, Any]) -> Segments:

@@ -11,6 +11,7 @@ from ddco_pyro.drawing import scores, words
 from ddco_pyro.drawing.pictures import Picture, keep
 from ddco_pyro.fitting.diagnostics import diagnose
 from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.labels import option_labels
 from ddco_pyro.report import (
     film,
     plot_branches,
@@ -170,8 +171,8 @@ def learning(fit: Fit) -> Figures | None:
 STAGES = {
     "vq": "“From clusters” trains each option of a level on a cluster of steps of its own, so that options differ from "
     "the beginning; it maximises another quantity, to be compared within its panel only.",
-    "parts": "“From equal parts” trains each option of a level on a part of every demonstration, all parts equally long; "
-    "it maximises another quantity, to be compared within its panel only.",
+    "parts": "“From equal parts” trains each option of a level on a part of its own of every demonstration, equally "
+    "long; it maximises another quantity, to be compared within its panel only.",
     "level": "“Alone” trains a level’s options before anything selects among them: each is as likely as any other.",
     "meta": "“Meta-policy alone” then trains the policy that selects the options.",
     "joint": "“All together” trains everything once more.",
@@ -205,7 +206,8 @@ def options(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mappin
     makers = (_posteriors, _rows, _trajectories, _timing)
     pictures = [picture for make in makers if (picture := make(fit, demos, activity, metrics)) is not None]
     names = [level.name for level in fit.spec.hierarchy.levels]
-    table = tables.option_use(names, metrics["options"], sum(metrics["demonstrations"][part] for part in PARTS))
+    number = sum(metrics["demonstrations"][part] for part in PARTS)
+    table = tables.option_use(names, metrics["options"], number, option_labels(metrics))
     several = "Each level numbers its own options: equal colours in two levels mean nothing."
     text = several if len(names) > 1 else ""
     return Figures(pictures, table, text)

@@ -12,6 +12,7 @@ from matplotlib.patches import Patch
 
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.pictures import FAINT, hide_frame
+from ddco_pyro.drawing.words import option_name
 
 LABEL_SHADES = ("#ffffff", "#d4d4d4")
 """Ground truth has no colours: those belong to options. Its segments alternate in shade and carry their label."""
@@ -54,9 +55,4 @@ def draw_labels(axes: Axes, labels: np.ndarray) -> None:
 
 def legend(choices: Sequence[int]) -> list[Patch]:
     """Handles that name the colours of choices."""
-    return [Patch(color=option_colour(choice), label=choice_name(choice)) for choice in choices]
-
-
-def choice_name(choice: int) -> str:
-    """``control`` or ``option h``."""
-    return f"option {choice}" if choice else "control"
+    return [Patch(color=option_colour(choice), label=option_name(choice)) for choice in choices]

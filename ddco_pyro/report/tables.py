@@ -8,10 +8,9 @@ from typing import Any
 
 from ddco_pyro.drawing import scores
 from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.drawing.words import interval, measure, method, number, p_value, percent, rate, signed
+from ddco_pyro.drawing.words import interval, measure, method, number, option_name, p_value, percent, rate, signed
 from ddco_pyro.fitting.convergence import effort
 from ddco_pyro.report.plot_likelihood import Likelihood
-from ddco_pyro.report.strips import choice_name
 
 
 @dataclass(frozen=True)
@@ -51,15 +50,23 @@ def against(methods: Mapping[str, Mapping[str, Any]], ours: str) -> Table | None
     return Table(head, rows) if rows else None
 
 
-def option_use(levels: Sequence[str], options: Sequence[Sequence[Mapping[str, Any]]], demonstrations: int) -> Table:
-    """How each choice of each level is used, the highest level first; control only where it is chosen."""
+def option_use(
+    levels: Sequence[str],
+    options: Sequence[Sequence[Mapping[str, Any]]],
+    demonstrations: int,
+    labels: Mapping[str, Mapping[int, int]],
+) -> Table:
+    """How each choice of each level is used, the highest level first; control only where it is chosen.
+
+    :param labels: the label that each option stands for, by level, where there is one.
+    """
     rows, colours = [], []
     for level, use in reversed(list(zip(levels, options, strict=True))):
         for row in use:
             if row["choice"] or row["share"] > 0:
                 each = row["selected"] / demonstrations
                 last = [percent(row["share"], 1), number(row["selected"], 1), number(each), number(row["duration"], 1)]
-                rows.append([level, choice_name(row["choice"]), *last])
+                rows.append([level, option_name(row["choice"], labels.get(level)), *last])
                 colours.append(option_colour(row["choice"]))
     head = ["Level", "Choice", "Share of steps", "Selections", "Selections per demonstration", "Expected steps"]
     return Table(head, rows, colours)
@@ -103,7 +110,7 @@ def agreement(levels: Sequence[str], record: Mapping[str, Any]) -> Table:
 
 def confusion(record: Mapping[str, Any]) -> Table:
     """Share of each label's steps in each option; under the options, the label that each stands for."""
-    head = ["Label", "Steps", *map(choice_name, record["options"])]
+    head = ["Label", "Steps", *map(option_name, record["options"])]
     rows = [
         [str(label), str(sum(steps)), *(percent(count / sum(steps)) if count else "" for count in steps)]
         for label, steps in zip(record["labels"], record["steps"], strict=True)

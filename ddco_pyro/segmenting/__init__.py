@@ -16,6 +16,7 @@ from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.inferred import Inferred
+from ddco_pyro.fitting.labels import option_labels
 
 __all__ = ["LevelLabels", "Segmented", "Segments", "demonstrations", "segments"]
 
@@ -66,13 +67,15 @@ class Segments:
 @dataclass(frozen=True)
 class Segmented:
     """All demonstrations of a source. ``counts`` has the number of options of each level by name; ``truth`` the name of
-    the labels that the run's spec compares a level with.
+    the labels that the run's spec compares a level with; ``option_labels`` the label that each option stands for, by
+    level, where the run was trained from labels.
     """
 
     segments: tuple[Segments, ...]
     counts: dict[str, int]
     frequency: float | None
     truth: Mapping[str, str] = field(default_factory=dict)
+    option_labels: Mapping[str, Mapping[int, int]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.segments)
@@ -96,7 +99,8 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
         segmented += _segments(fit, piece, tuple(counts), labels)
         on_event(DemonstrationsDone(len(segmented), len(chosen)))
     names = fit.spec.demonstrations.labels_by_level(len(counts))
-    return Segmented(tuple(segmented), counts, source.frequency, dict(zip(counts, names, strict=bool(names))))
+    truth = dict(zip(counts, names, strict=bool(names)))
+    return Segmented(tuple(segmented), counts, source.frequency, truth, option_labels(fit.metrics))
 
 
 def demonstrations(source: Source, names: Iterable[str], fit: Fit) -> Demonstrations:

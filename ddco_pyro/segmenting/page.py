@@ -12,9 +12,10 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing import scores as measures
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.templates import render
+from ddco_pyro.drawing.words import option_name
 from ddco_pyro.segmenting import Segmented
 from ddco_pyro.segmenting.scores import LevelScores
-from ddco_pyro.segmenting.timeline import duration, option_name, timelines
+from ddco_pyro.segmenting.timeline import duration, timelines
 
 
 def write_page(path: Path, segmented: Segmented, run: str, file: str, scores: Mapping[str, LevelScores]) -> None:
@@ -47,7 +48,7 @@ def _level(name: str, count: int, segmented: Segmented) -> dict[str, Any]:
             typical = float(np.median(lengths)) if lengths else None
             options.append(
                 {
-                    "name": option_name(option),
+                    "name": option_name(option, segmented.option_labels.get(name)),
                     "colour": option_colour(option),
                     "share": f"{sum(lengths) / total:.1%}",
                     "segments": len(lengths),

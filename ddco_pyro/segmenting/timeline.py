@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from urllib.parse import quote
@@ -12,6 +12,7 @@ import matplotlib
 import numpy as np
 
 from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.drawing.words import option_name
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
 
 SHADES = ("#f2f2f2", "#d4d4d4")
@@ -67,7 +68,7 @@ def timelines(segmented: Segmented, most_boxes: float = math.inf) -> list[Timeli
     return [
         Timeline(
             demo.name, anchor(demo.name), duration(len(demo), segmented.frequency), demo.log_likelihood, demo.held_out,
-            tuple(_rows(demo, segmented.frequency, longest)),
+            tuple(_rows(demo, segmented, longest)),
         )
         for demo in shown
     ]  # fmt: skip
@@ -87,24 +88,22 @@ def duration(steps: float, frequency: float | None) -> str:
     return f"{steps:g} steps" + (f", {steps / frequency:.3g} s" if frequency else "")
 
 
-def option_name(option: int) -> str:
-    """``control`` or ``option h``."""
-    return f"option {option}" if option else "control"
-
-
-def _rows(demo: Segments, frequency: float | None, longest: int) -> Iterator[Row]:
+def _rows(demo: Segments, segmented: Segmented, longest: int) -> Iterator[Row]:
     for name, level in reversed(demo.levels.items()):
-        yield Row(name, tuple(_option_box(level, run, frequency, longest) for run in level.runs()))
+        labels = segmented.option_labels.get(name, {})
+        yield Row(name, tuple(_option_box(level, run, labels, segmented.frequency, longest) for run in level.runs()))
     for name, values in demo.labels.items():
         if name not in demo.levels and not name.endswith("_boundary"):
             yield Row(name, tuple(_label_boxes(name, values, longest)))
 
 
-def _option_box(level: LevelLabels, run: tuple[int, int, int], frequency: float | None, longest: int) -> Box:
+def _option_box(
+    level: LevelLabels, run: tuple[int, int, int], labels: Mapping[int, int], frequency: float | None, longest: int
+) -> Box:
     option, start, end = run
     mean = float(level.probability[start:end].mean())
     when = f" ({start / frequency:.3g} to {end / frequency:.3g} s)" if frequency else ""
-    title = f"{option_name(option)}, steps {start} to {end - 1}{when}, probability {mean:.2f}"
+    title = f"{option_name(option, labels)}, steps {start} to {end - 1}{when}, probability {mean:.2f}"
     return _box(start, end, longest, option_colour(option), str(option) if option else "", title)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from ddco_pyro.errors import BadInput, nearest
@@ -102,7 +103,7 @@ def show(value: Any) -> str:
 def _suggestion(parts: list[str], whole: type[BaseModel]) -> str:
     """The valid key nearest to an unknown one: beside it, or of the same name elsewhere; else all that are valid."""
     *above, wrong = parts
-    valid = [key for model in _models_at(above, whole) for key in model.model_fields]
+    valid = [key for model in _models_at(above, whole) for key in _fields(model)]
     close = difflib.get_close_matches(wrong, valid, n=1)
     if close:
         return f"did you mean {'.'.join([*above, close[0]])}?"
@@ -112,12 +113,17 @@ def _suggestion(parts: list[str], whole: type[BaseModel]) -> str:
     return f"valid here: {', '.join(valid)}"
 
 
+def _fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """The fields by their keys."""
+    return {field.alias or name: field for name, field in model.model_fields.items()}
+
+
 def _models_at(parts: list[str], whole: type[BaseModel]) -> list[type[BaseModel]]:
     """The models that a key path leads to."""
     models = [whole]
     for part in parts:
         if not part.isdecimal():
-            fields = [model.model_fields[part] for model in models if part in model.model_fields]
+            fields = [fields[part] for fields in map(_fields, models) if part in fields]
             if fields:  # else it is a name in a mapping of models
                 models = [inner for field in fields for inner in _models_in(field.annotation)]
     return models
@@ -133,7 +139,7 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 def _all_paths(model: type[BaseModel], prefix: str = "", above: tuple[type[BaseModel], ...] = ()) -> Iterator[str]:
     """Every key path below a model, with 0 for the place in a list; networks within networks are left out."""
-    for name, field in model.model_fields.items():
+    for name, field in _fields(model).items():
         yield prefix + name
         place = ".0" if get_origin(field.annotation) is tuple else ""
         for inner in _models_in(field.annotation):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import ConfigDict, Field, TypeAdapter, model_validator
 
 from ddco_pyro.spec.messages import invalid
 from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Seed, Share, TaskName, Text, bare, nested
@@ -176,6 +176,44 @@ class OptimizerSpec(Model):
     """L2 penalty."""
 
 
+class LabelsSpec(Model):
+    """Labels of demonstrations that say which option of a level is active; at steps where a label is -1 it is free."""
+
+    model_config = ConfigDict(serialize_by_alias=True)
+
+    level: Text
+    """Name of the level."""
+    source: Text = Field(alias="from")
+    """Name of the labels in the file, integers: those from 0 on, sorted, are the options 1, 2, ..."""
+    count: Count | None = None
+    """Number of demonstrations whose labels are used: the first ones in training, those to tune with last; null: all.
+    Those of held-out demonstrations never are."""
+    hold: bool = True
+    """Whether labels say which option is active in all of training; false: in initialisation alone."""
+
+
+Duration = Annotated[float, Field(ge=1)]
+Durations = Annotated[Items[Duration], Field(min_length=1)]
+
+
+class DurationSpec(Model):
+    """A prior on how long options last: a Beta distribution of each option's probability ψ to terminate at a step."""
+
+    mean: Annotated[
+        Duration | Durations,
+        nested(
+            (list, tuple),
+            TypeAdapter(Durations, config=Model.model_config).validate_python,
+            "a number of steps, at least 1, or a list of them",
+        ),
+    ]
+    """Steps that an option lasts on average, 1 / E[ψ]; a list has one for each level, lowest first. A level above the
+    lowest counts the options below it that end instead."""
+    weight: float = Field(default=1.0, ge=0, le=1e30)
+    """How many selections of each option the prior counts as, beside those in the training demonstrations; 0 for no
+    prior."""
+
+
 class TrainingSpec(Model):
     """How the model is trained."""
 
@@ -206,6 +244,10 @@ class TrainingSpec(Model):
     """Epochs without improvement before a stage stops; null for never."""
     clip_gradient: Positive | None = None
     """Largest norm of a gradient; null for no limit."""
+    labels: LabelsSpec | None = None
+    """Labels that say which option is active in some demonstrations; null for none."""
+    duration: DurationSpec | None = None
+    """A prior on how long options last; null for none."""
 
     @model_validator(mode="after")
     def _ends(self) -> TrainingSpec:
@@ -213,6 +255,8 @@ class TrainingSpec(Model):
             raise invalid(("epochs", "null trains until training.patience, which is null too; give one of them"))
         if self.epochs is None and self.optimizer.schedule == "cosine":
             raise invalid(("optimizer.schedule", "cosine falls to 0 at the end of training.epochs, which is null"))
+        if self.labels is not None and not self.labels.hold and self.initialize == "random":
+            raise invalid(("labels.hold", "false uses labels in initialisation alone, which is random; say vq there"))
         return self
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import Field, ValidationError, model_validator
 
-from ddco_pyro.spec.hierarchy import Baseline, HierarchySpec
+from ddco_pyro.spec.hierarchy import Baseline, HierarchySpec, LevelSpec
 from ddco_pyro.spec.keypaths import edited
 from ddco_pyro.spec.messages import SpecError, invalid, lines, nearest, show
 from ddco_pyro.spec.settings import (
@@ -21,7 +21,7 @@ from ddco_pyro.spec.settings import (
     SelectionSpec,
     TrainingSpec,
 )
-from ddco_pyro.spec.types import Items, Model, Seed, TaskName
+from ddco_pyro.spec.types import Emission, Items, Model, Seed, TaskName
 
 
 class Spec(Model):
@@ -74,6 +74,8 @@ class Spec(Model):
             *self._unknown_trajectory(),
             *self._nothing_held_out(),
             *self._labels_of_other_levels(),
+            *self._labelled_level(),
+            *self._durations(),
         ]
         if problems:
             raise invalid(*problems)
@@ -106,6 +108,35 @@ class Spec(Model):
                 "demonstrations.labels",
                 f"must have a name for each of {levels} levels, or be one name for all, got {show([*names])}",
             )
+
+    def _labelled_level(self) -> Iterator[tuple[str, str]]:
+        if self.training.labels is None:
+            return
+        name, names = self.training.labels.level, [level.name for level in self._levels]
+        if name not in names:
+            there = f"there is: {', '.join(names)}" if names else "a baseline has none; leave training.labels out"
+            yield "training.labels.level", f"there is no level {name!r}{nearest(name, names)}; {there}"
+        elif any("options" not in emits for emits in self._emitted[names.index(name) + 1 :]):
+            yield "training.labels.level", f"nothing selects the options of {name!r}; let what is above emit options"
+
+    def _durations(self) -> Iterator[tuple[str, str]]:
+        duration, levels = self.training.duration, len(self._levels)
+        if duration is None:
+            return
+        if not levels:
+            yield "training.duration", "a baseline has no options that last; leave it out"
+        elif isinstance(duration.mean, tuple) and len(duration.mean) != levels:
+            yield "training.duration.mean", f"has {len(duration.mean)} numbers, but the number of levels is {levels}"
+
+    @property
+    def _levels(self) -> tuple[LevelSpec, ...]:
+        return self.hierarchy.levels if self.hierarchy else ()
+
+    @property
+    def _emitted(self) -> list[tuple[Emission, ...]]:
+        """What the callers of each level emit, and the meta-policy."""
+        meta_policy = [self.hierarchy.meta_policy.emits] if self.hierarchy else []
+        return [*(level.policy.emits for level in self._levels), *meta_policy]
 
     def _repeated_observations(self) -> Iterator[tuple[str, str]]:
         keys = [observation.key for observation in self.observations]

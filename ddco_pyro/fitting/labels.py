@@ -1,0 +1,120 @@
+"""Labels that say which option of a level is active in some demonstrations (``training.labels``)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.prepare import parts
+from ddco_pyro.fitting.stages import Stage
+from ddco_pyro.spec import LevelSpec, Spec, SpecError
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What labels say of the options of a level.
+
+    :param level: 1 is the lowest.
+    :param hold: whether they are used in all of training, or in its initialisation alone.
+    :param values: the labels that the options 1, 2, ... stand for.
+    :param demonstrations: the names of those whose labels are used.
+    :param train: the option of each step of the demonstrations to train with, -1 where it is free, [N, T].
+    :param tune: that of those to tune with.
+    """
+
+    level: int
+    hold: bool
+    values: tuple[int, ...]
+    demonstrations: tuple[str, ...]
+    train: Tensor
+    tune: Tensor
+
+    @classmethod
+    def of(cls, spec: Spec, train: Demonstrations, tune: Demonstrations) -> Labels | None:
+        """The labels that training uses; None where the spec names none.
+
+        :raises SpecError: there are none in the demonstrations to train with, or more than options.
+        """
+        own = spec.training.labels
+        if own is None or spec.hierarchy is None:
+            return None
+        number, level = next(item for item in enumerate(spec.hierarchy.levels, 1) if item[1].name == own.level)
+        used = (*train, *tune)[: own.count]
+        values = _known(demo.labels[own.source] for demo in used)
+        if not _known(demo.labels[own.source] for demo in used[: len(train)]):
+            raise SpecError(
+                f"training.labels: labels/{own.source} is -1 at every step of the demonstrations to train with that "
+                "have labels; raise training.labels.count, or leave training.labels out"
+            )
+        _refuse_too_many(own.source, values, level, number)
+        names = tuple(demo.name for demo in used)
+        choices = (_choices(part, own.source, values, names) for part in (train, tune))
+        return cls(number, own.hold, values, names, *choices)
+
+    def matter_in(self, stage: Stage) -> bool:
+        """Whether a stage of training uses them."""
+        seen = stage.discovering is None or self.level <= stage.discovering
+        return seen if self.hold else stage.clamped == self.level
+
+
+def used(spec: Spec, demos: Demonstrations) -> Labels | None:
+    """The labels that a fit to these demonstrations uses; None where the spec names none.
+
+    :raises SpecError: as :meth:`Labels.of`.
+    """
+    if spec.training.labels is None:
+        return None
+    return Labels.of(spec, *parts(spec, demos)["train"].split(spec.training.tune_fraction, spec.seed))
+
+
+def trained_labels(fit: Fit, demos: Demonstrations) -> dict[str, Any]:
+    """What ``metrics.json`` says of the labels that a fit used; nothing where it used none.
+
+    ``agreement`` is the part of the labelled steps whose most likely option, as if they had no label, is the label's.
+    """
+    labels, own = used(fit.spec, demos), fit.spec.training.labels
+    if labels is None or own is None:
+        return {}
+    labelled = demos.select(labels.demonstrations)
+    segments = torch.as_tensor(fit.segment(labelled)[labels.level - 1])
+    known = _choices(labelled, own.source, labels.values, labelled.names)
+    agreement = float((segments == known)[known >= 0].double().mean())
+    said = {"level": own.level, "labels": own.source, "values": labels.values, "demonstrations": labels.demonstrations}
+    return {"trained_labels": {**said, "agreement": agreement}}
+
+
+def option_labels(metrics: Mapping[str, Any]) -> dict[str, dict[int, int]]:
+    """The label that each option stands for, by level, of a run trained from labels."""
+    said = metrics.get("trained_labels")
+    return {said["level"]: dict(enumerate(said["values"], start=1))} if said else {}
+
+
+def _known(labels: Any) -> tuple[int, ...]:
+    """The different labels from 0 on, sorted."""
+    return tuple(sorted({int(value) for array in labels for value in np.unique(array) if value >= 0}))
+
+
+def _refuse_too_many(name: str, values: tuple[int, ...], level: LevelSpec, number: int) -> None:
+    if len(values) > level.count:
+        raise SpecError(
+            f"training.labels: labels/{name} has {len(values)} labels from 0 on ({', '.join(map(str, values))}), but "
+            f"level {level.name!r} has {level.count} options; raise hierarchy.levels.{number - 1}.count, or say -1 for "
+            "labels that are no option"
+        )
+
+
+def _choices(demos: Demonstrations, name: str, values: tuple[int, ...], labelled: tuple[str, ...]) -> Tensor:
+    """The option of each step, [N, T]; -1 where it is free, and past a demonstration's end."""
+    each = []
+    for demo in demos:
+        labels = demo.labels[name] if demo.name in labelled else np.full(len(demo), -1)
+        each.append(torch.as_tensor(np.where(labels >= 0, np.searchsorted(values, labels) + 1, -1)))
+    return pad_sequence(each, batch_first=True, padding_value=-1)

@@ -1,0 +1,151 @@
+"""The prior on how long options last."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from planted import make_spec, make_trainer, make_truth, plant
+from scipy import integrate, stats
+
+import ddco_pyro
+from ddco_pyro.events import ignore
+from ddco_pyro.fitting.checkpoint import Progress, Restart
+from ddco_pyro.fitting.duration import log_duration_prior
+from ddco_pyro.fitting.objective import Objective
+from ddco_pyro.fitting.stages import plan
+from ddco_pyro.fitting.training import Training
+from ddco_pyro.inference import log_likelihood, total_log_likelihood
+from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.links import log_termination
+from ddco_pyro.spec import DurationSpec
+
+LENGTHS = torch.tensor([4, 3])
+
+
+def prior(mean, weight=1.0):
+    return DurationSpec.model_validate({"mean": mean, "weight": weight})
+
+
+def random_logits(*counts, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return [torch.randn(2, 4, count, generator=generator, dtype=torch.float64) for count in counts]
+
+
+@pytest.mark.parametrize("mean", [20, [20, 3]])
+def test_it_is_a_beta_density_of_each_logit_summed_over_steps(mean):
+    """Differences of scipy's Beta log-densities, with the Jacobian dψ/dx = ψ (1 - ψ): constants cancel."""
+    means = mean if isinstance(mean, list) else [mean, mean]
+    values, expected = [], []
+    for seed in (0, 1):
+        logits = random_logits(2, 3, seed=seed)
+        values.append(log_duration_prior([log_termination(x) for x in logits], LENGTHS, prior(mean, 2.5)))
+        total = 0.0
+        for level, m in zip(logits, means, strict=True):
+            psi = (12 * torch.tanh(level / 12)).sigmoid().numpy()
+            density = stats.beta(2.5, 2.5 * (m - 1)).logpdf(psi) + np.log(psi) + np.log(1 - psi)
+            total += sum(density[n, :length].sum() for n, length in enumerate(LENGTHS.tolist()))
+        expected.append(total)
+    assert float(values[0] - values[1]) == pytest.approx(expected[0] - expected[1], rel=1e-9)
+
+
+def test_the_mean_of_that_density_is_one_in_as_many_steps():
+    """E[ψ] = 1/m, by integration over the logit."""
+
+    def density(x):
+        return math.exp(float(log_duration_prior([log_termination(torch.full((1, 1, 1), x))], torch.tensor([1]), own)))
+
+    own = prior(20, 3)
+    total, first = (
+        integrate.quad(lambda x, f=f: f(12 * math.tanh(x / 12)) * density(x), -10, 4, limit=200)[0]
+        for f in (lambda _: 1.0, lambda x: 1 / (1 + math.exp(-x)))
+    )
+    assert first / total == pytest.approx(1 / 20, rel=0.02)  # the bound on logits bends them a little
+
+
+def test_no_weight_is_no_prior_and_lower_levels_alone_have_theirs():
+    tables = [log_termination(x) for x in random_logits(2, 3)]
+    assert float(log_duration_prior(tables, LENGTHS, prior(20, 0))) == 0
+    alone = log_duration_prior(tables[:1], LENGTHS, prior([20, 3]))
+    assert float(alone) == float(log_duration_prior(tables[:1], LENGTHS, prior(20)))
+
+
+def test_its_gradient_is_that_of_finite_differences():
+    assert torch.autograd.gradcheck(
+        lambda *logits: log_duration_prior([log_termination(x) for x in logits], LENGTHS, prior([20, 3], 0.7)),
+        [x.requires_grad_() for x in random_logits(2, 3)],
+    )
+
+
+# --- in training ------------------------------------------------------------------------------------------------------
+
+TRAINING = {"epochs": 80, "patience": None, "initialize": "vq_controls", "batch_size": 4, "optimizer": {"lr": 0.1}}
+
+
+@pytest.fixture(scope="module")
+def demos():
+    """Short options: each ends with a probability of a half."""
+    return plant(make_truth(make_spec((2,)), ending=0.0), 12, 20, seed=1)[0]
+
+
+def fitted(demos, tmp_path, **training):
+    trainer = make_trainer(make_spec((2,), **TRAINING, **training), demos, tmp_path)
+    return trainer, trainer.run()
+
+
+def test_all_training_demonstrations_together_have_it_once(demos, tmp_path):
+    """Whatever the minibatches; the tuning demonstrations in the same proportion to their likelihood."""
+    spec = make_spec((2,), duration={"mean": 20, "weight": 3})
+    trainer = make_trainer(spec, demos, tmp_path)
+    trainer = Training(trainer.material, Restart(Progress(0)), None, ignore)
+    model, objective = (
+        trainer._material.hierarchy(0),
+        Objective(trainer, plan(trainer.spec, len(trainer.spec.hierarchy.levels))[-1]),
+    )
+    for batch in (trainer.train, trainer.tune):
+        with torch.no_grad():
+            tables = model.tabulate(batch)
+        likelihood = float(total_log_likelihood(tables, batch.lengths))
+        means = sum(
+            float((table.double().mean((0, 1)) @ torch.tensor([57.0, 3.0]).double()).sum())
+            for table in tables.termination
+        )
+        if batch is trainer.tune:
+            expected = likelihood / batch.steps + means / trainer.train.steps
+            assert objective.tune(model) == pytest.approx(expected, rel=1e-6)
+            continue
+        parts = [objective.ascend(model, rows) for rows in torch.arange(len(batch)).split(4)]
+        assert sum(parts) == pytest.approx(likelihood + means, rel=1e-6)
+
+
+def durations(model, demos):
+    """1/ψ of each option, by the mean of ψ over all steps."""
+    with torch.no_grad():
+        batch = encode(demos, model.encoder, model.scaling)
+        return 1 / model.tabulate(batch).termination[0][..., 1].exp().mean((0, 1))
+
+
+def test_it_lengthens_options_and_much_of_it_makes_them_geometric(demos, tmp_path):
+    _, free = fitted(demos, tmp_path / "free")
+    _, some = fitted(demos, tmp_path / "some", duration={"mean": 12, "weight": 40.0})
+    _, much = fitted(demos, tmp_path / "much", duration={"mean": 12, "weight": 1e6})
+    assert (durations(free, demos) < 3).all()
+    assert (durations(some, demos) > 1.3 * durations(free, demos)).all()
+    assert (durations(some, demos) < 12).all()
+    with torch.no_grad():
+        psi = much.tabulate(encode(demos, much.encoder, much.scaling)).termination[0][..., 1].exp()
+    assert (psi - 1 / 12).abs().max() < 0.02  # at every step, whatever is seen
+
+
+def test_what_is_reported_is_the_likelihood_alone(demos):
+    spec = make_spec((2,), **{**TRAINING, "epochs": 4}, duration={"mean": 50, "weight": 1e3})
+    fit = ddco_pyro.fit(spec, demos)
+    batch = encode(demos, fit.hierarchy.encoder, fit.hierarchy.scaling)
+    with torch.no_grad():
+        values = log_likelihood(fit.hierarchy.tabulate(batch), batch.lengths).numpy()
+    for part in ("train", "valid"):
+        names = [row["name"] for row in fit.metrics["demonstrations_by_likelihood"] if row["part"] == part]
+        expected = sum(values[demos.names.index(name)] for name in names) / (20 * len(names))
+        assert fit.metrics["log_likelihood_per_step"][part] == pytest.approx(expected, rel=1e-4)

@@ -1,0 +1,304 @@
+"""Labels of a few demonstrations say which options are active, and name them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from command_line import call
+from oracle import paths
+from planted import CONTROL, make_spec, make_trainer, make_truth, plant
+from sklearn.metrics import normalized_mutual_info_score
+
+import ddco_pyro
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.events import ignore
+from ddco_pyro.fitting.building import Dimensions
+from ddco_pyro.fitting.checkpoint import Progress, Restart
+from ddco_pyro.fitting.clusters import Clusters
+from ddco_pyro.fitting.labels import Labels
+from ddco_pyro.fitting.objective import Objective
+from ddco_pyro.fitting.restarts import Trainer
+from ddco_pyro.fitting.stages import plan
+from ddco_pyro.fitting.training import Training
+from ddco_pyro.inference import segment
+from ddco_pyro.model.encoding import encode
+from ddco_pyro.spec import SpecError, dump_spec, parse_spec
+
+STEPS = 3
+LABELS = [[5, -1, -1], [-1, 9, 5], [-1, -1, 9], [-1, -1, -1], [9, 9, -1]]
+
+
+def random_demonstrations(labels=LABELS, seed=0):
+    random = np.random.default_rng(seed)
+    return Demonstrations(
+        tuple(
+            Demonstration(
+                f"demo_{n}",
+                {"state": random.normal(size=(len(each), 2))},
+                0.1 * random.normal(size=(len(each), 2)),
+                {"phase": np.array(each)},
+            )
+            for n, each in enumerate(labels)
+        )
+    )
+
+
+def labelled(level=1, counts=(2,), training=(), **own):
+    """A spec whose training uses labels."""
+    return make_spec(counts, labels={"level": f"level-{level}", "from": "phase", **own}, **dict(training))
+
+
+def make(spec, demos):
+    """A restart before any training."""
+    trainer = Trainer(spec, Dimensions.of(demos), *demos.split(0.2, 0))
+    return Training(trainer.material, Restart(Progress(0)), None, ignore)
+
+
+def fresh(trainer):
+    return trainer._material.hierarchy(0)
+
+
+def options(labels):
+    """Those of :data:`LABELS`: 5 is option 1, 9 is option 2."""
+    return [{5: 1, 9: 2}.get(label, -1) for label in labels]
+
+
+# --- what is maximised ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("counts", "level"), [((2,), 1), ((2, 2), 1), ((2, 2), 2)])
+def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
+    """Against the sum over all paths, one after another."""
+    demos = random_demonstrations(LABELS[: 5 if len(counts) == 1 else 3])
+    trainer = make(labelled(level, counts), demos)
+    model = fresh(trainer)
+    objective = Objective(trainer, plan(trainer.spec, len(trainer.spec.hierarchy.levels))[-1])
+    values = {}
+    for name, batch in (("train", trainer.train), ("tune", trainer.tune)):
+        names = trainer.names if name == "train" else [n for n in demos.names if n not in trainer.names]
+        with torch.no_grad():
+            tables = model.tabulate(batch)
+        values[name] = 0.0
+        for n, demo in enumerate(demos.select(names)):
+            known = options(demo.labels["phase"].tolist())
+            every = paths(tables, n, STEPS, [1 + count for count in counts])
+            total = sum(
+                probability
+                for path, _, probability in every
+                if all(option in (-1, h[level - 1]) for option, h in zip(known, path, strict=True))
+            )
+            values[name] += math.log(total)
+    assert objective.ascend(model, torch.arange(len(trainer.train))) == pytest.approx(values["train"], abs=1e-5)
+    assert objective.tune(model) == pytest.approx(values["tune"] / STEPS, abs=1e-5)
+
+
+def test_its_gradient_is_that_of_finite_differences():
+    trainer = make(labelled(), random_demonstrations())
+    model = fresh(trainer)
+    assert model.step_bytes > 0  # counted while it is as it was built
+    model = model.double()
+    objective, rows = (
+        Objective(trainer, plan(trainer.spec, len(trainer.spec.hierarchy.levels))[-1]),
+        torch.arange(len(trainer.train)),
+    )
+    trainer.train = replace(trainer.train, inputs=trainer.train.inputs.map(torch.Tensor.double, torch.arange(STEPS)))
+    parameter = model.levels[0].termination.layers[0].weight
+    objective.ascend(model, rows)
+    gradients = parameter.grad.clone()
+    for place in ((0, 0, 0), (1, 1, 0)):
+        gradient, values = float(gradients[place]), []
+        for step in (1e-4, -1e-4):
+            with torch.no_grad():
+                parameter[place] += step
+            values.append(objective.ascend(model, rows))
+            with torch.no_grad():
+                parameter[place] -= step
+        assert gradient == pytest.approx(-(values[0] - values[1]) / 2e-4 / trainer.train.steps, rel=1e-5, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("level", "own", "stages"),
+    [
+        (1, {}, ["vq-1", "level-1", "vq-2", "level-2", "meta-policy", "joint"]),
+        (2, {}, ["vq-2", "level-2", "meta-policy", "joint"]),
+        (1, {"hold": False}, ["vq-1"]),
+        (2, {"hold": False}, ["vq-2"]),
+    ],
+)
+def test_labels_matter_in_every_stage_that_has_their_level_or_in_its_initialisation(level, own, stages):
+    trainer = make(labelled(level, (2, 2), **own), random_demonstrations())
+    assert [stage.name for stage in plan(trainer.spec, 2) if trainer.labels.matter_in(stage)] == stages
+
+
+def test_the_label_wins_over_the_cluster():
+    demos = random_demonstrations([[7, -1, 3, 3], [-1, 3, -1, -1], [3, 7, 7, -1], [-1, -1, -1, 7], [7, -1, -1, -1]])
+    trainer = make(labelled(), demos)
+    objective = Objective(trainer, plan(trainer.spec, 1)[0])
+    for known, names in zip(objective.known, (trainer.names, set(demos.names) - set(trainer.names)), strict=True):
+        for choices, demo in zip(known[1].tolist(), demos.select(names), strict=True):
+            for choice, label in zip(choices, demo.labels["phase"].tolist(), strict=True):
+                assert choice == {3: 1, 7: 2}.get(label, choice)
+                assert choice in (1, 2)
+
+
+# --- which labels are used --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("count", "used"), [(1, 1), (2, 2), (4, 4), (5, 5), (None, 5), (99, 5)])
+def test_the_first_demonstrations_in_training_have_labels_those_to_tune_with_last(count, used):
+    demos = random_demonstrations()
+    train, tune = demos.split(0.2, 0)
+    labels = Labels.of(labelled(count=count), train, tune)
+    assert labels.demonstrations == (*train.names, *tune.names)[:used]
+    for part, tensor in ((train, labels.train), (tune, labels.tune)):
+        for demo, row in zip(part, tensor.tolist(), strict=True):
+            given = options(demo.labels["phase"].tolist()) if demo.name in labels.demonstrations else [-1] * STEPS
+            seen = {value for name in labels.demonstrations for value in options(_labels(demos, name))} - {-1}
+            assert row == (given if seen == {1, 2} else [min(option, 1) for option in given])
+
+
+def _labels(demos, name):
+    return demos.select([name])[0].labels["phase"].tolist()
+
+
+def test_labels_of_unequal_length_are_free_past_the_end():
+    demos = random_demonstrations([[0, 4, -1], [4], [0, 0], [4, -3]])
+    labels = Labels.of(labelled(), demos, demos.select(["demo_3"]))
+    assert labels.values == (0, 4)
+    assert labels.train.tolist() == [[1, 2, -1], [2, -1, -1], [1, 1, -1], [2, -1, -1]]
+    assert labels.tune.tolist() == [[2, -1]]
+
+
+@pytest.mark.parametrize(
+    ("labels", "message"),
+    [
+        ([[0, 1, 2], [0, 1, 2]], r"labels/phase has 3 labels from 0 on \(0, 1, 2\), but level 'level-1' has 2 options"),
+        ([[-1, -1], [-1, -1]], "labels/phase is -1 at every step of the demonstrations to train with"),
+    ],
+)
+def test_labels_that_cannot_be_used_are_one_line(labels, message):
+    demos = random_demonstrations(labels)
+    with pytest.raises(SpecError, match=message) as caught:
+        make(labelled(), demos)
+    assert "\n" not in str(caught.value)
+
+
+# --- clusters ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+def test_the_clusters_of_labelled_options_start_from_their_steps(order):
+    """Three places far apart; a step of each has a label, or of two of them: then the third cluster is the third."""
+    places = np.array([[0.0, 9.0], [9.0, 0.0], [0.0, 0.0]])
+    truth = np.arange(12) % 3
+    states = places[truth] + 0.1 * np.random.default_rng(0).normal(size=(12, 2))
+    demos = Demonstrations((Demonstration("demo", {"state": states}, states),))
+    trainer = make_batchable(demos)
+    numbers = np.array(order) + 1
+    for known in (3, 2):
+        labels = np.where((np.arange(12) < 3) & (numbers[truth] <= known), numbers[truth], -1)
+        choices = Clusters(trainer, 3, seed=0, labels=torch.tensor(labels[None])).choices(trainer)
+        np.testing.assert_array_equal(choices[0], numbers[truth])
+
+
+def make_batchable(demos):
+    model = make_truth(make_spec((2,)))
+    return encode(demos, model.encoder, model.scaling)
+
+
+# --- planted options --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("names", [[30, 10, 20], [7, 5, 6]])
+def test_three_labelled_demonstrations_name_the_options_of_thirty(tmp_path, names):
+    """Held-out segments have the numbers of the labels, whichever those are; the options 1 to 3 of the truth do not."""
+    training = {"epochs": 160, "patience": 15, "initialize": "vq", "optimizer": {"lr": 0.03}}
+    labels = {"level": "level-1", "from": "phase", "count": 3}
+    spec = make_spec((3,), control=CONTROL, labels=labels, **training)
+    truth = make_truth(spec)
+    demos, choices = plant(truth, 30, 24, seed=1)
+    demos = Demonstrations(
+        tuple(
+            Demonstration(demo.name, demo.observations, demo.actions, {"phase": np.array(names)[row[:, 0] - 1]})
+            for demo, row in zip(demos, choices.numpy(), strict=True)
+        )
+    )
+    held_out, true = plant(truth, 20, 24, seed=11)
+    model = make_trainer(spec, demos, tmp_path).run()
+    with torch.no_grad():
+        batch = encode(held_out, model.encoder, model.scaling)
+        (found,) = segment(model.tabulate(batch), batch.lengths)
+    number = np.argsort(np.argsort(names)) + 1
+    assert normalized_mutual_info_score(true.flatten(), found.flatten()) > 0.95
+    assert (found.numpy() == number[true[..., 0] - 1]).mean() > 0.98
+
+
+# --- the spec, the run and what is said of it -------------------------------------------------------------------------
+
+
+def test_the_spec_is_written_as_it_is_read():
+    spec = labelled(count=3, hold=False)
+    written = dump_spec(spec)
+    assert "labels: {level: level-1, from: phase, count: 3, hold: false}" in written
+    assert parse_spec(yaml.safe_load(written)) == spec
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A spec and demonstrations with labels, of which two of three options have one."""
+    labels = [[0, 0, 2, 2], [0, 2, 2, 2], [0, 0, 0, 2], [0, 0, 2, 2], [0, 2, 0, 2]]
+    random_demonstrations(labels).write(tmp_path / "demos.hdf5")
+    (tmp_path / "mine.yaml").write_text(
+        f"""
+demonstrations: {{path: {tmp_path / "demos.hdf5"}}}
+observations: [state]
+hierarchy: {{levels: [{{name: skill, count: 3, policy: {{network: linear}}}}], meta_policy: {{network: linear}}}}
+compare_with: [{{kind: flat, policy: {{network: linear}}}}]
+training: {{epochs: 3, labels: {{level: skill, from: phase, count: 2}}, duration: {{mean: 3}}}}
+"""
+    )
+    return tmp_path
+
+
+def test_a_run_says_for_which_labels_its_options_stand(files):
+    output = call("check", files / "mine.yaml").out
+    assert "labels/phase, level 'skill': 0 is option 1, 2 is option 2; used of 2 demonstrations" in output
+    call("fit", files / "mine.yaml", "--out", files / "run")
+    said = json.loads((files / "run" / "metrics.json").read_text())["trained_labels"]
+    assert (said["level"], said["labels"], said["values"]) == ("skill", "phase", [0, 2])
+    again = ddco_pyro.load(files / "run")
+    labelled = again.demonstrations.select(said["demonstrations"])
+    assert len(labelled) == 2
+    option = {0: 1, 2: 2}
+    (segments,) = again.segment(labelled)
+    same = [
+        option[label] == choice
+        for demo, row in zip(labelled, segments, strict=True)
+        for label, choice in zip(demo.labels["phase"].tolist(), row.tolist(), strict=True)
+    ]
+    assert said["agreement"] == pytest.approx(np.mean(same))
+    assert again.baselines["flat"].spec.training.labels is None
+    call("segment", files / "run", files / "demos.hdf5", "--html", files / "page.html")
+    for page in (files / "page.html", files / "run" / "report.html"):
+        text = page.read_text()
+        assert "option 2 (label 2)" in text
+        assert "option 3" in text
+        assert "option 3 (" not in text
+
+
+def test_labels_that_do_not_fit_are_refused_before_anything_is_written(files):
+    text = (files / "mine.yaml").read_text()
+    for old, new in (("{level: skill", "{level: arm"), ("count: 3", "count: 1")):
+        (files / "other.yaml").write_text(text.replace(old, new))
+        for command in (["check"], ["fit", "--out", files / "none"]):
+            ended = call(command[0], files / "other.yaml", *command[1:])
+            assert (ended.status, ended.err.count("\n")) == (2, 1)
+            assert "training.labels" in ended.err
+        assert not (files / "none").exists()
