@@ -21,7 +21,7 @@ from joblib import Parallel, delayed
 from provenance import record, sentence, text
 
 from ddco_pyro.data.files import write_text
-from ddco_pyro.errors import Failed
+from ddco_pyro.errors import BadInput, Failed
 
 TASKS = tuple(
     f"{name}-v3"
@@ -63,7 +63,7 @@ def main() -> None:
     arena_cell.add_settings(parser)
     try:
         print(run(parser.parse_args()))
-    except Failed as error:
+    except (BadInput, Failed) as error:
         raise SystemExit(str(error)) from None
 
 

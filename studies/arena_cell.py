@@ -29,8 +29,8 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
-from ddco_pyro.errors import Failed
-from ddco_pyro.export import export
+from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.export import write_numpy
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.spec import load_spec
@@ -191,7 +191,8 @@ def play(task: str, methods: dict[str, Fit], source: Path, settings: Settings) -
     """Episodes of each exported method, and by how much its controls differ from its fit's on recorded observations."""
     with tempfile.TemporaryDirectory() as folder:
         for name, one in methods.items():
-            export(one, Path(folder) / name)
+            (Path(folder) / name).mkdir()
+            write_numpy(one, Path(folder) / name)
         out, named = Path(folder) / "played.json", [f"{name}={folder}/{name}" for name in methods]
         options = ("--episodes", str(settings.episodes), "--recorded", source.resolve())
         arena_venv.run(arena_venv.made(settings.runs / "venv"), "play", task, out, *named, *options)
@@ -244,7 +245,7 @@ def main() -> None:
     cell = Cell(own.task, own.count, own.seed)
     try:
         print(json.dumps(run(cell, settings(own), record(cell.command(settings(own)))), indent=1))
-    except Failed as error:
+    except (BadInput, Failed) as error:
         raise SystemExit(str(error)) from None
 
 
