@@ -36,6 +36,7 @@ from ddco_pyro.fitting.run import fit
 from ddco_pyro.spec import load_spec
 
 OURS = "ddco"
+LABELS = "phase"
 HELD_OUT = 20
 """The first demonstrations of a file are held out, whatever the others are used for."""
 
@@ -163,9 +164,8 @@ def fitted_cell(cell: Cell, source: Path, overrides: tuple[str, ...], folder: Pa
     started = folder / "started.yaml"
     write_text(started, starting_spec(facts, source.resolve()))
     spec = load_spec(started, [*overrides, f"seed={cell.seed}"])
-    labels = [spec.demonstrations.labels] if spec.demonstrations.labels else []
     demos = replace(
-        Demonstrations.read(source, spec.observed, labels).select([*names, *valid]),
+        Demonstrations.read(source, spec.observed, [LABELS]).select([*names, *valid]),
         masks={"train": tuple(names), "valid": tuple(valid)},
     )
     return fit(spec, demos, out=folder / "fit")

@@ -48,6 +48,8 @@ UNSEEN = 1_000_000
 GIVE_UP = 10
 """Attempts for each demonstration that is wanted."""
 
+CAMERA = "corner2"
+
 Step = tuple[Observation, np.ndarray, int, bool]
 """What was seen, the control, the phase, and whether the task succeeded thereby."""
 
@@ -167,8 +169,13 @@ def film(task: str, out: Path, folder: str, frames: int) -> None:
     drawn: list[np.ndarray] = []
 
     class Filmed(Sawyer):
+        def reset(self, seed: int) -> Observation:
+            observation = super().reset(seed)
+            self.world.mujoco_renderer.camera_id = self.world.model.camera(CAMERA).id
+            return observation
+
         def step(self, control: np.ndarray) -> tuple[Observation, bool, bool]:
-            drawn.append(np.rot90(self.world.render(), 2))  # Meta-World's cameras stand on their heads
+            drawn.append(np.rot90(self.world.render(), 2))  # this camera stands on its head
             return super().step(control)
 
     played = play(exported(folder), Filmed(task, render_mode="rgb_array"), UNSEEN)

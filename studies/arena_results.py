@@ -61,7 +61,8 @@ def _method(cells: list[Result]) -> Result:
 
 def nmi(agreement: Result) -> float:
     """Held-out NMI of the lowest level's segments with the phases."""
-    return float(agreement["valid"][0])
+    lowest = agreement["valid"][0]  # a number, or a table of measures
+    return float(lowest["nmi"] if isinstance(lowest, dict) else lowest)
 
 
 def page(results: Result, made_by: str) -> str:
