@@ -151,6 +151,7 @@ def _run(cell: Cell, settings: Settings, made_by: Record) -> dict[str, Any]:
             for name, one in methods.items()
         },
         "difference": {name: one["difference"] for name, one in metrics["comparison"].items()},
+        "held_out": [row for row in metrics["demonstrations_by_likelihood"] if row["part"] == "valid"],
         "agreement": metrics["agreement"],
         "options": metrics["options"],
         "seconds": {"fit": trained - begun, "play": ended - trained, "all": ended - begun},

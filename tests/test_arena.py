@@ -292,6 +292,7 @@ def cell(seed, nmi, ours, flat, success):
         "expert": {"successes": 70, "attempts": 72, "shares": [0.5, 0.495, 0.005]},
         "methods": methods,
         "difference": {"flat": {"nats_per_step": ours - flat}},
+        "held_out": [{"log_likelihood_per_step": {"ddco": ours + more, "flat": flat}} for more in (0.0, -1.0)],
         "agreement": {"labels": "phase", "valid": [nmi]},
         "seconds": {"all": 60.0},
     }
@@ -303,6 +304,6 @@ def test_the_page_of_two_seeds_worked_by_hand():
     assert found["nmi_valid"]["mean"] == pytest.approx(0.6)
     assert found["methods"]["ddco"]["success"]["by_seed"] == [0.25, 0.75]
     text = page(json.loads(json.dumps(results)), "Made.")
-    assert "| hammer-v3 | 5 | 0.60 [0.00, 1.00] | 1.50 [-4.85, 7.85] | +0.25 [+0.25, +0.25] |" in text
+    assert "| hammer-v3 | 5 | 0.60 [0.00, 1.00] | 1.50 [-4.85, 7.85] | +0.25 [+0.25, +0.25]; 50% |" in text
     assert "| 4 of 8, 50% [0%, 100%] | 2 of 8, 25% [0%, 100%] | 60 [60, 60] |" in text
     assert "| hammer-v3 | 70 of 72 | 50%, 50%, 0.5% (rare) |" in text
