@@ -82,8 +82,8 @@ def page(results: Result, made_by: str) -> str:
         "",
         "Means over training seeds, with 95 % t intervals where there are several. Every method acts from the same "
         "initial states, none of which was demonstrated, and has to succeed within Meta-World's 500 steps. Seconds are "
-        "those of a cell on one thread: a fit of all methods, and their episodes. After a difference stands which part of "
-        f"the held-out demonstrations is likelier under {OURS}: a few that are very unlikely decide the mean.",
+        "those of a cell on one thread: a fit of all methods, and their episodes. After a difference stands which part "
+        f"of the held-out demonstrations is likelier under {OURS}: a few that are very unlikely decide the mean.",
         "",
         f"| {' | '.join(head)} |",
         "|---" * len(head) + "|",
@@ -142,10 +142,9 @@ def draw(results: Result, path: Path) -> None:
                 mean, label = found["success"]["mean"], name if row == 0 else None
                 right.plot(mean, height, "|", ms=9, mew=2, color=COLOURS[name], label=label)
         left.set(yticks=range(len(results)), yticklabels=list(results), xlim=(-0.02, 1.02))
-        left.set(xlabel="held-out NMI with the expert's phases (dots: seeds)")
+        left.set(ylim=(len(results) - 0.5, -0.5), xlabel="held-out NMI with the expert's phases (dots: seeds)")
         right.set(xlim=(-0.02, 1.02), xlabel="success rate, most demonstrations")
-        left.invert_yaxis()
         for axes in (left, right):
             axes.grid(axis="x", color="#e4e4e4")
-            axes.legend(loc="lower left", fontsize=7)
+            axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, fontsize=7, frameon=False)
         keep(figure, path, "Agreement of options with the expert's phases, and success, by task", "")
