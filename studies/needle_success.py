@@ -18,7 +18,7 @@ import numpy as np
 from joblib import Parallel, delayed
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from provenance import Record, record, sentence, text
+from provenance import Record, is_kept, record, sentence, text
 from scipy import stats
 
 from ddco_pyro.data.files import whole_file, write_text
@@ -60,13 +60,6 @@ def run_seed(seed: int, arguments: argparse.Namespace, made_by: Record) -> None:
         "supervisor_demonstrations": metrics["demonstrations"]["supervisor"],
     }
     write_text(path, text(kept, [made_by]))
-
-
-def is_kept(content: Any, settings: dict[str, Any], made_by: Record) -> bool:
-    """Whether a ``seed-N.json`` is what this code gives with these settings."""
-    if [one and one.get("code") for one in content.get("provenance", [])] != [made_by["code"]]:
-        return False
-    return all(content["results"].get(key) == value for key, value in settings.items())
 
 
 def summarize(seeds: list[Seed]) -> dict[str, Any]:

@@ -39,7 +39,7 @@ NO_NUMBERS = ("ddco_pyro/report/", "studies/provenance.py")
 FOLDERS = ("benchmarks", "ddco_pyro", "specs", "studies", "tasks", "tests")
 SHARED = ("studies", "tests/support")
 """Where scripts find modules beside those of their own folder."""
-ENDINGS = {".py", ".yaml", ".xml", ".json", ".toml", ".j2"}
+ENDINGS = {".py", ".yaml", ".xml", ".json", ".toml", ".j2", ".txt"}
 
 Record = dict[str, Any]
 
@@ -207,6 +207,13 @@ def text(results: Any, records: Iterable[Record | None]) -> str:
 def distinct(records: Iterable[Record | None]) -> list[Record | None]:
     """Records that differ in more than the command; None is what nothing is known of."""
     return list({json.dumps((one or {}) | {"command": ""}, sort_keys=True): one for one in records}.values())
+
+
+def is_kept(content: Any, settings: Mapping[str, Any], made_by: Record) -> bool:
+    """Whether a result that a study keeps as JSON, settings and all, is what this code gives with these settings."""
+    if [one and one.get("code") for one in content.get("provenance", [])] != [made_by["code"]]:
+        return False
+    return all(content["results"].get(key) == value for key, value in settings.items())
 
 
 def sentence(command: str, records: Iterable[Record | None]) -> str:

@@ -7,8 +7,8 @@ import re
 
 import numpy as np
 import pytest
-from needle_success import differences, is_kept, over_seeds, page, summarize
-from provenance import ROOT
+from needle_success import differences, over_seeds, page, summarize
+from provenance import ROOT, is_kept
 
 SEEDS, DRAWS = 5, 4000
 

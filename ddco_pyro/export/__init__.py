@@ -29,7 +29,7 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.links import TERMINATION_BOUND
 from ddco_pyro.spec import STEP, RolloutSpec
 
-__all__ = ["TOLERANCE", "Exported", "export"]
+__all__ = ["TOLERANCE", "Exported", "export", "write_numpy"]
 
 EPISODES, STEPS = 3, 20
 """Made-up episodes on which every form has to act as the original does; without images the first one is a step longer
@@ -71,20 +71,29 @@ def export(fit: Fit, folder: Path, onnx: bool = False) -> Exported:
         return _compare(temporary, forms)
 
 
-def _write(fit: Fit, folder: Path, onnx: bool) -> list[str]:
-    """Write every file; the forms that can be run."""
+def write_numpy(fit: Fit, folder: Path) -> bool:
+    """Write ``controller.json``, ``weights.npz`` and ``runner.py`` into a folder, without comparing how they act.
+
+    :returns: whether numpy can evaluate every network; else there is no ``weights.npz``.
+    """
     hierarchy = fit.hierarchy.eval()
     program = StepProgram(hierarchy).eval()
     weights, about = weights_and_networks(hierarchy)
     about |= _about(hierarchy, fit.spec.rollout) | {"outputs": program.names, "state": _state(program)}
     if about["numpy"]:
         np.savez(folder / "weights.npz", **weights)  # type: ignore[arg-type]
-    for name, content in _programs(program, onnx).items():
-        (folder / name).write_bytes(content)
     shutil.copyfile(runner.__file__, folder / "runner.py")
-    np.savez(folder / "check.npz", **record(fit.controller(), hierarchy))  # type: ignore[arg-type]
     (folder / "controller.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
-    return [*(["numpy"] if about["numpy"] else []), "torch", *(["onnx"] if onnx else [])]
+    return bool(about["numpy"])
+
+
+def _write(fit: Fit, folder: Path, onnx: bool) -> list[str]:
+    """Write every file; the forms that can be run."""
+    forms = ["numpy"] if write_numpy(fit, folder) else []
+    for name, content in _programs(StepProgram(fit.hierarchy.eval()).eval(), onnx).items():
+        (folder / name).write_bytes(content)
+    np.savez(folder / "check.npz", **record(fit.controller(), fit.hierarchy))  # type: ignore[arg-type]
+    return [*forms, "torch", *(["onnx"] if onnx else [])]
 
 
 def _compare(folder: Path, forms: list[str]) -> Exported:

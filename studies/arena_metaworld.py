@@ -1,0 +1,214 @@
+"""What is done with Meta-World itself, by the Python of an environment of its own (``arena_venv.py``).
+
+    python arena_metaworld.py collect TASK OUT.hdf5 [--number 70] [--held-out 20] [--noise 0.1]
+    python arena_metaworld.py play TASK OUT.json NAME=EXPORTED... [--episodes 50] [--recorded DEMONSTRATIONS.hdf5]
+    python arena_metaworld.py film TASK OUT.png NAME=EXPORTED [--frames 8]
+
+``collect`` records the scripted expert, executed with normal noise on every control; of each step its phase is the
+return statement by which the expert's ``_desired_pos`` ended. ``play`` lets exported controllers act from initial
+states that were never demonstrated, the same for all, and on the observations of a demonstration. ``film`` draws an
+episode.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+import h5py
+import numpy as np
+from arena_phases import Phases
+from arena_playing import Observation, controls, exported, play
+from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
+from metaworld.policies import ENV_POLICY_MAP
+
+OBSERVATIONS = {
+    "hand_pos": slice(0, 3),
+    "gripper": slice(3, 4),
+    "object_pos": slice(4, 7),
+    "object_quat": slice(7, 11),
+    "object2_pos": slice(11, 14),
+    "object2_quat": slice(14, 18),
+    "goal_pos": slice(36, 39),
+}
+"""What Meta-World's vector says of now; between is what it said a step before."""
+
+AFTER_SUCCESS = 5
+"""Steps that a demonstration goes on once the task has succeeded."""
+
+UNSEEN = 1_000_000
+"""Seeds of initial states from here on are not demonstrated."""
+
+GIVE_UP = 10
+"""Attempts for each demonstration that is wanted."""
+
+CAMERA = "corner2"
+
+Step = tuple[Observation, np.ndarray, int, bool]
+"""What was seen, the control, the phase, and whether the task succeeded thereby."""
+
+
+class Sawyer:
+    """A task of Meta-World; every episode has a world of its own, so that none depends on those before."""
+
+    def __init__(self, task: str, **drawing: Any) -> None:
+        self._make = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{task}-goal-observable"]
+        self._drawing = drawing
+        self.world: Any = None
+        self.seen = np.zeros(39)
+
+    def reset(self, seed: int) -> Observation:
+        """The initial state of this seed."""
+        if self.world is not None:
+            self.world.close()
+        self.world = self._make(seed=seed, **self._drawing)
+        self.seen, _ = self.world.reset()
+        return named(self.seen)
+
+    def step(self, control: np.ndarray) -> tuple[Observation, bool, bool]:
+        """The next observation, success, and whether Meta-World's time (500 steps) is up."""
+        self.seen, _, _, ended, told = self.world.step(np.clip(control, -1, 1).astype(np.float32))
+        return named(self.seen), bool(told["success"]), bool(ended)
+
+
+def named(vector: np.ndarray) -> Observation:
+    """The observations by key, as precise as they are recorded."""
+    return {key: vector[part].astype(np.float32) for key, part in OBSERVATIONS.items()}
+
+
+def demonstrate(world: Sawyer, expert: Any, phases: Phases, seed: int, noise: float) -> list[Step] | None:
+    """An episode of the expert, which ends soon after its success; None where there was none."""
+    random, steps, left = np.random.default_rng(seed), [], None
+    observation, ended = world.reset(seed), False
+    while not ended and left != 0:
+        control, phase = phases.of(expert.get_action, world.seen)
+        executed = np.clip(control + noise * random.normal(size=len(control)), -1, 1).astype(np.float32)
+        before = observation
+        observation, success, ended = world.step(executed)
+        steps.append((before, executed, phase, success))
+        left = left - 1 if left else AFTER_SUCCESS if success else None
+    return None if left is None else steps
+
+
+def collect(task: str, out: Path, number: int, held_out: int, noise: float) -> None:
+    """Record the first successful episodes; of them the first ones are held out, however many there are."""
+    world, expert = Sawyer(task), ENV_POLICY_MAP[task]()
+    phases = Phases(type(expert)._desired_pos)
+    temporary = out.with_name(f".{out.name}.tmp")
+    counts, seed, names = np.zeros(len(phases.lines), int), 0, []
+    with h5py.File(temporary, "w") as file:
+        data = file.create_group("data")
+        while len(names) < number:
+            if seed >= GIVE_UP * number:
+                raise SystemExit(
+                    f"{task}: the expert succeeded in {len(names)} of {seed} episodes; {number} are needed"
+                )
+            steps = demonstrate(world, expert, phases, seed, noise)
+            if steps is not None:
+                names.append(f"demo_{len(names)}")
+                counts += write(data.create_group(names[-1]), steps, seed, len(counts))
+            seed += 1
+        for mask, chosen in (("valid", names[:held_out]), ("train", names[held_out:])):
+            file[f"mask/{mask}"] = np.array(chosen, "S")
+        data.attrs["total"] = counts.sum()
+        data.attrs["env_args"] = json.dumps({"env_name": f"metaworld/{task}", "type": 2, "env_kwargs": {}})
+        shares = (counts / counts.sum()).tolist()
+        said = {"successes": number, "attempts": seed, "noise": noise, "lines": phases.lines, "shares": shares}
+        file.attrs["expert"] = json.dumps(said)
+    temporary.replace(out)
+
+
+def write(group: Any, steps: list[Step], seed: int, phases: int) -> np.ndarray:
+    """A demonstration in robomimic's layout; how many of its steps each phase has."""
+    seen, executed, phase, success = zip(*steps, strict=True)
+    group["actions"] = np.stack(executed)
+    for key in OBSERVATIONS:
+        group[f"obs/{key}"] = np.stack([observation[key] for observation in seen])
+    group["labels/phase"] = np.array(phase, np.int8)
+    group["rewards"] = np.array(success, np.float32)
+    group["dones"] = np.arange(len(steps)) == len(steps) - 1
+    group.attrs.update({"num_samples": len(steps), "seed": seed})
+    return np.bincount(phase, minlength=phases)
+
+
+def play_all(task: str, out: Path, folders: dict[str, str], episodes: int, recorded: Path | None) -> None:
+    """Episodes of each controller, and what it does on the first held-out demonstration."""
+    controllers, world = {name: exported(folder) for name, folder in folders.items()}, Sawyer(task)
+    played: dict[str, Any] = {
+        "episodes": {
+            name: [play(controller, world, UNSEEN + number) for number in range(episodes)]
+            for name, controller in controllers.items()
+        }
+    }
+    if recorded is not None:
+        name, seen = first_held_out(recorded)
+        played |= {"demonstration": name, "controls": {}}
+        for method, controller in controllers.items():
+            played["controls"][method] = controls(controller, seen, 0).tolist()
+    out.write_text(json.dumps(played))
+
+
+def first_held_out(path: Path) -> tuple[str, list[Observation]]:
+    """Name and observations of a demonstration."""
+    with h5py.File(path) as file:
+        name = file["mask/valid"][0].decode()
+        seen = {key: values[()] for key, values in file[f"data/{name}/obs"].items()}
+    return name, [dict(zip(seen, values, strict=True)) for values in zip(*seen.values(), strict=True)]
+
+
+def film(task: str, out: Path, folder: str, frames: int) -> None:
+    """Pictures of an episode side by side, evenly spread over it."""
+    import imageio.v3 as imageio
+
+    drawn: list[np.ndarray] = []
+
+    class Filmed(Sawyer):
+        def reset(self, seed: int) -> Observation:
+            observation = super().reset(seed)
+            self.world.mujoco_renderer.camera_id = self.world.model.camera(CAMERA).id
+            return observation
+
+        def step(self, control: np.ndarray) -> tuple[Observation, bool, bool]:
+            drawn.append(np.rot90(self.world.render(), 2))  # this camera stands on its head
+            return super().step(control)
+
+    played = play(exported(folder), Filmed(task, render_mode="rgb_array"), UNSEEN)
+    chosen = np.linspace(0, len(drawn) - 1, frames).round().astype(int)
+    imageio.imwrite(out, np.concatenate([drawn[place][::2, ::2] for place in chosen], axis=1))
+    print(played)
+
+
+def main() -> None:
+    """Collect, play or draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["collect", "play", "film"])
+    parser.add_argument("task")
+    parser.add_argument("out", type=Path)
+    parser.add_argument("controllers", nargs="*", metavar="NAME=EXPORTED")
+    parser.add_argument("--number", type=int, default=70)
+    parser.add_argument("--held-out", type=int, default=20)
+    parser.add_argument("--noise", type=float, default=0.1)
+    parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--recorded", type=Path)
+    parser.add_argument("--frames", type=int, default=8)
+    own = parser.parse_args()
+    warnings.filterwarnings("ignore")  # the experts' gains are meant to saturate
+    if own.task not in ENV_POLICY_MAP:
+        raise SystemExit(f"there is no task {own.task!r}; Meta-World has: {', '.join(sorted(ENV_POLICY_MAP))}")
+    folders = dict(one.split("=", 1) for one in own.controllers)
+    if own.what == "collect":
+        collect(own.task, own.out, own.number, own.held_out, own.noise)
+    elif own.what == "play":
+        play_all(own.task, own.out, folders, own.episodes, own.recorded)
+    else:
+        film(own.task, own.out, next(iter(folders.values())), own.frames)
+
+
+if __name__ == "__main__":
+    main()

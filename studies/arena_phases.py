@@ -1,0 +1,65 @@
+"""Which return statement of a function ended its call: the phase that a scripted policy was in. Needs no package."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import sys
+import textwrap
+from collections.abc import Callable
+from types import CodeType, FrameType
+from typing import Any
+
+
+class Phases:
+    """The return statements of a function, 0 to P − 1 in the order of their lines, and which of them a call reached.
+
+    The function is not changed: while it runs it is traced, and what returns is told by its line.
+
+    :param function: a Python function whose source can be read.
+    :raises ValueError: it has no return statement.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._code: CodeType = inspect.unwrap(function).__code__
+        lines, first = inspect.getsourcelines(self._code)
+        tree = ast.parse(textwrap.dedent("".join(lines)))
+        returns = sorted((node.lineno, node.end_lineno or node.lineno) for node in _returns(tree.body[0]))
+        if not returns:
+            raise ValueError(f"{function.__qualname__} has no return statement")
+        self.lines = [first + start - 1 for start, _ in returns]
+        self._phase = {
+            first + line - 1: number for number, (start, end) in enumerate(returns) for line in range(start, end + 1)
+        }
+        self._last: int | None = None
+
+    def of(self, call: Callable[..., Any], *arguments: Any) -> tuple[Any, int]:
+        """What ``call(*arguments)`` returns, and the phase in which the function, called by it last, returned.
+
+        :raises LookupError: the function was not called.
+        """
+        before, self._last = sys.gettrace(), None
+        sys.settrace(self._watch)
+        try:
+            value = call(*arguments)
+        finally:
+            sys.settrace(before)
+        if self._last is None:
+            raise LookupError(f"{self._code.co_qualname} was not called")
+        return value, self._phase[self._last]
+
+    def _watch(self, frame: FrameType, _: str, __: Any) -> Callable[..., Any] | None:
+        return self._inside if frame.f_code is self._code else None
+
+    def _inside(self, frame: FrameType, event: str, _: Any) -> Callable[..., Any]:
+        if event == "return":
+            self._last = frame.f_lineno
+        return self._inside
+
+
+def _returns(node: ast.AST) -> list[ast.Return]:
+    """The return statements of a function, without those of functions inside it."""
+    inner = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda, ast.ClassDef)
+    children = [child for child in ast.iter_child_nodes(node) if not isinstance(child, inner)]
+    own = [child for child in children if isinstance(child, ast.Return)]
+    return own + [found for child in children for found in _returns(child)]

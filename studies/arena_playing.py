@@ -1,0 +1,53 @@
+"""Plays an exported controller (``ddco-pyro export``) in an environment, with numpy alone."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+Observation = Mapping[str, np.ndarray]
+
+
+class Environment(Protocol):
+    """An episode's world."""
+
+    def reset(self, seed: int) -> Observation:
+        """Begin the episode of this seed."""
+        ...
+
+    def step(self, control: np.ndarray) -> tuple[Observation, bool, bool]:
+        """The next observation, whether the task succeeded now, and whether the episode's time is up."""
+        ...
+
+
+def exported(folder: str | Path) -> Any:
+    """The ``Runner`` of an exported controller, by the ``runner.py`` that was exported beside it."""
+    path = Path(folder) / "runner.py"
+    spec = importlib.util.spec_from_file_location("exported_runner", path)
+    if spec is None or spec.loader is None or not path.exists():
+        raise FileNotFoundError(f"{path}: no controller was exported there")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.Runner(folder)
+
+
+def play(controller: Any, environment: Environment, seed: int) -> dict[str, Any]:
+    """One episode: it ends when the task has succeeded, or when its time is up."""
+    observation = environment.reset(seed)
+    controller.reset(seed)
+    success = ended = False
+    steps = 0
+    while not (success or ended):
+        observation, success, ended = environment.step(controller.act(observation))
+        steps += 1
+    return {"success": success, "steps": steps}
+
+
+def controls(controller: Any, seen: Iterable[Observation], seed: int) -> np.ndarray:
+    """What a controller does on recorded observations, [T, A]."""
+    controller.reset(seed)
+    return np.stack([controller.act(observation) for observation in seen])

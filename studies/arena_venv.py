@@ -1,0 +1,59 @@
+"""An environment of its own for Meta-World, which needs another mujoco than this project, and what is run in it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from ddco_pyro.data.files import only_one, write_text
+from ddco_pyro.errors import Failed
+
+HERE = Path(__file__).parent
+PINS = HERE / "arena_requirements.txt"
+SCRIPT = HERE / "arena_metaworld.py"
+MADE = ".made"
+"""In the environment: the pins that it was made from, once all of them are installed."""
+
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+def made(folder: Path, pins: Path = PINS, python: str = sys.executable) -> Path:
+    """The Python of the environment in ``folder``, which is made where it is not there, or of other pins.
+
+    :raises Failed: it cannot be made; one line.
+    """
+    marker, wanted = folder / MADE, pins.read_text(encoding="utf-8")
+    with only_one(folder, wait=True):
+        if not marker.exists() or marker.read_text(encoding="utf-8") != wanted:
+            pip = [str(_python(folder)), "-m", "pip", "install", "-q", "--no-compile", "--no-deps", "-r", str(pins)]
+            for command in ([python, "-m", "venv", "--clear", str(folder)], pip):
+                _run(command, f"{folder}: an environment with {pins.name} cannot be made")
+            write_text(marker, wanted)
+    return _python(folder)
+
+
+def run(python: Path, *arguments: str | Path) -> None:
+    """Run ``arena_metaworld.py`` on one thread.
+
+    :raises Failed: it ended with an error; its last line.
+    """
+    command = [str(python), "-W", "ignore", str(SCRIPT), *map(str, arguments)]
+    _run(command, f"{SCRIPT.name} {arguments[0]} {arguments[1]}", ONE_THREAD)
+
+
+def _python(folder: Path) -> Path:
+    return folder / "bin" / "python"
+
+
+def _run(command: list[str], what: str, environment: dict[str, str] | None = None) -> None:
+    try:
+        ended = subprocess.run(
+            command, capture_output=True, text=True, check=False, env=os.environ | (environment or {})
+        )
+    except OSError as error:
+        raise Failed(f"{what}: {command[0]}: {error.strerror}") from error
+    if ended.returncode:
+        said = (ended.stderr.strip() or ended.stdout.strip() or f"exit status {ended.returncode}").splitlines()
+        raise Failed(f"{what}: {said[-1].strip()}")

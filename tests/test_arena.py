@@ -1,0 +1,309 @@
+"""The arena without Meta-World: phases of a toy expert, episodes of an exported controller, and what is refused."""
+
+from __future__ import annotations
+
+import functools
+import json
+import stat
+import sys
+
+import arena
+import arena_cell
+import arena_venv
+import h5py
+import numpy as np
+import pytest
+import torch
+from arena_phases import Phases
+from arena_playing import controls, exported, play
+from arena_results import page, summarize
+
+from ddco_pyro.errors import Failed
+from ddco_pyro.export import write_numpy
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.spec import parse_spec
+
+# --- phases -----------------------------------------------------------------------------------------------------------
+
+
+def twice(function):
+    @functools.wraps(function)
+    def wrapped(*arguments):
+        return list(function(*arguments))
+
+    return wrapped
+
+
+class Expert:
+    """Which of its four return statements was reached is known from the value alone."""
+
+    @staticmethod
+    def _desired_pos(x):
+        def shifted(y):
+            return y + 100  # not a return of the outer function
+
+        if x < 0:
+            place = [shifted(0), 0]
+            return place
+        elif x < 1:
+            return [
+                1,
+                x,
+            ]
+        for number in (2, 3):
+            if x < number:
+                return [number, x]
+        return [4, x]
+
+    def get_action(self, x):
+        self._desired_pos(-1)  # the last call counts
+        return self._desired_pos(x)
+
+
+PLACES = {-0.5: 0, 0.5: 1, 1.5: 2, 2.5: 2, 7.0: 3}
+
+
+@pytest.mark.parametrize(("x", "phase"), PLACES.items())
+def test_a_phase_is_the_return_statement_that_was_reached(x, phase):
+    phases, expert = Phases(Expert._desired_pos), Expert()
+    assert len(phases.lines) == 4
+    assert phases.lines == sorted(phases.lines)
+    value, reached = phases.of(expert.get_action, x)
+    assert (value, reached) == (expert.get_action(x), phase)
+
+
+def test_lines_are_those_of_the_file():
+    with open(__file__) as file:
+        text = file.read().splitlines()
+    first, second, third, fourth = (text[line - 1].strip() for line in Phases(Expert._desired_pos).lines)
+    assert (first, second, third, fourth) == ("return place", "return [", "return [number, x]", "return [4, x]")
+
+
+def test_a_decorated_function_is_seen_through():
+    @twice
+    def desired(x):
+        if x:
+            return [1]
+        return [0]
+
+    phases = Phases(desired)
+    assert [phases.of(desired, x) for x in (True, False)] == [([1], 0), ([0], 1)]
+
+
+def test_tracing_is_left_as_it_was():
+    def fails():
+        raise KeyError
+
+    def mine(*_):
+        return None
+
+    phases, before = Phases(Expert._desired_pos), sys.gettrace()
+    try:
+        sys.settrace(mine)
+        phases.of(Expert._desired_pos, 0)
+        assert sys.gettrace() is mine
+        with pytest.raises(KeyError):
+            phases.of(fails)
+        assert sys.gettrace() is mine
+    finally:
+        sys.settrace(before)
+
+
+def test_what_has_no_phase_is_refused():
+    phases = Phases(Expert._desired_pos)
+    phases.of(Expert._desired_pos, 0)
+    with pytest.raises(LookupError, match="_desired_pos was not called"):
+        phases.of(abs, -1)
+
+    def nothing():
+        pass
+
+    with pytest.raises(ValueError, match="has no return statement"):
+        Phases(nothing)
+
+
+# --- episodes ---------------------------------------------------------------------------------------------------------
+
+
+class World:
+    """The state drifts with the control; success once its first number is above ``goal``, time is up after 30 steps."""
+
+    def __init__(self, goal):
+        self.goal = goal
+        self.received = []
+
+    def reset(self, seed):
+        self.state, self.time, self.received = np.random.default_rng(seed).normal(size=3), 0, []
+        return {"state": self.state}
+
+    def step(self, control):
+        self.received.append(control)
+        self.state = self.state + np.array([0.1, *0.2 * control])
+        self.time += 1
+        return {"state": self.state}, bool(self.state[0] > self.goal), self.time == 30
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """Never trained: random networks, and controls of other units."""
+    linear = {"network": "linear"}
+    spec = parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": [{"key": "state", "differences": True}],
+            "control": {"std": 0.5},
+            "hierarchy": {"levels": [{"count": 3, "policy": {"network": "mlp"}}], "meta_policy": linear},
+        }
+    )
+    torch.manual_seed(0)
+    hierarchy = Hierarchy(spec, {"state": (3,)}, 2, 30)
+    hierarchy.scaling.scale.copy_(torch.tensor([2.0, 0.5]))
+    return Fit(spec, hierarchy.eval())
+
+
+@pytest.fixture(scope="module")
+def runner(fitted, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("exported")
+    assert write_numpy(fitted, folder)
+    return exported(folder)
+
+
+@pytest.mark.parametrize(("goal", "success"), [(1.0, True), (1e9, False)])
+def test_an_exported_controller_plays_as_its_fit_does(fitted, runner, goal, success):
+    for seed in (3, 4):
+        world, controller, observed, expected = World(goal), fitted.controller(), [], []
+        observation, done, ended = world.reset(seed), False, False
+        controller.reset(seed)
+        while not (done or ended):
+            observed.append(observation)
+            expected.append(controller.act(observation))
+            observation, done, ended = world.step(expected[-1])
+        played = World(goal)
+        assert play(runner, played, seed) == {"success": success, "steps": len(expected)}
+        assert (len(expected) < 30) == success
+        np.testing.assert_allclose(played.received, expected, atol=1e-5)
+        np.testing.assert_allclose(controls(runner, observed, seed), expected, atol=1e-5)
+        rows = {"state": np.stack([one["state"] for one in observed])}
+        np.testing.assert_allclose(controls(runner, observed, 0), arena_cell.acted(fitted, rows), atol=1e-5)
+
+
+def test_where_nothing_was_exported_that_is_said(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no controller was exported there"):
+        exported(tmp_path)
+
+
+# --- the environment --------------------------------------------------------------------------------------------------
+
+
+def python_that(tmp_path, pip):
+    """A stand-in for Python, whose environments have a Python that does this instead of installing."""
+    path = tmp_path / "python"
+    inner = f"#!/bin/sh\\necho installed >> {tmp_path}/log\\n{pip}\\n"
+    path.write_text(f"#!/bin/sh\nmkdir -p $4/bin\nprintf '{inner}' > $4/bin/python\nchmod +x $4/bin/python\n")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return str(path)
+
+
+def test_an_environment_is_made_once_and_again_for_other_pins(tmp_path):
+    pins, folder, python = tmp_path / "pins.txt", tmp_path / "venv", python_that(tmp_path, "exit 0")
+    for content, times in (("a==1\n", 1), ("a==1\n", 1), ("a==2\n", 2)):
+        pins.write_text(content)
+        assert arena_venv.made(folder, pins, python) == folder / "bin" / "python"
+        assert (tmp_path / "log").read_text().count("installed") == times
+
+
+def test_an_environment_that_cannot_be_made_is_one_line(tmp_path):
+    pins, folder = tmp_path / "pins.txt", tmp_path / "venv"
+    pins.write_text("a==1\n")
+    failing = python_that(tmp_path, "echo looking >&2; echo ERROR: no a==1 >&2; exit 1")
+    for python, why in ((failing, "ERROR: no a==1"), ("/no/such/python", "No such file or directory")):
+        with pytest.raises(Failed, match=why) as refused:
+            arena_venv.made(folder, pins, python)
+        assert "\n" not in str(refused.value)
+        assert f"{folder}: an environment with pins.txt cannot be made" in str(refused.value)
+        assert not (folder / arena_venv.MADE).exists()
+
+
+def test_a_study_without_its_environment_ends_with_that_line(tmp_path, monkeypatch):
+    (tmp_path / "venv").write_text("")  # a file is in its place
+    words = ["arena.py", "--runs", str(tmp_path), "--tasks", "pick-place-v3", "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as ended:
+        arena.main()
+    assert "\n" not in str(ended.value.code)
+    assert "venv" in str(ended.value.code)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_error_in_the_environment_is_its_last_line():
+    with pytest.raises(Failed) as refused:
+        arena_venv.run(sys.executable, "collect", "pick-place-v3", "out.hdf5")
+    assert str(refused.value).startswith("arena_metaworld.py collect pick-place-v3: ModuleNotFoundError")
+
+
+# --- cells ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_same_demonstrations_are_held_out_from_all_cells(tmp_path):
+    names = [f"demo_{number}" for number in range(12)]
+    with h5py.File(tmp_path / "demos.hdf5", "w") as file:
+        file["mask/valid"], file["mask/train"] = np.array(names[:4], "S"), np.array(names[4:], "S")
+    used = {
+        (count, seed): arena_cell.chosen(tmp_path / "demos.hdf5", arena_cell.Cell("task", count, seed))
+        for count in (2, 5, 8)
+        for seed in (0, 1)
+    }
+    for (count, _), (train, valid, unused) in used.items():
+        assert (len(train), valid) == (count, names[:4])
+        assert sorted([*train, *valid, *unused]) == sorted(names)
+    for seed in (0, 1):
+        assert set(used[2, seed][0]) < set(used[5, seed][0]) < set(used[8, seed][0])
+    assert used[5, 0] != used[5, 1]
+    with pytest.raises(Failed, match="has 8 demonstrations to train on, 9 are asked for"):
+        arena_cell.chosen(tmp_path / "demos.hdf5", arena_cell.Cell("task", 9, 0))
+
+
+def test_other_settings_are_other_cells(tmp_path):
+    cell = arena_cell.Cell("pick-place-v3", 5, 0)
+    settings = [
+        arena_cell.Settings(70, 0.1, episodes, overrides, tmp_path)
+        for episodes, overrides in ((50, ()), (20, ()), (50, ("training.epochs=3",)))
+    ]
+    assert len({cell.path(one) for one in settings}) == 3
+    assert cell.command(settings[2]).endswith("pick-place-v3 5 0 --demonstrations 70 --noise 0.1 --episodes 50 "
+                                              "--set 'training.epochs=3'")  # fmt: skip
+
+
+def cell(seed, nmi, ours, flat, success):
+    methods = {
+        name: {
+            "log_likelihood_per_step": {"valid": value},
+            "success": [True] * successes + [False] * (4 - successes),
+            "converged": True,
+            "bridge_difference": 1e-7,
+        }
+        for name, value, successes in zip(("ddco", "flat"), (ours, flat), success, strict=True)
+    }
+    return {
+        "task": "hammer-v3",
+        "count": 5,
+        "seed": seed,
+        "expert": {"successes": 70, "attempts": 72, "shares": [0.5, 0.495, 0.005]},
+        "methods": methods,
+        "difference": {"flat": {"nats_per_step": ours - flat}},
+        "held_out": [{"log_likelihood_per_step": {"ddco": ours + more, "flat": flat}} for more in (0.0, -1.0)],
+        "agreement": {"labels": "phase", "valid": [nmi]},
+        "seconds": {"all": 60.0},
+    }
+
+
+def test_the_page_of_two_seeds_worked_by_hand():
+    results = summarize([cell(0, 0.5, 1.0, 0.75, (1, 0)), cell(1, 0.7, 2.0, 1.75, (3, 2))])
+    found = results["hammer-v3"]["counts"]["5"]
+    assert found["nmi_valid"]["mean"] == pytest.approx(0.6)
+    assert found["methods"]["ddco"]["success"]["by_seed"] == [0.25, 0.75]
+    text = page(json.loads(json.dumps(results)), "Made.")
+    assert "| hammer-v3 | 5 | 0.60 [0.00, 1.00] | 1.50 [-4.85, 7.85] | +0.25 [+0.25, +0.25]; 50% |" in text
+    assert "| 4 of 8, 50% [0%, 100%] | 2 of 8, 25% [0%, 100%] | 60 [60, 60] |" in text
+    assert "| hammer-v3 | 70 of 72 | 50%, 50%, 0.5% (rare) |" in text
