@@ -70,6 +70,14 @@ def play(controller, steps):
     return [choice for _, choice in played], np.array([control for control, _ in played])
 
 
+def without_controls(hierarchy, states):
+    """What enumeration of all paths says of the latents where no control is seen."""
+    with torch.no_grad():
+        tables = hierarchy.tabulate(encode(demonstrations([states]), hierarchy.encoder, hierarchy.scaling))
+    unseen = tuple(torch.where(density.isfinite(), 0.0, density) for density in tables.control)
+    return brute_force(replace(tables, control=unseen), 0, len(states))
+
+
 # --- terminations and selections --------------------------------------------------------------------------------------
 
 
@@ -117,6 +125,29 @@ def test_most_likely_takes_the_mode_of_every_choice():
     assert play(controller, 2)[0] == [1, 1]
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_marginal_takes_the_choice_that_is_likeliest_given_all_observations(seed):
+    hierarchy = make((4,), ("options", "control"), "linear", seed=seed)
+    states = 2 * torch.randn(4, 3, generator=torch.Generator().manual_seed(seed)).numpy()
+    controller = Controller(hierarchy, options="marginal")
+    for steps in range(1, 5):
+        controller.act({"state": states[steps - 1]})
+        truth = without_controls(hierarchy, states[:steps])
+        assert controller.choices == (truth.u[0][steps - 1].argmax(),)
+
+
+def test_marginal_adds_up_over_steps_how_likely_it_is_that_an_option_has_ended():
+    """Option 2 is begun with, ends with a probability of 0.3 a step, and only option 1 is selected from then on."""
+    hierarchy = by_hand(MEANS, [SELDOM, logit(0.3), SELDOM], [0.0, 50.0, 0.0])
+    controllers = [Controller(hierarchy, options=options) for options in ("most_likely", "marginal")]
+    played = [play(controller, 1)[0] for controller in controllers]
+    fix(hierarchy.meta_policy.network, [[50.0, 0.0, 0.0]])
+    assert [first + play(controller, 3)[0] for first, controller in zip(played, controllers, strict=True)] == [
+        [2, 2, 2, 2],
+        [2, 2, 1, 1],  # 0.7, then 0.49
+    ]
+
+
 @pytest.mark.parametrize(
     ("counts", "emits", "network"),
     [((2,), ("options",), "linear"), ((2, 2), ("options", "control"), "linear"), ((2,), ("options",), "lstm")],
@@ -125,10 +156,7 @@ def test_choices_follow_the_models_latents(counts, emits, network):
     """Over many episodes of three different states, p(h_t) is that of the AHMM without any control seen."""
     hierarchy = make(counts, emits, network, seed=3)
     states = torch.randn(3, 3, generator=torch.Generator().manual_seed(1)).numpy()
-    with torch.no_grad():
-        tables = hierarchy.tabulate(encode(demonstrations([states]), hierarchy.encoder, hierarchy.scaling))
-    unseen = tuple(torch.where(one.isfinite(), 0.0, one) for one in tables.control)
-    truth = brute_force(replace(tables, control=unseen), 0, 3)
+    truth = without_controls(hierarchy, states)
     controller, episodes = Controller(hierarchy), 300
     last = []
     for seed in range(episodes):

@@ -91,6 +91,7 @@ FITS = {
     "conv": make("conv", camera=True),
     "hybrid": make("mlp", (2, 3), ("options", "control"), control="sample"),
     "three levels": make("mlp", (2, 3, 2), ("options", "control")),
+    "marginal": make("mlp", (2, 3, 2), ("options", "control"), options="marginal"),
     "flat": make("mlp", (), built_in=("step",)),
     "lstm": make(RECURRENT, (2, 2), ("options", "control"), endings=RECURRENT, control="sample"),
     "lstm over pictures": make({"network": "lstm", "over": CONVOLUTIONS}, camera=True, endings=CONVOLUTIONS, steps=30),

@@ -17,6 +17,7 @@ from ddco_pyro.spec import RolloutSpec, parse_spec
 
 SEEDS = (3, 4, 5, 6)
 MEAN = RolloutSpec(control="mean", options="most_likely")
+MARGINAL = RolloutSpec(control="mean", options="marginal")
 SAMPLED = RolloutSpec(control="sample", options="sample")
 SHAPES = {"offsets": (4,), "visited": (1,)}
 OBSERVATIONS = [{"key": "offsets", "differences": True}, "visited"]
@@ -52,7 +53,7 @@ def ragged(task):
     return replace(task, load=lambda seed: toy_task.Point(seed, steps=seed))
 
 
-@pytest.mark.parametrize("spec", [MEAN, SAMPLED], ids=["most likely", "sampled"])
+@pytest.mark.parametrize("spec", [MEAN, MARGINAL, SAMPLED], ids=["most likely", "marginal", "sampled"])
 @pytest.mark.parametrize(
     ("name", "weights", "actors"),
     [("flat", (0,), {0}), ("lstm", (0,), {0}), ("options", (4, 6, 8), {0}), ("hybrid", (0, 2, 10), {0, 1, 2})],

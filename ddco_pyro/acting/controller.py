@@ -11,12 +11,13 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from ddco_pyro.acting.window import Window
+from ddco_pyro.inference.logspace import arrive
 from ddco_pyro.model.actor import Acting
 from ddco_pyro.model.ahmm import Tabulated, choose
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks.state import States
-from ddco_pyro.model.tables import complete
-from ddco_pyro.spec import RolloutSpec
+from ddco_pyro.model.tables import Step, complete
+from ddco_pyro.spec import OptionExecution, RolloutSpec
 
 
 class Controller:
@@ -29,14 +30,15 @@ class Controller:
     With :meth:`reset_all` and :meth:`act_all` it acts in several episodes at once, in each as it would alone.
 
     :param control: execute the ``mean`` control or a ``sample``.
-    :param options: ``sample`` terminations and selections, or take the ``most_likely``.
+    :param options: ``sample`` terminations and selections; take the ``most_likely`` of each; or take the choices with
+        the largest ``marginal`` p(h_t | s_0, ..., s_t), which adds up over steps how likely options are to have ended.
     """
 
     def __init__(
         self,
         hierarchy: Hierarchy,
         control: Literal["mean", "sample"] = "mean",
-        options: Literal["sample", "most_likely"] = "sample",
+        options: OptionExecution = "sample",
         seed: int = 0,
     ) -> None:
         self.hierarchy = hierarchy.eval()
@@ -57,6 +59,7 @@ class Controller:
         self.seeds, self.time = list(seeds), 0
         self._window = Window(self.hierarchy.encoder)
         self._choices: tuple[Tensor, ...] | None = None
+        self._log_marginal: Tensor | None = None
         self._states: States | None = None
         self.all_terminations = np.zeros((len(seeds), 0))
 
@@ -92,8 +95,7 @@ class Controller:
         with torch.no_grad():
             outputs, self._states = self.hierarchy.advance(self._window.inputs(observations), self._states)
             now = complete(outputs.tables(), torch.ones(len(self.seeds), dtype=torch.int64)).steps()[0]
-            with MostLikely() if self.options == "most_likely" else Drawn(generators):
-                self._choices = choose(self.time, now, self._choices)
+            self._choices = self._chosen(now, generators)
             steps = (None if emission is None else emission.steps()[0] for emission in outputs.emissions)
             acting = Acting(tuple(steps), self._choices)
             control = acting.mode if self.control == "mean" else acting.draw(_noise(generators, acting.event_shape[0]))
@@ -102,6 +104,19 @@ class Controller:
         self.all_terminations = _columns(ended, len(self.seeds))
         self.time += 1
         return self.hierarchy.scaling.unscaled(control)
+
+    def _chosen(self, now: Step, generators: Sequence[np.random.Generator]) -> tuple[Tensor, ...]:
+        if self.options == "marginal":
+            self._log_marginal = arrive(self._log_marginal, now).message
+            return _largest(self._log_marginal)
+        with MostLikely() if self.options == "most_likely" else Drawn(generators):
+            return choose(self.time, now, self._choices)
+
+
+def _largest(joint: Tensor) -> tuple[Tensor, ...]:
+    """The joint choice of the largest of values [N, C_D, ..., C_1], each [N], lowest level first."""
+    sizes = joint.shape[1:]
+    return tuple(reversed(torch.unravel_index(joint.flatten(1).argmax(-1), sizes))) if sizes else ()
 
 
 def _columns(levels: Sequence[Tensor], number: int) -> np.ndarray:

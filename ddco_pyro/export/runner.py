@@ -61,6 +61,7 @@ class Runner:
         self.terminations: tuple[float, ...] = ()
         self.outputs: Outputs = {}
         self._last: dict[str, np.ndarray] | None = None
+        self._marginal: np.ndarray | None = None
         self._state = [np.array(part["values"], part["kind"]).reshape(part["shape"]) for part in self.about["state"]]
 
     def act(self, observation: Mapping[str, Any]) -> np.ndarray:
@@ -77,7 +78,8 @@ class Runner:
         self.outputs, self._state = self._networks(features, self.time, images, self._state)
         outputs = self.outputs
         generator = np.random.default_rng([self.seed, self.time])
-        self.choices = self._choose(outputs, generator)
+        choose = self._largest_marginal if self.about["options"] == "marginal" else self._choose
+        self.choices = choose(outputs, generator)
         self.terminations = tuple(
             float(outputs[f"termination_{level}"][choice - 1]) if choice else 1.0
             for level, choice in enumerate(self.choices)
@@ -115,6 +117,23 @@ class Runner:
                 probabilities = np.eye(len(probabilities))[self.choices[level]]
             caller = choices[level] = self._pick(probabilities, generator)
         return tuple(choices)
+
+    def _largest_marginal(self, outputs: Outputs, _: np.random.Generator) -> tuple[int, ...]:
+        """The choices with the largest p(h_t | s_0, ..., s_t); ``_marginal`` has that of all, [C_D, ..., C_1]."""
+        depth, kept = len(self.about["levels"]), []
+        ended = np.ones(()) if self._marginal is None else self._marginal
+        for level in range(depth if self._marginal is not None else 0):
+            psi = np.append(1.0, outputs[f"termination_{level}"])  # control lasts a step
+            kept.append(ended * (1 - psi))
+            ended = (ended * psi).sum(-1)
+        for level in reversed(range(depth)):
+            selection = np.exp(outputs[f"selection_{level + 1}"].astype(np.float64))
+            if level < depth - 1:  # below control there is nothing left to choose
+                selection = np.vstack([np.eye(selection.shape[1])[0], selection])
+            ended = ended[..., None] * (selection if level < depth - 1 else selection[0])
+            ended = ended + (kept[level] if kept else 0.0)
+        self._marginal = ended
+        return tuple(int(place) for place in reversed(np.unravel_index(ended.argmax(), ended.shape)))
 
     def _pick(self, probabilities: np.ndarray, generator: np.random.Generator) -> int:
         if self.about["options"] == "most_likely":

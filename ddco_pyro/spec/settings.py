@@ -276,6 +276,9 @@ class SelectionSpec(Model):
     """Key path of this spec to the values to try there."""
 
 
+OptionExecution = Literal["sample", "most_likely", "marginal"]
+
+
 class RolloutSpec(Model):
     """How the fitted policy is tried in the task."""
 
@@ -285,8 +288,9 @@ class RolloutSpec(Model):
     """Seed of the first episode; the next ones count up from it."""
     control: Literal["mean", "sample"] = "mean"
     """Whether the control is the mean of its distribution or a sample."""
-    options: Literal["sample", "most_likely"] = "sample"
-    """Whether options and terminations are sampled or the most likely ones."""
+    options: OptionExecution = "sample"
+    """``sample`` selections and terminations, take the ``most_likely`` of each, or act with the options of the largest
+    ``marginal`` probability given all observations so far, in which small probabilities of having ended add up."""
     policies: Items[Text] = ()
     """Scripted policies of the task that are rolled out beside, such as ``open_loop``."""
 
