@@ -1,77 +1,148 @@
-"""How a task's models are best trained, chosen on held-out likelihood of demonstrations that no result is about.
+"""How a task's models are best trained and executed, chosen on development seeds that no result is about.
 
-    python studies/recipe.py [--spec specs/needle.yaml] [--seeds 5000 6000] [--folds 3] [--jobs -1] [--out runs/recipe]
+    python studies/recipe.py [--spec specs/needle.yaml] [--seeds 5000 6000] [--episodes 60] [--jobs 2] [--out runs/recipe]
 
-For each development seed, which has demonstrations of its own, ``select`` scores every candidate of a grid over the
-recipe, the hierarchy's and the flat policies' alike; scores in ``--out`` are not made again. Writes
-``docs/results/recipe.json`` and ``.md``.
+Each development seed has demonstrations of its own. Every model, baselines too, has as many candidates; each is trained
+once for each seed, scored on held-out demonstrations, and rolled out from starts that no result is about. A cell that is
+in ``--out`` is not made again by the same code. Writes ``docs/results/recipe.json`` and ``.md``.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from provenance import record, sentence, text
+from joblib import Parallel, delayed
+from provenance import Record, is_kept, record, sentence, text
+from scipy import stats
 
+import ddco_pyro
+from ddco_pyro.acting.lockstep import play
 from ddco_pyro.data.files import write_text
-from ddco_pyro.selection import Workers, select
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.inference.threads import one_thread
+from ddco_pyro.simulation.task import find_task
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 
-SHARED, OWN = ({"learn": True, "floor": 0.02, "per_option": own} for own in (False, True))
-RECIPE = {
-    "training.initialize": ["vq_controls", "random"],
-    "training.layerwise": [True, False],
-    "training.restarts": [1, 3],
-    "control.std": [SHARED, OWN],
+STARTS = 500_000  # seed of the first episode
+EXECUTIONS = ("most_likely", "marginal")
+PERCEPTRON: dict[str, Any] = {"network": "mlp", "hidden": [64]}
+BEFORE: dict[str, Any] = {
+    "training.initialize": "vq_controls",
+    "training.layerwise": True,
+    "training.optimizer.weight_decay": 0.0,
+    "control.std": {"learn": True, "floor": 0.02},
+    "hierarchy.levels.0.termination": PERCEPTRON,
+    "hierarchy.meta_policy": PERCEPTRON,
 }
-GRIDS: dict[str, dict[str, list[Any]]] = {
-    "ddco": RECIPE,
-    "flat": {
-        "training.restarts": [1, 3],
-        "training.optimizer.lr": [3e-3, 1e-3],
-        "baseline.policy.hidden": [[64], [128], [256], [609]],
-    },
-}
-"""Sixteen candidates of each model; flat policies have up to the hierarchy's parameters."""
-OUT = Path("docs/results/recipe")
+OWN_STD = {"learn": True, "floor": 0.02, "per_option": True}
+INITIALIZE = ("vq", "vq_controls", "equal_parts", "random")
+DECAYS = (0.0, 1e-3)
+RATES = (3e-3, 1e-3)
+Candidate = dict[str, Any]
+Cell = dict[str, Any]
 
 
-def spec_of(path: str, model: str, seed: int, folds: int) -> Spec:
-    """The spec of one model's selection, with demonstrations of the seed's own."""
-    spec = load_spec(path, [f"demonstrations.seed={seed}", f"seed={seed}", "compare_with=[]"])
-    if model == "flat":
-        flat = {"kind": "flat", "policy": {"network": "mlp", "hidden": [64]}}
-        spec = with_overrides(spec, {"hierarchy": None, "baseline": flat})
-    return with_overrides(spec, {"selection.folds": folds, "selection.grid": GRIDS[model]})
-
-
-def scored(spec: Spec, folder: Path, jobs: int) -> list[dict[str, Any]]:
-    """Every candidate's held-out log-likelihood per step over the folds."""
-    selection = select(spec, folder, workers=Workers(jobs))
-    return [
-        {"candidate": row.candidate.name, "values": dict(row.candidate.values), "valid": row.mean, "error": row.error}
-        for row in selection.choice.rows
+def candidates() -> dict[str, list[Candidate]]:
+    """For each model the settings to try; sixteen each, and for the hierarchy besides the recipe of before."""
+    ours = [
+        {
+            **BEFORE,
+            "training.layerwise": False,
+            "control.std": OWN_STD,
+            "training.initialize": initialize,
+            "training.optimizer.weight_decay": decay,
+            "hierarchy.levels.0.termination": switching,
+            "hierarchy.meta_policy": switching,
+        }
+        for initialize, decay, switching in product(INITIALIZE, DECAYS, (PERCEPTRON, {"network": "linear"}))
     ]
+    flat = [_baseline("flat", *values) for values in product(([64], [128], [256], [609]), DECAYS, RATES)]
+    clock = [_baseline("per_timestep", *values) for values in product(([8], [16], [32], [64]), DECAYS, RATES)]
+    return {"ddco": [BEFORE, *ours], "flat": flat, "per_timestep": clock}
 
 
-def table(results: dict[str, dict[str, list[dict[str, Any]]]], made_by: str) -> str:
-    """Candidates by their mean over the seeds, the best first, as Markdown."""
-    lines = [made_by, ""]
-    for model, by_seed in results.items():
-        seeds = list(by_seed)
-        lines += [
-            f"| {model} | {' | '.join(f'seed {seed}' for seed in seeds)} | mean |",
-            "|---" * (len(seeds) + 2) + "|",
-        ]
-        names = [row["candidate"] for row in by_seed[seeds[0]]]
-        values = {name: [by_seed[seed][place]["valid"] for seed in seeds] for place, name in enumerate(names)}
-        for name, cells in sorted(values.items(), key=lambda item: -np.mean(item[1])):
-            lines.append(f"| {name} | {' | '.join(f'{cell:.2f}' for cell in cells)} | {np.mean(cells):.2f} |")
-        lines.append("")
-    return "\n".join([*lines, "Held-out nats per step, mean over the folds."]) + "\n"
+def _baseline(kind: str, hidden: list[int], decay: float, rate: float) -> Candidate:
+    return {
+        "hierarchy": None,
+        "baseline": {"kind": kind, "policy": {"network": "mlp", "hidden": hidden}},
+        "training.optimizer.weight_decay": decay,
+        "training.optimizer.lr": rate,
+    }
+
+
+def run_cell(path: str, seed: int, candidate: Candidate, episodes: int, kept: Path, made_by: Record) -> Cell:
+    """One candidate on one development seed: held-out nats per step, and successes with each execution of options."""
+    settings = {"spec": path, "seed": seed, "values": candidate, "episodes": episodes}
+    if kept.exists():
+        content = json.loads(kept.read_text())
+        if is_kept(content, settings, made_by):
+            return dict(content["results"])
+    spec = load_spec(path, [f"demonstrations.seed={seed}", f"seed={seed}", "compare_with=[]"])
+    spec = with_overrides(spec, candidate)
+    with one_thread():
+        fitted = ddco_pyro.fit(spec)
+        success = {
+            execution: successes(fitted, spec, execution, episodes)
+            for execution in (EXECUTIONS if spec.hierarchy else EXECUTIONS[:1])
+        }
+    found = settings | {"valid": fitted.metrics["log_likelihood_per_step"]["valid"], "success": success}
+    write_text(kept, text(found, [made_by]))
+    return found
+
+
+def successes(fitted: Fit, spec: Spec, execution: str, episodes: int) -> int:
+    """Of how many episodes a policy succeeds."""
+    rollout = spec.rollout.model_copy(update={"options": execution})
+    seeds = range(STARTS, STARTS + episodes)
+    return int(sum(one.outcome["success"] for one in play(find_task(str(spec.task)), fitted.hierarchy, rollout, seeds)))
+
+
+def summarize(cells: list[Cell], seeds: list[int]) -> list[dict[str, Any]]:
+    """Candidates with each execution, by their mean success over the seeds and then by likelihood, the best first."""
+    rows = []
+    for values in {json.dumps(cell["values"]): cell["values"] for cell in cells}.values():
+        own = [next(cell for cell in cells if cell["values"] == values and cell["seed"] == seed) for seed in seeds]
+        for execution in own[0]["success"]:
+            rows.append(
+                {
+                    "values": values,
+                    "execution": execution,
+                    "success": [cell["success"][execution] for cell in own],
+                    "valid": [cell["valid"] for cell in own],
+                }
+            )
+    return sorted(rows, key=lambda row: (-np.mean(row["success"]), -np.mean(row["valid"])))
+
+
+def page(models: dict[str, list[dict[str, Any]]], seeds: list[int], episodes: int, made_by: str) -> str:
+    """The results as Markdown."""
+    lines = [made_by, "", f"Successes of {episodes} and held-out nats per step on development seeds {seeds}.", ""]
+    for model, rows in models.items():
+        lines += [f"## {model}", "", "| candidate | options | successes | held-out nats/step |", "|---|---|---|---|"]
+        for row in rows:
+            nats = ", ".join(f"{value:.2f}" for value in row["valid"])
+            execution = row["execution"] if model == "ddco" else "–"
+            lines.append(f"| {words(row['values'])} | {execution} | {', '.join(map(str, row['success']))} | {nats} |")
+        pairs = np.array([[np.mean(row["success"]), np.mean(row["valid"])] for row in rows])
+        lines += ["", f"Spearman's correlation of the two: {stats.spearmanr(*pairs.T).statistic:.2f}.", ""]
+    return "\n".join(lines)
+
+
+def words(values: Candidate) -> str:
+    """What a candidate sets."""
+    if values == BEFORE:
+        return "the recipe of before: clusters of observations and controls, layer by layer, one σ, perceptrons switch"
+    if "baseline" in values:
+        said = [f"hidden {values['baseline']['policy']['hidden']}", f"lr {values['training.optimizer.lr']}"]
+    else:
+        switching = values["hierarchy.meta_policy"]["network"]
+        said = [values["training.initialize"], f"{'perceptrons' if switching == 'mlp' else switching} switch"]
+    return ", ".join([*said, f"decay {values['training.optimizer.weight_decay']}"])
 
 
 def main() -> None:
@@ -79,20 +150,35 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--spec", default="specs/needle.yaml")
     parser.add_argument("--seeds", type=int, nargs="+", default=[5000, 6000])
-    parser.add_argument("--folds", type=int, default=3)
-    parser.add_argument("--jobs", type=int, default=-1)
+    parser.add_argument("--episodes", type=int, default=60)
+    parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("runs/recipe"))
     arguments = parser.parse_args()
     seeds = " ".join(map(str, arguments.seeds))
-    made_by = record(f"python studies/recipe.py --spec {arguments.spec} --seeds {seeds} --folds {arguments.folds}")
-    results: dict[str, dict[str, list[dict[str, Any]]]] = {model: {} for model in GRIDS}
-    for seed in arguments.seeds:
-        for model in GRIDS:
-            spec = spec_of(arguments.spec, model, seed, arguments.folds)
-            results[model][str(seed)] = scored(spec, arguments.out / f"{model}-{seed}", arguments.jobs)
-            write_text(OUT.with_suffix(".json"), text(results, [made_by]))
-    write_text(OUT.with_suffix(".md"), table(results, sentence(made_by["command"], [made_by])))
-    print(OUT.with_suffix(".md").read_text())
+    command = f"python studies/recipe.py --spec {arguments.spec} --seeds {seeds} --episodes {arguments.episodes}"
+    made_by = record(command)
+    for seed in arguments.seeds:  # collected by whoever comes first, and only once
+        ddco_pyro.fitting.prepare.demonstrations(load_spec(arguments.spec, [f"demonstrations.seed={seed}"]))
+    models = {}
+    for model, tried in candidates().items():
+        calls = [
+            delayed(run_cell)(
+                arguments.spec,
+                seed,
+                values,
+                arguments.episodes,
+                arguments.out / f"{model}-{number}-{seed}.json",
+                made_by,
+            )
+            for seed in arguments.seeds
+            for number, values in enumerate(tried)
+        ]
+        models[model] = summarize(Parallel(n_jobs=arguments.jobs)(calls), arguments.seeds)
+        out = Path("docs/results/recipe.json")
+        write_text(out, text(models, [made_by]))
+        summary = page(models, arguments.seeds, arguments.episodes, sentence(command, [made_by]))
+        write_text(out.with_suffix(".md"), summary)
+    print(summary)
 
 
 if __name__ == "__main__":
