@@ -1,10 +1,10 @@
 """How a task's models are best trained and executed, chosen on development seeds that no result is about.
 
-    python studies/recipe.py [--spec specs/needle.yaml] [--seeds 5000 6000] [--episodes 60] [--jobs 2] [--out runs/recipe]
+    python studies/recipe.py [--spec specs/needle.yaml] [--seeds 5000 6000] [--episodes 60] [--jobs 2] [--out DIR]
 
-Each development seed has demonstrations of its own. Every model, baselines too, has as many candidates; each is trained
-once for each seed, scored on held-out demonstrations, and rolled out from starts that no result is about. A cell that is
-in ``--out`` is not made again by the same code. Writes ``docs/results/recipe.json`` and ``.md``.
+Each development seed has demonstrations of its own. Every model, baselines too, has as many candidates; each is
+trained once for each seed, scored on held-out demonstrations, and rolled out from starts that no result is about. A
+cell that is in ``--out`` is not made again by the same code. Writes ``docs/results/recipe.json`` and ``.md``.
 """
 
 from __future__ import annotations
