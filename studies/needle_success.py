@@ -2,9 +2,10 @@
 
     python studies/needle_success.py [--seeds 5] [--episodes 200] [--jobs 2] [--set KEY=VALUE]... [--out DIR]
 
-Every seed is a fit of ``specs/needle.yaml`` with its baselines and a rollout of all methods from the same starts. What
-this code has done already with the same settings (``seed-N.json``, and fits under ``runs``) is not done again. Writes
-``summary.json``, ``summary.md`` and ``success.png``.
+Every seed has demonstrations of its own; it is a fit of ``specs/needle.yaml`` with its baselines, another with the time
+step as an observation besides, and a rollout of all methods from the same starts. What this code has done already with
+the same settings (``seed-N.json``, and fits under ``runs``) is not done again. Writes ``summary.json``, ``summary.md``
+and ``success.png``.
 """
 
 from __future__ import annotations
@@ -22,44 +23,66 @@ from provenance import Record, is_kept, record, sentence, text
 from scipy import stats
 
 from ddco_pyro.data.files import whole_file, write_text
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit
+from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.simulation.episodes import rate
 from ddco_pyro.spec import load_spec
 
 OURS = "ddco"
 RATES = ("success", "grasped", "inserted")
+ALL = 100
+"""The demonstrations of a training seed."""
+DEMONSTRATIONS, APART, STARTS = 20_000, 1_000, 700_000
+"""Seeds: of the first seed's first demonstration, from one training seed to the next, and of the first start."""
+CLOCK = ("observations=[gripper_pose, jaw, needle_ellipse, step]", "compare_with=[flat]", "rollout.policies=[]")
+VARIANTS = {"": (), "_clock": CLOCK}
+"""Fits of the spec as it is, and with the time step as an observation besides."""
 Seed = dict[str, Any]
 """What is kept of one training seed: the ``results`` of ``seed-N.json``."""
 
 
-def run_seed(seed: int, arguments: argparse.Namespace, made_by: Record) -> None:
-    """Fit, roll out, and keep the numbers of one training seed."""
-    path = arguments.out / f"seed-{seed}.json"
-    settings = {"seed": seed, "episodes": arguments.episodes, "overrides": arguments.set}
+def run_seed(seed: int, count: int, arguments: argparse.Namespace, made_by: Record) -> None:
+    """Fit, roll out, and keep the numbers of one training seed that is given so many of its demonstrations."""
+    path = kept_at(arguments.out, seed, count)
+    settings = {"seed": seed, "count": count, "episodes": arguments.episodes, "overrides": arguments.set}
     if path.exists() and is_kept(json.loads(path.read_text()), settings, made_by):
         return
-    overrides = [*arguments.set, f"seed={seed}"]
-    if seed > 0:
-        overrides.append("rollout.policies=[]")  # scripted policies know no training seed
-    folder = arguments.runs / made_by["code"][:12] / f"seed-{seed}"
-    fitted = fit(load_spec("specs/needle.yaml", overrides), out=folder)
-    rolled = roll_out(fitted, arguments.episodes, 0, lambda name: None, jobs=1)
+    first = DEMONSTRATIONS + APART * seed
+    left_out = ", ".join(f"demo_{first + number}" for number in range(count, ALL))
+    own = [f"seed={seed}", f"demonstrations.seed={first}", f"demonstrations.exclude=[{left_out}]"]
+    own.append(f"rollout.seed={STARTS}")
+    if (seed, count) != (0, ALL):
+        own.append("rollout.policies=[]")  # scripted policies know neither training seed nor demonstrations
+    folder = arguments.runs / made_by["code"][:12] / path.stem
+    found: dict[str, Any] = {}
+    for name, changes in VARIANTS.items() if count == ALL else [("", ())]:
+        spec = load_spec("specs/needle.yaml", [*arguments.set, *own, *changes])
+        with one_thread():
+            fitted = fit(spec, out=folder / (name or "plain"))
+            rolled = roll_out(fitted, arguments.episodes, jobs=1)
+        for part, values in _numbers(fitted, rolled).items():
+            found[part] = found.get(part, {}) | {f"{method}{name}": value for method, value in values.items()}
+    write_text(path, text(settings | found, [made_by]))
+
+
+def kept_at(out: Path, seed: int, count: int) -> Path:
+    """Where the numbers of a seed and a number of demonstrations are kept."""
+    return out / (f"seed-{seed}.json" if count == ALL else f"count-{count:03d}-seed-{seed}.json")
+
+
+def _numbers(fitted: Fit, rolled: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """By part what there is of every method."""
     metrics = fitted.metrics
-    likelihood = {name: one["log_likelihood_per_step"] for name, one in metrics["comparison"].items()}
-    likelihood[OURS] = metrics["log_likelihood_per_step"]
-    training = {name: one["training"] for name, one in metrics["comparison"].items()} | {OURS: metrics["training"]}
-    kept = settings | {
-        "log_likelihood_per_step": likelihood,
-        "difference": {name: one["difference"] for name, one in metrics["comparison"].items()},
-        "training": training,
+    models = {OURS: metrics} | metrics["comparison"]
+    return {
+        "log_likelihood_per_step": {name: model["log_likelihood_per_step"] for name, model in models.items()},
+        "training": {name: model["training"] for name, model in models.items()},
         "methods": rolled["methods"],
-        "options": metrics["options"],
-        "seconds": metrics["seconds"],
-        "engine_check": metrics["engine_check"],
-        "supervisor_demonstrations": metrics["demonstrations"]["supervisor"],
+        "options": {OURS: metrics["options"]},
+        "engine_check": {OURS: metrics["engine_check"]},
     }
-    write_text(path, text(kept, [made_by]))
 
 
 def summarize(seeds: list[Seed]) -> dict[str, Any]:
@@ -203,8 +226,8 @@ def main() -> None:
     settings = "".join(f" --set '{one}'" for one in arguments.set)
     command = f"python studies/needle_success.py --seeds {arguments.seeds} --episodes {arguments.episodes}{settings}"
     made_by = record(command)
-    Parallel(n_jobs=arguments.jobs)(delayed(run_seed)(seed, arguments, made_by) for seed in range(arguments.seeds))
-    kept = [json.loads((arguments.out / f"seed-{seed}.json").read_text()) for seed in range(arguments.seeds)]
+    Parallel(n_jobs=arguments.jobs)(delayed(run_seed)(seed, ALL, arguments, made_by) for seed in range(arguments.seeds))
+    kept = [json.loads(kept_at(arguments.out, seed, ALL).read_text()) for seed in range(arguments.seeds)]
     seeds, records = [one["results"] for one in kept], [one for each in kept for one in each["provenance"]]
     results = {"methods": summarize(seeds), "differences": differences(seeds)}
     summary = page(results, arguments.seeds, sentence(command, records))

@@ -288,7 +288,7 @@ class RolloutSpec(Model):
     """Seed of the first episode; the next ones count up from it."""
     control: Literal["mean", "sample"] = "mean"
     """Whether the control is the mean of its distribution or a sample."""
-    options: OptionExecution = "sample"
+    options: OptionExecution = "marginal"
     """``sample`` selections and terminations, take the ``most_likely`` of each, or act with the options of the largest
     ``marginal`` probability given all observations so far, in which small probabilities of having ended add up."""
     policies: Items[Text] = ()
