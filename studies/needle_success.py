@@ -2,10 +2,10 @@
 
     python studies/needle_success.py [--seeds 5] [--episodes 200] [--jobs 2] [--set KEY=VALUE]... [--out DIR]
 
-Every seed has demonstrations of its own; it is a fit of ``specs/needle.yaml`` with its baselines, another with the time
-step as an observation besides, and a rollout of all methods from the same starts. What this code has done already with
-the same settings (``seed-N.json``, and fits under ``runs``) is not done again. Writes ``summary.json``, ``summary.md``
-and ``success.png``.
+Every seed has demonstrations of its own. The specs of the hierarchy, of the flat and of the per-timestep policy are
+fitted to them, the first two also with the time step as an observation; all are rolled out from the same starts.
+``--set`` changes the hierarchy's spec. What this code has done already with the same settings (``seed-N.json``, and
+fits under ``runs``) is not done again. Writes ``summary.json``, ``summary.md`` and ``success.png``.
 """
 
 from __future__ import annotations
@@ -36,9 +36,17 @@ ALL = 100
 """The demonstrations of a training seed."""
 DEMONSTRATIONS, APART, STARTS = 20_000, 1_000, 700_000
 """Seeds: of the first seed's first demonstration, from one training seed to the next, and of the first start."""
-CLOCK = ("observations=[gripper_pose, jaw, needle_ellipse, step]", "compare_with=[flat]", "rollout.policies=[]")
-VARIANTS = {"": (), "_clock": CLOCK}
-"""Fits of the spec as it is, and with the time step as an observation besides."""
+STEP = "observations=[gripper_pose, jaw, needle_ellipse, step]"
+FITS: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "ddco": ("specs/needle.yaml", "", ("compare_with=[flat_equal]",)),
+    "flat": ("specs/needle_flat.yaml", "", ()),
+    "per_timestep": ("specs/needle_per_timestep.yaml", "", ()),
+    "ddco_clock": ("specs/needle.yaml", "_clock", ("compare_with=[]", STEP)),
+    "flat_clock": ("specs/needle_flat.yaml", "_clock", (STEP,)),
+}
+"""Each model as its own spec has it: file, what stands behind the names of its methods, and what is changed."""
+FEW = ("ddco", "flat", "per_timestep")
+"""The fits to fewer than all demonstrations."""
 Seed = dict[str, Any]
 """What is kept of one training seed: the ``results`` of ``seed-N.json``."""
 
@@ -53,17 +61,17 @@ def run_seed(seed: int, count: int, arguments: argparse.Namespace, made_by: Reco
     left_out = ", ".join(f"demo_{first + number}" for number in range(count, ALL))
     own = [f"seed={seed}", f"demonstrations.seed={first}", f"demonstrations.exclude=[{left_out}]"]
     own.append(f"rollout.seed={STARTS}")
-    if (seed, count) != (0, ALL):
-        own.append("rollout.policies=[]")  # scripted policies know neither training seed nor demonstrations
     folder = arguments.runs / made_by["code"][:12] / path.stem
     found: dict[str, Any] = {}
-    for name, changes in VARIANTS.items() if count == ALL else [("", ())]:
-        spec = load_spec("specs/needle.yaml", [*arguments.set, *own, *changes])
+    for name in FITS if count == ALL else FEW:
+        file, suffix, changes = FITS[name]
+        scripted = () if (name, seed, count) == ("ddco", 0, ALL) else ("rollout.policies=[]",)
+        spec = load_spec(file, [*own, *changes, *scripted, *(arguments.set if name.startswith(OURS) else ())])
         with one_thread():
-            fitted = fit(spec, out=folder / (name or "plain"))
+            fitted = fit(spec, out=folder / name)
             rolled = roll_out(fitted, arguments.episodes, jobs=1)
         for part, values in _numbers(fitted, rolled).items():
-            found[part] = found.get(part, {}) | {f"{method}{name}": value for method, value in values.items()}
+            found[part] = found.get(part, {}) | {f"{method}{suffix}": value for method, value in values.items()}
     write_text(path, text(settings | found, [made_by]))
 
 
@@ -75,13 +83,13 @@ def kept_at(out: Path, seed: int, count: int) -> Path:
 def _numbers(fitted: Fit, rolled: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """By part what there is of every method."""
     metrics = fitted.metrics
-    models = {OURS: metrics} | metrics["comparison"]
+    models = {fitted.name: metrics} | metrics.get("comparison", {})
     return {
         "log_likelihood_per_step": {name: model["log_likelihood_per_step"] for name, model in models.items()},
         "training": {name: model["training"] for name, model in models.items()},
         "methods": rolled["methods"],
-        "options": {OURS: metrics["options"]},
-        "engine_check": {OURS: metrics["engine_check"]},
+        "options": {fitted.name: metrics.get("options")},
+        "engine_check": {fitted.name: metrics["engine_check"]},
     }
 
 
