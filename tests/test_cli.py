@@ -190,6 +190,10 @@ GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
             "control.scale: has 3 numbers, but the control has 2",
         ),
         (
+            ["check", "SPEC", *with_set("control.parts=[{name: hand, dims: [2]}]")],
+            r"control\.parts\.0\.dims: there is no control dimension 2; the control has 2, counted from 0",
+        ),
+        (
             ["check", "SPEC", *with_set(OWN)],
             r"hierarchy\.levels\.0\.policy\.network: would import user code \(user_networks:Own\); pass --allow-code",
         ),

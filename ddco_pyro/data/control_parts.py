@@ -113,18 +113,27 @@ def control_parts(spec: ControlSpec, dimensions: Sequence[ControlDimension]) -> 
 
     :raises SpecError: the spec asks for what does not fit the demonstrations.
     """
+    refuse_unknown_dimensions(spec, len(dimensions))
     varying = {dim.number: dim for dim in dimensions if not dim.constant}
     named = []
     for place, part in enumerate(spec.parts):
-        unknown = [dimension for dimension in part.dims if dimension >= len(dimensions)]
-        if unknown:
-            raise SpecError(
-                f"control.parts.{place}.dims: there is no control dimension {unknown[0]}; the control has "
-                f"{len(dimensions)}, counted from 0"
-            )
         own = [varying.pop(dimension) for dimension in part.dims if dimension in varying]
         named += list(_parts(part.kind, own, f"control.parts.{place}", part))
     return (*named, *_parts(spec.kind, list(varying.values()), "control", None))
+
+
+def refuse_unknown_dimensions(spec: ControlSpec, size: int) -> None:
+    """See that a control of this size has every dimension that is named.
+
+    :raises SpecError: it does not.
+    """
+    for place, part in enumerate(spec.parts):
+        unknown = [dimension for dimension in part.dims if dimension >= size]
+        if unknown:
+            raise SpecError(
+                f"control.parts.{place}.dims: there is no control dimension {unknown[0]}; the control has {size}, "
+                "counted from 0"
+            )
 
 
 def _parts(

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from ddco_pyro.data.control_dimensions import ControlDimension, all_constant, control_dimensions
-from ddco_pyro.data.control_parts import ControlPart, control_parts
+from ddco_pyro.data.control_parts import ControlPart, control_parts, refuse_unknown_dimensions
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.fitting.widths import nearest_widths
 from ddco_pyro.model.encoding import Shapes
@@ -70,6 +70,7 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
         raise SpecError(
             f"control.scale: has {len(scale)} numbers, but the control has {dimensions.control_size} dimensions"
         )
+    refuse_unknown_dimensions(spec.control, dimensions.control_size)
     _refuse_giants(spec, dimensions)
     try:
         return _hierarchy(spec, dimensions)
