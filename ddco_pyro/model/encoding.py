@@ -61,8 +61,10 @@ class ObservationEncoder(nn.Module):
     Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model.
     A dimension that never changes, or by rounding alone (:func:`~ddco_pyro.data.values.rounding`), is only centred, and
     so are the differences of one that does so within each demonstration: rounding is no feature, and what moves later
-    on moves in its own units, not in multiples of a rounding. The built-in observation :data:`~ddco_pyro.spec.STEP` is made here:
-    the number of the step divided by ``longest``, the steps of the longest demonstration given to :meth:`fit`.
+    on moves in its own units, not in multiples of a rounding.
+
+    The built-in observation :data:`~ddco_pyro.spec.STEP` is made here: the number of the step divided by ``longest``,
+    the steps of the longest demonstration given to :meth:`fit`.
     """
 
     mean: Tensor
