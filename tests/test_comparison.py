@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import re
 import shutil
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from command_line import call
 from scipy import stats
+from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro import load
 from ddco_pyro.comparison import CompareError, Comparison, Row, compare, page, write
@@ -106,7 +108,7 @@ def test_the_verdict_is_that_of_the_report_in_its_words(toy_run, found, folders)
 def test_the_verdict_says_whether_a_difference_is_outside_its_error(each, said):
     """By hand, trajectories of one step: ± is the standard deviation of the four differences by the root of four."""
     rows = [row("a", 0, each), row("b", 1, [0.0] * 4)]
-    found = Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], "a")
+    found = Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "a")
     assert page.verdict(found) == (
         f"a explains held-out demonstrations {said} (4 held-out demonstrations; ± is one standard error)."
     )
@@ -215,6 +217,53 @@ def test_one_run_is_nothing_to_compare(folders):
         compare([folders[0], folders[0] / "baselines" / ".."])
 
 
+# --- agreement with labels --------------------------------------------------------------------------------------------
+
+
+def test_agreement_is_that_of_each_run_on_what_was_held_out(found, folders, held_out):
+    """NMI by scikit-learn, mean over frames by the best of all matchings; baselines have no options."""
+    by_run = {str(folder): load(folder) for folder in (folders[0], folders[-1])}
+    assert [row["run"] for row in found.agreement] == [row.name for row in found.rows if row.name in by_run]
+    phases = np.concatenate([demo.labels["phase"] for demo in held_out])
+    for row in found.agreement:
+        fitted = by_run[row["run"]]
+        options = segments(fitted, held_out)
+        assert (row["level"], row["labels"]) == (fitted.spec.hierarchy.levels[0].name, "phase")
+        assert row["nmi"] == pytest.approx(normalized_mutual_info_score(phases, options))
+        assert row["accuracy"] == pytest.approx(best_match(phases, options))
+        (scores,) = fitted.metrics["agreement"]["valid"]
+        assert [row[f"boundary_f1_{n}"] for n in (1, 3, 5)] == [scores[f"boundary_f1_{n}"] for n in (1, 3, 5)]
+
+
+def segments(fitted, demos):
+    (level,) = fitted.segment(demos)
+    return np.concatenate([row[: len(demo)] for row, demo in zip(level, demos, strict=True)])
+
+
+def best_match(labels, options):
+    """The largest share of steps that agree, where each option stands for a label of its own."""
+    names, values = np.unique(options), np.unique(labels)
+    values = [*values, *(None for _ in names)]  # an option may be left over
+    matches = (dict(zip(names, chosen, strict=True)) for chosen in itertools.permutations(values, len(names)))
+    return max(np.mean([match[h] == label for h, label in zip(options, labels, strict=True)]) for match in matches)
+
+
+def test_runs_without_labels_have_no_table_of_them(other):
+    runs = [other(name, demonstrations__labels=None, training__epochs=n) for n, name in ((1, "a"), (2, "b"))]
+    compared = compare([each.folder for each in runs])
+    assert compared.agreement == []
+    assert "labels" not in page.markdown(compared)
+
+
+def test_runs_of_before_have_the_mutual_information_alone(folders, toy_run, tmp_path):
+    run = shutil.copytree(toy_run.folder, tmp_path / "run")
+    metrics = json.loads((run / "metrics.json").read_text())
+    metrics["agreement"] = {"labels": "phase", "train": [0.123], "valid": [0.456]}
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    (row,) = page.agreement_cells(compare([run, run / "baselines" / "flat"]))
+    assert row[2:] == ["phase", "0.456", "–", "–", "–", "–"]
+
+
 # --- rollouts ---------------------------------------------------------------------------------------------------------
 
 
@@ -296,12 +345,15 @@ def test_the_files_say_the_same(found, tmp_path):
     read = Cells()
     read.feed(path.read_text())
     assert read.loaded == []
+    scores = [cell for row in [page.AGREEMENT_HEAD, *page.agreement_cells(found)] for cell in row]
     listed = [cell for row in [page.list_head(found), *page.list_cells(found)] for cell in row]
-    assert read.cells == [*page.HEAD, *(cell for row in found.rows for cell in page.cells(row)), *listed]
+    assert read.cells == [*page.HEAD, *(cell for row in found.rows for cell in page.cells(row)), *scores, *listed]
     assert data["demonstrations"] == found.worst_first
     assert text.startswith(page.verdict(found))
-    assert table[2 + len(found.rows)] == page.list_head(found)
-    assert table[4 + len(found.rows) :] == page.list_cells(found)
+    agreement = [list(page.AGREEMENT_HEAD), *page.agreement_cells(found)]
+    rest = [row for row in table[2 + len(found.rows) :] if not row[0].startswith("---")]
+    assert rest == [*agreement, page.list_head(found), *page.list_cells(found)]
+    assert data["agreement"] == found.agreement
     assert f'<p class="verdict">{page.verdict(found)}</p>' in path.read_text()
     assert (folder / "compare.png").read_bytes().startswith(b"\x89PNG")
 

@@ -50,6 +50,19 @@ def test_a_fit_that_stops_early_says_so(clock, capsys):
     ]
 
 
+def test_the_first_of_many_says_nothing_of_the_time_left(monkeypatch, capsys):
+    """Restarts in processes: 30 s until they have begun, then all epochs of ten seconds at once."""
+    times = iter([0.0, *[30.0] * 50, *[41.0] * 50])
+    monkeypatch.setattr("ddco_pyro.cli.console.time.monotonic", lambda: next(times))
+    with console.Progress() as progress:
+        progress(TrainingBegan("ddco", 1000))
+        for _ in range(100):
+            progress(EpochEnded(0, "joint", 1, 1.0, 0.5))
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "training ddco: 1/1000  joint: training 1.000, tuning 0.500 nats/step"
+    assert second.startswith(f"training ddco: 51/1000, at most {41 / 51 * 949:.0f} s left")
+
+
 def test_where_nobody_knows_how_far_it_goes_there_is_no_time_left(clock, capsys):
     with console.Progress() as progress:
         progress(TrainingBegan("ddco", None))

@@ -261,7 +261,9 @@ def test_every_network_of_every_option_is_compared(tensor, by, tmp_path, damaged
 def test_networks_of_every_step_are_compared(tmp_path, damaged):
     """The last of 30 steps' networks differs."""
     damaged(lambda folder: damage_numpy(folder, "caller_0.1.bias"))
-    with pytest.raises(Failed, match=r"^nothing was written: as numpy it differs from the run by 1\.0e-03;"):
+    with pytest.raises(
+        Failed, match=r"^nothing was written: as numpy it differs from the run by 1\.0e-03, of 1\.0e-06 that"
+    ):
         export(make("per_timestep", (), steps=30), tmp_path / "out")
 
 

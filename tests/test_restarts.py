@@ -60,9 +60,10 @@ class Interrupting:
     """Ctrl-C at so many epochs."""
 
     def __init__(self, epochs):
-        self.left = epochs
+        self.left, self.stopped = epochs, []
 
     def __call__(self, event):
+        self.stopped += [event] if isinstance(event, RestartStopped) else []
         self.left -= isinstance(event, EpochEnded)
         if self.left == 0:
             raise KeyboardInterrupt
@@ -98,15 +99,19 @@ def test_what_is_no_number_of_processes_is_refused(spec, demos, jobs):
 def test_an_interruption_changes_nothing(undisturbed, spec, demos, tmp_path, monkeypatch):
     """In the first rung, at its end, in the middle of later ones, again and again until it is done."""
     monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
-    interruptions = 0
+    interruptions, stopped = 0, []
     while True:
-        trainer = make_trainer(spec, demos, tmp_path, Interrupting(4))
+        told = Interrupting(4)
+        trainer = make_trainer(spec, demos, tmp_path, told)
         try:
             model = trainer.run().state_dict()
         except KeyboardInterrupt:
             interruptions += 1
         else:
             break
+        finally:
+            stopped += told.stopped
+    assert stopped == [event for event in undisturbed[2] if isinstance(event, RestartStopped)]  # each once
     assert interruptions >= len(undisturbed[0].history) // 4
     assert_same(trainer, model, tmp_path, undisturbed)
 

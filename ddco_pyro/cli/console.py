@@ -85,9 +85,11 @@ class _Bar:
             self._say(f"{self._place(now)}  {note}".rstrip())
 
     def _place(self, now: float) -> str:
-        """How far it has come, and the time left."""
+        """How far it has come, and the time left; that does not follow from a late first, which waited for a start."""
         if self._total is None:
             return str(self._done)
+        if self._done == 1 < self._total and now - self._start > PLAIN_SECONDS:
+            return f"1/{self._total}"
         left = (now - self._start) / max(self._done, 1) * (self._total - self._done)
         return f"{self._done}/{self._total}, at most {left:.0f} s left"
 

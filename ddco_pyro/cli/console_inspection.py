@@ -59,11 +59,12 @@ def _notes(field: Field) -> str:
         notes.append(f"{field.nan} NaN, {field.infinite} infinite")
     if field.huge:
         notes.append(f"{field.huge} beyond ±{LARGEST:g}")
-    constant = field.constant
-    if constant and len(constant) == len(field.minimum):
-        notes.append("constant")
-    elif constant and not field.image:
-        notes.append(f"constant: {', '.join(map(str, constant))}")
+    constant, rounding = field.constant, field.rounding
+    if constant + rounding and len(constant + rounding) == len(field.minimum):
+        notes.append("constant but for rounding" if rounding else "constant")
+    elif constant + rounding and not field.image:
+        listed = {"constant": constant, "constant but for rounding": rounding}
+        notes += [f"{what}: {', '.join(map(str, dimensions))}" for what, dimensions in listed.items() if dimensions]
     elif field.still and not field.video:
         notes.append("one value per demonstration")
     return "; ".join(notes)

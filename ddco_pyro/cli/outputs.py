@@ -161,8 +161,9 @@ def export(
     observations, by the loop of runner.py. It has to choose the options
     that the run's controller chooses, with probabilities within 1e-6 and
     controls within 1e-6 of the largest of 1, their spread, and their
-    distance from their mean; else nothing is written and what was there
-    stays.
+    distance from their mean, or within four times what float32 does to the
+    run's own networks where that is more; else nothing is written and what
+    was there stays.
     """
     from ddco_pyro.export import export as write
     from ddco_pyro.fitting.fit import load

@@ -30,6 +30,8 @@ def compare(
 
     compared = comparison.compare(runs, allow_code)
     console.comparison(page.HEAD, [page.cells(row) for row in compared.rows])
+    if compared.agreement:
+        console.comparison(page.AGREEMENT_HEAD, page.agreement_cells(compared), "agreement with labels, held out")
     if compared.rollouts:
         console.comparison(page.ROLLOUT_HEAD, page.rollout_cells(compared))
     print(page.verdict(compared))

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ddco_pyro.comparison import page, plot
+from ddco_pyro.comparison.agreement import agreements
 from ddco_pyro.comparison.rollouts import paired_rollouts
 from ddco_pyro.comparison.shared import Held, held_out
 from ddco_pyro.data.files import write_text
@@ -53,13 +54,15 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Rows, the best first; the ``trajectories`` they were compared on and their ``steps``; rollouts paired by initial
-    state; and the run whose likelihood sorts the trajectories: the best with options, or the best.
+    """Rows, the best first; the ``trajectories`` they were compared on and their ``steps``; how well options agree with
+    labels on them; rollouts paired by initial state; and the run whose likelihood sorts the trajectories: the best with
+    options, or the best.
     """
 
     rows: Sequence[Row]
     trajectories: Sequence[str]
     steps: Sequence[int]
+    agreement: Sequence[dict[str, Any]]
     rollouts: Sequence[dict[str, Any]]
     sorted_by: str
 
@@ -83,6 +86,7 @@ class Comparison:
             "steps": sum(self.steps),
             "demonstrations": self.worst_first,
             "rows": [vars(row) | {"each": list(row.each)} for row in self.rows],
+            "agreement": list(self.agreement),
             "rollouts": list(self.rollouts),
         }
 
@@ -105,12 +109,14 @@ def compare(folders: Sequence[Path], allow_code: bool = False) -> Comparison:
     best = int(values.sum(1).argmax())
     rows = [_row(0, held, values[best]) for held in runs]
     ranked = sorted(rows, key=lambda row: row.difference)
+    order = [row.name for row in ranked]
     with_options = {held.run for held in runs if held.fit.spec.hierarchy}
     return Comparison(
         [Row(**vars(row) | {"rank": rank}) for rank, row in enumerate(ranked)],
         runs[0].names,
         runs[0].steps,
-        paired_rollouts(fits, [row.name for row in ranked]),
+        agreements(fits, order),
+        paired_rollouts(fits, order),
         next((row.name for row in ranked if row.name in with_options), ranked[0].name),
     )
 

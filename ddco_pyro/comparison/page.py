@@ -22,7 +22,14 @@ if TYPE_CHECKING:
     from ddco_pyro.drawing.pictures import Picture
 
 HEAD = ("rank", "run", "model", "parameters", "total", "se", "diff", "dse", "nats/step", "gradient steps")
+AGREEMENT_HEAD = ("run", "level", "labels", "NMI", "MoF", "boundary F1 ±1", "±3", "±5")
 ROLLOUT_HEAD = ("run", "succeeds", "other", "succeeds", "only run", "only other", "states", "p")
+
+AGREEMENT = (
+    "Agreement of options with labels on the same trajectories, 1 where it is perfect; no run is ranked by it. NMI: "
+    "normalised mutual information; MoF: mean over frames, steps that agree where each option stands for one label; "
+    "boundary F1: where segments begin, within so many steps."
+)
 
 
 def cells(row: Row) -> list[str]:
@@ -32,6 +39,15 @@ def cells(row: Row) -> list[str]:
         numbers[2:] = ["0", "0"]
     per_step = words.number(row.per_step, 3)
     return [str(row.rank), row.name, row.model, str(row.parameters), *numbers, per_step, effort(row.training)]
+
+
+def agreement_cells(compared: Comparison) -> list[list[str]]:
+    """The rows of the agreement with labels."""
+    measures = ("nmi", "accuracy", "boundary_f1_1", "boundary_f1_3", "boundary_f1_5")
+    return [
+        [row["run"], row["level"], row["labels"], *(words.number(row[measure], 3) for measure in measures)]
+        for row in compared.agreement
+    ]
 
 
 def rollout_cells(compared: Comparison) -> list[list[str]]:
@@ -101,6 +117,8 @@ def explanation(compared: Comparison) -> str:
 def markdown(compared: Comparison) -> str:
     """The verdict and tables in Markdown."""
     lines = [verdict(compared), "", explanation(compared), "", *_table(HEAD, [cells(row) for row in compared.rows])]
+    if compared.agreement:
+        lines += ["", AGREEMENT, "", *_table(AGREEMENT_HEAD, agreement_cells(compared))]
     listed = list_cells(compared)
     lines += ["", list_note(compared), "", *_table(list_head(compared), listed[:SHOWN])]
     if len(listed) > SHOWN:
@@ -121,6 +139,7 @@ def html(compared: Comparison, picture: Picture, folder: Path) -> str:
     values = {
         "verdict": verdict(compared), "explanation": explanation(compared), "head": HEAD,
         "rows": [cells(row) for row in compared.rows], "list_head": list_head(compared),
+        "agreement_head": AGREEMENT_HEAD, "agreement": agreement_cells(compared), "agreement_note": AGREEMENT,
         "list_note": list_note(compared), "first": listed[:SHOWN], "rest": listed[SHOWN:], "picture": picture,
         "rollout_head": ROLLOUT_HEAD, "rollouts": rollout_cells(compared), "links": _links(compared, folder),
     }  # fmt: skip

@@ -14,7 +14,7 @@ from ddco_pyro.data.control_dimensions import ControlDimension, ControlStatistic
 from ddco_pyro.data.control_parts import control_parts, described
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.sources import Column, Format, Source, open_source
-from ddco_pyro.data.values import LARGEST, NUMBERS, usable
+from ddco_pyro.data.values import LARGEST, NUMBERS, rounding, usable
 from ddco_pyro.spec import ControlSpec
 
 
@@ -69,6 +69,15 @@ class Field:
     def constant(self) -> list[int]:
         """Dimensions that never change in the whole file."""
         return [int(index) for index in np.flatnonzero(self.minimum == self.maximum)]
+
+    @property
+    def rounding(self) -> list[int]:
+        """Dimensions of an observation that change, but by :func:`~ddco_pyro.data.values.rounding` alone."""
+        if not self.place.startswith("obs/") or not self.numeric:
+            return []
+        spread = self.maximum.astype(np.float64) - self.minimum
+        rests = spread <= rounding(self.minimum, self.maximum, np.dtype(self.dtype))
+        return [int(index) for index in np.flatnonzero(rests & (self.minimum != self.maximum))]
 
     @property
     def unusable(self) -> str:
@@ -188,7 +197,7 @@ class Inspection:
 def _as_json(array: Field) -> dict[str, Any]:
     data = asdict(array)
     ends = {name: [float(value) if np.isfinite(value) else None for value in data[name]] for name in _ENDS}
-    return data | ends | {"shape": list(array.shape), "constant": array.constant}
+    return data | ends | {"shape": list(array.shape), "constant": array.constant, "rounding": array.rounding}
 
 
 _ENDS = ("minimum", "maximum")

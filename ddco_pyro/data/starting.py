@@ -162,7 +162,7 @@ def _labels(inspection: Inspection) -> Iterator[str]:
 def _observations(inspection: Inspection) -> Iterator[str]:
     vectors, left_out = [], []
     for field in inspection.observations:
-        reason = _unusable(inspection, field) or ("is constant" if _constant(field) else "")
+        reason = _unusable(inspection, field) or _constant(field)
         if reason:
             left_out.append((field, reason))
         elif not field.image:
@@ -204,8 +204,11 @@ def _unusable(inspection: Inspection, field: Field) -> str:
     return ""
 
 
-def _constant(field: Field) -> bool:
-    return len(field.constant) == len(field.minimum)
+def _constant(field: Field) -> str:
+    """That an array says nothing, in words; nothing where it does."""
+    if len(field.constant) == len(field.minimum):
+        return "is constant"
+    return "is constant but for rounding" if len(field.constant + field.rounding) == len(field.minimum) else ""
 
 
 def _only_images(inspection: Inspection) -> bool:

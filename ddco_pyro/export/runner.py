@@ -25,8 +25,9 @@ from typing import Any
 import numpy as np
 
 TOLERANCE = 1e-6
-"""Largest difference from the original: of a probability, and of a control in units of the largest of 1, its spread,
-and its distance from where it is centred (networks are float32)."""
+"""Differences from the original that are always allowed: of a probability, and of a control in units of the largest of
+1, its spread, and its distance from where it is centred. ``check.npz`` says what is allowed of this controller: more
+where float32, in which its networks are, rounds more."""
 
 Outputs = dict[str, np.ndarray]
 """``selection_d`` log-probabilities [K, 1 + k], ``termination_d`` ψ [k], ``control_d`` the numbers of the control
@@ -420,20 +421,27 @@ def replay(controller: Runner, episodes: Mapping[str, np.ndarray]) -> tuple[floa
     largest, seconds = 0.0, []
     for number, seed in enumerate(episodes["seeds"]):
         controller.reset(int(seed))
+        observations = seen(episodes, number)
         for step in range(len(episodes[f"controls_{number}"])):
-            prefix = f"observation_{number}_"
-            seen = {key.removeprefix(prefix): rows[step] for key, rows in episodes.items() if key.startswith(prefix)}
+            observation = {key: rows[step] for key, rows in observations.items()}
             start = time.perf_counter()
-            control = controller.act(seen)
+            control = controller.act(observation)
             seconds.append(time.perf_counter() - start)
             if list(controller.choices) != episodes[f"choices_{number}"][step].tolist():
                 largest = np.inf
             for name, value in {**controller.outputs, "controls": control}.items():
-                largest = max(largest, _difference(controller.about, name, value, episodes[f"{name}_{number}"][step]))
+                largest = max(largest, difference(controller.about, name, value, episodes[f"{name}_{number}"][step]))
     return largest, float(np.median(seconds))
 
 
-def _difference(about: Mapping[str, Any], name: str, value: np.ndarray, original: np.ndarray) -> float:
+def seen(episodes: Mapping[str, np.ndarray], number: int) -> dict[str, np.ndarray]:
+    """The observations of a recorded episode by key, each [T, ...]."""
+    prefix = f"observation_{number}_"
+    return {key.removeprefix(prefix): rows for key, rows in episodes.items() if key.startswith(prefix)}
+
+
+def difference(about: Mapping[str, Any], name: str, value: np.ndarray, original: np.ndarray) -> float:
+    """The largest difference of an output from the original's, in the units of :data:`TOLERANCE`; infinite for NaN."""
     if name.startswith("selection"):
         value, original = np.exp(value), np.exp(original)
     unit = np.ones(original.shape)
@@ -452,9 +460,11 @@ def main() -> None:
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
     networks = sys.argv[2] if len(sys.argv) > 2 else "numpy"
     with np.load(folder / "check.npz", allow_pickle=False) as file:
-        difference, seconds = replay(Runner(folder, networks), {name: file[name] for name in file.files})
-    print(f"largest difference: {difference:.1e}; a step takes {1e3 * seconds:.3f} ms")
-    sys.exit(0 if difference < TOLERANCE else 1)
+        episodes = {name: file[name] for name in file.files}
+    largest, seconds = replay(Runner(folder, networks), episodes)
+    allowed = float(episodes["tolerance"])
+    print(f"largest difference: {largest:.1e} of {allowed:.1e} that are allowed; a step takes {1e3 * seconds:.3f} ms")
+    sys.exit(0 if largest < allowed else 1)
 
 
 if __name__ == "__main__":

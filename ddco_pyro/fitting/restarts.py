@@ -81,9 +81,10 @@ class Trainer:
         self.restarts = [self._begun(number) for number in range(self.spec.training.restarts)]
         left, epochs = list(range(len(self.restarts))), self.spec.training.halving
         while epochs is not None and len(left) > 1:
+            before = len(self.history)
             self._train(left, epochs)
             better = better_half({number: best_until(self.restarts[number].progress, epochs) for number in left})
-            self._stop([number for number in left if number not in better])
+            self._stop([number for number in left if number not in better], tell=len(self.history) > before)
             left, epochs = better, 2 * epochs
         self._train(left, None)
         model = self.material.hierarchy(self.best)
@@ -123,13 +124,17 @@ class Trainer:
     def _path(self, number: int) -> Path | None:
         return None if self.checkpoints is None else self.checkpoints / f"restart-{number}.safetensors"
 
-    def _stop(self, numbers: Sequence[int]) -> None:
-        """Those that are done need not be stopped."""
+    def _stop(self, numbers: Sequence[int], tell: bool) -> None:
+        """Those that are done need not be stopped.
+
+        :param tell: whether it is news: where nothing was trained for it, they were stopped before an interruption.
+        """
         for number in numbers:
             progress = self.restarts[number].progress
             if not progress.done:
                 self.stopped[number] = progress.epoch
-                self.on_event(RestartStopped(number, progress.epoch))
+                if tell:
+                    self.on_event(RestartStopped(number, progress.epoch))
 
     def _train(self, numbers: Sequence[int], until: int | None) -> None:
         """Train these restarts until so many epochs of the last stage, None for to the end; processes in slices."""

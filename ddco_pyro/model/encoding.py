@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.data.values import rounding
 from ddco_pyro.model.controls import ControlScaling, refuse_impossible
 from ddco_pyro.model.networks import Inputs, InputShape
 from ddco_pyro.spec import STEP, ObservationSpec
@@ -58,8 +59,12 @@ class ObservationEncoder(nn.Module):
     """Observations by name to one feature vector: differences appended, standardised where the spec says so.
 
     Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model.
-    A dimension that never changes is only centred. The built-in observation :data:`~ddco_pyro.spec.STEP` is made here:
-    the number of the step divided by ``longest``, the steps of the longest demonstration given to :meth:`fit`.
+    A dimension that never changes, or by rounding alone (:func:`~ddco_pyro.data.values.rounding`), is only centred, and
+    so are the differences of one that does so within each demonstration: rounding is no feature, and what moves later
+    on moves in its own units, not in multiples of a rounding.
+
+    The built-in observation :data:`~ddco_pyro.spec.STEP` is made here: the number of the step divided by ``longest``,
+    the steps of the longest demonstration given to :meth:`fit`.
     """
 
     mean: Tensor
@@ -91,12 +96,30 @@ class ObservationEncoder(nn.Module):
         """Take mean and standard deviation from every step of these demonstrations, and the longest of them."""
         if STEP in self.keys:
             self.longest.fill_(max(demonstrations.lengths))
-        rows = np.concatenate([self.features(demo.observations) for demo in demonstrations])
+        each = [self.features(demo.observations) for demo in demonstrations]
+        rows = np.concatenate(each)
         standardize = np.repeat(np.array([spec.standardize for spec in self.specs], dtype=bool), self.sizes)
-        spread = rows.std(0)
-        changes = standardize & (spread > 1e-9 * np.maximum(np.abs(rows).max(0, initial=0.0), 1e-9))
+        changes = standardize & self._moves(each, demonstrations)
         self.mean.copy_(torch.as_tensor(np.where(standardize, rows.mean(0), 0.0)))
-        self.std.copy_(torch.as_tensor(np.where(changes, spread, 1.0)))
+        self.std.copy_(torch.as_tensor(np.where(changes, rows.std(0), 1.0)))
+
+    def _moves(self, rows: Sequence[np.ndarray], demonstrations: Demonstrations) -> np.ndarray:
+        """Which features [F] of these demonstrations' ``rows`` [T_n, F] vary by more than rounding; differences do
+        where their dimension does within a demonstration.
+        """
+        low, high = (np.stack([end(part, axis=0) for part in rows]) for end in (np.min, np.max))
+        moves, first = [np.zeros(0, dtype=bool)], 0
+        for spec, size in zip(self.specs, self.sizes, strict=True):
+            arrays = [] if spec.key == STEP else [demo.observations[spec.key] for demo in demonstrations]
+            dtype = np.result_type(*arrays) if arrays else np.dtype(np.float64)
+            own = slice(first, first + size // (2 if spec.differences else 1))
+            lowest, highest = low[:, own].min(0), high[:, own].max(0)
+            most = rounding(lowest, highest, dtype)
+            moves.append(highest - lowest > most)
+            if spec.differences:
+                moves.append((high - low)[:, own].max(0) > most)
+            first += size
+        return np.concatenate(moves)
 
     def features(self, observations: Mapping[str, np.ndarray], times: np.ndarray | None = None) -> np.ndarray:
         """Observations [T, ...] by name to features [T, F], not yet standardised.

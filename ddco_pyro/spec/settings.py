@@ -65,7 +65,8 @@ class ObservationSpec(Model):
     differences: bool = False
     """Append x_t − x_{t−1}."""
     standardize: bool = True
-    """Shift and scale to mean 0 and standard deviation 1 over the training demonstrations."""
+    """Shift and scale to mean 0 and standard deviation 1 over the training demonstrations; dimensions that vary by
+    rounding alone, or not at all, are only shifted."""
 
     @model_validator(mode="after")
     def _steps_are_even(self) -> ObservationSpec:

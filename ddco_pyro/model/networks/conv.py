@@ -83,8 +83,9 @@ class Conv(nn.Module):
 
     def _map(self, key: str, image: Tensor) -> Tensor:
         """uint8 [M, H, W, C] to [K, M, features of the picture]."""
-        maps = image.permute(0, 3, 1, 2).float() / 255
-        for layer in self._layers(key):
+        layers = self._layers(key)
+        maps = image.permute(0, 3, 1, 2).to(layers[0].weight.dtype) / 255
+        for layer in layers:
             maps = torch.relu(layer(maps))
         return self._pool(maps).reshape(len(image), self.copies, -1).transpose(0, 1)
 

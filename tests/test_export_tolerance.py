@@ -1,0 +1,166 @@
+"""How much an exported form may differ from the run: a few times what float32 itself does, and no more.
+
+The truth is the same perceptron in float64, written out with numpy.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+import ddco_pyro.export as module
+from ddco_pyro.errors import Failed
+from ddco_pyro.export import export, runner
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.spec import parse_spec
+
+HALF = 32
+
+
+def steep(gain: float) -> Fit:
+    """A policy of pairs of hidden units that differ by 1 / gain, of which it takes gain times the difference: what
+    float32 rounds in a unit it has gain times.
+    """
+    spec = parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": ["state"],
+            "baseline": {"kind": "flat", "policy": {"network": "mlp", "hidden": [2 * HALF]}},
+        }
+    )
+    torch.manual_seed(2)
+    hierarchy = Hierarchy(spec, {"state": (5,)}, 2, 7)
+    first, *_, last = hierarchy.meta_policy.network.layers
+    with torch.no_grad():
+        first.weight[..., HALF:] = first.weight[..., :HALF]
+        first.bias[..., HALF:] = first.bias[..., :HALF] + 1 / gain
+        last.weight[:, HALF:] = -last.weight[:, :HALF]
+        last.weight.mul_(gain)
+    return Fit(spec, hierarchy.eval())
+
+
+STEEP = 40.0
+
+
+def measured(folder: Path) -> float:
+    """How far the original's controls, as recorded, are from those of float64."""
+    with np.load(folder / "weights.npz") as file:
+        names = [f"caller_0.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")]
+        weight, bias, weight_2, bias_2 = (file[name][0].astype(np.float64) for name in names)
+    largest = 0.0
+    with np.load(folder / "check.npz") as file:
+        for episode in file["seeds"]:
+            seen = file[f"observation_{episode}_state"].astype(np.float32).astype(np.float64)
+            exact = np.maximum(seen @ weight + bias, 0) @ weight_2 + bias_2
+            error = np.abs(file[f"control_0_{episode}"][:, 0] - exact) / np.maximum(1, np.abs(exact))
+            largest = max(largest, error.max())
+    return largest
+
+
+def allowed(folder: Path) -> float:
+    with np.load(folder / "check.npz") as file:
+        return float(file["tolerance"])
+
+
+def test_a_sound_fit_may_differ_by_what_float32_does(tmp_path, capsys, monkeypatch):
+    differences = export(steep(STEEP), tmp_path, onnx=True)
+    assert max(difference for difference, _ in differences.values()) > 1e-6  # which was refused before
+    error = measured(tmp_path)
+    assert 1e-6 < error < 2.5e-5
+    assert allowed(tmp_path) == pytest.approx(4 * error, rel=1e-6)
+    monkeypatch.setattr("sys.argv", ["runner.py", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        runner.main()
+    assert ended.value.code == 0
+    assert f" of {allowed(tmp_path):.1e} that are allowed; " in capsys.readouterr().out
+
+
+def test_where_float32_is_exact_enough_the_tolerance_is_as_it_was(tmp_path):
+    export(steep(0.5), tmp_path)
+    assert measured(tmp_path) < 2.5e-7
+    assert allowed(tmp_path) == 1e-6
+
+
+def test_networks_for_float32_alone_have_the_least_tolerance(tmp_path):
+    fit = steep(STEEP)
+    fit.hierarchy.meta_policy.network = Single(fit.hierarchy.meta_policy.network)
+    export(fit, tmp_path)
+    assert allowed(tmp_path) == 1e-6
+
+
+class Single(torch.nn.Module):
+    """A user's network that has float32 written into it."""
+
+    def __init__(self, network):
+        super().__init__()
+        self.network = network
+
+    def forward(self, inputs):
+        return self.network(inputs.map(torch.Tensor.float, inputs.time))
+
+
+def test_no_fit_is_so_unsound_that_anything_goes(tmp_path):
+    """A hundred thousand times the difference of units: what it says is rounding to 1 %."""
+    with pytest.raises(
+        Failed, match=r"^nothing was written: .* of 1\.0e-04 that are allowed; the weights are so large"
+    ):
+        export(steep(1e5), tmp_path / "out")
+
+
+@pytest.mark.parametrize("array", [f"caller_0.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")])
+def test_weights_that_are_off_by_a_thousandth_are_refused(array, tmp_path, monkeypatch):
+    """Each array alone, of numpy's form; whoever replays it later sees it too."""
+    refused(tmp_path, monkeypatch, lambda folder: scale(folder / "weights.npz", array), "numpy")
+    export(steep(STEEP), tmp_path / "later")
+    scale(tmp_path / "later" / "weights.npz", array)
+    monkeypatch.setattr("sys.argv", ["runner.py", str(tmp_path / "later")])
+    with pytest.raises(SystemExit) as ended:
+        runner.main()
+    assert ended.value.code == 1
+
+
+@pytest.mark.parametrize("form", ["torch", "onnx"])
+def test_programs_that_are_off_by_a_thousandth_are_refused(form, tmp_path, monkeypatch):
+    refused(tmp_path, monkeypatch, {"torch": scale_torch, "onnx": scale_onnx}[form], form)
+
+
+def scale(path: Path, array: str) -> None:
+    with np.load(path) as file:
+        weights = {name: file[name] for name in file.files}
+    weights[array] = weights[array] * np.float32(1.001)
+    np.savez(path, **weights)
+
+
+def scale_torch(folder: Path) -> None:
+    program = torch.export.load(folder / "controller.pt2")
+    program.state_dict["hierarchy.meta_policy.network.layers.3.weight"].data *= 1.001
+    torch.export.save(program, folder / "controller.pt2")
+
+
+def scale_onnx(folder: Path) -> None:
+    model = onnx.load(folder / "controller.onnx")
+    (weight,) = (each for each in model.graph.initializer if np.prod(each.dims) == 2 * HALF * 2)  # of the last layer
+    values = onnx.numpy_helper.to_array(weight) * np.float32(1.001)
+    weight.CopyFrom(onnx.numpy_helper.from_array(values, weight.name))
+    onnx.save(model, folder / "controller.onnx")
+
+
+def refused(tmp_path, monkeypatch, damage, form):
+    """The export, where what was written is damaged on the disk before it is compared."""
+    write = module._write
+
+    def damaging(fit, folder, onnx):
+        forms = write(fit, folder, onnx)
+        damage(folder)
+        return forms
+
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "_write", damaging)
+        with pytest.raises(Failed, match=rf"^nothing was written: as {form} it differs from the run by "):
+            export(steep(STEEP), tmp_path / "out", onnx=form == "onnx")
+    assert not (tmp_path / "out").exists()
