@@ -86,7 +86,7 @@ BRANCHES = {
 }
 FITS = {
     "linear": make("linear", options="most_likely"),
-    "mlp": make("mlp", control="sample"),
+    "mlp": make("mlp", control="sample", options="sample"),
     "per_timestep": make("per_timestep", steps=30),
     "conv": make("conv", camera=True),
     "hybrid": make("mlp", (2, 3), ("options", "control"), control="sample"),
@@ -94,7 +94,9 @@ FITS = {
     "marginal": make("mlp", (2, 3, 2), ("options", "control"), options="marginal"),
     "flat": make("mlp", (), built_in=("step",)),
     "lstm": make(RECURRENT, (2, 2), ("options", "control"), endings=RECURRENT, control="sample"),
-    "lstm over pictures": make({"network": "lstm", "over": CONVOLUTIONS}, camera=True, endings=CONVOLUTIONS, steps=30),
+    "lstm over pictures": make(
+        {"network": "lstm", "over": CONVOLUTIONS}, camera=True, endings=CONVOLUTIONS, steps=30, options="sample"
+    ),
     "trunk": make(
         "linear", (2, 3), ("options", "control"), True, trunk=BRANCHES, meta_policy=BRANCHES, built_in=("step",)
     ),
