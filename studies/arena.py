@@ -15,7 +15,6 @@ import itertools
 from pathlib import Path
 
 import arena_cell
-import arena_venv
 from arena_results import draw, page, summarize
 from joblib import Parallel, delayed
 from provenance import record, sentence, text
@@ -40,7 +39,7 @@ def run(own: argparse.Namespace) -> str:
         for seed, count, task in itertools.product(range(own.seeds), own.counts, own.tasks)
     ]
     made_by = record(cells[0].command(settings))
-    arena_venv.made(settings.runs / "venv")  # or nothing else has to begin
+    arena_cell.sawyer(settings).made()  # or nothing else has to begin
     kept = Parallel(n_jobs=own.jobs, verbose=10)(delayed(arena_cell.run)(cell, settings, made_by) for cell in cells)
     results = summarize([one["results"] for one in kept])
     records = [one["provenance"][0] for one in kept]

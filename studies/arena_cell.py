@@ -12,25 +12,22 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import arena_venv
 import h5py
 import numpy as np
-import torch
-from provenance import ROOT, Record, code, is_kept, record, sources, text, tree
-from threadpoolctl import threadpool_limits
+from apart import Apart
+from cells import digest, kept
+from provenance import Record, record
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import only_one, write_text
+from ddco_pyro.data.files import write_text
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.export import write_numpy
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.spec import load_spec
@@ -83,29 +80,16 @@ class Cell:
 
     def path(self, settings: Settings) -> Path:
         """Its JSON; other settings have other folders."""
-        digest = hashlib.sha256(json.dumps(settings.kept()).encode()).hexdigest()[:8]
-        return settings.runs / "cells" / digest / f"{self.task}-{self.count:03d}-{self.seed}.json"
+        return settings.runs / "cells" / digest(settings.kept()) / f"{self.task}-{self.count:03d}-{self.seed}.json"
 
     def command(self, settings: Settings) -> str:
         """What runs it."""
         return f"python studies/arena_cell.py {self.task} {self.count} {self.seed} {settings.words()}"
 
 
-def collected(task: str, settings: Settings) -> Path:
-    """The task's demonstrations, recorded where they are not there, or were by other code or settings.
-
-    :raises Failed: Meta-World cannot be used, or the expert fails.
-    """
-    made_by = code(sources(tree(ROOT), f"python {arena_venv.SCRIPT.relative_to(ROOT).as_posix()}"))
-    identity = [made_by, arena_venv.PINS.read_text(), task, settings.demonstrations, settings.noise, HELD_OUT]
-    digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:12]
-    path = settings.runs / "demonstrations" / task / f"{digest}.hdf5"
-    with only_one(path.parent, wait=True):
-        if not path.exists():
-            python = arena_venv.made(settings.runs / "venv")
-            numbers = ("--number", settings.demonstrations, "--held-out", HELD_OUT, "--noise", settings.noise)
-            arena_venv.run(python, "collect", task, path, *map(str, numbers))
-    return path
+def sawyer(settings: Settings) -> Apart:
+    """Meta-World, in an environment of its own."""
+    return Apart("arena_metaworld.py", "arena_requirements.txt", settings.runs)
 
 
 def run(cell: Cell, settings: Settings, made_by: Record) -> dict[str, Any]:
@@ -114,26 +98,19 @@ def run(cell: Cell, settings: Settings, made_by: Record) -> dict[str, Any]:
     :param made_by: what was known of the code of this file when the work began.
     :raises Failed: Meta-World cannot be used, or the expert fails.
     """
-    made_by, path = made_by | {"command": cell.command(settings)}, cell.path(settings)
-    kept = {"task": cell.task, "count": cell.count, "seed": cell.seed} | settings.kept()
-    if path.exists():
-        content: dict[str, Any] = json.loads(path.read_text())
-        if is_kept(content, kept, made_by):
-            return content
-    torch.set_num_threads(1)
-    with threadpool_limits(1):
-        found = _run(cell, settings, made_by)
-    write_text(path, text(kept | found, [made_by]))
-    return dict(json.loads(path.read_text()))
+    made_by = made_by | {"command": cell.command(settings)}
+    named = {"task": cell.task, "count": cell.count, "seed": cell.seed} | settings.kept()
+    return kept(cell.path(settings), named, made_by, lambda: _run(cell, settings, made_by))
 
 
 def _run(cell: Cell, settings: Settings, made_by: Record) -> dict[str, Any]:
-    begun, source = time.perf_counter(), collected(cell.task, settings)
+    begun, world = time.perf_counter(), sawyer(settings)
+    source = world.collected(cell.task, number=settings.demonstrations, held_out=HELD_OUT, noise=settings.noise)
     folder = settings.runs / "fits" / made_by["code"][:12] / cell.path(settings).parent.name / cell.path(settings).stem
     fitted = fitted_cell(cell, source, settings.overrides, folder)
     trained = time.perf_counter()
     methods = {OURS: fitted} | fitted.baselines
-    played = play(cell.task, methods, source, settings)
+    played = world.play(cell.task, methods, source, settings.episodes)
     ended = time.perf_counter()
     metrics = fitted.metrics
     return {
@@ -186,33 +163,6 @@ def chosen(source: Path, cell: Cell) -> tuple[list[str], list[str], list[str]]:
     first = set(np.random.default_rng(cell.seed).permutation(len(train))[: cell.count])
     used = [name for place, name in enumerate(train) if place in first]
     return used, valid, [name for name in train if name not in used]
-
-
-def play(task: str, methods: dict[str, Fit], source: Path, settings: Settings) -> dict[str, Any]:
-    """Episodes of each exported method, and by how much its controls differ from its fit's on recorded observations."""
-    with tempfile.TemporaryDirectory() as folder:
-        for name, one in methods.items():
-            (Path(folder) / name).mkdir()
-            write_numpy(one, Path(folder) / name)
-        out, named = Path(folder) / "played.json", [f"{name}={folder}/{name}" for name in methods]
-        options = ("--episodes", str(settings.episodes), "--recorded", source.resolve())
-        arena_venv.run(arena_venv.made(settings.runs / "venv"), "play", task, out, *named, *options)
-        played: dict[str, Any] = json.loads(out.read_text())
-    spec = next(iter(methods.values())).spec
-    demo = Demonstrations.read(source, spec.observed).select([played["demonstration"]])[0]
-    played["differences"] = {
-        name: float(np.abs(np.array(played["controls"][name]) - acted(one, demo.observations)).max())
-        for name, one in methods.items()
-    }
-    return played
-
-
-def acted(one: Fit, observations: dict[str, np.ndarray]) -> np.ndarray:
-    """What a fit's controller does on recorded observations, [T, A]."""
-    controller = one.controller()
-    controller.reset(0)
-    rows = (dict(zip(observations, row, strict=True)) for row in zip(*observations.values(), strict=True))
-    return np.stack([controller.act(row) for row in rows])
 
 
 def expert(source: Path) -> dict[str, Any]:

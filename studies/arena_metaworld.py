@@ -13,7 +13,6 @@ episode.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import warnings
 from pathlib import Path
@@ -21,10 +20,11 @@ from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 
-import h5py
+import arena_recording
 import numpy as np
 from arena_phases import Phases
-from arena_playing import Observation, controls, exported, play
+from arena_playing import Observation, exported, play, play_all
+from arena_recording import Recorded
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
 from metaworld.policies import ENV_POLICY_MAP
 
@@ -44,9 +44,6 @@ AFTER_SUCCESS = 5
 
 UNSEEN = 1_000_000
 """Seeds of initial states from here on are not demonstrated."""
-
-GIVE_UP = 10
-"""Attempts for each demonstration that is wanted."""
 
 CAMERA = "corner2"
 
@@ -97,72 +94,30 @@ def demonstrate(world: Sawyer, expert: Any, phases: Phases, seed: int, noise: fl
 
 
 def collect(task: str, out: Path, number: int, held_out: int, noise: float) -> None:
-    """Record the first successful episodes; of them the first ones are held out, however many there are."""
+    """Record the first successful episodes."""
     world, expert = Sawyer(task), ENV_POLICY_MAP[task]()
     phases = Phases(type(expert)._desired_pos)
-    temporary = out.with_name(f".{out.name}.tmp")
-    counts, seed, names = np.zeros(len(phases.lines), int), 0, []
-    with h5py.File(temporary, "w") as file:
-        data = file.create_group("data")
-        while len(names) < number:
-            if seed >= GIVE_UP * number:
-                raise SystemExit(
-                    f"{task}: the expert succeeded in {len(names)} of {seed} episodes; {number} are needed"
-                )
-            steps = demonstrate(world, expert, phases, seed, noise)
-            if steps is not None:
-                names.append(f"demo_{len(names)}")
-                counts += write(data.create_group(names[-1]), steps, seed, len(counts))
-            seed += 1
-        for mask, chosen in (("valid", names[:held_out]), ("train", names[held_out:])):
-            file[f"mask/{mask}"] = np.array(chosen, "S")
-        data.attrs["total"] = counts.sum()
-        data.attrs["env_args"] = json.dumps({"env_name": f"metaworld/{task}", "type": 2, "env_kwargs": {}})
-        shares = (counts / counts.sum()).tolist()
-        said = {"successes": number, "attempts": seed, "noise": noise, "lines": phases.lines, "shares": shares}
-        file.attrs["expert"] = json.dumps(said)
-    temporary.replace(out)
+
+    def demonstration(seed: int) -> Recorded | None:
+        steps = demonstrate(world, expert, phases, seed, noise)
+        return steps and recorded(steps)
+
+    labels, about = {"phase": len(phases.lines)}, {"noise": noise, "lines": phases.lines}
+    arena_recording.collect(out, f"metaworld/{task}", demonstration, number, held_out, labels, **about)
 
 
-def write(group: Any, steps: list[Step], seed: int, phases: int) -> np.ndarray:
-    """A demonstration in robomimic's layout; how many of its steps each phase has."""
+def recorded(steps: list[Step]) -> Recorded:
+    """The arrays of a demonstration."""
     seen, executed, phase, success = zip(*steps, strict=True)
-    group["actions"] = np.stack(executed)
-    for key in OBSERVATIONS:
-        group[f"obs/{key}"] = np.stack([observation[key] for observation in seen])
-    group["labels/phase"] = np.array(phase, np.int8)
-    group["rewards"] = np.array(success, np.float32)
-    group["dones"] = np.arange(len(steps)) == len(steps) - 1
-    group.attrs.update({"num_samples": len(steps), "seed": seed})
-    return np.bincount(phase, minlength=phases)
-
-
-def play_all(task: str, out: Path, folders: dict[str, str], episodes: int, recorded: Path | None) -> None:
-    """Episodes of each controller, and what it does on the first held-out demonstration."""
-    controllers, world = {name: exported(folder) for name, folder in folders.items()}, Sawyer(task)
-    played: dict[str, Any] = {
-        "episodes": {
-            name: [play(controller, world, UNSEEN + number) for number in range(episodes)]
-            for name, controller in controllers.items()
-        }
+    return {
+        "actions": np.stack(executed),
+        **{f"obs/{key}": np.stack([observation[key] for observation in seen]) for key in OBSERVATIONS},
+        "labels/phase": np.array(phase, np.int8),
+        "rewards": np.array(success, np.float32),
     }
-    if recorded is not None:
-        name, seen = first_held_out(recorded)
-        played |= {"demonstration": name, "controls": {}}
-        for method, controller in controllers.items():
-            played["controls"][method] = controls(controller, seen, 0).tolist()
-    out.write_text(json.dumps(played))
 
 
-def first_held_out(path: Path) -> tuple[str, list[Observation]]:
-    """Name and observations of a demonstration."""
-    with h5py.File(path) as file:
-        name = file["mask/valid"][0].decode()
-        seen = {key: values[()] for key, values in file[f"data/{name}/obs"].items()}
-    return name, [dict(zip(seen, values, strict=True)) for values in zip(*seen.values(), strict=True)]
-
-
-def film(task: str, out: Path, folder: str, frames: int) -> None:
+def film(task: str, out: Path, controller: Any, frames: int) -> None:
     """Pictures of an episode side by side, evenly spread over it."""
     import imageio.v3 as imageio
 
@@ -178,7 +133,7 @@ def film(task: str, out: Path, folder: str, frames: int) -> None:
             drawn.append(np.rot90(self.world.render(), 2))  # this camera stands on its head
             return super().step(control)
 
-    played = play(exported(folder), Filmed(task, render_mode="rgb_array"), UNSEEN)
+    played = play(controller, Filmed(task, render_mode="rgb_array"), UNSEEN)
     chosen = np.linspace(0, len(drawn) - 1, frames).round().astype(int)
     imageio.imwrite(out, np.concatenate([drawn[place][::2, ::2] for place in chosen], axis=1))
     print(played)
@@ -201,13 +156,13 @@ def main() -> None:
     warnings.filterwarnings("ignore")  # the experts' gains are meant to saturate
     if own.task not in ENV_POLICY_MAP:
         raise SystemExit(f"there is no task {own.task!r}; Meta-World has: {', '.join(sorted(ENV_POLICY_MAP))}")
-    folders = dict(one.split("=", 1) for one in own.controllers)
+    controllers = {name: exported(folder) for name, _, folder in (one.partition("=") for one in own.controllers)}
     if own.what == "collect":
         collect(own.task, own.out, own.number, own.held_out, own.noise)
     elif own.what == "play":
-        play_all(own.task, own.out, folders, own.episodes, own.recorded)
+        play_all(Sawyer(own.task), own.out, controllers, range(UNSEEN, UNSEEN + own.episodes), own.recorded)
     else:
-        film(own.task, own.out, next(iter(folders.values())), own.frames)
+        film(own.task, own.out, next(iter(controllers.values())), own.frames)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,14 @@
-"""Plays an exported controller (``ddco-pyro export``) in an environment, with numpy alone."""
+"""Plays an exported controller (``ddco-pyro export``) in an environment. Needs numpy and h5py alone."""
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterable, Mapping
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+import h5py
 import numpy as np
 
 Observation = Mapping[str, np.ndarray]
@@ -51,3 +53,34 @@ def controls(controller: Any, seen: Iterable[Observation], seed: int) -> np.ndar
     """What a controller does on recorded observations, [T, A]."""
     controller.reset(seed)
     return np.stack([controller.act(observation) for observation in seen])
+
+
+def play_all(
+    environment: Environment,
+    out: Path,
+    controllers: Mapping[str, Any],
+    seeds: Sequence[int],
+    recorded: Path | None,
+    scripted: Mapping[str, Any] | None = None,
+) -> None:
+    """Episodes of each controller, and what it does on the first held-out demonstration, as JSON.
+
+    :param scripted: controllers of which only the episodes are wanted.
+    """
+    played: dict[str, Any] = {"episodes": {}}
+    for name, controller in {**controllers, **(scripted or {})}.items():
+        played["episodes"][name] = [play(controller, environment, seed) for seed in seeds]
+    if recorded is not None:
+        demonstration, seen = first_held_out(recorded)
+        played |= {"demonstration": demonstration, "controls": {}}
+        for name, controller in controllers.items():
+            played["controls"][name] = controls(controller, seen, 0).tolist()
+    out.write_text(json.dumps(played))
+
+
+def first_held_out(path: Path) -> tuple[str, list[Observation]]:
+    """Name and observations of a demonstration."""
+    with h5py.File(path) as file:
+        name = file["mask/valid"][0].decode()
+        seen = {key: values[()] for key, values in file[f"data/{name}/obs"].items()}
+    return name, [dict(zip(seen, values, strict=True)) for values in zip(*seen.values(), strict=True)]

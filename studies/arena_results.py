@@ -120,7 +120,7 @@ def _success(one: Result) -> str:
 
 
 def _expert(one: Result) -> str:
-    shares = ", ".join(f"{share:.0%}" if share >= RARE else f"{share:.1%} (rare)" for share in one["shares"])
+    shares = ", ".join(f"{share:.0%}" if share >= RARE else f"{share:.1%} (rare)" for share in one["shares"]["phase"])
     return f"{one['successes']} of {one['attempts']} | {shares}"
 
 

@@ -1,4 +1,4 @@
-"""An environment of its own for Meta-World, which needs another mujoco than this project, and what is run in it."""
+"""An environment of its own for packages that do not go with this project's, and what is run in it."""
 
 from __future__ import annotations
 
@@ -10,16 +10,13 @@ from pathlib import Path
 from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.errors import Failed
 
-HERE = Path(__file__).parent
-PINS = HERE / "arena_requirements.txt"
-SCRIPT = HERE / "arena_metaworld.py"
 MADE = ".made"
 """In the environment: the pins that it was made from, once all of them are installed."""
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
-def made(folder: Path, pins: Path = PINS, python: str = sys.executable) -> Path:
+def made(folder: Path, pins: Path, python: str = sys.executable) -> Path:
     """The Python of the environment in ``folder``, which is made where it is not there, or of other pins.
 
     :raises Failed: it cannot be made; one line.
@@ -34,13 +31,13 @@ def made(folder: Path, pins: Path = PINS, python: str = sys.executable) -> Path:
     return _python(folder)
 
 
-def run(python: Path, *arguments: str | Path) -> None:
-    """Run ``arena_metaworld.py`` on one thread.
+def run(python: Path, script: Path, *arguments: str | Path) -> None:
+    """Run a script on one thread.
 
     :raises Failed: it ended with an error; its last line.
     """
-    command = [str(python), "-W", "ignore", str(SCRIPT), *map(str, arguments)]
-    _run(command, f"{SCRIPT.name} {arguments[0]} {arguments[1]}", ONE_THREAD)
+    command = [str(python), "-W", "ignore", str(script), *map(str, arguments)]
+    _run(command, f"{script.name} {arguments[0]} {arguments[1]}", ONE_THREAD)
 
 
 def _python(folder: Path) -> Path:

@@ -7,6 +7,7 @@ import json
 import stat
 import sys
 
+import apart
 import arena
 import arena_cell
 import arena_venv
@@ -185,7 +186,7 @@ def test_an_exported_controller_plays_as_its_fit_does(fitted, runner, goal, succ
         np.testing.assert_allclose(played.received, expected, atol=1e-5)
         np.testing.assert_allclose(controls(runner, observed, seed), expected, atol=1e-5)
         rows = {"state": np.stack([one["state"] for one in observed])}
-        np.testing.assert_allclose(controls(runner, observed, 0), arena_cell.acted(fitted, rows), atol=1e-5)
+        np.testing.assert_allclose(controls(runner, observed, 0), apart.acted(fitted, rows), atol=1e-5)
 
 
 def test_where_nothing_was_exported_that_is_said(tmp_path):
@@ -238,7 +239,7 @@ def test_a_study_without_its_environment_ends_with_that_line(tmp_path, monkeypat
 
 def test_an_error_in_the_environment_is_its_last_line():
     with pytest.raises(Failed) as refused:
-        arena_venv.run(sys.executable, "collect", "pick-place-v3", "out.hdf5")
+        arena_venv.run(sys.executable, apart.HERE / "arena_metaworld.py", "collect", "pick-place-v3", "out.hdf5")
     assert str(refused.value).startswith("arena_metaworld.py collect pick-place-v3: ModuleNotFoundError")
 
 
@@ -289,7 +290,7 @@ def cell(seed, nmi, ours, flat, success):
         "task": "hammer-v3",
         "count": 5,
         "seed": seed,
-        "expert": {"successes": 70, "attempts": 72, "shares": [0.5, 0.495, 0.005]},
+        "expert": {"successes": 70, "attempts": 72, "shares": {"phase": [0.5, 0.495, 0.005]}},
         "methods": methods,
         "difference": {"flat": {"nats_per_step": ours - flat}},
         "held_out": [{"log_likelihood_per_step": {"ddco": ours + more, "flat": flat}} for more in (0.0, -1.0)],

@@ -1,0 +1,92 @@
+"""A simulator that needs other packages than this project: an environment of its own, and the script that runs in it.
+
+A script has two commands: ``collect TASK OUT.hdf5`` records demonstrations (``arena_recording.py``), and ``play TASK
+OUT.json NAME=EXPORTED...`` lets exported controllers act (``arena_playing.py``).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import arena_venv
+import numpy as np
+from provenance import ROOT, code, sources, tree
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.files import only_one
+from ddco_pyro.export import write_numpy
+from ddco_pyro.fitting.fit import Fit
+
+HERE = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Apart:
+    """What is done by a script, and with which packages.
+
+    :param script: its file name in this folder.
+    :param pins: the file name of its requirements.
+    :param runs: the folder of the environment and of the demonstrations.
+    """
+
+    script: str
+    pins: str
+    runs: Path
+
+    def made(self) -> Path:
+        """The Python of its environment, made where it is not there.
+
+        :raises Failed: it cannot be made.
+        """
+        return arena_venv.made(self.runs / "venv", HERE / self.pins)
+
+    def collected(self, task: str, **options: float) -> Path:
+        """The task's demonstrations, recorded where they are not there, or were by other code or options.
+
+        :param options: of the script's command ``collect``.
+        :raises Failed: the simulator cannot be used, or its expert fails.
+        """
+        made_by = code(sources(tree(ROOT), f"python studies/{self.script}"))
+        identity = [made_by, (HERE / self.pins).read_text(), task, options]
+        digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:12]
+        path = self.runs / "demonstrations" / task / f"{digest}.hdf5"
+        with only_one(path.parent, wait=True):
+            if not path.exists():
+                python = self.made()
+                words = [word for key, value in options.items() for word in (f"--{key.replace('_', '-')}", str(value))]
+                arena_venv.run(python, HERE / self.script, "collect", task, path, *words)
+        return path
+
+    def play(self, task: str, methods: dict[str, Fit], source: Path, episodes: int) -> dict[str, Any]:
+        """Episodes of each exported method, and by how much its controls differ from its fit's on a demonstration.
+
+        :raises Failed: the simulator cannot be used.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            for name, one in methods.items():
+                (Path(folder) / name).mkdir()
+                write_numpy(one, Path(folder) / name)
+            out, named = Path(folder) / "played.json", [f"{name}={folder}/{name}" for name in methods]
+            options = ("--episodes", str(episodes), "--recorded", source.resolve())
+            arena_venv.run(self.made(), HERE / self.script, "play", task, out, *named, *options)
+            played: dict[str, Any] = json.loads(out.read_text())
+        keys = {key for one in methods.values() for key in one.spec.observed}
+        demo = Demonstrations.read(source, sorted(keys)).select([played["demonstration"]])[0]
+        played["differences"] = {
+            name: float(np.abs(np.array(played["controls"][name]) - acted(one, demo.observations)).max())
+            for name, one in methods.items()
+        }
+        return played
+
+
+def acted(one: Fit, observations: dict[str, np.ndarray]) -> np.ndarray:
+    """What a fit's controller does on recorded observations, [T, A]."""
+    controller = one.controller()
+    controller.reset(0)
+    rows = (dict(zip(observations, row, strict=True)) for row in zip(*observations.values(), strict=True))
+    return np.stack([controller.act(row) for row in rows])

@@ -1,0 +1,73 @@
+"""Records the successful episodes of an expert as HDF5 in robomimic's layout. Needs numpy and h5py alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+GIVE_UP = 10
+"""Attempts for each demonstration that is wanted."""
+
+Recorded = Mapping[str, np.ndarray]
+"""Arrays of a demonstration by their place, such as ``obs/gripper``; each has a row for every step."""
+
+
+def collect(
+    out: Path,
+    environment: str,
+    demonstrate: Callable[[int], Recorded | None],
+    number: int,
+    held_out: int,
+    labels: Mapping[str, int],
+    **about: Any,
+) -> None:
+    """Record the first successful episodes; of them the first ones are held out, however many there are.
+
+    The file's attribute ``expert`` says how many attempts it took, which ``shares`` of the steps each label has, and
+    what it is told ``about`` the expert.
+
+    :param demonstrate: the episode of a seed; None where it had no success.
+    :param labels: how many values each of the labels can have.
+    :raises SystemExit: too few episodes succeed; nothing is written.
+    """
+    temporary, seed, names = out.with_name(f".{out.name}.tmp"), 0, []
+    counts = {label: np.zeros(values, int) for label, values in labels.items()}
+    with h5py.File(temporary, "w") as file:
+        data, total = file.create_group("data"), 0
+        while len(names) < number:
+            if seed >= GIVE_UP * number:
+                temporary.unlink()
+                raise SystemExit(
+                    f"{environment}: the expert succeeded in {len(names)} of {seed} episodes; {number} are needed"
+                )
+            recorded = demonstrate(seed)
+            if recorded is not None:
+                names.append(f"demo_{len(names)}")
+                total += _write(data.create_group(names[-1]), recorded, seed)
+                for label, count in counts.items():
+                    known = recorded[f"labels/{label}"]
+                    count += np.bincount(known[known >= 0], minlength=len(count))
+            seed += 1
+        for mask, chosen in (("valid", names[:held_out]), ("train", names[held_out:])):
+            file[f"mask/{mask}"] = np.array(chosen, "S")
+        data.attrs["total"] = total
+        data.attrs["env_args"] = json.dumps({"env_name": environment, "type": 2, "env_kwargs": {}})
+        shares = {label: (count / total).tolist() for label, count in counts.items()}
+        said = {"successes": number, "attempts": seed, "shares": shares, **about}
+        file.attrs["expert"] = json.dumps(said)
+    temporary.replace(out)
+
+
+def _write(group: Any, recorded: Recorded, seed: int) -> int:
+    """A demonstration; its number of steps."""
+    for place, values in recorded.items():
+        group[place] = values
+    steps = len(recorded["actions"])
+    group["dones"] = np.arange(steps) == steps - 1
+    group.attrs.update({"num_samples": steps, "seed": seed})
+    return steps
