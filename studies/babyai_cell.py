@@ -1,0 +1,242 @@
+"""One cell of the BabyAI study: a level, whether what is fulfilled is told, and a training seed.
+
+    python studies/babyai_cell.py LEVEL hidden|told SEED [--episodes 50] [--set KEY=VALUE]... [--runs DIR]
+
+Fits one level of options, two levels, and policies without options, by one rule for all levels; ``--set`` changes it
+for all. Keeps the fits and a JSON with held-out log-likelihoods, agreement with what the bot was about, and how often
+each method succeeded in the same missions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from apart import Apart
+from arena_cell import HELD_OUT, expert
+from cells import digest, kept
+from provenance import Record, record
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.files import write_text
+from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.fitting.agreement import agreement
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.run import fit
+from ddco_pyro.segmenting import baselines
+from ddco_pyro.spec import load_spec
+
+LABELS = ("subgoal", "mission")
+COUNTS = (5, 3)
+"""Options of each level, lowest first."""
+PROGRESS = ("hidden", "told")
+TOLD = "done"
+"""The observation that is left out where progress is hidden."""
+REFERENCES = ("equal", "kmeans")
+"""Segmentations without options, to compare with; beside them a single segment."""
+PERCEPTRON: dict[str, Any] = {"network": "mlp", "hidden": [32]}
+LINEAR: dict[str, Any] = {"network": "linear"}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all cells of a study share.
+
+    :param demonstrations: recorded for each level, with those that are held out.
+    :param episodes: played by each method.
+    :param overrides: of the specs, each KEY=VALUE.
+    :param runs: the folder of everything but the results.
+    """
+
+    demonstrations: int
+    episodes: int
+    overrides: tuple[str, ...]
+    runs: Path
+
+    def kept(self) -> dict[str, Any]:
+        """What decides a result."""
+        return {
+            "demonstrations": self.demonstrations,
+            "episodes": self.episodes,
+            "overrides": list(self.overrides),
+        }
+
+    def words(self) -> str:
+        """The same as words of a command."""
+        changes = "".join(f" --set '{one}'" for one in self.overrides)
+        return f"--demonstrations {self.demonstrations} --episodes {self.episodes}{changes}"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A level, what is said of its progress, and the seed of training."""
+
+    level: str
+    progress: str
+    seed: int
+
+    def path(self, settings: Settings) -> Path:
+        """Its JSON; other settings have other folders."""
+        folder = settings.runs / "cells" / digest(settings.kept())
+        return folder / f"{self.level}-{self.progress}-{self.seed}.json"
+
+    def command(self, settings: Settings) -> str:
+        """What runs it."""
+        return f"python studies/babyai_cell.py {self.level} {self.progress} {self.seed} {settings.words()}"
+
+
+def gridworld(settings: Settings) -> Apart:
+    """minigrid, in an environment of its own."""
+    return Apart("babyai_minigrid.py", "babyai_requirements.txt", settings.runs)
+
+
+def run(cell: Cell, settings: Settings, made_by: Record) -> dict[str, Any]:
+    """A cell's provenance and results, as its JSON has them; nothing is done again.
+
+    :param made_by: what was known of the code of this file when the work began.
+    :raises Failed: minigrid cannot be used, or there is no such level.
+    """
+    made_by = made_by | {"command": cell.command(settings)}
+    named = {"level": cell.level, "progress": cell.progress, "seed": cell.seed} | settings.kept()
+    return kept(cell.path(settings), named, made_by, lambda: _run(cell, settings, made_by))
+
+
+def _run(cell: Cell, settings: Settings, made_by: Record) -> dict[str, Any]:
+    begun, world = time.perf_counter(), gridworld(settings)
+    source = world.collected(cell.level, number=settings.demonstrations, held_out=HELD_OUT)
+    folder = settings.runs / "fits" / made_by["code"][:12] / cell.path(settings).parent.name / cell.path(settings).stem
+    demos = Demonstrations.read(source, observed(source, cell.progress), list(LABELS))
+    fits = {name: fitted(cell, source, demos, name, folder, settings.overrides) for name in ("one", "two")}
+    methods = {"flat": fits["one"].baselines["flat"], "flat_equal": fits["one"].baselines["flat_equal"], **fits}
+    trained = time.perf_counter()
+    played = world.play(cell.level, methods, source, settings.episodes)
+    ended = time.perf_counter()
+    valid = demos.select(demos.masks["valid"])
+    return {
+        "demonstrations_sha256": hashlib.sha256(source.read_bytes()).hexdigest(),
+        "bot": expert(source) | {"steps": list(map(len, demos))},
+        "methods": {
+            name: {
+                "log_likelihood_per_step": one.metrics["log_likelihood_per_step"],
+                "parameters": one.metrics["parameters"],
+                "converged": one.metrics["training"]["converged"],
+                "bridge_difference": played["differences"][name],
+            }
+            for name, one in methods.items()
+        },
+        "played": {
+            name: {key: [one[key] for one in episodes] for key in ("success", "steps")}
+            for name, episodes in played["episodes"].items()
+        },
+        "agreement": {name: one.metrics["agreement"] for name, one in fits.items()},
+        "crossed": {name: crossed(one.segment(valid), valid) for name, one in fits.items()},
+        "references": references(demos, valid, cell.seed),
+        "options": {name: one.metrics["options"] for name, one in fits.items()},
+        "seconds": {"fit": trained - begun, "play": ended - trained, "all": ended - begun},
+    }
+
+
+def observed(source: Path, progress: str) -> list[str]:
+    """The observations that vary in the training demonstrations, without what is told where progress is hidden."""
+    with h5py.File(source) as file:
+        names = [name.decode() for name in file["mask/train"]]
+        keys = [key for key in file[f"data/{names[0]}/obs"] if key != TOLD or progress == "told"]
+        rows = {key: np.concatenate([file[f"data/{name}/obs/{key}"][()] for name in names]) for key in keys}
+    return [key for key, values in rows.items() if np.ptp(values, axis=0).any()]
+
+
+def rule(source: Path, keys: list[str], levels: int, seed: int) -> dict[str, Any]:
+    """The spec of a hierarchy, whatever the level of BabyAI."""
+    names = ("option", "plan")[:levels]
+    return {
+        "demonstrations": {"path": str(source.resolve()), "labels": list(LABELS[:levels])},
+        "observations": keys,
+        "control": {"kind": "categorical"},
+        "hierarchy": {
+            "levels": [
+                {"name": name, "count": count, "policy": PERCEPTRON, "termination": LINEAR}
+                for name, count in zip(names, COUNTS, strict=False)
+            ],
+            "meta_policy": LINEAR,
+        },
+        "training": {
+            "initialize": "vq_controls",
+            "optimizer": {"name": "adam", "lr": 3e-3, "weight_decay": 1e-3},
+            "epochs": 400,
+            "patience": 50,
+            "batch_size": 16,
+        },
+        "rollout": {"control": "sample"},  # the most likely action may turn round for ever
+        "compare_with": [{"kind": kind, "policy": PERCEPTRON} for kind in ("flat", "flat_equal")]
+        if levels == 1
+        else [],
+        "seed": seed,
+    }
+
+
+def fitted(cell: Cell, source: Path, demos: Demonstrations, name: str, folder: Path, overrides: tuple[str, ...]) -> Fit:
+    """A fit of one level of options, with the policies without options, or of two."""
+    levels = {"one": 1, "two": 2}[name]
+    path = folder / f"{name}.yaml"
+    write_text(path, json.dumps(rule(source, list(demos.observation_shapes), levels, cell.seed), indent=1))
+    return fit(load_spec(path, list(overrides)), demos, out=folder / name)
+
+
+def crossed(levels: Iterable[np.ndarray], demos: Demonstrations) -> list[dict[str, Any]]:
+    """Agreement of each level's options, padded with -1, with each of the labels."""
+    return [
+        {label: agreement([row[row >= 0] for row in rows], [demo.labels[label] for demo in demos]) for label in LABELS}
+        for rows in levels
+    ]
+
+
+def references(demos: Demonstrations, valid: Demonstrations, seed: int) -> dict[str, dict[str, Any]]:
+    """Agreement of segmentations without options, with as many kinds as a level of options has."""
+    train = demos.select(demos.masks["train"])
+    found: dict[str, dict[str, Any]] = {name: {} for name in ("constant", *REFERENCES)}
+    for label, count in zip(LABELS, COUNTS, strict=True):
+        truth = [demo.labels[label] for demo in valid]
+        found["constant"][label] = agreement([np.zeros_like(one) for one in truth], truth)
+        for name in REFERENCES:
+            found[name][label] = agreement(baselines.segment(name, train, valid, count, seed), truth)
+    return found
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """The arguments that :func:`settings` reads."""
+    parser.add_argument("--demonstrations", type=int, default=80)
+    parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--runs", type=Path, default=Path("runs/babyai"))
+
+
+def settings(own: argparse.Namespace) -> Settings:
+    """What was said of all cells."""
+    return Settings(own.demonstrations, own.episodes, tuple(own.set), own.runs)
+
+
+def main() -> None:
+    """Run a cell."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("level")
+    parser.add_argument("progress", choices=PROGRESS)
+    parser.add_argument("seed", type=int)
+    add_settings(parser)
+    own = parser.parse_args()
+    cell = Cell(own.level, own.progress, own.seed)
+    try:
+        print(json.dumps(run(cell, settings(own), record(cell.command(settings(own)))), indent=1))
+    except (BadInput, Failed) as error:
+        raise SystemExit(str(error)) from None
+
+
+if __name__ == "__main__":
+    main()
