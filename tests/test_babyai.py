@@ -6,12 +6,14 @@ import json
 import sys
 from types import SimpleNamespace
 
+import arena_playing
 import arena_recording
 import babyai
 import babyai_cell
 import babyai_labels
 import babyai_results
 import babyai_seen
+import cells
 import h5py
 import numpy as np
 import pytest
@@ -226,6 +228,56 @@ def test_an_expert_that_fails_is_one_line_and_no_file(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+class Line:
+    """An agent at 0 that has to get to 3 within five steps."""
+
+    def reset(self, seed):
+        self.place, self.time = 0, 0
+        return {"body": np.array([0.0])}
+
+    def step(self, control):
+        self.place, self.time = self.place + int(control[0]), self.time + 1
+        return {"body": np.array([float(self.place)])}, self.place == 3, self.time == 5
+
+
+class Walker:
+    """Takes a step while it sees less than this."""
+
+    def __init__(self, until):
+        self.until = until
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        return np.array([int(observation["body"][0] < self.until)])
+
+
+def test_controllers_are_played_and_shown_a_demonstration_scripted_ones_played_alone(tmp_path):
+    arena_recording.collect(tmp_path / "demos.hdf5", "toy", episode, 2, 1, {})
+    players, out = {"good": Walker(3), "short": Walker(2)}, tmp_path / "played.json"
+    arena_playing.play_all(Line(), out, players, range(2), tmp_path / "demos.hdf5", {"late": Walker(9)})
+    done, failed = {"success": True, "steps": 3}, {"success": False, "steps": 5}
+    assert json.loads(out.read_text()) == {
+        "episodes": {"good": [done, done], "short": [failed, failed], "late": [done, done]},
+        "demonstration": "demo_0",
+        "controls": {"good": [[1], [1], [1], [0]], "short": [[1], [1], [0], [0]]},
+    }
+
+
+def test_a_cell_is_done_once_for_each_code_and_settings(tmp_path):
+    done = []
+
+    def work():
+        done.append(len(done))
+        return {"value": done[-1]}
+
+    for code, settings, value in (("a", {"seed": 1}, 0), ("a", {"seed": 1}, 0), ("b", {"seed": 1}, 1)):
+        content = cells.kept(tmp_path / "cell.json", settings, {"code": code}, work)
+        assert content == {"provenance": [{"code": code}], "results": settings | {"value": value}}
+    assert cells.kept(tmp_path / "cell.json", {"seed": 2}, {"code": "b"}, work)["results"] == {"seed": 2, "value": 2}
+
+
 # --- the study --------------------------------------------------------------------------------------------------------
 
 
@@ -275,8 +327,8 @@ def cell(seed, likelihoods, successes, nmi):
 
 
 def test_the_page_of_two_seeds_worked_by_hand():
-    cells = [cell(0, (-1.0, -1.0, -0.5, -0.25), 1, 0.25), cell(1, (-1.0, -1.0, -0.5, -0.25), 2, 0.75)]
-    text = babyai_results.page(json.loads(json.dumps(babyai_results.summarize(cells))), "Made.")
+    found = [cell(0, (-1.0, -1.0, -0.5, -0.25), 1, 0.25), cell(1, (-1.0, -1.0, -0.5, -0.25), 2, 0.75)]
+    text = babyai_results.page(json.loads(json.dumps(babyai_results.summarize(found))), "Made.")
     two = "-0.250 [-0.250, -0.250]; +0.750 [+0.750, +0.750] (-0.25), 2 not converged"
     assert f"-0.500 [-0.500, -0.500]; +0.500 [+0.500, +0.500] (-0.25) | {two} |" in text
     assert "| Toy | told | 3 of 8 | 3 of 8 | 3 of 8 | 3 of 8 | 3 of 8 | 3 of 8 |" in text
