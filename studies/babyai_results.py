@@ -100,7 +100,8 @@ def page(rows: list[Result], made_by: str) -> str:
         *_table(["level", "progress", *PLAYED], _successes(rows)),
         "",
         "Of missions that were never demonstrated, the same for all, within 120 steps. "
-        f"On a recorded demonstration exported controllers differ from their fits by {max(differences):.0e} at most.",
+        f"Actions of exported controllers on a recorded demonstration differ from their fits' by {max(differences):g} "
+        "at most.",
         "",
         "## Agreement with what the bot was about, held out",
         "",
