@@ -1,9 +1,9 @@
 """What the kind of emission and a σ for each option change on somebody else's demonstrations, over seeds.
 
-    python studies/emission_kinds.py [--seeds 5] [--spec specs/metaworld_pick_place.yaml]
+    python studies/emission_kinds.py [--seeds 5] [--spec specs/metaworld_pick_place.yaml] [--set KEY=VALUE] [--out FILE]
 
-Fits the spec with each variant; writes ``docs/results/emission_kinds.json`` and ``.md``. Cells that the JSON has
-already, made by the same code, are not done again. Log-likelihoods of different kinds measure different things and
+Fits the spec with each variant; writes ``docs/results/emission_kinds.json`` and ``.md``, or those of ``--out``. Cells
+that the JSON has already, made by the same code, are not done again. Log-likelihoods of different kinds measure different things and
 are not compared; how well the options agree with the labelled phases can be.
 """
 
@@ -30,12 +30,12 @@ VARIANTS = [(kind, network, own) for kind in ("gaussian", "auto") for network in
 OUT = Path("docs/results/emission_kinds")
 
 
-def run(spec: str, variant: tuple[str, str, str], seed: int) -> dict[str, Any]:
+def run(spec: str, own_changes: list[str], variant: tuple[str, str, str], seed: int) -> dict[str, Any]:
     """One fit: its held-out log-likelihood per step, its agreement with the phases, and what was decided."""
     kind, network, own = variant
     changes = [
         f"control.kind={kind}", f"control.std={OWN[own]}", f"hierarchy.levels.0.policy={NETWORKS[network]}",
-        f"seed={seed}", "compare_with=[]",
+        f"seed={seed}", "compare_with=[]", *own_changes,
     ]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         metrics = fit(load_spec(spec, changes), out=Path(folder) / "run").metrics
@@ -85,21 +85,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--spec", default=SPEC)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--out", type=Path, default=OUT, help="The results' path, without an ending.")
     parser.add_argument("--jobs", type=int, default=-1)
     arguments = parser.parse_args()
-    made_by = record(f"python studies/emission_kinds.py --seeds {arguments.seeds} --spec {arguments.spec}")
-    page = OUT.with_suffix(".json")
+    command = f"python studies/emission_kinds.py --seeds {arguments.seeds} --spec {arguments.spec}"
+    command += "".join(f" --set '{change}'" for change in arguments.set)
+    made_by, page = record(command), arguments.out.with_suffix(".json")
     kept = json.loads(page.read_text()) if page.exists() else {}
     same = bool(kept) and kept["provenance"][0]["code"] == made_by["code"]
     rows = kept["results"] if same else []
     done = {(row["kind"], row["network"], row["sigma"], row["seed"]) for row in rows}
     cells = [(variant, seed) for seed in range(arguments.seeds) for variant in VARIANTS if (*variant, seed) not in done]
-    calls = (delayed(run)(arguments.spec, variant, seed) for variant, seed in cells)
+    calls = (delayed(run)(arguments.spec, arguments.set, variant, seed) for variant, seed in cells)
     for row in Parallel(n_jobs=arguments.jobs, return_as="generator_unordered")(calls):
         rows.append(row)
         write_text(page, text(rows, [made_by]))
-    write_text(OUT.with_suffix(".md"), table(rows, sentence(made_by["command"], [made_by])))
-    print(OUT.with_suffix(".md").read_text())
+    write_text(arguments.out.with_suffix(".md"), table(rows, sentence(made_by["command"], [made_by])))
+    print(arguments.out.with_suffix(".md").read_text())
 
 
 if __name__ == "__main__":
