@@ -3,8 +3,8 @@
     python studies/emission_kinds.py [--seeds 5] [--spec specs/metaworld_pick_place.yaml] [--set KEY=VALUE] [--out FILE]
 
 Fits the spec with each variant; writes ``docs/results/emission_kinds.json`` and ``.md``, or those of ``--out``. Cells
-that the JSON has already, made by the same code, are not done again. Log-likelihoods of different kinds measure different things and
-are not compared; how well the options agree with the labelled phases can be.
+that the JSON has already, made by the same code, are not done again. Log-likelihoods of different kinds measure
+different things and are not compared; how well the options agree with the labelled phases can be.
 """
 
 from __future__ import annotations
