@@ -9,6 +9,7 @@ from planted import make_spec, make_trainer, make_truth, plant, recovered
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.control_parts import ControlPart, control_parts
+from ddco_pyro.fitting.building import Dimensions
 
 BOUND = 0.12
 """Far from its corner an option is on a bound nearly always: more than half of the controls are."""
@@ -56,7 +57,7 @@ def switches(jaw):
 def test_a_switch_is_never_half_open_and_switches_as_often(switched, tmp_path):
     """Rolled out in the plane that the demonstrations were made in."""
 
-    parts = control_parts(learned("auto").control, make_trainer(learned("auto"), switched, tmp_path).dimensions.control)
+    parts = control_parts(learned("auto").control, Dimensions.of(switched).control)
     assert {part.kind: part.dims for part in parts} == {"gaussian": (0, 1), "binary": (2,)}
     model = make_trainer(learned("auto"), switched, tmp_path / "fit").run()
     controller, jaws = Controller(model, "sample"), []

@@ -54,12 +54,13 @@ def option_use(
     levels: Sequence[str],
     options: Sequence[Sequence[Mapping[str, Any]]],
     demonstrations: int,
-    labels: Mapping[str, Mapping[int, int]],
+    labels: Mapping[str, Mapping[int, int]] | None = None,
 ) -> Table:
     """How each choice of each level is used, the highest level first; control only where it is chosen.
 
     :param labels: the label that each option stands for, by level, where there is one.
     """
+    labels = labels or {}
     rows, colours = [], []
     for level, use in reversed(list(zip(levels, options, strict=True))):
         for row in use:
