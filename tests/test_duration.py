@@ -11,12 +11,10 @@ from planted import make_spec, make_trainer, make_truth, plant
 from scipy import integrate, stats
 
 import ddco_pyro
-from ddco_pyro.events import ignore
-from ddco_pyro.fitting.checkpoint import Progress, Restart
+from ddco_pyro.fitting.checkpoint import Progress
 from ddco_pyro.fitting.duration import log_duration_prior
 from ddco_pyro.fitting.objective import Objective
 from ddco_pyro.fitting.stages import plan
-from ddco_pyro.fitting.training import Training
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.links import log_termination
@@ -99,12 +97,9 @@ def test_all_training_demonstrations_together_have_it_once(demos, tmp_path):
     """Whatever the minibatches; the tuning demonstrations in the same proportion to their likelihood."""
     spec = make_spec((2,), duration={"mean": 20, "weight": 3})
     trainer = make_trainer(spec, demos, tmp_path)
-    trainer = Training(trainer.material, Restart(Progress(0)), None, ignore)
-    model, objective = (
-        trainer._material.hierarchy(0),
-        Objective(trainer, plan(trainer.spec, len(trainer.spec.hierarchy.levels))[-1]),
-    )
-    for batch in (trainer.train, trainer.tune):
+    material = trainer.material
+    model, objective = material.hierarchy(0), Objective(material, Progress(0), plan(spec, 1)[-1])
+    for batch in (material.train, material.tune):
         with torch.no_grad():
             tables = model.tabulate(batch)
         likelihood = float(total_log_likelihood(tables, batch.lengths))
@@ -112,8 +107,8 @@ def test_all_training_demonstrations_together_have_it_once(demos, tmp_path):
             float((table.double().mean((0, 1)) @ torch.tensor([57.0, 3.0]).double()).sum())
             for table in tables.termination
         )
-        if batch is trainer.tune:
-            expected = likelihood / batch.steps + means / trainer.train.steps
+        if batch is material.tune:
+            expected = likelihood / batch.steps + means / material.train.steps
             assert objective.tune(model) == pytest.approx(expected, rel=1e-6)
             continue
         parts = [objective.ascend(model, rows) for rows in torch.arange(len(batch)).split(4)]

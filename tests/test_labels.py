@@ -18,15 +18,13 @@ from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.events import ignore
 from ddco_pyro.fitting.building import Dimensions
-from ddco_pyro.fitting.checkpoint import Progress, Restart
+from ddco_pyro.fitting.checkpoint import Progress
 from ddco_pyro.fitting.clusters import Clusters
 from ddco_pyro.fitting.labels import Labels
 from ddco_pyro.fitting.objective import Objective
 from ddco_pyro.fitting.restarts import Trainer
 from ddco_pyro.fitting.stages import plan
-from ddco_pyro.fitting.training import Training
 from ddco_pyro.inference import segment
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.spec import SpecError, dump_spec, parse_spec
@@ -56,13 +54,13 @@ def labelled(level=1, counts=(2,), training=(), **own):
 
 
 def make(spec, demos):
-    """A restart before any training."""
-    trainer = Trainer(spec, Dimensions.of(demos), *demos.split(0.2, 0))
-    return Training(trainer.material, Restart(Progress(0)), None, ignore)
+    """What restarts are trained on."""
+    return Trainer(spec, Dimensions.of(demos), *demos.split(0.2, 0)).material
 
 
-def fresh(trainer):
-    return trainer._material.hierarchy(0)
+def whole(material):
+    """What is maximised in the last stage."""
+    return Objective(material, Progress(0), plan(material.spec, len(material.spec.hierarchy.levels))[-1])
 
 
 def options(labels):
@@ -77,12 +75,12 @@ def options(labels):
 def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
     """Against the sum over all paths, one after another."""
     demos = random_demonstrations(LABELS[: 5 if len(counts) == 1 else 3])
-    trainer = make(labelled(level, counts), demos)
-    model = fresh(trainer)
-    objective = Objective(trainer, plan(trainer.spec, len(trainer.spec.hierarchy.levels))[-1])
+    material = make(labelled(level, counts), demos)
+    model = material.hierarchy(0)
+    objective = whole(material)
     values = {}
-    for name, batch in (("train", trainer.train), ("tune", trainer.tune)):
-        names = trainer.names if name == "train" else [n for n in demos.names if n not in trainer.names]
+    for name, batch in (("train", material.train), ("tune", material.tune)):
+        names = material.names if name == "train" else [n for n in demos.names if n not in material.names]
         with torch.no_grad():
             tables = model.tabulate(batch)
         values[name] = 0.0
@@ -95,20 +93,18 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
                 if all(option in (-1, h[level - 1]) for option, h in zip(known, path, strict=True))
             )
             values[name] += math.log(total)
-    assert objective.ascend(model, torch.arange(len(trainer.train))) == pytest.approx(values["train"], abs=1e-5)
+    assert objective.ascend(model, torch.arange(len(material.train))) == pytest.approx(values["train"], abs=1e-5)
     assert objective.tune(model) == pytest.approx(values["tune"] / STEPS, abs=1e-5)
 
 
 def test_its_gradient_is_that_of_finite_differences():
-    trainer = make(labelled(), random_demonstrations())
-    model = fresh(trainer)
+    material = make(labelled(), random_demonstrations())
+    model = material.hierarchy(0)
     assert model.step_bytes > 0  # counted while it is as it was built
     model = model.double()
-    objective, rows = (
-        Objective(trainer, plan(trainer.spec, len(trainer.spec.hierarchy.levels))[-1]),
-        torch.arange(len(trainer.train)),
-    )
-    trainer.train = replace(trainer.train, inputs=trainer.train.inputs.map(torch.Tensor.double, torch.arange(STEPS)))
+    double = material.train.inputs.map(torch.Tensor.double, torch.arange(STEPS))
+    material = replace(material, train=replace(material.train, inputs=double))
+    objective, rows = whole(material), torch.arange(len(material.train))
     parameter = model.levels[0].termination.layers[0].weight
     objective.ascend(model, rows)
     gradients = parameter.grad.clone()
@@ -120,7 +116,7 @@ def test_its_gradient_is_that_of_finite_differences():
             values.append(objective.ascend(model, rows))
             with torch.no_grad():
                 parameter[place] -= step
-        assert gradient == pytest.approx(-(values[0] - values[1]) / 2e-4 / trainer.train.steps, rel=1e-5, abs=1e-9)
+        assert gradient == pytest.approx(-(values[0] - values[1]) / 2e-4 / material.train.steps, rel=1e-5, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -133,15 +129,15 @@ def test_its_gradient_is_that_of_finite_differences():
     ],
 )
 def test_labels_matter_in_every_stage_that_has_their_level_or_in_its_initialisation(level, own, stages):
-    trainer = make(labelled(level, (2, 2), **own), random_demonstrations())
-    assert [stage.name for stage in plan(trainer.spec, 2) if trainer.labels.matter_in(stage)] == stages
+    material = make(labelled(level, (2, 2), **own), random_demonstrations())
+    assert [stage.name for stage in plan(material.spec, 2) if material.labels.matter_in(stage)] == stages
 
 
 def test_the_label_wins_over_the_cluster():
     demos = random_demonstrations([[7, -1, 3, 3], [-1, 3, -1, -1], [3, 7, 7, -1], [-1, -1, -1, 7], [7, -1, -1, -1]])
-    trainer = make(labelled(), demos)
-    objective = Objective(trainer, plan(trainer.spec, 1)[0])
-    for known, names in zip(objective.known, (trainer.names, set(demos.names) - set(trainer.names)), strict=True):
+    material = make(labelled(), demos)
+    objective = Objective(material, Progress(0), plan(material.spec, 1)[0])
+    for known, names in zip(objective.known, (material.names, set(demos.names) - set(material.names)), strict=True):
         for choices, demo in zip(known[1].tolist(), demos.select(names), strict=True):
             for choice, label in zip(choices, demo.labels["phase"].tolist(), strict=True):
                 assert choice == {3: 1, 7: 2}.get(label, choice)

@@ -5,21 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 import numpy as np
 
+from ddco_pyro.comparison.table import Comparison, Row
 from ddco_pyro.drawing import words
+from ddco_pyro.drawing.pictures import Picture
 from ddco_pyro.drawing.templates import render
 from ddco_pyro.fitting.analysis import paired
 from ddco_pyro.fitting.convergence import effort
 from ddco_pyro.report.demonstration_list import SHOWN
 from ddco_pyro.segmenting.timeline import anchor
-
-if TYPE_CHECKING:
-    from ddco_pyro.comparison import Comparison, Row
-    from ddco_pyro.drawing.pictures import Picture
 
 HEAD = ("rank", "run", "model", "parameters", "total", "se", "diff", "dse", "nats/step", "gradient steps")
 AGREEMENT_HEAD = ("run", "level", "labels", "NMI", "MoF", "boundary F1 ±1", "±3", "±5")

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from ddco_pyro.comparison.table import Comparison, Row
 from ddco_pyro.drawing.pictures import FAINT, INK, Picture, blank, keep, style
-
-if TYPE_CHECKING:
-    from ddco_pyro.comparison import Comparison, Row
 
 
 def write(compared: Comparison, path: Path) -> Picture:

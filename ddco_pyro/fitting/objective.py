@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from ddco_pyro.errors import Failed
+from ddco_pyro.fitting.checkpoint import Progress
 from ddco_pyro.fitting.clusters import Clusters, EqualParts
 from ddco_pyro.fitting.duration import log_duration_prior
+from ddco_pyro.fitting.material import Material
 from ddco_pyro.fitting.stages import Stage
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables
-
-if TYPE_CHECKING:
-    from ddco_pyro.fitting.training import Training
 
 
 class TrainingError(Failed):
@@ -31,10 +28,10 @@ Known = dict[int, Tensor]
 class Objective:
     """What a stage maximises: the log-likelihood with the choices that are known, and the log-prior of durations."""
 
-    def __init__(self, trainer: Training, stage: Stage) -> None:
-        self.trainer, self.stage = trainer, stage
+    def __init__(self, material: Material, progress: Progress, stage: Stage) -> None:
+        self.material, self.progress, self.stage = material, progress, stage
         self.known: tuple[Known, Known] = {}, {}
-        labels = trainer.labels
+        labels = material.labels
         if labels is not None and labels.matter_in(stage):
             self.known = {labels.level: labels.train}, {labels.level: labels.tune}
         if stage.clamped is not None:
@@ -42,15 +39,15 @@ class Objective:
 
     def _clamp_to_start(self, level: int) -> None:
         """Where a step has no label its cluster, or the part of the demonstration it is in, is its choice."""
-        trainer, hierarchy = self.trainer, self.trainer.spec.hierarchy
+        material, hierarchy = self.material, self.material.spec.hierarchy
         assert hierarchy is not None  # only levels are clamped
-        kind, count = trainer.spec.training.initialize, hierarchy.levels[level - 1].count
+        kind, count = material.spec.training.initialize, hierarchy.levels[level - 1].count
         if kind == "equal_parts":
             start: EqualParts | Clusters = EqualParts(count)
         else:
-            seed = trainer._seed(trainer.progress.restart, trainer.progress.stage)
-            start = Clusters(trainer.train, count, seed, kind == "vq_controls", self.known[0].get(level))
-        for known, batch in zip(self.known, (trainer.train, trainer.tune), strict=True):
+            seed = material.seed(self.progress.restart, self.progress.stage)
+            start = Clusters(material.train, count, seed, kind == "vq_controls", self.known[0].get(level))
+        for known, batch in zip(self.known, (material.train, material.tune), strict=True):
             choices = start.choices(batch)
             labelled = known.get(level, choices)
             known[level] = torch.where(labelled < 0, choices, labelled)
@@ -61,7 +58,7 @@ class Objective:
 
         The loss is minus that per step. A batch that is long is processed in parts.
         """
-        batch, total = self.trainer.train.select(rows), 0.0
+        batch, total = self.material.train.select(rows), 0.0
         for part, piece in batch.pieces(model.steps_at_once):
             tables = self._tables(model, piece, self.known[0], rows[part])
             value = self._total(tables, piece)
@@ -76,9 +73,9 @@ class Objective:
         with torch.no_grad():
             values = [
                 float(self._total(self._tables(model, piece, self.known[1], part), piece))
-                for part, piece in self.trainer.tune.pieces(model.steps_at_once)
+                for part, piece in self.material.tune.pieces(model.steps_at_once)
             ]
-        return sum(values) / self.trainer.tune.steps
+        return sum(values) / self.material.tune.steps
 
     def _tables(self, model: Hierarchy, batch: Batch, known: Known, rows: Tensor) -> Tables:
         tables = model.tabulate(batch, self.stage.discovering)
@@ -87,18 +84,18 @@ class Objective:
         return tables
 
     def _total(self, tables: Tables, batch: Batch) -> Tensor:
-        value = total_log_likelihood(tables, batch.lengths, self.trainer.spec.inference.engine)
-        prior = self.trainer.spec.training.duration
+        value = total_log_likelihood(tables, batch.lengths, self.material.spec.inference.engine)
+        prior = self.material.spec.training.duration
         if prior is None:
             return value
-        return value + log_duration_prior(tables.termination, batch.lengths, prior) / self.trainer.train.steps
+        return value + log_duration_prior(tables.termination, batch.lengths, prior) / self.material.train.steps
 
     def _not_finite(self, tables: Tables, batch: Batch, rows: Tensor) -> TrainingError:
         with torch.no_grad():
             values = log_likelihood(tables, batch.lengths)
-        bad = [self.trainer.names[int(row)] for row, ok in zip(rows, torch.isfinite(values), strict=True) if not ok]
+        bad = [self.material.names[int(row)] for row, ok in zip(rows, torch.isfinite(values), strict=True) if not ok]
         where = ", ".join(bad) or "this minibatch (no trajectory alone)"
         return TrainingError(
-            f"stage {self.stage.name}, epoch {self.trainer.progress.epoch + 1}: the log-likelihood of {where} is not "
+            f"stage {self.stage.name}, epoch {self.progress.epoch + 1}: the log-likelihood of {where} is not "
             "finite; look at these demonstrations, raise control.std, or lower training.optimizer.lr"
         )

@@ -22,8 +22,9 @@ from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.checkpoint import Progress, Restart
 from ddco_pyro.fitting.convergence import StageEnd, summary
 from ddco_pyro.fitting.labels import Labels
+from ddco_pyro.fitting.material import Material
 from ddco_pyro.fitting.processes import pool, results, useful_jobs
-from ddco_pyro.fitting.training import Material, advance
+from ddco_pyro.fitting.training import advance
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec

@@ -22,10 +22,6 @@ class Stage:
     trained: tuple[str, ...]
 
 
-WHOLE = Stage("whole", None, None, ())
-"""The whole hierarchy, as it is."""
-
-
 def plan(spec: Spec, depth: int) -> list[Stage]:
     """The stages of training for D levels: from the lowest level up, the meta-policy last."""
     training = spec.training

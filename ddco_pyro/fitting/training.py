@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -21,49 +20,16 @@ import torch
 from torch import nn
 
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
-from ddco_pyro.fitting.building import Dimensions, build_hierarchy
-from ddco_pyro.fitting.checkpoint import Restart, State, copy_of, optimizer_state, restore_optimizer
+from ddco_pyro.fitting.checkpoint import Restart, copy_of, optimizer_state, restore_optimizer
 from ddco_pyro.fitting.convergence import StageEnd, share
-from ddco_pyro.fitting.labels import Labels
+from ddco_pyro.fitting.material import Material
 from ddco_pyro.fitting.objective import Objective
 from ddco_pyro.fitting.stages import Stage, plan
 from ddco_pyro.inference.threads import one_thread
-from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import OptimizerSpec, Spec
+from ddco_pyro.spec import OptimizerSpec
 
 SAVE_EVERY = 1.0  # s between checkpoints, at least: an epoch of a small model takes less time than its checkpoint
-
-
-@dataclass(frozen=True)
-class Material:
-    """What all restarts share: demonstrations to train and to tune on, and how they were encoded and scaled.
-
-    :param names: of the training demonstrations.
-    :param labels: the labels that say which options are active; None where there are none.
-    """
-
-    spec: Spec
-    dimensions: Dimensions
-    train: Batch
-    tune: Batch
-    names: Sequence[str]
-    encoder: State
-    scaling: State
-    labels: Labels | None = None
-
-    def hierarchy(self, restart: int) -> Hierarchy:
-        """A restart's hierarchy before any training, in evaluation mode."""
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.seed(restart))
-            hierarchy = build_hierarchy(self.spec, self.dimensions)
-        hierarchy.encoder.load_state_dict(self.encoder)
-        hierarchy.scaling.load_state_dict(self.scaling)
-        return hierarchy.eval()
-
-    def seed(self, *where: int) -> int:
-        """A seed for a restart, one of its stages, or an epoch of a stage."""
-        return int(np.random.SeedSequence([self.spec.seed, *where]).generate_state(1)[0])
 
 
 def advance(
@@ -89,8 +55,7 @@ class Training:
     """A restart in training."""
 
     def __init__(self, material: Material, restart: Restart, checkpoint: Path | None, on_event: OnEvent) -> None:
-        self.spec, self.train, self.tune, self.names = material.spec, material.train, material.tune, material.names
-        self.progress, self._seed, self.labels = restart.progress, material.seed, material.labels
+        self.spec, self.progress = material.spec, restart.progress
         self._material, self._restart, self._checkpoint, self._on_event = material, restart, checkpoint, on_event
         self._saved_at = -np.inf  # the first epoch is saved
 
@@ -116,7 +81,7 @@ class Training:
         """Whether it has ended, rather than come to the epoch ``until`` or the deadline."""
         now, training, states = self.progress, self.spec.training, self._restart.states
         cap = share(training.epochs, sum(end["epochs"] for end in now.ended), stages_left)
-        objective = Objective(self, stage)
+        objective = Objective(self._material, now, stage)
         parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
         optimizer = _optimizer(training.optimizer, parameters)
         if now.epoch > 0:
@@ -146,16 +111,16 @@ class Training:
         """One pass over the training demonstrations; the log-likelihood per step seen on the way."""
         now, total = self.progress, 0.0
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self._seed(now.restart, now.stage, now.epoch))
+            torch.manual_seed(self._material.seed(now.restart, now.stage, now.epoch))
             model.train()
-            for rows in torch.randperm(len(self.train)).split(self.spec.training.batch_size):
+            for rows in torch.randperm(len(self._material.train)).split(self.spec.training.batch_size):
                 optimizer.zero_grad(set_to_none=True)
                 total += objective.ascend(model, rows)
                 if self.spec.training.clip_gradient is not None:
                     nn.utils.clip_grad_norm_(parameters, self.spec.training.clip_gradient)
                 optimizer.step()
             model.eval()
-        return total / self.train.steps
+        return total / self._material.train.steps
 
     def _record(self, stage: Stage, train: float, tune: float, model: Hierarchy) -> None:
         now = self.progress

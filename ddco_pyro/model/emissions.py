@@ -7,6 +7,7 @@ two of them are apart; nothing else in the project knows how a control is distri
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Protocol, Self
@@ -66,7 +67,7 @@ class Emission(Steps, Protocol):
         ...
 
 
-class Kind:
+class Kind(ABC):
     """What all kinds share: tensors as fields, of which those over time are the first ones."""
 
     over_time: ClassVar[int] = 1
@@ -83,9 +84,9 @@ class Kind:
         """[..., K, A]: a number for each dimension, unless a kind says otherwise."""
         return self.numbers.shape
 
+    @abstractmethod
     def by_dimension(self, actions: Tensor) -> Tensor:
         """log π(a_d | s) of each caller and dimension, [..., K, A]."""
-        raise NotImplementedError
 
     def log_density(self, actions: Tensor) -> Tensor:
         """log π(a | s), [..., K]: dimensions are independent given the caller, unless a kind says otherwise."""

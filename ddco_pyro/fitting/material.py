@@ -1,0 +1,47 @@
+"""What all restarts of a fit are trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ddco_pyro.fitting.building import Dimensions, build_hierarchy
+from ddco_pyro.fitting.checkpoint import State
+from ddco_pyro.fitting.labels import Labels
+from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.spec import Spec
+
+
+@dataclass(frozen=True)
+class Material:
+    """What all restarts share: demonstrations to train and to tune on, and how they were encoded and scaled.
+
+    :param names: of the training demonstrations.
+    :param labels: the labels that say which options are active; None where there are none.
+    """
+
+    spec: Spec
+    dimensions: Dimensions
+    train: Batch
+    tune: Batch
+    names: Sequence[str]
+    encoder: State
+    scaling: State
+    labels: Labels | None = None
+
+    def hierarchy(self, restart: int) -> Hierarchy:
+        """A restart's hierarchy before any training, in evaluation mode."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.seed(restart))
+            hierarchy = build_hierarchy(self.spec, self.dimensions)
+        hierarchy.encoder.load_state_dict(self.encoder)
+        hierarchy.scaling.load_state_dict(self.scaling)
+        return hierarchy.eval()
+
+    def seed(self, *where: int) -> int:
+        """A seed for a restart, one of its stages, or an epoch of a stage."""
+        return int(np.random.SeedSequence([self.spec.seed, *where]).generate_state(1)[0])
