@@ -56,8 +56,8 @@ def fit(
     >>> fit = ddco_pyro.fit("mine.yaml", demos)
     >>> fit.metrics["demonstrations"]
     {'train': 4, 'tune': 1, 'valid': 1}
-    >>> ddco_pyro.fit("mine.yaml", demos, out="runs/mine").folder
-    PosixPath('runs/mine')
+    >>> ddco_pyro.fit("mine.yaml", demos, out="runs/mine").folder.as_posix()
+    'runs/mine'
 
     :param spec: a spec, or its YAML file; one that names user code is given by ``load_spec(path, allow_code=True)``.
     :param demonstrations: in memory, or the HDF5 file to use instead of ``demonstrations.path``; None for those that
