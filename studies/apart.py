@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import arena_venv
+import h5py
 import numpy as np
 from provenance import ROOT, code, sources, tree
 
@@ -23,6 +24,8 @@ from ddco_pyro.export import write_numpy
 from ddco_pyro.fitting.fit import Fit
 
 HERE = Path(__file__).parent
+HELD_OUT = 20
+"""The first demonstrations of a file are held out, whatever the others are used for."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,12 @@ class Apart:
             for name, one in methods.items()
         }
         return played
+
+
+def expert(source: Path) -> dict[str, Any]:
+    """How often the expert succeeded, and which part of the steps each of its labels has."""
+    with h5py.File(source) as file:
+        return dict(json.loads(str(file.attrs["expert"])))
 
 
 def acted(one: Fit, observations: dict[str, np.ndarray]) -> np.ndarray:

@@ -12,7 +12,6 @@ episode.
 
 from __future__ import annotations
 
-import argparse
 import os
 import warnings
 from pathlib import Path
@@ -23,7 +22,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 import arena_recording
 import numpy as np
 from arena_phases import Phases
-from arena_playing import Observation, exported, play, play_all
+from arena_playing import Observation, arguments, named_controllers, play, play_all
 from arena_recording import Recorded
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
 from metaworld.policies import ENV_POLICY_MAP
@@ -141,22 +140,14 @@ def film(task: str, out: Path, controller: Any, frames: int) -> None:
 
 def main() -> None:
     """Collect, play or draw."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["collect", "play", "film"])
-    parser.add_argument("task")
-    parser.add_argument("out", type=Path)
-    parser.add_argument("controllers", nargs="*", metavar="NAME=EXPORTED")
-    parser.add_argument("--number", type=int, default=70)
-    parser.add_argument("--held-out", type=int, default=20)
+    parser = arguments(__doc__, ("collect", "play", "film"), 70)
     parser.add_argument("--noise", type=float, default=0.1)
-    parser.add_argument("--episodes", type=int, default=50)
-    parser.add_argument("--recorded", type=Path)
     parser.add_argument("--frames", type=int, default=8)
     own = parser.parse_args()
     warnings.filterwarnings("ignore")  # the experts' gains are meant to saturate
     if own.task not in ENV_POLICY_MAP:
         raise SystemExit(f"there is no task {own.task!r}; Meta-World has: {', '.join(sorted(ENV_POLICY_MAP))}")
-    controllers = {name: exported(folder) for name, _, folder in (one.partition("=") for one in own.controllers)}
+    controllers = named_controllers(own.controllers)
     if own.what == "collect":
         collect(own.task, own.out, own.number, own.held_out, own.noise)
     elif own.what == "play":

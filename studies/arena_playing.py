@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,6 +25,30 @@ class Environment(Protocol):
     def step(self, control: np.ndarray) -> tuple[Observation, bool, bool]:
         """The next observation, whether the task succeeded now, and whether the episode's time is up."""
         ...
+
+
+def arguments(text: str | None, what: tuple[str, ...], number: int) -> argparse.ArgumentParser:
+    """What scripts of simulators are told: ``WHAT TASK OUT NAME=EXPORTED...`` and options.
+
+    :param text: what the help begins with.
+    :param what: the commands there are.
+    :param number: of demonstrations, where nothing else is said.
+    """
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=what)
+    parser.add_argument("task")
+    parser.add_argument("out", type=Path)
+    parser.add_argument("controllers", nargs="*", metavar="NAME=EXPORTED")
+    parser.add_argument("--number", type=int, default=number)
+    parser.add_argument("--held-out", type=int, default=20)
+    parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--recorded", type=Path)
+    return parser
+
+
+def named_controllers(named: Iterable[str]) -> dict[str, Any]:
+    """The exported controllers of ``NAME=EXPORTED...``."""
+    return {name: exported(folder) for name, _, folder in (pair.partition("=") for pair in named)}
 
 
 def exported(folder: str | Path) -> Any:

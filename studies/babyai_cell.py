@@ -9,7 +9,6 @@ each method succeeded in the same missions.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import time
@@ -20,14 +19,11 @@ from typing import Any
 
 import h5py
 import numpy as np
-from apart import Apart
-from arena_cell import HELD_OUT, expert
-from cells import digest, kept
-from provenance import Record, record
+from apart import HELD_OUT, Apart, expert
+from cells import Cell, Settings, described
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
-from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.fitting.agreement import agreement
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import fit
@@ -45,103 +41,58 @@ REFERENCES = ("equal", "kmeans")
 PERCEPTRON: dict[str, Any] = {"network": "mlp", "hidden": [32]}
 LINEAR: dict[str, Any] = {"network": "linear"}
 
-
-@dataclass(frozen=True)
-class Settings:
-    """What all cells of a study share.
-
-    :param demonstrations: recorded for each level, with those that are held out.
-    :param episodes: played by each method.
-    :param overrides: of the specs, each KEY=VALUE.
-    :param runs: the folder of everything but the results.
-    """
-
-    demonstrations: int
-    episodes: int
-    overrides: tuple[str, ...]
-    runs: Path
-
-    def kept(self) -> dict[str, Any]:
-        """What decides a result."""
-        return {
-            "demonstrations": self.demonstrations,
-            "episodes": self.episodes,
-            "overrides": list(self.overrides),
-        }
-
-    def words(self) -> str:
-        """The same as words of a command."""
-        changes = "".join(f" --set '{one}'" for one in self.overrides)
-        return f"--demonstrations {self.demonstrations} --episodes {self.episodes}{changes}"
+DEFAULTS = Settings({"demonstrations": 80, "episodes": 50}, Path("runs/babyai"))
+"""Recorded for each level, with those that are held out; and what each method plays."""
 
 
 @dataclass(frozen=True)
-class Cell:
+class BabyAICell(Cell):
     """A level, what is said of its progress, and the seed of training."""
+
+    script = "babyai_cell.py"
 
     level: str
     progress: str
     seed: int
 
-    def path(self, settings: Settings) -> Path:
-        """Its JSON; other settings have other folders."""
-        folder = settings.runs / "cells" / digest(settings.kept())
-        return folder / f"{self.level}-{self.progress}-{self.seed}.json"
-
-    def command(self, settings: Settings) -> str:
-        """What runs it."""
-        return f"python studies/babyai_cell.py {self.level} {self.progress} {self.seed} {settings.words()}"
+    def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
+        """Fit, play, and compare the options with what the bot was about."""
+        begun, world, own = time.perf_counter(), gridworld(settings), settings.values
+        source = world.collected(self.level, number=own["demonstrations"], held_out=HELD_OUT)
+        demos = Demonstrations.read(source, observed(source, self.progress), list(LABELS))
+        fits = {name: fitted(self, source, demos, name, folder, settings.overrides) for name in ("one", "two")}
+        methods = {"flat": fits["one"].baselines["flat"], "flat_equal": fits["one"].baselines["flat_equal"], **fits}
+        trained = time.perf_counter()
+        played = world.play(self.level, methods, source, int(own["episodes"]))
+        ended = time.perf_counter()
+        valid = demos.select(demos.masks["valid"])
+        return {
+            "demonstrations_sha256": hashlib.sha256(source.read_bytes()).hexdigest(),
+            "bot": expert(source) | {"steps": list(map(len, demos))},
+            "methods": {
+                name: {
+                    "log_likelihood_per_step": one.metrics["log_likelihood_per_step"],
+                    "parameters": one.metrics["parameters"],
+                    "converged": one.metrics["training"]["converged"],
+                    "bridge_difference": played["differences"][name],
+                }
+                for name, one in methods.items()
+            },
+            "played": {
+                name: {key: [one[key] for one in episodes] for key in ("success", "steps")}
+                for name, episodes in played["episodes"].items()
+            },
+            "agreement": {name: one.metrics["agreement"] for name, one in fits.items()},
+            "crossed": {name: crossed(one.segment(valid), valid) for name, one in fits.items()},
+            "references": references(demos, valid, self.seed),
+            "options": {name: one.metrics["options"] for name, one in fits.items()},
+            "seconds": {"fit": trained - begun, "play": ended - trained, "all": ended - begun},
+        }
 
 
 def gridworld(settings: Settings) -> Apart:
     """minigrid, in an environment of its own."""
     return Apart("babyai_minigrid.py", "babyai_requirements.txt", settings.runs)
-
-
-def run(cell: Cell, settings: Settings, made_by: Record) -> dict[str, Any]:
-    """A cell's provenance and results, as its JSON has them; nothing is done again.
-
-    :param made_by: what was known of the code of this file when the work began.
-    :raises Failed: minigrid cannot be used, or there is no such level.
-    """
-    made_by = made_by | {"command": cell.command(settings)}
-    named = {"level": cell.level, "progress": cell.progress, "seed": cell.seed} | settings.kept()
-    return kept(cell.path(settings), named, made_by, lambda: _run(cell, settings, made_by))
-
-
-def _run(cell: Cell, settings: Settings, made_by: Record) -> dict[str, Any]:
-    begun, world = time.perf_counter(), gridworld(settings)
-    source = world.collected(cell.level, number=settings.demonstrations, held_out=HELD_OUT)
-    folder = settings.runs / "fits" / made_by["code"][:12] / cell.path(settings).parent.name / cell.path(settings).stem
-    demos = Demonstrations.read(source, observed(source, cell.progress), list(LABELS))
-    fits = {name: fitted(cell, source, demos, name, folder, settings.overrides) for name in ("one", "two")}
-    methods = {"flat": fits["one"].baselines["flat"], "flat_equal": fits["one"].baselines["flat_equal"], **fits}
-    trained = time.perf_counter()
-    played = world.play(cell.level, methods, source, settings.episodes)
-    ended = time.perf_counter()
-    valid = demos.select(demos.masks["valid"])
-    return {
-        "demonstrations_sha256": hashlib.sha256(source.read_bytes()).hexdigest(),
-        "bot": expert(source) | {"steps": list(map(len, demos))},
-        "methods": {
-            name: {
-                "log_likelihood_per_step": one.metrics["log_likelihood_per_step"],
-                "parameters": one.metrics["parameters"],
-                "converged": one.metrics["training"]["converged"],
-                "bridge_difference": played["differences"][name],
-            }
-            for name, one in methods.items()
-        },
-        "played": {
-            name: {key: [one[key] for one in episodes] for key in ("success", "steps")}
-            for name, episodes in played["episodes"].items()
-        },
-        "agreement": {name: one.metrics["agreement"] for name, one in fits.items()},
-        "crossed": {name: crossed(one.segment(valid), valid) for name, one in fits.items()},
-        "references": references(demos, valid, cell.seed),
-        "options": {name: one.metrics["options"] for name, one in fits.items()},
-        "seconds": {"fit": trained - begun, "play": ended - trained, "all": ended - begun},
-    }
 
 
 def observed(source: Path, progress: str) -> list[str]:
@@ -182,7 +133,9 @@ def rule(source: Path, keys: list[str], levels: int, seed: int) -> dict[str, Any
     }
 
 
-def fitted(cell: Cell, source: Path, demos: Demonstrations, name: str, folder: Path, overrides: tuple[str, ...]) -> Fit:
+def fitted(
+    cell: BabyAICell, source: Path, demos: Demonstrations, name: str, folder: Path, overrides: tuple[str, ...]
+) -> Fit:
     """A fit of one level of options, with the policies without options, or of two."""
     levels = {"one": 1, "two": 2}[name]
     path = folder / f"{name}.yaml"
@@ -210,32 +163,13 @@ def references(demos: Demonstrations, valid: Demonstrations, seed: int) -> dict[
     return found
 
 
-def add_settings(parser: argparse.ArgumentParser) -> None:
-    """The arguments that :func:`settings` reads."""
-    parser.add_argument("--demonstrations", type=int, default=80)
-    parser.add_argument("--episodes", type=int, default=50)
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--runs", type=Path, default=Path("runs/babyai"))
-
-
-def settings(own: argparse.Namespace) -> Settings:
-    """What was said of all cells."""
-    return Settings(own.demonstrations, own.episodes, tuple(own.set), own.runs)
-
-
 def main() -> None:
     """Run a cell."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = described(__doc__)
     parser.add_argument("level")
     parser.add_argument("progress", choices=PROGRESS)
     parser.add_argument("seed", type=int)
-    add_settings(parser)
-    own = parser.parse_args()
-    cell = Cell(own.level, own.progress, own.seed)
-    try:
-        print(json.dumps(run(cell, settings(own), record(cell.command(settings(own)))), indent=1))
-    except (BadInput, Failed) as error:
-        raise SystemExit(str(error)) from None
+    BabyAICell.main(parser, DEFAULTS)
 
 
 if __name__ == "__main__":

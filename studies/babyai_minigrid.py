@@ -10,12 +10,10 @@ were never demonstrated, the same for all. Only missions of two instructions or 
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import os
 from itertools import count
-from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -24,7 +22,7 @@ import arena_recording
 import gymnasium
 import minigrid  # noqa: F401  its levels are registered
 import numpy as np
-from arena_playing import Observation, exported, play_all
+from arena_playing import Observation, arguments, named_controllers, play_all
 from arena_recording import Recorded
 from babyai_labels import MOST, SUBGOALS, Stack, leaves, subgoal
 from babyai_seen import observation
@@ -140,30 +138,20 @@ def demonstration(level: Level, bot: Bot, seed: int) -> Recorded | None:
 
 def main() -> None:
     """Collect or play."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["collect", "play"])
-    parser.add_argument("level")
-    parser.add_argument("out", type=Path)
-    parser.add_argument("controllers", nargs="*", metavar="NAME=EXPORTED")
-    parser.add_argument("--number", type=int, default=80)
-    parser.add_argument("--held-out", type=int, default=20)
-    parser.add_argument("--episodes", type=int, default=50)
-    parser.add_argument("--recorded", type=Path)
-    own = parser.parse_args()
-    if f"BabyAI-{own.level}-v0" not in gymnasium.registry:
-        raise SystemExit(f"minigrid has no level BabyAI-{own.level}-v0")
-    level = Level(own.level)
+    own = arguments(__doc__, ("collect", "play"), 80).parse_args()
+    if f"BabyAI-{own.task}-v0" not in gymnasium.registry:
+        raise SystemExit(f"minigrid has no level BabyAI-{own.task}-v0")
+    level = Level(own.task)
     bot = Bot(level)
     if own.what == "collect":
         labels = {"subgoal": len(SUBGOALS), "mission": MOST}
         arena_recording.collect(
-            own.out, f"BabyAI-{own.level}-v0", lambda seed: demonstration(level, bot, seed), own.number, own.held_out,
+            own.out, f"BabyAI-{own.task}-v0", lambda seed: demonstration(level, bot, seed), own.number, own.held_out,
             labels,
         )  # fmt: skip
     else:
-        named = {name: exported(folder) for name, _, folder in (one.partition("=") for one in own.controllers)}
         seeds, scripted = range(UNSEEN, UNSEEN + own.episodes), {"bot": bot, "random": Random()}
-        play_all(level, own.out, named, seeds, own.recorded, scripted)
+        play_all(level, own.out, named_controllers(own.controllers), seeds, own.recorded, scripted)
 
 
 if __name__ == "__main__":

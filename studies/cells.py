@@ -2,17 +2,117 @@
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
-from provenance import Record, is_kept, text
+from provenance import Record, is_kept, record, text
 from threadpoolctl import threadpool_limits
 
 from ddco_pyro.data.files import write_text
+from ddco_pyro.errors import BadInput, Failed
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all cells of a study share.
+
+    :param values: numbers that decide a result, by the name of their option: a study has its own.
+    :param runs: the folder of everything but the results.
+    :param overrides: of the specs, each KEY=VALUE.
+    """
+
+    values: Mapping[str, float]
+    runs: Path
+    overrides: tuple[str, ...] = ()
+
+    def kept(self) -> dict[str, Any]:
+        """What decides a result."""
+        return {**self.values, "overrides": list(self.overrides)}
+
+    def words(self) -> str:
+        """The same as words of a command."""
+        values = " ".join(f"--{name} {value:g}" for name, value in self.values.items())
+        return values + "".join(f" --set '{change}'" for change in self.overrides)
+
+    def add_to(self, parser: argparse.ArgumentParser) -> None:
+        """The arguments that :meth:`given` reads; these settings are their defaults."""
+        for name, value in self.values.items():
+            parser.add_argument(f"--{name}", type=type(value), default=value)
+        parser.add_argument("--set", action="append", default=list(self.overrides), metavar="KEY=VALUE")
+        parser.add_argument("--runs", type=Path, default=self.runs)
+
+    def given(self, own: argparse.Namespace) -> Settings:
+        """What was said of all cells."""
+        values = {name: getattr(own, name) for name in self.values}
+        return replace(self, values=values, runs=own.runs, overrides=tuple(own.set))
+
+
+class Cell(ABC):
+    """A cell of a study. Each study has a dataclass of its own, whose fields name a cell, also in its command."""
+
+    script: ClassVar[str]
+    """Its file in this folder."""
+
+    @abstractmethod
+    def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
+        """Do the work; ``folder`` keeps the fits.
+
+        :raises Failed: the simulator cannot be used, or its expert fails.
+        """
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return "-".join(map(str, astuple(self)))
+
+    def path(self, settings: Settings) -> Path:
+        """Its JSON; other settings have other folders."""
+        return settings.runs / "cells" / digest(settings.kept()) / f"{self.name}.json"
+
+    def command(self, settings: Settings) -> str:
+        """What runs it."""
+        words = " ".join(map(str, astuple(self)))
+        return f"python studies/{self.script} {words} {settings.words()}"
+
+    def run(self, settings: Settings, made_by: Record) -> dict[str, Any]:
+        """Its provenance and results, as its JSON has them; nothing is done again.
+
+        :param made_by: what was known of the code of its script when the work began.
+        :raises Failed: as :meth:`results` does.
+        """
+        path, made_by = self.path(settings), made_by | {"command": self.command(settings)}
+        folder = settings.runs / "fits" / made_by["code"][:12] / path.parent.name / path.stem
+        named = asdict(self) | settings.kept()
+        return kept(path, named, made_by, lambda: self.results(settings, folder))
+
+    @classmethod
+    def main(cls, parser: argparse.ArgumentParser, defaults: Settings) -> None:
+        """Run the cell that the command line names, by arguments like its fields, and print its JSON."""
+        defaults.add_to(parser)
+        own = parser.parse_args()
+        settings = defaults.given(own)
+        cell = cls(*(getattr(own, field.name) for field in fields(cls)))
+        printed(lambda: json.dumps(cell.run(settings, record(cell.command(settings))), indent=1))
+
+
+def described(text: str | None) -> argparse.ArgumentParser:
+    """A parser whose help is a script's docstring."""
+    return argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
+def printed(work: Callable[[], str]) -> None:
+    """Print what work gives, or end with the line that says why it cannot be done."""
+    try:
+        print(work())
+    except (BadInput, Failed) as error:
+        raise SystemExit(str(error)) from None
 
 
 def digest(settings: Mapping[str, Any]) -> str:
@@ -34,6 +134,6 @@ def kept(
             return content
     torch.set_num_threads(1)
     with threadpool_limits(1):
-        found = work()
-    write_text(path, text({**settings, **found}, [made_by]))
+        results = work()
+    write_text(path, text({**settings, **results}, [made_by]))
     return dict(json.loads(path.read_text()))

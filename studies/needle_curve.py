@@ -8,7 +8,6 @@ with 100 where they are there. Resumable as that study is. Writes ``curve.json``
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from typing import Any
 from joblib import Parallel, delayed
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from needle_success import ALL, differences, kept_at, run_seed, spread, summarize
+from needle_success import ALL, described, differences, kept_at, run_seed, spread, summarize, words
 from provenance import record, sentence, text
 
 from ddco_pyro.data.files import whole_file, write_text
@@ -65,19 +64,10 @@ def draw(curve: Curve, path: Path) -> None:
 
 def main() -> None:
     """Run the study."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = described(__doc__, seeds=3, episodes=60)
     parser.add_argument("--counts", type=int, nargs="+", default=[10, 20, 40, 80])
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--episodes", type=int, default=60)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--out", type=Path, default=Path("docs/results/needle"))
-    parser.add_argument("--runs", type=Path, default=Path("runs/needle-success"))
     arguments = parser.parse_args()
-    settings = "".join(f" --set '{one}'" for one in arguments.set)
-    counts = " ".join(map(str, arguments.counts))
-    command = f"python studies/needle_curve.py --counts {counts} --seeds {arguments.seeds} "
-    command += f"--episodes {arguments.episodes}{settings}"
+    command = f"python studies/needle_curve.py --counts {' '.join(map(str, arguments.counts))} {words(arguments)}"
     made_by = record(command)
     cells = [(seed, count) for count in arguments.counts for seed in range(arguments.seeds)]
     Parallel(n_jobs=arguments.jobs)(delayed(run_seed)(*cell, arguments, made_by) for cell in cells)

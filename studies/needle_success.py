@@ -221,18 +221,28 @@ def draw(methods: dict[str, Any], path: Path) -> None:
         figure.savefig(temporary, dpi=120, format="png")
 
 
-def main() -> None:
-    """Run the study."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--episodes", type=int, default=200)
+def described(text: str | None, seeds: int, episodes: int) -> argparse.ArgumentParser:
+    """What studies of this task are told."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=seeds)
+    parser.add_argument("--episodes", type=int, default=episodes)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--out", type=Path, default=Path("docs/results/needle"))
     parser.add_argument("--runs", type=Path, default=Path("runs/needle-success"))
-    arguments = parser.parse_args()
-    settings = "".join(f" --set '{one}'" for one in arguments.set)
-    command = f"python studies/needle_success.py --seeds {arguments.seeds} --episodes {arguments.episodes}{settings}"
+    return parser
+
+
+def words(arguments: argparse.Namespace) -> str:
+    """What decides a result, as words of a command."""
+    changes = "".join(f" --set '{change}'" for change in arguments.set)
+    return f"--seeds {arguments.seeds} --episodes {arguments.episodes}{changes}"
+
+
+def main() -> None:
+    """Run the study."""
+    arguments = described(__doc__, seeds=5, episodes=200).parse_args()
+    command = f"python studies/needle_success.py {words(arguments)}"
     made_by = record(command)
     Parallel(n_jobs=arguments.jobs)(delayed(run_seed)(seed, ALL, arguments, made_by) for seed in range(arguments.seeds))
     kept = [json.loads(kept_at(arguments.out, seed, ALL).read_text()) for seed in range(arguments.seeds)]

@@ -6,6 +6,7 @@ import functools
 import json
 import stat
 import sys
+from dataclasses import replace
 
 import apart
 import arena
@@ -251,7 +252,7 @@ def test_the_same_demonstrations_are_held_out_from_all_cells(tmp_path):
     with h5py.File(tmp_path / "demos.hdf5", "w") as file:
         file["mask/valid"], file["mask/train"] = np.array(names[:4], "S"), np.array(names[4:], "S")
     used = {
-        (count, seed): arena_cell.chosen(tmp_path / "demos.hdf5", arena_cell.Cell("task", count, seed))
+        (count, seed): arena_cell.chosen(tmp_path / "demos.hdf5", arena_cell.ArenaCell("task", count, seed))
         for count in (2, 5, 8)
         for seed in (0, 1)
     }
@@ -262,13 +263,13 @@ def test_the_same_demonstrations_are_held_out_from_all_cells(tmp_path):
         assert set(used[2, seed][0]) < set(used[5, seed][0]) < set(used[8, seed][0])
     assert used[5, 0] != used[5, 1]
     with pytest.raises(Failed, match="has 8 demonstrations to train on, 9 are asked for"):
-        arena_cell.chosen(tmp_path / "demos.hdf5", arena_cell.Cell("task", 9, 0))
+        arena_cell.chosen(tmp_path / "demos.hdf5", arena_cell.ArenaCell("task", 9, 0))
 
 
-def test_other_settings_are_other_cells(tmp_path):
-    cell = arena_cell.Cell("pick-place-v3", 5, 0)
+def test_other_settings_are_other_cells():
+    cell = arena_cell.ArenaCell("pick-place-v3", 5, 0)
     settings = [
-        arena_cell.Settings(70, 0.1, episodes, overrides, tmp_path)
+        replace(arena_cell.DEFAULTS, values=arena_cell.DEFAULTS.values | {"episodes": episodes}, overrides=overrides)
         for episodes, overrides in ((50, ()), (20, ()), (50, ("training.epochs=3",)))
     ]
     assert len({cell.path(one) for one in settings}) == 3

@@ -46,9 +46,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     :raises NotWritable: nothing may be written there.
     """
     with _explained(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _remove_stale(path)
-        prefix = f".{path.name}-{platform.node()}-{os.getpid()}-"
+        prefix = _prepared(path)
         handle, name = tempfile.mkstemp(prefix=prefix, suffix=_TEMPORARY, dir=path.parent)
         os.close(handle)
         temporary = Path(name)
@@ -79,9 +77,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
     :raises NotWritable: nothing may be written there.
     """
     with _explained(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _remove_stale(path)
-        prefix = f".{path.name}-{platform.node()}-{os.getpid()}-"
+        prefix = _prepared(path)
         temporary = Path(tempfile.mkdtemp(prefix=prefix, suffix=_TEMPORARY, dir=path.parent))
         try:
             yield temporary
@@ -97,13 +93,18 @@ def whole_folder(path: Path) -> Iterator[Path]:
             shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _remove_stale(path: Path) -> None:
-    """Remove what a process of this machine, killed while it wrote this very file or folder, has left."""
+def _prepared(path: Path) -> str:
+    """How temporary names of this process beside ``path`` begin.
+
+    What a process of this machine, killed while it wrote this very file or folder, has left is removed.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
     prefix = f".{path.name}-{platform.node()}-"
     for old in path.parent.glob(f"{glob.escape(prefix)}*{_TEMPORARY}"):
         process = old.name.removeprefix(prefix).partition("-")[0]
         if process.isdecimal() and not Path(f"/proc/{process}").exists():
             shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
+    return f"{prefix}{os.getpid()}-"
 
 
 def leftovers(folder: Path) -> list[Path]:
