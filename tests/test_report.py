@@ -1,42 +1,26 @@
 import html
 import re
 import shutil
-from dataclasses import replace
 from html.parser import HTMLParser
 
 import h5py
 import numpy as np
 import pytest
 import toy_task
+from moving_demonstrations import made, reaches, recorded
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.agreement import MATCHED, UNMATCHED
 from ddco_pyro.fitting.fit import load
 from ddco_pyro.fitting.prepare import demonstrations, parts
 from ddco_pyro.fitting.run import fit, write_metrics
-from ddco_pyro.report import film, tables, write_report
-from ddco_pyro.report.activity import Activity, LevelActivity, activity, bins
-from ddco_pyro.report.plot_rows import order
-from ddco_pyro.report.plot_timing import shares, terminations
-from ddco_pyro.report.plot_trajectories import movement, position_key, view
+from ddco_pyro.report import film, write_report
+from ddco_pyro.report.activity import activity
 from ddco_pyro.simulation.episodes import Episode, paired_difference, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.spec import parse_spec
 
 LINEAR = {"network": "linear"}
-
-
-def made(number=8, size=3):
-    rng = np.random.default_rng(0)
-    demos = []
-    for n in range(number):
-        steps = 12 + n
-        place = np.cumsum(rng.normal(size=(steps, size)), axis=0)
-        phase = (np.arange(steps) >= steps // 2).astype(int)
-        actions = np.where(phase[:, None], 1.0, -1.0) * place[:, :2] + 0.1 * rng.normal(size=(steps, 2))
-        demos.append(Demonstration(f"demo_{n}", {"place": place}, actions, {"phase": phase}))
-    return Demonstrations(tuple(demos))
 
 
 def run(folder, demos, **changes):
@@ -292,41 +276,12 @@ def test_words_of_the_method_are_explained_where_they_stand(labelled, deep):
     assert "per-timestep: a policy for each time step." in " ".join(text(deep[1]).split())
 
 
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [
-        ("vq-1", "level 1 from clusters"),
-        ("level-2", "level 2 alone"),
-        ("meta-policy", "meta-policy alone"),
-        ("joint", "all together"),
-        ("policy", "policy"),
-    ],
-)
-def test_stages_in_words(name, said):
-    assert words.stage(name) == said
-
-
 def test_success_is_shown_with_trials_intervals_and_the_paired_comparison(deep):
     shown = " ".join(text(deep[1]).split())
     assert "DDCO 3 of 4 (30 to 95 %) 3.33 ± 1.53 [−0.46 to 7.13], n = 3" in shown
     assert "flat 1 of 4 (5 to 70 %) 3.00, n = 1" in shown
     assert "flat 2 0 4 0.5" in shown
     assert "DDCO succeeds in 3 of 4 episodes (30 to 95 %); flat in 1 of 4 (5 to 70 %)." in shown
-
-
-def test_a_column_is_of_one_kind_whatever_was_seen():
-    """A method that toppled 0 or 1 boxes in each episode beside one that toppled more, and one that grasped nothing."""
-    task = replace(toy_task.task, measures={"topples": "mean", "inserted": "rate", "accuracy_mm": "mean"})
-    seen = {
-        "flat": [{"topples": 0.0, "inserted": np.nan, "accuracy_mm": np.nan}] * 2,
-        "ddco": [{"topples": 3.0, "inserted": 1.0, "accuracy_mm": 1.0}] * 2,
-    }
-    found = tables.measures({name: {"measures": summarize(task, outcomes)} for name, outcomes in seen.items()})
-    assert found.head == ["Method", "Topples", "Inserted", "Accuracy (mm)"]
-    assert found.rows == [
-        ["flat", "0.00 ± 0.00 [0.00 to 0.00], n = 2", "0 of 0", "– (n = 0)"],
-        ["DDCO", "3.00 ± 0.00 [3.00 to 3.00], n = 2", "2 of 2 (34 to 100 %)", "1.00 ± 0.00 [1.00 to 1.00], n = 2"],
-    ]
 
 
 def test_warnings_are_in_words_with_their_numbers(labelled, deep):
@@ -376,154 +331,12 @@ def test_names_are_escaped(tmp_path):
     assert "from clusters" not in page
 
 
-def comparison(mean, error, held_out=10):
-    return {
-        "model": "ddco",
-        "valid": [{}] * held_out,
-        "log_likelihood_per_step": {"train": 2.0, "valid": 1.0},
-        "comparison": {"flat": {"difference": {"nats_per_step": mean, "standard_error": error}}},
-    }
-
-
-@pytest.mark.parametrize(
-    ("mean", "error", "held_out", "said"),
-    [
-        (0.42, 0.05, 10, "0.42 ± 0.05 nats per step better than flat"),
-        (-0.42, 0.05, 10, "0.42 ± 0.05 nats per step worse than flat"),
-        (0.1, 0.05, 10, "with no clear difference from flat (+0.10 ± 0.05 nats per step)"),
-        (0.1, 0.04, 100, "0.10 ± 0.04 nats per step better than flat"),
-        (0.1, 0.04, 3, "with no clear difference from flat"),
-        (0.1, float("nan"), 1, "0.10 nats per step better than flat (error unknown) (1 held-out demonstration;"),
-    ],
-)
-def test_the_verdict_is_honest(mean, error, held_out, said):
-    assert said in words.verdict(comparison(mean, error, held_out))
-
-
-def test_numbers_in_words():
-    assert [words.number(one) for one in (None, float("nan"), -1.234, -0.001)] == ["–", "–", "−1.23", "0.00"]
-    assert [words.signed(one) for one in (1.0, -1.0, 0.0)] == ["+1.00", "−1.00", "0.00"]
-    assert [words.p_value(one) for one in (0.0004, 0.0123, 1.0)] == ["< 0.001", "0.012", "1"]
-    assert [words.measure(one) for one in ("success", "accuracy_mm", "picked_up")] == [
-        "Success",
-        "Accuracy (mm)",
-        "Picked up",
-    ]
-
-
 def test_activity_is_what_the_fit_says_in_one_go(labelled, monkeypatch):
     found, _, demos = labelled
     monkeypatch.setattr("ddco_pyro.model.hierarchy.STEPS_AT_ONCE", 1)  # one demonstration at a time
     level = activity(found, demos).levels[0]
     np.testing.assert_allclose(level.active, found.posterior(demos).u[0], atol=1e-5)
     np.testing.assert_array_equal(level.path, found.segment(demos)[0])
-
-
-def test_bins_are_steps_where_demonstrations_are_equally_long():
-    found = bins(np.array([4, 4]))
-    np.testing.assert_array_equal(found.index, [[0, 1, 2, 3]] * 2)
-    np.testing.assert_array_equal(found.edges, [-0.5, 0.5, 1.5, 2.5, 3.5])
-
-
-def test_bins_are_normalised_time_otherwise():
-    found = bins(np.array([2, 4]))
-    np.testing.assert_array_equal(found.index, [[0, 1, -1, -1], [0, 0, 1, 1]])
-    assert len(bins(np.array([2000, 1999])).edges) == 61
-
-
-def test_shares_and_terminations_are_weighted_means():
-    active = np.array([[[0, 1, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 0], [0, 0.5, 0.5], [0, 0, 1]]], dtype=float)
-    termination = np.array([[[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]], [[0.1, 0.2], [0.7, 0.8], [0.9, 1.0]]])
-    level = LevelActivity("option", active, np.zeros((2, 3), int), np.zeros((2, 3), int), termination)
-    gathered = bins(np.array([3, 3]))
-    np.testing.assert_allclose(shares(level, gathered), [[0, 1, 0], [0, 0.75, 0.25], [0, 0, 1]])
-    nan = np.nan  # nobody can end before the first step, and option 2 is not there before the last
-    expected = [[nan, nan], [0.5, nan], [(0.5 + 0.5 * 0.9) / 1.5, 1.0]]
-    np.testing.assert_allclose(terminations(level, gathered), expected)
-
-
-def test_rows_are_sorted_by_length_then_by_the_first_change():
-    """Two levels, of which the lowest counts; a demonstration without a change comes after those of its length."""
-    paths = ["11222", "1222-", "12111", "1111-", "11111", "1121-", "1----"]
-    low = np.array([[-1 if step == "-" else int(step) for step in path] for path in paths])
-    high = np.array([[1, 2, 1, 1, 1]] * len(paths))
-    nothing = np.zeros((len(paths), 5, 3))
-    levels = tuple(
-        LevelActivity(name, nothing, path, np.zeros_like(path), nothing)
-        for name, path in (("low", low), ("high", high))
-    )
-    found = order(Activity(levels, (low >= 0).sum(1)))
-    assert [paths[row] for row in found] == ["1----", "1222-", "1121-", "1111-", "12111", "11222", "11111"]
-
-
-def test_positions_are_seen_from_where_they_spread():
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(200, 3)) * [0.01, 1.0, 1.0]  # a plane across the first axis
-    elevation, azimuth = view(points, np.ones(3))
-    assert elevation == 15
-    assert min(abs(azimuth % 180), 180 - azimuth % 180) <= 15.0001
-
-
-@pytest.mark.parametrize(("size", "key"), [(2, None), (3, "place"), (7, "place")])
-def test_a_position_has_three_numbers_or_more(size, key):
-    assert position_key(made(2, size)) == key
-
-
-def recorded(**keys):
-    """Demonstrations of these observations, key to an array [T, ...] for each demonstration."""
-    rows = [dict(zip(keys, values, strict=True)) for values in zip(*keys.values(), strict=True)]
-    return Demonstrations(
-        tuple(
-            Demonstration(f"demo_{n}", row, np.sin(np.arange(len(row[next(iter(keys))]))[:, None]))
-            for n, row in enumerate(rows)
-        )
-    )
-
-
-def reaches(number=6, steps=40):
-    """Smooth reaches from scattered starts by scattered ways: positions [T, 3] of each."""
-    rng, time = np.random.default_rng(0), np.linspace(0, 1, steps)[:, None]
-    eased = 10 * time**3 - 15 * time**4 + 6 * time**5
-    return [rng.normal(size=3) + eased * 2 * rng.normal(size=3) for _ in range(number)]
-
-
-def test_what_moves_is_drawn_whatever_comes_first():
-    """Before it in the alphabet: what is constant within each demonstration, in all of them, or only measured badly."""
-    rng, hands = np.random.default_rng(1), reaches()
-    steps = [np.ones((len(hand), 1)) for hand in hands]
-    demos = recorded(
-        base=[step * np.array([0.1, 0.2, 0.3]) for step in steps],
-        goal=[step * rng.normal(size=3) for step in steps],
-        guess=[step * rng.normal(size=3) + 1e-3 * rng.normal(size=(len(step), 3)) for step in steps],
-        hand=hands,
-    )
-    assert position_key(demos) == "hand"
-
-
-def test_what_goes_somewhere_is_drawn_rather_than_its_velocity_or_a_force():
-    rng, hands = np.random.default_rng(1), reaches()
-    demos = recorded(
-        force=[rng.normal(size=hand.shape) for hand in hands],
-        speed=[np.gradient(hand, axis=0) for hand in hands],
-        state=[np.hstack([hand, hand]) for hand in hands],  # the same, but three of its six numbers are not drawn
-        hand=hands,
-    )
-    assert position_key(demos) == "hand"
-
-
-def test_nothing_is_drawn_where_nothing_moves():
-    assert position_key(recorded(goal=[np.full((5, 3), 0.1), np.full((1, 3), 0.7)])) is None
-
-
-def test_movement_by_hand():
-    """Even steps along a straight line: 1; there and back: half as far for the way it goes."""
-    line = np.arange(5.0)[:, None] * np.array([1.0, 2.0, 2.0])
-    assert movement([line, line]) == pytest.approx(1)
-    assert movement([line[[0, 1, 2, 1, 0]]] * 2) == pytest.approx(0.5)
-    assert movement([np.hstack([line, line])] * 2) == pytest.approx(0.5)
-    within, between = 9 * 2.0, 3 * 4.0  # the variance of 0 to 4 is 2; that of a mean of -2 and one of 2 is 4
-    assert movement([line - 2, line + 2]) == pytest.approx(np.sqrt(within / (within + between)))
-    assert movement([np.array([[1.0, 2.0, 3.0]])]) == 0
 
 
 def test_the_spec_may_say_what_is_drawn(tmp_path, labelled):

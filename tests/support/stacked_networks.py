@@ -1,0 +1,68 @@
+"""Small stacked networks, inputs for them, and ordinary torch networks with the same weights."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
+from ddco_pyro.model.networks.stacked import StackedLinear
+from ddco_pyro.spec import NetworkSpec
+
+FEATURES, OUTPUTS, COPIES, LONGEST = 3, 2, 4, 5
+SHAPE = InputShape({"state": FEATURES}, {}, LONGEST)
+PIXELS = (14, 18, 3)
+
+
+def make(shape=SHAPE, **settings):
+    torch.manual_seed(0)
+    return build(NetworkSpec(**settings), shape, OUTPUTS, COPIES).eval()
+
+
+def make_inputs(trajectories=2, steps=LONGEST, start=0, images=()):
+    generator = torch.Generator().manual_seed(1)
+    vector = torch.randn(trajectories, steps, FEATURES, generator=generator)
+    pictures = {
+        key: torch.randint(0, 256, (trajectories, steps, *PIXELS), generator=generator, dtype=torch.uint8)
+        for key in images
+    }
+    return Inputs({"state": vector}, pictures, torch.arange(start, start + steps))
+
+
+def random_inputs(shape, trajectories, steps, start):
+    generator = torch.Generator().manual_seed(2)
+    images = {
+        key: torch.randint(256, (trajectories, steps, *size), generator=generator, dtype=torch.uint8)
+        for key, size in shape.images.items()
+    }
+    vectors = {key: torch.randn(trajectories, steps, size, generator=generator) for key, size in shape.vectors.items()}
+    return Inputs(vectors, images, torch.arange(start, start + steps))
+
+
+def separate(layers, k):
+    """The k-th of the stacked perceptrons as an ordinary torch network with the same weights."""
+    found = []
+    for layer in layers:
+        if isinstance(layer, StackedLinear):
+            linear = nn.Linear(*layer.weight.shape[1:])
+            with torch.no_grad():
+                linear.weight.copy_(layer.weight[k].T)
+                linear.bias.copy_(layer.bias[k, 0])
+            found.append(linear)
+        elif isinstance(layer, nn.ReLU):
+            found.append(nn.ReLU())
+    return nn.Sequential(*found)
+
+
+def assert_close(found, expected):
+    assert found.shape == expected.shape
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-5)
+
+
+def refused(**settings):
+    """The one line by which a network is refused when it is made."""
+    with pytest.raises(ShapeError) as caught:
+        make(**settings)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)

@@ -1,0 +1,140 @@
+"""A step alone and in its trajectory give the same: every kind of network, LSTMs, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stacked_networks import COPIES, assert_close, make, make_inputs, random_inputs, refused, separate
+from torch import nn
+
+from ddco_pyro.model.networks import CLASSES, InputShape
+from ddco_pyro.model.networks.state import answer
+
+
+def step_by_step(network, inputs):
+    """The outputs of a call for every step of every trajectory, the state carried from each to the next."""
+    trajectories, steps = inputs.batch
+    rows = []
+    for n in range(trajectories):
+        state = None
+        for t in range(steps):
+            here = inputs.map(lambda array, n=n, t=t: array[n, t][None, None], inputs.time[t : t + 1])
+            row, state = answer(network, here, state)
+            rows.append(row)
+    return torch.stack([torch.stack(rows[n * steps : (n + 1) * steps]) for n in range(trajectories)])[:, :, 0, 0]
+
+
+sizes = st.lists(st.integers(1, 5), max_size=2)
+some_vectors = st.dictionaries(st.sampled_from(["pose", "goal"]), st.integers(1, 6), min_size=1)
+pictures = st.dictionaries(
+    st.sampled_from(["camera", "wrist"]), st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(1, 4)),
+    min_size=1,
+)  # fmt: skip
+perceptrons = st.fixed_dictionaries({"network": st.sampled_from(["mlp", "per_timestep"]), "hidden": sizes})
+convolutions = st.fixed_dictionaries(
+    {"network": st.just("conv"), "hidden": sizes, "filters": st.integers(1, 3), "kernel": st.integers(1, 5)},
+    optional={"pool": st.sampled_from(["flatten", "mean", "spatial_softmax"]), "pooled": st.integers(1, 3)},
+)
+users = st.sampled_from(
+    [{"network": "user_networks:Own", "options": {"gain": 0.7}}, {"network": "user_networks:Remembering"}]
+)
+
+
+def lstm(over):
+    """An LSTM over another network."""
+    some = st.lists(st.integers(1, 5), min_size=1, max_size=2)
+    return st.fixed_dictionaries({"network": st.just("lstm"), "over": over, "hidden": some})
+
+
+def branches():
+    """A branch for each of three observations, and one for two of them."""
+    pair = (perceptrons | lstm(perceptrons)).map(lambda network: network | {"inputs": ["goal", "pose"]})
+    vector = st.just({"network": "linear"}) | perceptrons | users | lstm(perceptrons)
+    of = st.fixed_dictionaries(
+        {"camera": convolutions | lstm(convolutions)}, optional={"pose": vector, "goal": vector, "pair": pair}
+    )
+    some = st.lists(st.integers(1, 5), min_size=1, max_size=2)
+    return st.fixed_dictionaries({"network": st.just("branches"), "of": of, "hidden": some})
+
+
+assert set(CLASSES) == {"linear", "mlp", "per_timestep", "conv", "lstm", "branches"}, (
+    "a new network belongs in every_kind"
+)
+every_kind = st.one_of(
+    st.tuples(st.just({"network": "linear"}) | perceptrons | users, some_vectors, st.just({})),
+    st.tuples(lstm(st.none() | perceptrons | users | lstm(perceptrons)), some_vectors, st.just({})),
+    st.tuples(branches(), st.just({"pose": 2, "goal": 3}), st.just({"camera": (7, 6, 2)})),
+    st.tuples(convolutions | lstm(convolutions), some_vectors | st.just({}), pictures),
+)
+
+
+@settings(deadline=None)
+@given(every_kind, st.integers(1, 9), st.integers(1, 3), st.integers(1, 8), st.integers(0, 12))
+def test_a_call_for_many_steps_is_a_call_for_each(kind, longest, trajectories, steps, start):
+    spec, vectors, images = kind
+    network = make(InputShape(vectors, images, longest), **spec)
+    inputs = random_inputs(InputShape(vectors, images), trajectories, steps, start)
+    whole, _ = answer(network, inputs)
+    assert_close(whole, step_by_step(network, inputs))
+
+
+@pytest.mark.parametrize("over", [None, {"hidden": [7]}])
+def test_lstms_are_separate_networks(over):
+    network, inputs = make(network="lstm", over=over, hidden=[6, 5]), make_inputs()
+    values = torch.stack([inputs.vector] * COPIES)
+    if over:
+        values = torch.stack([separate(network.over.layers, k)(inputs.vector) for k in range(COPIES)])
+    expected = []
+    for k in range(COPIES):
+        own = values[k]
+        for layer in network.memory:
+            alone = nn.LSTM(layer.inputs.weight.shape[1], layer.size[1], batch_first=True)
+            with torch.no_grad():
+                alone.weight_ih_l0.copy_(layer.inputs.weight[k].T)
+                alone.weight_hh_l0.copy_(layer.recurrent[k].T)
+                alone.bias_ih_l0.copy_(layer.inputs.bias[k, 0])
+                alone.bias_hh_l0.zero_()
+            own, _ = alone(own)
+        expected.append(separate(network.layers, k)(own))
+    assert_close(answer(network, inputs)[0], torch.stack(expected, dim=2))
+
+
+def test_no_option_is_trained_by_another_options_memory():
+    network = make(network="lstm", hidden=[8])
+    answer(network, make_inputs())[0][:, :, 1].sum().backward()
+    for parameter in network.parameters():
+        per_option = parameter.grad.abs().flatten(1).sum(1)
+        assert per_option[1] > 0
+        assert per_option[[0, 2, 3]].tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("alone", "has initial_state(N), which has to give a tuple of tensors [N, ...]; each call"),
+        ("list", "has initial_state(N), which has to give a tuple"),
+        ("without trajectories", "has initial_state(N), which has to give a tuple"),
+        ("other shape", "has initial_state(N), which has to give a tuple"),
+        ("forgets", "gives other outputs step by step than for a whole trajectory: its state has to hold all"),
+        ("looks ahead", "gives other outputs step by step than for a whole trajectory"),
+        ("over trajectories", "gives other outputs step by step than for a whole trajectory"),
+    ],
+)
+def test_a_state_that_does_not_go_on_is_refused_when_the_network_is_made(how, message):
+    said = refused(network="user_networks:Remembering", options={"how": how})
+    assert said.startswith(f"network 'user_networks:Remembering' {message}")
+
+
+MEMORIES = ["over time", "over trajectories", "differences", "later steps", "whole trajectory", "whole batch", "chance"]
+
+
+@pytest.mark.parametrize("zero", [False, True])
+@pytest.mark.parametrize("how", MEMORIES)
+def test_a_network_with_a_memory_is_refused_when_it_is_made(how, zero):
+    said = refused(network="user_networks:WithMemory", options={"how": how, "zero": zero})
+    assert said.startswith(
+        "network 'user_networks:WithMemory' gives a step alone other outputs than within its trajectory: it depends on "
+        "earlier steps"
+    )
