@@ -166,6 +166,12 @@ assert not {"torch", "onnxruntime", "pyro", "ddco_pyro"} .difference({needed}) &
 """
 
 
+def test_the_runner_is_one_file_in_which_nothing_is_missing(exported):
+    folder, _ = exported
+    linter = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F,E402", folder / "runner.py"]
+    assert subprocess.run(linter, capture_output=True, text=True).stdout == "All checks passed!\n"
+
+
 @pytest.mark.parametrize("form", ["numpy", "torch", "onnx"])
 def test_each_form_runs_without_this_library(exported, form):
     folder, _ = exported

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import json
 import logging
 import math
-import shutil
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,7 +18,7 @@ import torch
 
 from ddco_pyro.data.files import whole_folder
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.export import runner
+from ddco_pyro.export import runner, runner_networks
 from ddco_pyro.export.program import StepProgram
 from ddco_pyro.export.recording import MOST, record, tolerance
 from ddco_pyro.export.runner import TOLERANCE
@@ -80,9 +80,17 @@ def write_numpy(fit: Fit, folder: Path) -> bool:
     about |= _about(hierarchy, fit.spec.rollout) | {"outputs": program.names, "state": _state(program)}
     if about["numpy"]:
         np.savez(folder / "weights.npz", **weights)  # type: ignore[arg-type]
-    shutil.copyfile(runner.__file__, folder / "runner.py")
+    (folder / "runner.py").write_text(_runner_alone(), encoding="utf-8")
     (folder / "controller.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
     return bool(about["numpy"])
+
+
+def _runner_alone() -> str:
+    """The runner as one file without this library: the module of its networks stands where it is imported."""
+    whole, networks = inspect.getsource(runner), inspect.getsource(runner_networks)
+    before, line, after = whole.partition(f"from {runner_networks.__name__} import FORMS, Outputs\n")
+    assert line  # or the file would need this library
+    return before + networks.partition("import numpy as np\n\n")[2] + after
 
 
 def _write(fit: Fit, folder: Path, onnx: bool) -> list[str]:
