@@ -27,7 +27,7 @@ from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.fitting.records import read_metrics, read_successes
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.report import plot_likelihood, sections, tables
+from ddco_pyro.report import option_figures, plot_likelihood, sections, tables
 
 LINE = r"ddco-pyro: {path}: is damaged: "
 
@@ -146,7 +146,9 @@ def _read_all(fit: Fit, metrics: dict[str, Any]) -> None:
     sections.agreement(fit, metrics)
     rows = plot_likelihood.likelihoods(metrics, {name: one.metrics for name, one in fit.baselines.items()})
     tables.likelihood(rows)
-    tables.option_use(["option"], metrics["options"], sum(metrics["demonstrations"][part] for part in sections.PARTS))
+    tables.option_use(
+        ["option"], metrics["options"], sum(metrics["demonstrations"][part] for part in option_figures.PARTS)
+    )
     found = metrics.get("rollouts")
     if found:
         tables.measures(found["methods"]), tables.against(found["methods"], metrics["model"])

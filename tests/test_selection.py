@@ -112,8 +112,8 @@ def test_other_demonstrations_are_refused(finished, tmp_path):
 
 
 def test_the_final_fit_is_on_all_the_data(finished):
-    spec, _, made, _ = finished
-    final = final_spec(spec, made.choice.chosen.candidate)
+    _, _, made, _ = finished
+    final = final_spec(made.choice.chosen.candidate)
     assert final.demonstrations.valid_fraction == 0
     assert final.hierarchy.levels[0].count == made.choice.chosen.candidate.values["hierarchy.levels.0.count"]
     assert final.selection.grid == {}

@@ -126,7 +126,7 @@ def select(
         made = selection.select(loaded, folder, progress, workers, stop_early, demos)
         progress.end()
         assert made.choice.chosen is not None  # or it would have failed
-        final = selection.final_spec(loaded, made.choice.chosen.candidate)
+        final = selection.final_spec(made.choice.chosen.candidate)
         fitted = fit_run(final, seen(final, made.demos), folder / "fit", progress, jobs)
     console.selection(made.choice, HEAD, [cells(row, made.choice) for row in made.choice.rows])
     _warn(fitted)

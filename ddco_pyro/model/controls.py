@@ -48,7 +48,7 @@ class ControlScaling(nn.Module):
         self.parts = parts
         varying = [dimension for dimension in range(size) if dimension not in constant]
         self.groups = [tuple(varying.index(dimension) for dimension in part.dims) for part in parts]
-        shift, scale, standardized = _declared(spec, size, varying, parts)
+        shift, scale, standardized = _declared(spec, varying, parts)
         self.standardized = np.array(standardized, dtype=bool)
         self.register_buffer("shift", torch.tensor(shift, dtype=torch.float64))
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
@@ -166,7 +166,7 @@ class ControlScaling(nn.Module):
 
 
 def _declared(
-    spec: ControlSpec, size: int, varying: Sequence[int], parts: Sequence[ControlPart]
+    spec: ControlSpec, varying: Sequence[int], parts: Sequence[ControlPart]
 ) -> tuple[list[float], list[float], list[bool]]:
     """Shift, scale, and whether both are taken from demonstrations, of each dimension that varies."""
     own = {part.name: part.scale for part in spec.parts if part.scale is not None}

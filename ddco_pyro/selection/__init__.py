@@ -112,7 +112,7 @@ def _select(
     return Selection(folder, demos, choice, folds)
 
 
-def final_spec(spec: Spec, chosen: Candidate) -> Spec:
+def final_spec(chosen: Candidate) -> Spec:
     """The spec of the fit that follows: what was chosen, on all demonstrations but those its file sets apart."""
     return with_overrides(chosen.spec, {"demonstrations.valid_fraction": 0.0})
 

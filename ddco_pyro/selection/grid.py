@@ -85,11 +85,11 @@ def candidates(spec: Spec, dimensions: Dimensions) -> list[Candidate]:
             problems += [f"selection.grid: {_where(grid, values)}: {problem}" for problem in error.problems]
     if problems:
         raise SpecError(*problems)
-    _refuse_other_measures(grid, valid, dimensions)
+    _refuse_other_measures(valid, dimensions)
     return valid
 
 
-def _refuse_other_measures(grid: Mapping[str, Any], candidates: Sequence[Candidate], dimensions: Dimensions) -> None:
+def _refuse_other_measures(candidates: Sequence[Candidate], dimensions: Dimensions) -> None:
     """A density cannot be ranked against a probability.
 
     :raises SpecError: candidates model a control dimension as different kinds.
