@@ -171,7 +171,8 @@ def test_controls_in_units_of_their_spread(scale, shift, unit):
     found = scaling(scale)
     np.testing.assert_allclose(found.scaled(ACTIONS), (ACTIONS - shift) / unit, atol=1e-12)
     np.testing.assert_allclose(found.unscaled(torch.from_numpy(found.scaled(ACTIONS))), ACTIONS, atol=1e-12)
-    np.testing.assert_allclose(found.log_scale, np.log(unit))
+    emission = found.emission(torch.zeros(1, 3), torch.ones(3))
+    np.testing.assert_allclose(emission.log_scale, np.log(unit))
 
 
 @pytest.mark.parametrize("scale", ["standardize", "none", [2.0, 0.5, 4.0]])

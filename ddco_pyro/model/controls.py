@@ -87,13 +87,6 @@ class ControlScaling(nn.Module):
             self.shift.copy_(torch.as_tensor(np.where(self.standardized, shift, self.shift.numpy())))
             self.scale.copy_(torch.as_tensor(np.where(self.standardized, scale, self.scale.numpy())))
 
-    @property
-    def log_scale(self) -> Tensor:
-        """log scale [A'], 0 where nothing is continuous: what a log-density in the control's own units is less by."""
-        logs = torch.zeros_like(self.scale)
-        logs[self.continuous] = self.scale[self.continuous].log()
-        return logs
-
     def scaled(self, actions: np.ndarray) -> np.ndarray:
         """[T, A] in the control's own units to [T, A'] as the model sees them; NaN for an unknown discrete action."""
         scaled: np.ndarray = (actions[:, self.varying.numpy()] - self.shift.numpy()) / self.scale.numpy()
@@ -148,15 +141,18 @@ class ControlScaling(nn.Module):
 
         :param std: σ of the continuous dimensions, part after part, [C] or [K, C].
         """
-        low, high = self.ends()
         groups: list[tuple[tuple[int, ...], Emission]] = []
         sizes, at = [part.size for part in self.parts], 0
-        for dims, part, own in zip(self.groups, self.parts, numbers.split(sizes, dim=-1), strict=True):
+        each = numbers.split(sizes, dim=-1) if len(sizes) > 1 else (numbers,)  # a split's gradient is a copy
+        for dims, part, own in zip(self.groups, self.parts, each, strict=True):
             if part.continuous:
                 deviation, at = std[..., at : at + part.size], at + part.size
-                gaussian = (own, deviation, self.log_scale[list(dims)])
-                bounds = (low[list(dims)], high[list(dims)])
-                groups.append((dims, Gaussian(*gaussian) if part.kind == "gaussian" else Clipped(*gaussian, *bounds)))
+                log_scale = self.scale[list(dims)].log()
+                emission: Emission = Gaussian(own, deviation, log_scale)
+                if part.kind == "clipped":
+                    low, high = (end[list(dims)] for end in self.ends())
+                    emission = Clipped(own, deviation, log_scale, low, high)
+                groups.append((dims, emission))
             elif part.kind == "binary":
                 groups.append((dims, Binary(own)))
             else:

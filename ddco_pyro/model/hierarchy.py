@@ -18,7 +18,7 @@ from ddco_pyro.model.controls import ControlScaling, ControlStd
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch, ObservationEncoder, Shapes
 from ddco_pyro.model.networks import Inputs, InputShape, build, build_trunk, named
 from ddco_pyro.model.networks.activations import training_bytes
-from ddco_pyro.model.networks.state import Carried, HasState, State, States, Trunk, initial_state
+from ddco_pyro.model.networks.state import Carried, State, States, Trunk, remembers
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
@@ -199,7 +199,7 @@ class Hierarchy(nn.Module):
     def initial_states(self, trajectories: int) -> dict[str, State]:
         """The states of the networks that remember before the first step, by name."""
         each = self.networks().items()
-        return {name: initial_state(network, trajectories) for name, network in each if isinstance(network, HasState)}
+        return {name: network.initial_state(trajectories) for name, network in each if remembers(network)}
 
     def tabulate(self, batch: Batch, discovering: int | None = None) -> Tables:
         """The tables of a batch: every network once, over all options, steps and trajectories."""

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from ddco_pyro.model.networks.head import Head
 from ddco_pyro.model.networks.inputs import Inputs, InputShape
-from ddco_pyro.model.networks.state import HasState, answer
+from ddco_pyro.model.networks.state import answer, remembers
 
 
 def training_bytes(networks: Iterable[nn.Module], shape: InputShape) -> int:
@@ -26,7 +26,7 @@ def _another(network: nn.Module) -> tuple[int, int]:
     """Trajectories and steps that are one more than (1, 1): a step, since a network may have parameters for each; where
     it remembers a trajectory, since what torch keeps of several steps grows in leaps.
     """
-    return (2, 1) if isinstance(network, HasState) else (1, 2)
+    return (2, 1) if remembers(network) else (1, 2)
 
 
 def _zeros(shape: InputShape, trajectories: int, steps: int) -> Inputs:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeGuard
 
 from torch import Tensor, nn
 
@@ -16,7 +16,6 @@ States = Mapping[str, State]
 """The states of several networks by name."""
 
 
-@runtime_checkable
 class HasState(Protocol):
     """A network that remembers: it is called with inputs and a state, and gives outputs and the state after them.
 
@@ -25,6 +24,11 @@ class HasState(Protocol):
 
     def initial_state(self, trajectories: int) -> State:
         """The state before the first step of N trajectories."""
+        ...
+
+    def __call__(self, inputs: Inputs, state: State) -> tuple[Tensor, State]:
+        """The outputs [N, T, K, outputs], and the state after them."""
+        ...
 
 
 class Trunk(NamedTuple):
@@ -34,9 +38,14 @@ class Trunk(NamedTuple):
     features: int
 
 
+def remembers(network: Any) -> TypeGuard[HasState]:
+    """Whether a network has a state; asked at every call, for which ``isinstance`` of a protocol is too slow."""
+    return hasattr(network, "initial_state")
+
+
 def initial_state(network: nn.Module, trajectories: int) -> State:
     """The state of any network before the first step; nothing where it has none."""
-    return network.initial_state(trajectories) if isinstance(network, HasState) else ()
+    return network.initial_state(trajectories) if remembers(network) else ()
 
 
 def answer(network: nn.Module, inputs: Inputs | Tensor, state: State | None = None) -> tuple[Tensor, State]:
@@ -45,10 +54,9 @@ def answer(network: nn.Module, inputs: Inputs | Tensor, state: State | None = No
     :param inputs: for a head the features of its trunk, [N, T, K, features].
     :param state: that after the steps before; None for the first step.
     """
-    if isinstance(inputs, Tensor) or not isinstance(network, HasState):
+    if isinstance(inputs, Tensor) or not remembers(network):
         return network(inputs), ()
-    said: tuple[Tensor, State] = network(inputs, initial_state(network, inputs.batch[0]) if state is None else state)
-    return said
+    return network(inputs, network.initial_state(inputs.batch[0]) if state is None else state)
 
 
 class Carried:
@@ -61,6 +69,6 @@ class Carried:
     def answer(self, name: str, network: nn.Module, inputs: Inputs | Tensor) -> Tensor:
         """The outputs of the network of this name."""
         outputs, state = answer(network, inputs, self.before.get(name))
-        if isinstance(network, HasState):
+        if remembers(network):
             self.after[name] = state
         return outputs

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
-from ddco_pyro.model.networks.state import HasState, State, initial_state
+from ddco_pyro.model.networks.state import State, initial_state, remembers
 
 TRAJECTORIES, STEPS = 2, 3
 
@@ -45,7 +45,7 @@ def try_network(name: str, network: nn.Module, shape: InputShape, size: tuple[in
             alone = torch.cat(rows, dim=1).reshape(whole.shape)
     largest = float(torch.where(whole.isfinite(), whole, 0.0).abs().max())
     if not torch.allclose(alone, whole, rtol=0.0, atol=1e-5 + TOLERANCE * largest, equal_nan=True):
-        if isinstance(network, HasState):
+        if remembers(network):
             raise ShapeError(
                 f"network {name!r} gives other outputs step by step than for a whole trajectory: its state has to hold "
                 "all that it knows of earlier steps, each trajectory's apart, and of later ones it can know nothing"
@@ -63,7 +63,7 @@ def _output(
     trajectories, steps = inputs.batch
     try:
         before: State = initial_state(network, trajectories) if state is None else state
-        said: Any = network(inputs, before) if isinstance(network, HasState) else (network(inputs), ())
+        said: Any = network(inputs, before) if remembers(network) else (network(inputs), ())
     except Exception as error:  # whatever the user's code raises
         what = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise ShapeError(
