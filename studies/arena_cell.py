@@ -18,7 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 from apart import HELD_OUT, Apart, expert
-from cells import Cell, Settings, described
+from cells import Cell, Settings
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
@@ -119,14 +119,5 @@ def chosen(source: Path, cell: ArenaCell) -> tuple[list[str], list[str], list[st
     return used, valid, [name for name in train if name not in used]
 
 
-def main() -> None:
-    """Run a cell."""
-    parser = described(__doc__)
-    parser.add_argument("task")
-    parser.add_argument("count", type=int)
-    parser.add_argument("seed", type=int)
-    ArenaCell.main(parser, DEFAULTS)
-
-
 if __name__ == "__main__":
-    main()
+    ArenaCell.main(__doc__, DEFAULTS)

@@ -20,7 +20,7 @@ from typing import Any
 import h5py
 import numpy as np
 from apart import HELD_OUT, Apart, expert
-from cells import Cell, Settings, described
+from cells import Cell, Settings
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
@@ -163,14 +163,5 @@ def references(demos: Demonstrations, valid: Demonstrations, seed: int) -> dict[
     return found
 
 
-def main() -> None:
-    """Run a cell."""
-    parser = described(__doc__)
-    parser.add_argument("level")
-    parser.add_argument("progress", choices=PROGRESS)
-    parser.add_argument("seed", type=int)
-    BabyAICell.main(parser, DEFAULTS)
-
-
 if __name__ == "__main__":
-    main()
+    BabyAICell.main(__doc__, DEFAULTS, progress=PROGRESS)

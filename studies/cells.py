@@ -6,10 +6,10 @@ import argparse
 import hashlib
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_type_hints
 
 import torch
 from provenance import Record, is_kept, record, text
@@ -93,8 +93,15 @@ class Cell(ABC):
         return kept(path, named, made_by, lambda: self.results(settings, folder))
 
     @classmethod
-    def main(cls, parser: argparse.ArgumentParser, defaults: Settings) -> None:
-        """Run the cell that the command line names, by arguments like its fields, and print its JSON."""
+    def main(cls, text: str | None, defaults: Settings, **choices: Sequence[str]) -> None:
+        """Run the cell that the command line names, a word for each field, and print its JSON.
+
+        :param text: the help.
+        :param choices: of a field, where not all are allowed.
+        """
+        parser, types = described(text), get_type_hints(cls)
+        for field in fields(cls):
+            parser.add_argument(field.name, type=types[field.name], choices=choices.get(field.name))
         defaults.add_to(parser)
         own = parser.parse_args()
         settings = defaults.given(own)

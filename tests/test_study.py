@@ -84,9 +84,6 @@ def test_a_cell_by_itself_is_the_studys(tmp_path, monkeypatch, capsys):
     command = Toy("a", 4).command(Settings({"episodes": 3, "noise": 0.25}, tmp_path))
     assert command == "python studies/provenance.py a 4 --episodes 3 --noise 0.25"
     monkeypatch.setattr("sys.argv", [*shlex.split(command)[1:], "--runs", f"{tmp_path}/runs"])
-    parser = described("A cell.")
-    parser.add_argument("task")
-    parser.add_argument("seed", type=int)
-    Toy.main(parser, DEFAULTS)
+    Toy.main("A cell.", DEFAULTS)
     assert json.loads(capsys.readouterr().out)["results"]["product"] == 1.0
     assert (tmp_path / "runs" / "done").read_text() == "a-4\n"
