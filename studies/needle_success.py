@@ -34,7 +34,7 @@ OURS = "ddco"
 RATES = ("success", "grasped", "inserted")
 ALL = 100
 """The demonstrations of a training seed."""
-DEMONSTRATIONS, APART, STARTS = 20_000, 1_000, 700_000
+DEMONSTRATIONS, APART, STARTS = 40_000, 1_000, 730_000
 """Seeds: of the first seed's first demonstration, from one training seed to the next, and of the first start."""
 STEP = "observations=[gripper_pose, jaw, needle_ellipse, step]"
 FITS: dict[str, tuple[str, str, tuple[str, ...]]] = {

@@ -1,10 +1,13 @@
 """How a task's models are best trained and executed, chosen on development seeds that no result is about.
 
-    python studies/recipe.py [--spec specs/needle.yaml] [--seeds 5000 6000] [--episodes 60] [--jobs 2] [--out DIR]
+    python studies/recipe.py [--grid initialization | decay] [--counts 100] [--spec specs/needle.yaml]
+        [--seeds 5000 6000] [--episodes 60] [--jobs 2] [--out DIR]
 
 Each development seed has demonstrations of its own. Every model, baselines too, has as many candidates; each is
-trained once for each seed, scored on held-out demonstrations, and rolled out from starts that no result is about. A
-cell that is in ``--out`` is not made again by the same code. Writes ``docs/results/recipe.json`` and ``.md``.
+trained once for each seed, scored on held-out demonstrations, and rolled out from starts that no result is about.
+``--grid initialization`` tries how options begin, ``decay`` how much weights decay and what policy and termination of
+an option share; ``--counts`` trains on the first demonstrations of a seed. A cell that is in ``--out`` is not made
+again by the same code. Writes ``docs/results/recipe.json`` and ``.md``, or ``recipe_decay`` for that grid.
 """
 
 from __future__ import annotations
@@ -47,7 +50,7 @@ Candidate = dict[str, Any]
 Cell = dict[str, Any]
 
 
-def candidates() -> dict[str, list[Candidate]]:
+def beginnings() -> dict[str, list[Candidate]]:
     """For each model the settings to try; sixteen each, and for the hierarchy besides the recipe of before."""
     ours = [
         {
@@ -66,6 +69,28 @@ def candidates() -> dict[str, list[Candidate]]:
     return {"ddco": [BEFORE, *ours], "flat": flat, "per_timestep": clock}
 
 
+def decays() -> dict[str, list[Candidate]]:
+    """For each model, as the first grid left it, six settings to try."""
+    apart = {"hierarchy.levels.0.policy": PERCEPTRON, "hierarchy.levels.0.termination": PERCEPTRON}
+    linear = {"network": "linear"}
+    shared = {f"hierarchy.levels.0.{part}": linear for part in ("policy", "termination")}
+    networks = (apart, shared | {"hierarchy.levels.0.trunk": PERCEPTRON})
+    begun = {"training.initialize": "equal_parts", "training.layerwise": False, "control.std": OWN_STD}
+    ours = [
+        {**begun, **own, "training.optimizer.weight_decay": decay}
+        for own, decay in product(networks, (1e-3, 1e-2, 3e-2))
+    ]
+    others = {"flat": [609], "per_timestep": [64]}
+    return {"ddco": ours} | {
+        kind: [_baseline(kind, hidden, *values) for values in product((1e-3, 1e-2, 3e-2), RATES)]
+        for kind, hidden in others.items()
+    }
+
+
+GRIDS = {"initialization": (beginnings, "recipe"), "decay": (decays, "recipe_decay")}
+"""What is tried, and the name of its results."""
+
+
 def _baseline(kind: str, hidden: list[int], decay: float, rate: float) -> Candidate:
     return {
         "hierarchy": None,
@@ -75,15 +100,18 @@ def _baseline(kind: str, hidden: list[int], decay: float, rate: float) -> Candid
     }
 
 
-def run_cell(path: str, seed: int, candidate: Candidate, episodes: int, kept: Path, made_by: Record) -> Cell:
+def run_cell(
+    path: str, count: int, seed: int, candidate: Candidate, episodes: int, kept: Path, made_by: Record
+) -> Cell:
     """One candidate on one development seed: held-out nats per step, and successes with each execution of options."""
-    settings = {"spec": path, "seed": seed, "values": candidate, "episodes": episodes}
+    settings = {"spec": path, "count": count, "seed": seed, "values": candidate, "episodes": episodes}
     if kept.exists():
         content = json.loads(kept.read_text())
         if is_kept(content, settings, made_by):
             return dict(content["results"])
     spec = load_spec(path, [f"demonstrations.seed={seed}", f"seed={seed}", "compare_with=[]"])
-    spec = with_overrides(spec, candidate)
+    left_out = [f"demo_{seed + number}" for number in range(count, spec.demonstrations.count)]
+    spec = with_overrides(spec, {**candidate, "demonstrations.exclude": left_out})
     with one_thread():
         fitted = ddco_pyro.fit(spec)
         success = {
@@ -126,7 +154,7 @@ def page(models: dict[str, list[dict[str, Any]]], seeds: list[int], episodes: in
         lines += [f"## {model}", "", "| candidate | options | successes | held-out nats/step |", "|---|---|---|---|"]
         for row in rows:
             nats = ", ".join(f"{value:.2f}" for value in row["valid"])
-            execution = row["execution"] if model == "ddco" else "–"
+            execution = row["execution"] if model.startswith("ddco") else "–"
             lines.append(f"| {words(row['values'])} | {execution} | {', '.join(map(str, row['success']))} | {nats} |")
         pairs = np.array([[np.mean(row["success"]), np.mean(row["valid"])] for row in rows])
         lines += ["", f"Spearman's correlation of the two: {stats.spearmanr(*pairs.T).statistic:.2f}.", ""]
@@ -139,46 +167,57 @@ def words(values: Candidate) -> str:
         return "the recipe of before: clusters of observations and controls, layer by layer, one σ, perceptrons switch"
     if "baseline" in values:
         said = [f"hidden {values['baseline']['policy']['hidden']}", f"lr {values['training.optimizer.lr']}"]
-    else:
+    elif "hierarchy.meta_policy" in values:
         switching = values["hierarchy.meta_policy"]["network"]
         said = [values["training.initialize"], f"{'perceptrons' if switching == 'mlp' else switching} switch"]
+    else:
+        shared = "hierarchy.levels.0.trunk" in values
+        said = [f"policy and termination of an option {'share a hidden layer' if shared else 'apart'}"]
     return ", ".join([*said, f"decay {values['training.optimizer.weight_decay']}"])
+
+
+def run(own: argparse.Namespace) -> str:
+    """The study; its page."""
+    grid, name = GRIDS[own.grid]
+    seeds, counts = " ".join(map(str, own.seeds)), " ".join(map(str, own.counts))
+    command = f"python studies/recipe.py --grid {own.grid} --counts {counts} --spec {own.spec} --seeds {seeds} "
+    made_by = record(f"{command}--episodes {own.episodes}")
+    for seed in own.seeds:  # collected by whoever comes first, and only once
+        ddco_pyro.fitting.prepare.demonstrations(load_spec(own.spec, [f"demonstrations.seed={seed}"]))
+    models, summary = {}, ""
+    for count, (model, tried) in product(own.counts, grid().items()):
+        calls = [
+            delayed(run_cell)(
+                own.spec,
+                count,
+                seed,
+                values,
+                own.episodes,
+                own.out / f"{name}-{model}-{number}-{count:03d}-{seed}.json",
+                made_by,
+            )
+            for seed in own.seeds
+            for number, values in enumerate(tried)
+        ]
+        models[f"{model}, {count} demonstrations"] = summarize(Parallel(n_jobs=own.jobs)(calls), own.seeds)
+        out = Path(f"docs/results/{name}.json")
+        write_text(out, text(models, [made_by]))
+        summary = page(models, own.seeds, own.episodes, sentence(made_by["command"], [made_by]))
+        write_text(out.with_suffix(".md"), summary)
+    return summary
 
 
 def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--grid", choices=GRIDS, default="initialization")
+    parser.add_argument("--counts", type=int, nargs="+", default=[100])
     parser.add_argument("--spec", default="specs/needle.yaml")
     parser.add_argument("--seeds", type=int, nargs="+", default=[5000, 6000])
     parser.add_argument("--episodes", type=int, default=60)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("runs/recipe"))
-    arguments = parser.parse_args()
-    seeds = " ".join(map(str, arguments.seeds))
-    command = f"python studies/recipe.py --spec {arguments.spec} --seeds {seeds} --episodes {arguments.episodes}"
-    made_by = record(command)
-    for seed in arguments.seeds:  # collected by whoever comes first, and only once
-        ddco_pyro.fitting.prepare.demonstrations(load_spec(arguments.spec, [f"demonstrations.seed={seed}"]))
-    models = {}
-    for model, tried in candidates().items():
-        calls = [
-            delayed(run_cell)(
-                arguments.spec,
-                seed,
-                values,
-                arguments.episodes,
-                arguments.out / f"{model}-{number}-{seed}.json",
-                made_by,
-            )
-            for seed in arguments.seeds
-            for number, values in enumerate(tried)
-        ]
-        models[model] = summarize(Parallel(n_jobs=arguments.jobs)(calls), arguments.seeds)
-        out = Path("docs/results/recipe.json")
-        write_text(out, text(models, [made_by]))
-        summary = page(models, arguments.seeds, arguments.episodes, sentence(command, [made_by]))
-        write_text(out.with_suffix(".md"), summary)
-    print(summary)
+    print(run(parser.parse_args()))
 
 
 if __name__ == "__main__":
