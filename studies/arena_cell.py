@@ -18,6 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 from apart import HELD_OUT, Apart, expert
+from arena_segments import scored
 from cells import Cell, Settings
 
 from ddco_pyro.data.demonstrations import Demonstrations
@@ -79,6 +80,7 @@ class ArenaCell(Cell):
             "difference": {name: one["difference"] for name, one in metrics["comparison"].items()},
             "held_out": [row for row in metrics["demonstrations_by_likelihood"] if row["part"] == "valid"],
             "agreement": metrics["agreement"],
+            "segments": scored(fitted, LABELS),
             "options": metrics["options"],
             "seconds": {"fit": trained - begun, "play": ended - trained, "all": ended - begun},
         }

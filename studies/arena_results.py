@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import arena_segments
 from needle_success import over_seeds, spread
 
 from ddco_pyro.drawing.pictures import blank, keep, style
@@ -21,15 +22,19 @@ Result = dict[str, Any]
 
 def summarize(cells: list[Result]) -> Result:
     """For each task its expert, and for each number of demonstrations every measure over training seeds."""
-    summary: Result = {}
+    tasks: Result = {}
     for task in dict.fromkeys(cell["task"] for cell in cells):
         own = [cell for cell in cells if cell["task"] == task]
         counts = sorted({cell["count"] for cell in own})
-        summary[task] = {
+        tasks[task] = {
             "expert": own[0]["expert"],
             "counts": {str(count): _summary([cell for cell in own if cell["count"] == count]) for count in counts},
         }
-    return summary
+    segments = {
+        str(count): arena_segments.compared([cell for cell in cells if cell["count"] == count])
+        for count in sorted({cell["count"] for cell in cells})
+    }
+    return {"tasks": tasks, "segments": segments}
 
 
 def _summary(cells: list[Result]) -> Result:
@@ -73,7 +78,8 @@ def nmi(agreement: Result) -> float:
 
 def page(results: Result, made_by: str) -> str:
     """The results as Markdown."""
-    first = next(iter(next(iter(results.values()))["counts"].values()))
+    tasks = results["tasks"]
+    first = next(iter(next(iter(tasks.values()))["counts"].values()))
     methods, others = list(first["methods"]), list(first["difference"])
     head = ["task", "demonstrations", "NMI held out", f"nats/step held out, {OURS}"]
     head += [*(f"minus {name}" for name in others), *(f"success {name}" for name in methods), "seconds"]
@@ -88,7 +94,7 @@ def page(results: Result, made_by: str) -> str:
         f"| {' | '.join(head)} |",
         "|---" * len(head) + "|",
     ]
-    for task, one in results.items():
+    for task, one in tasks.items():
         for count, found in one["counts"].items():
             cells = [task, count, spread(found["nmi_valid"], "{:.2f}")]
             cells += [_likelihood(found["methods"][OURS])]
@@ -100,8 +106,10 @@ def page(results: Result, made_by: str) -> str:
         "| task | the expert succeeds | share of the steps of each phase, by line of its code |",
         "|---|---|---|",
     ]
-    lines += [f"| {task} | {_expert(one['expert'])} |" for task, one in results.items()]
-    different = [found["methods"][name]["bridge_difference"] for one in results.values()
+    lines += [f"| {task} | {_expert(one['expert'])} |" for task, one in tasks.items()]
+    for count, table in results["segments"].items():
+        lines += ["", f"## Segments with {count} demonstrations", "", *arena_segments.page(table)]
+    different = [found["methods"][name]["bridge_difference"] for one in tasks.values()
                  for found in one["counts"].values() for name in methods]  # fmt: skip
     lines += [
         "",
@@ -126,10 +134,11 @@ def _expert(one: Result) -> str:
 
 def draw(results: Result, path: Path) -> None:
     """Held-out NMI by number of demonstrations, and success of each method with the most of them, by task."""
+    tasks = results["tasks"]
     with style():
-        figure = blank(0.8 + 0.45 * len(results))
+        figure = blank(0.8 + 0.45 * len(tasks))
         left, right = figure.subplots(1, 2, sharey=True)
-        for row, one in enumerate(results.values()):
+        for row, one in enumerate(tasks.values()):
             shades = SHADES[-len(one["counts"]) :]
             for shade, (count, found) in zip(shades, one["counts"].items(), strict=False):
                 values = found["nmi_valid"]["by_seed"]
@@ -141,8 +150,8 @@ def draw(results: Result, path: Path) -> None:
                 right.plot(values, [height] * len(values), "o", ms=4, alpha=0.6, color=COLOURS[name])
                 mean, label = found["success"]["mean"], name if row == 0 else None
                 right.plot(mean, height, "|", ms=9, mew=2, color=COLOURS[name], label=label)
-        left.set(yticks=range(len(results)), yticklabels=list(results), xlim=(-0.02, 1.02))
-        left.set(ylim=(len(results) - 0.5, -0.5), xlabel="held-out NMI with the expert's phases (dots: seeds)")
+        left.set(yticks=range(len(tasks)), yticklabels=list(tasks), xlim=(-0.02, 1.02))
+        left.set(ylim=(len(tasks) - 0.5, -0.5), xlabel="held-out NMI with the expert's phases (dots: seeds)")
         right.set(xlim=(-0.02, 1.02), xlabel="success rate, most demonstrations")
         for axes in (left, right):
             axes.grid(axis="x", color="#e4e4e4")

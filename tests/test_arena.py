@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import stat
 import sys
 from dataclasses import replace
@@ -19,6 +20,7 @@ import torch
 from arena_phases import Phases
 from arena_playing import controls, exported, play
 from arena_results import page, summarize
+from arena_segments import MEASURES
 
 from ddco_pyro.errors import Failed
 from ddco_pyro.export import write_numpy
@@ -277,7 +279,7 @@ def test_other_settings_are_other_cells():
                                               "--set 'training.epochs=3'")  # fmt: skip
 
 
-def cell(seed, nmi, ours, flat, success):
+def cell(seed, nmi, ours, flat, success, task="hammer-v3"):
     methods = {
         name: {
             "log_likelihood_per_step": {"valid": value},
@@ -288,7 +290,7 @@ def cell(seed, nmi, ours, flat, success):
         for name, value, successes in zip(("ddco", "flat"), (ours, flat), success, strict=True)
     }
     return {
-        "task": "hammer-v3",
+        "task": task,
         "count": 5,
         "seed": seed,
         "expert": {"successes": 70, "attempts": 72, "shares": {"phase": [0.5, 0.495, 0.005]}},
@@ -296,16 +298,30 @@ def cell(seed, nmi, ours, flat, success):
         "difference": {"flat": {"nats_per_step": ours - flat}},
         "held_out": [{"log_likelihood_per_step": {"ddco": ours + more, "flat": flat}} for more in (0.0, -1.0)],
         "agreement": {"labels": "phase", "valid": [nmi]},
+        "segments": {"ddco": dict.fromkeys(MEASURES, nmi), "kmeans": dict.fromkeys(MEASURES, 0.5)},
         "seconds": {"all": 60.0},
     }
 
 
 def test_the_page_of_two_seeds_worked_by_hand():
     results = summarize([cell(0, 0.5, 1.0, 0.75, (1, 0)), cell(1, 0.7, 2.0, 1.75, (3, 2))])
-    found = results["hammer-v3"]["counts"]["5"]
+    found = results["tasks"]["hammer-v3"]["counts"]["5"]
     assert found["nmi_valid"]["mean"] == pytest.approx(0.6)
     assert found["methods"]["ddco"]["success"]["by_seed"] == [0.25, 0.75]
     text = page(json.loads(json.dumps(results)), "Made.")
     assert "| hammer-v3 | 5 | 0.60 [0.00, 1.00] | 1.50 [-4.85, 7.85] | +0.25 [+0.25, +0.25]; 50% |" in text
     assert "| 4 of 8, 50% [0%, 100%] | 2 of 8, 25% [0%, 100%] | 60 [60, 60] |" in text
     assert "| hammer-v3 | 70 of 72 | 50%, 50%, 0.5% (rare) |" in text
+
+
+def test_segments_are_compared_over_tasks_and_not_over_seeds():
+    """Means over seeds of 0.6, 0.7, 0.8 against 0.5: 0.2 ± t(2) · 0.1 / √3, better on three of three."""
+    by_task = {"hammer-v3": (0.5, 0.7), "assembly-v3": (0.6, 0.8), "shelf-place-v3": (0.9, 0.7)}
+    cells = [cell(seed, nmi, 1.0, 0.5, (1, 0), task) for task, own in by_task.items() for seed, nmi in enumerate(own)]
+    measures = summarize(cells)["segments"]["5"]["measures"]
+    assert measures["nmi"]["methods"]["ddco"]["mean"] == pytest.approx(0.7)
+    difference = measures["nmi"]["difference"]["kmeans"]
+    half = 4.302653 * 0.1 / math.sqrt(3)
+    assert difference["interval"] == pytest.approx([0.2 - half, 0.2 + half], abs=1e-6)
+    assert difference["wins"] == 3
+    assert difference["wilcoxon_p"] == pytest.approx(0.25)  # the least that three pairs can have
