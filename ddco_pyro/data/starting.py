@@ -24,9 +24,6 @@ LEAST = 3
 STEPS_PER_BATCH = 1000
 """A minibatch has about so many steps: enough for a steady gradient, and several of them in an epoch."""
 
-LINEAR_BELOW = 2000
-"""With fewer steps than this in all, options have linear policies: hidden layers fit what will not come again."""
-
 GRADIENT_STEPS = 6000
 """A model may take about so many gradient steps in all: about a minute of one core, and enough for a hierarchy and for
 the policies beside it to stop by :data:`PATIENCE` on the files of docs/decisions.md."""
@@ -99,13 +96,12 @@ def _lines(inspection: Inspection, path: str) -> Iterator[str]:
     yield "control:"
     yield "  kind: auto                        # decided from the demonstrations; so it is:"
     yield from (f"  # {note}" for note in inspection.notes)
-    yield "  std: {learn: true, floor: 0.01}   # in units of each dimension's own spread"
+    yield "  std: {learn: true, floor: 0.01, per_option: true}   # in units of each dimension's own spread"
     yield "hierarchy:"
     yield "  levels:"
     yield "    - name: option"
     yield "      count: 4                      # how many options; try others: --set hierarchy.levels.0.count=3"
-    few = lengths.sum() < LINEAR_BELOW
-    yield f"      policy: {_smallest(inspection) if few else _network(inspection)}"
+    yield f"      policy: {_smallest(inspection)}   # perceptrons where skills are crooked: {_network(inspection)}"
     yield f"      termination: {_smallest(inspection)}"
     yield f"  meta_policy: {_smallest(inspection)}"
     yield "training:"
