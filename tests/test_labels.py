@@ -126,6 +126,9 @@ def test_its_gradient_is_that_of_finite_differences():
         (2, {}, ["vq-2", "level-2", "meta-policy", "joint"]),
         (1, {"hold": False}, ["vq-1"]),
         (2, {"hold": False}, ["vq-2"]),
+        (1, {"training": {"upper_levels": "segments"}, "hold": False}, ["vq-1"]),
+        (2, {"training": {"upper_levels": "segments"}, "hold": False}, ["segments"]),
+        (2, {"training": {"upper_levels": "segments"}}, ["segments", "upper", "joint"]),
     ],
 )
 def test_labels_matter_in_every_stage_that_has_their_level_or_in_its_initialisation(level, own, stages):

@@ -52,6 +52,8 @@ def flat(kind="flat", network="linear", lr=0.03, **training):
         ({"initialize": "equal_parts", "layerwise": False}, 2, ["parts-1", "parts-2", "joint"]),
         ({"initialize": "random"}, 2, ["level-1", "level-2", "meta-policy", "joint"]),
         ({"lower_levels": "frozen"}, 1, ["vq-1", "level-1", "meta-policy"]),
+        ({"upper_levels": "segments"}, 1, ["vq-1", "level-1", "meta-policy", "joint"]),
+        ({"upper_levels": "segments"}, 3, ["vq-1", "level-1", "segments", "upper", "joint"]),
         ({"layerwise": False}, 2, ["vq-1", "vq-2", "joint"]),
         ({"layerwise": False, "initialize": "random"}, 3, ["joint"]),
         ({}, 0, ["policy"]),
@@ -158,8 +160,9 @@ def test_without_a_budget_every_stage_trains_until_its_patience(tmp_path):
         ("adam", {"epochs": 18}, 2 * 6 * 3),
         ("momentum", {"epochs": 18}, 2 * 6 * 3),
         ("adam", {"epochs": 30, "patience": 1}, None),
+        ("adam", {"epochs": 20, "upper_levels": "segments"}, 2 * 5 * 4),
     ],
-    ids=["adam", "momentum", "stages that stop early"],
+    ids=["adam", "momentum", "stages that stop early", "paths that are drawn"],
 )
 def test_resuming_gives_the_same_bits(tmp_path, optimizer, training, rows):
     spec = make_spec((2, 2), optimizer={"name": optimizer, "lr": 0.01}, restarts=2, **training)

@@ -35,6 +35,7 @@ def stage(name: str) -> str:
     """What a stage of training is called in the page: ``vq-1`` is ``level 1 from clusters``."""
     kind, _, level = name.partition("-")
     whole = {"meta-policy": "meta-policy alone", "joint": "all together"}
+    whole |= {"segments": "levels above the lowest from segments", "upper": "levels above the lowest together"}
     how = {"vq": "from clusters", "parts": "from equal parts", "level": "alone"}.get(kind)
     return f"level {level} {how}" if how else whole.get(name, name)
 

@@ -62,7 +62,7 @@ class Labels:
     def matter_in(self, stage: Stage) -> bool:
         """Whether a stage of training uses them."""
         seen = stage.discovering is None or self.level <= stage.discovering
-        return seen if self.hold else stage.clamped == self.level
+        return seen if self.hold else stage.clamped == self.level or (stage.from_constants and self.level > 1)
 
 
 def used(spec: Spec, demos: Demonstrations) -> Labels | None:

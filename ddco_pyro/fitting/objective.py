@@ -11,6 +11,7 @@ from ddco_pyro.fitting.clusters import Clusters, EqualParts
 from ddco_pyro.fitting.duration import log_duration_prior
 from ddco_pyro.fitting.material import Material
 from ddco_pyro.fitting.stages import Stage
+from ddco_pyro.fitting.upper import Constants, expected, fitted
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -26,11 +27,16 @@ Known = dict[int, Tensor]
 
 
 class Objective:
-    """What a stage maximises: the log-likelihood with the choices that are known, and the log-prior of durations."""
+    """What a stage maximises: the log-likelihood with the choices that are known, and the log-prior of durations.
+
+    Where networks take over :attr:`constants`, the expected log-probability of selections and terminations is in the
+    place of the log-likelihood.
+    """
 
     def __init__(self, material: Material, progress: Progress, stage: Stage) -> None:
         self.material, self.progress, self.stage = material, progress, stage
         self.known: tuple[Known, Known] = {}, {}
+        self.constants: Constants | None = None
         labels = material.labels
         if labels is not None and labels.matter_in(stage):
             self.known = {labels.level: labels.train}, {labels.level: labels.tune}
@@ -51,6 +57,16 @@ class Objective:
             choices = start.choices(batch)
             labelled = known.get(level, choices)
             known[level] = torch.where(labelled < 0, choices, labelled)
+
+    def find_constants(self, model: Hierarchy) -> None:
+        """Those that the networks are to take over, given the lowest level of the model; none in other stages."""
+        if self.stage.from_constants:
+            with torch.no_grad():
+                pieces = [
+                    (self._tables(model, piece, self.known[0], rows), piece.lengths)
+                    for rows, piece in self.material.train.pieces(model.steps_at_once)
+                ]
+            self.constants = fitted(pieces, self.material.seed(self.progress.restart, self.progress.stage))
 
     def ascend(self, model: Hierarchy, rows: Tensor) -> float:
         """Add the gradient of the loss of some training demonstrations to the parameters'; what they add to what is
@@ -84,7 +100,10 @@ class Objective:
         return tables
 
     def _total(self, tables: Tables, batch: Batch) -> Tensor:
-        value = total_log_likelihood(tables, batch.lengths, self.material.spec.inference.engine)
+        if self.constants is None:
+            value = total_log_likelihood(tables, batch.lengths, self.material.spec.inference.engine)
+        else:
+            value = expected(tables, batch.lengths, self.constants)
         prior = self.material.spec.training.duration
         if prior is None:
             return value

@@ -14,12 +14,14 @@ class Stage:
     :param discovering: train levels 1 to d under a uniform meta-policy; None for the whole hierarchy.
     :param clamped: the level whose choices are clamped to clusters or parts of the demonstrations; None for no level.
     :param trained: prefixes of the names of the parameters that are trained.
+    :param from_constants: networks take over what :class:`ddco_pyro.fitting.upper.Constants` say.
     """
 
     name: str
     discovering: int | None
     clamped: int | None
     trained: tuple[str, ...]
+    from_constants: bool = False
 
 
 def plan(spec: Spec, depth: int) -> list[Stage]:
@@ -29,14 +31,19 @@ def plan(spec: Spec, depth: int) -> list[Stage]:
     if depth == 0:
         return [Stage("policy", None, None, everything)]
     stages: list[Stage] = []
-    for level in range(1, depth + 1):
+    together = training.upper_levels == "segments" and depth > 1
+    for level in range(1, 2 if together else depth + 1):
         own = (f"levels.{level - 1}.",)
         if training.initialize != "random":
             kind = "parts" if training.initialize == "equal_parts" else "vq"
             stages.append(Stage(f"{kind}-{level}", level, level, own))
         if training.layerwise:
             stages.append(Stage(f"level-{level}", level, None, own))
-    if training.layerwise:
+    if together:
+        upper = (*(f"levels.{level}." for level in range(1, depth)), "meta_policy.")
+        stages.append(Stage("segments", None, None, upper, from_constants=True))
+        stages.append(Stage("upper", None, None, upper))
+    elif training.layerwise:
         stages.append(Stage("meta-policy", None, None, ("meta_policy.",)))
     if not training.layerwise or training.lower_levels == "fine_tuned":
         stages.append(Stage("joint", None, None, everything))

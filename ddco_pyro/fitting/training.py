@@ -25,6 +25,7 @@ from ddco_pyro.fitting.convergence import StageEnd, share
 from ddco_pyro.fitting.material import Material
 from ddco_pyro.fitting.objective import Objective
 from ddco_pyro.fitting.stages import Stage, plan
+from ddco_pyro.fitting.upper import Constants
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import OptimizerSpec
@@ -86,7 +87,10 @@ class Training:
         optimizer = _optimizer(training.optimizer, parameters)
         if now.epoch > 0:
             restore_optimizer(optimizer, states["optimizer"])
+            objective.constants = Constants.of(states.get("constants", {}))
         else:
+            objective.find_constants(model)
+            states["constants"] = objective.constants.state() if objective.constants else {}
             now.start, now.stale = objective.tune(model), 0
             now.best = now.start
             states["best"] = copy_of(model)

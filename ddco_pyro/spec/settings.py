@@ -224,6 +224,9 @@ class TrainingSpec(Model):
     follow one another; ``random``: random weights."""
     layerwise: bool = True
     """Discover level after level, lowest first, rather than all at once."""
+    upper_levels: Literal["clusters", "segments"] = "clusters"
+    """How levels above the lowest are discovered, layer by layer: ``clusters``: each as the lowest is, after the one
+    below it; ``segments``: all together, from which options of the lowest level follow each other."""
     lower_levels: Literal["fine_tuned", "frozen"] = "fine_tuned"
     """Layer-wise training: whether a last stage trains all levels together, or what was discovered stays as it is."""
     optimizer: OptimizerSpec = OptimizerSpec()
@@ -256,6 +259,8 @@ class TrainingSpec(Model):
             raise invalid(("epochs", "null trains until training.patience, which is null too; give one of them"))
         if self.epochs is None and self.optimizer.schedule == "cosine":
             raise invalid(("optimizer.schedule", "cosine falls to 0 at the end of training.epochs, which is null"))
+        if self.upper_levels == "segments" and not self.layerwise:
+            raise invalid(("upper_levels", "segments are those of a lowest level found before; say layerwise: true"))
         if self.labels is not None and not self.labels.hold and self.initialize == "random":
             raise invalid(("labels.hold", "false uses labels in initialisation alone, which is random; say vq there"))
         return self

@@ -76,6 +76,7 @@ class Spec(Model):
             *self._labels_of_other_levels(),
             *self._labelled_level(),
             *self._durations(),
+            *self._segments(),
         ]
         if problems:
             raise invalid(*problems)
@@ -137,6 +138,15 @@ class Spec(Model):
         """What the callers of each level emit, and the meta-policy."""
         meta_policy = [self.hierarchy.meta_policy.emits] if self.hierarchy else []
         return [*(level.policy.emits for level in self._levels), *meta_policy]
+
+    def _segments(self) -> Iterator[tuple[str, str]]:
+        if self.training.upper_levels != "segments":
+            return
+        for number, emits in enumerate(self._emitted[1:], start=1):
+            if "options" not in emits:
+                place = f"levels.{number}.policy" if number < len(self._levels) else "meta_policy"
+                problem = "needs options, which training.upper_levels: segments finds by what is selected"
+                yield f"hierarchy.{place}.emits", problem
 
     def _repeated_observations(self) -> Iterator[tuple[str, str]]:
         keys = [observation.key for observation in self.observations]

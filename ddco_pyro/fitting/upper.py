@@ -1,0 +1,137 @@
+"""Where the levels above the lowest start from: which options of the lowest level follow each other.
+
+What an option above the lowest level does shows in what it selects, one selection after another, and not in any single
+step. So an AHMM is fitted in which the state says nothing of selections, nor of terminations above the lowest level: a
+hierarchical hidden Markov model (Fine, Singer, Tishby 1998) above the lowest level as it was discovered.
+EM (Baum et al. 1970) is exact there: the E-step is the elimination, the M-step divides expected counts. What it finds
+depends on where it starts, and it costs no gradient: the likeliest of many random starts is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from ddco_pyro.inference import fused
+from ddco_pyro.model.tables import NEVER, Tables
+
+STARTS = 16
+"""Random ones; of them the likelier half goes on, and so on. On planted levels about one in three reaches the best."""
+
+FIRST = 10
+"""Iterations before the first halving; then twice as many, and so on."""
+
+MOST = 200
+"""Iterations of the last that is left."""
+
+CONVERGED = 1e-6
+"""Nats per step that its last iteration has to gain, or it ends before."""
+
+PSEUDO = 0.1
+"""What every count has before anything is counted, so that nothing is impossible for good."""
+
+Piece = tuple[Tables, Tensor]
+"""Tables of some demonstrations, and their lengths."""
+
+
+@dataclass(frozen=True)
+class Constants:
+    """Probabilities that are the same at every step, float64.
+
+    :param selection: of the options of each level, lowest first, given the caller, [K_d, k_d].
+    :param termination: ψ of the options of each level above the lowest, [k_d].
+    """
+
+    selection: tuple[Tensor, ...]
+    termination: tuple[Tensor, ...]
+
+    @classmethod
+    def drawn(cls, tables: Tables, random: np.random.Generator) -> Constants:
+        """Random ones for a hierarchy with such tables."""
+        sizes = [table.shape[2:] for table in tables.selection]
+        selection = (random.dirichlet(np.ones(choices - 1), size=callers) for callers, choices in sizes)
+        termination = (random.uniform(0.05, 0.5, table.shape[2]) for table in tables.termination[1:])
+        return cls(tuple(map(torch.as_tensor, selection)), tuple(map(torch.as_tensor, termination)))
+
+    @classmethod
+    def of(cls, state: Mapping[str, Tensor]) -> Constants | None:
+        """Those of a :meth:`state`; None where it is empty."""
+        selection, termination = (
+            tuple(state[name] for name in sorted(state) if name.startswith(kind))
+            for kind in ("selection", "termination")
+        )
+        return cls(selection, termination) if state else None
+
+    def state(self) -> dict[str, Tensor]:
+        """As tensors by name."""
+        parts = {"selection": self.selection, "termination": self.termination}
+        return {f"{kind}.{number:03}": table for kind, tables in parts.items() for number, table in enumerate(tables)}
+
+    def within(self, tables: Tables) -> Tables:
+        """The tables with these probabilities in the place of what networks say; no caller has control."""
+        selection, termination = list(tables.selection), list(tables.termination)
+        for level, chosen in enumerate(self.selection):
+            selection[level] = pad(chosen.log(), (1, 0), value=NEVER).expand(tables.selection[level].shape)
+        for level, ended in enumerate(self.termination, start=1):
+            termination[level] = torch.stack([1 - ended, ended], -1).log().expand(tables.termination[level].shape)
+        return replace(tables, selection=tuple(selection), termination=tuple(termination))
+
+
+def fitted(pieces: Sequence[Piece], seed: int) -> Constants:
+    """The likeliest constants that EM finds from :data:`STARTS` random ones.
+
+    :param pieces: tables of all demonstrations; of their selections, and terminations above the lowest level, only the
+        shapes count.
+    """
+    random, steps = np.random.default_rng(seed), sum(int(lengths.sum()) for _, lengths in pieces)
+    left, iterations = [Constants.drawn(pieces[0][0], random) for _ in range(STARTS)], FIRST
+    while len(left) > 1:
+        ends = sorted((_run(pieces, start, iterations, 0.0) for start in left), key=lambda end: -end[0])
+        left, iterations = [constants for _, constants in ends[: len(ends) // 2]], 2 * iterations
+    return _run(pieces, left[0], MOST, CONVERGED * steps)[1]
+
+
+def _run(pieces: Sequence[Piece], constants: Constants, iterations: int, least: float) -> tuple[float, Constants]:
+    """Iterations of EM while they gain so many nats: the last log-likelihood, and the constants."""
+    value = -np.inf
+    for _ in range(iterations):
+        before, (value, constants) = value, improved(pieces, constants)
+        if value - before < least:
+            break
+    return value, constants
+
+
+def improved(pieces: Sequence[Piece], constants: Constants) -> tuple[float, Constants]:
+    """An iteration of EM: the log-likelihood of the constants, and those that the expected counts make of them."""
+    value = 0.0
+    selected = [torch.full_like(table, PSEUDO) for table in constants.selection]
+    ended = [torch.full((*table.shape, 2), PSEUDO, dtype=table.dtype) for table in constants.termination]
+    for tables, lengths in pieces:
+        found = fused.eliminate(constants.within(tables), lengths)
+        value += float(found.value.sum())
+        for total, counts in zip(selected, found.tables.selection, strict=True):
+            total += counts.sum((0, 1))[:, 1:]
+        for total, counts in zip(ended, found.tables.termination[1:], strict=True):
+            total += counts.sum((0, 1))
+    selection = tuple(total / total.sum(-1, keepdim=True) for total in selected)
+    return value, Constants(selection, tuple(total[:, 1] / total.sum(-1) for total in ended))
+
+
+def expected(tables: Tables, lengths: Tensor, constants: Constants) -> Tensor:
+    """Σ_n E[log p(ζ_n)] of selections, and of terminations above the lowest level, under the posterior of ζ_n that the
+    constants give, nats, a scalar in float64: what an M-step of networks maximises.
+    """
+    counts = fused.eliminate(constants.within(tables), lengths).tables
+    pairs = [
+        *zip(tables.selection, counts.selection, strict=True),
+        *zip(tables.termination[1:], counts.termination[1:], strict=True),
+    ]
+    total = torch.zeros((), dtype=torch.float64)
+    for table, count in pairs:
+        total = total + (table.double() * count)[count > 0].sum()
+    return total
