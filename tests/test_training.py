@@ -162,7 +162,7 @@ def test_without_a_budget_every_stage_trains_until_its_patience(tmp_path):
         ("adam", {"epochs": 30, "patience": 1}, None),
         ("adam", {"epochs": 20, "upper_levels": "segments"}, 2 * 5 * 4),
     ],
-    ids=["adam", "momentum", "stages that stop early", "paths that are drawn"],
+    ids=["adam", "momentum", "stages that stop early", "levels from segments"],
 )
 def test_resuming_gives_the_same_bits(tmp_path, optimizer, training, rows):
     spec = make_spec((2, 2), optimizer={"name": optimizer, "lr": 0.01}, restarts=2, **training)

@@ -88,12 +88,18 @@ def fitted(pieces: Sequence[Piece], seed: int) -> Constants:
     :param pieces: tables of all demonstrations; of their selections, and terminations above the lowest level, only the
         shapes count.
     """
-    random, steps = np.random.default_rng(seed), sum(int(lengths.sum()) for _, lengths in pieces)
+    random = np.random.default_rng(seed)
     left, iterations = [Constants.drawn(pieces[0][0], random) for _ in range(STARTS)], FIRST
     while len(left) > 1:
         ends = sorted((_run(pieces, start, iterations, 0.0) for start in left), key=lambda end: -end[0])
         left, iterations = [constants for _, constants in ends[: len(ends) // 2]], 2 * iterations
-    return _run(pieces, left[0], MOST, CONVERGED * steps)[1]
+    return converged(pieces, left[0])
+
+
+def converged(pieces: Sequence[Piece], constants: Constants) -> Constants:
+    """Where EM takes the constants, in :data:`MOST` iterations at most."""
+    steps = sum(int(lengths.sum()) for _, lengths in pieces)
+    return _run(pieces, constants, MOST, CONVERGED * steps)[1]
 
 
 def _run(pieces: Sequence[Piece], constants: Constants, iterations: int, least: float) -> tuple[float, Constants]:
