@@ -74,7 +74,7 @@ def _sums(hierarchy: Hierarchy, piece: Inferred, level: int, branch: nn.Module) 
     with torch.no_grad(), ExitStack() as hooks:
         seen = hooks.enter_context(_watched(branch))
         hierarchy(piece.batch.inputs)
-        activation = seen[0].double().mean(-1)
+        activation = torch.cat(seen, dim=1).double().mean(-1)
         hooks.enter_context(_replaced(branch, piece.batch.lengths))
         loss = _score(hierarchy, piece, level, weight) - _score(hierarchy, piece, level, weight, replaced=True)
     return torch.stack([(weight * activation).sum((0, 1)), loss, weight.sum((0, 1))], dim=-1)
@@ -102,7 +102,7 @@ def _score(hierarchy: Hierarchy, piece: Inferred, level: int, weight: Tensor, re
 
 @contextmanager
 def _watched(branch: nn.Module) -> Iterator[list[Tensor]]:
-    """What a branch gives, [N, T, K, F] for each call."""
+    """What a branch gives, [N, T, K, F] for each chunk of time."""
     given: list[Tensor] = []
 
     def keep(_: nn.Module, __: Any, output: Any) -> None:
@@ -117,11 +117,11 @@ def _watched(branch: nn.Module) -> Iterator[list[Tensor]]:
 
 @contextmanager
 def _replaced(branch: nn.Module, lengths: Tensor) -> Iterator[None]:
-    """A branch reads at each step what was observed at another, drawn without replacement."""
+    """A branch reads at each step what was observed at another of the same chunk of time, drawn without replacement."""
 
     def replace(_: nn.Module, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
         inputs: Inputs = arguments[0]
-        alive = torch.arange(inputs.batch[1]) < lengths[:, None]
+        alive = inputs.time < lengths[:, None]
         order = torch.randperm(int(alive.sum()), generator=torch.Generator().manual_seed(SEED))
 
         def shuffled(array: Tensor) -> Tensor:

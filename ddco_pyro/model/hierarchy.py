@@ -5,13 +5,14 @@ A baseline is a hierarchy without option levels whose meta-policy emits control.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from ddco_pyro.data.control_parts import ControlPart, all_gaussian
 from ddco_pyro.model.controls import ControlScaling, ControlStd
@@ -24,9 +25,12 @@ from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
 
 BYTES_AT_ONCE = 256 * 10**6
-"""Most bytes that networks take for the trajectories that go through them together, one trajectory at least."""
+"""Most bytes that networks take for the steps that go through them together, one step at least."""
 
 Emits = Literal["options", "control"]
+
+Answers = Sequence[Tensor]
+"""The outputs of networks [N, T, K, F]: policy and termination of each level, lowest first, and the meta-policy's."""
 
 
 class Caller(nn.Module):
@@ -163,16 +167,32 @@ class Hierarchy(nn.Module):
         return training_bytes(self.networks().values(), self.input_shape)
 
     @property
+    def steps_in_memory(self) -> int:
+        """Steps that networks can be trained on at a time: longer trajectories are processed in chunks of time."""
+        return max(1, BYTES_AT_ONCE // max(1, self.step_bytes))
+
+    @property
     def steps_at_once(self) -> int:
-        """Steps that go through the networks together, where trajectories are short enough."""
-        return max(1, min(STEPS_AT_ONCE, BYTES_AT_ONCE // max(1, self.step_bytes)))
+        """Steps of several trajectories that go through the networks together, where these are short enough."""
+        return min(STEPS_AT_ONCE, self.steps_in_memory)
 
     def forward(self, inputs: Inputs, discovering: int | None = None) -> Outputs:
         """What the networks say about these observations, from the first step of their trajectories on.
 
+        What is too long for :attr:`steps_in_memory` goes through them in chunks of time, of which nothing is kept but
+        the answers and the states between; for the gradient, each chunk is computed again, the last first.
+
         :param discovering: d gives levels 1 to d alone under a uniform meta-policy (layer-wise training, SM 2.3).
         """
-        return self.advance(inputs, None, discovering)[0]
+        chunks = list(inputs.chunks(self.steps_in_memory // inputs.batch[0]))
+        if len(chunks) == 1:
+            return self.advance(inputs, None, discovering)[0]
+        answers: list[Answers] = []
+        states: States | None = None
+        for chunk in chunks:
+            said, states = checkpoint(self._answers, chunk, states, discovering, use_reentrant=False)
+            answers.append(said)
+        return self._outputs([torch.cat(each, dim=1) for each in zip(*answers, strict=True)], discovering)
 
     def advance(
         self, inputs: Inputs, states: States | None, discovering: int | None = None
@@ -181,20 +201,31 @@ class Hierarchy(nn.Module):
 
         :param states: those after the observations before; None at the first step.
         """
-        carried = Carried(states)
-        levels = self.option_levels()[:discovering]
-        callers, endings = [], []
-        for number, level in enumerate(levels):
+        answers, after = self._answers(inputs, states, discovering)
+        return self._outputs(answers, discovering), after
+
+    def _answers(
+        self, inputs: Inputs, states: States | None, discovering: int | None
+    ) -> tuple[Answers, dict[str, State]]:
+        """The networks' own outputs, and their states after them."""
+        carried, answers = Carried(states), []
+        for number, level in enumerate(self.option_levels()[:discovering]):
             place, trunk = f"levels.{number}", level.trunk
             seen = inputs if trunk is None else carried.answer(f"{place}.trunk", trunk, inputs)
-            callers.append(level.policy(carried.answer(f"{place}.policy", level.policy.network, seen), self.scaling))
-            endings.append(carried.answer(f"{place}.termination", level.termination, seen).squeeze(-1))
-        if discovering:
-            callers.append(_uniform(inputs, levels[-1].count))
-        else:
-            said = carried.answer("meta_policy", self.meta_policy.network, inputs)
-            callers.append(self.meta_policy(said, self.scaling))
-        return Outputs(tuple(callers), tuple(endings)), carried.after
+            answers.append(carried.answer(f"{place}.policy", level.policy.network, seen))
+            answers.append(carried.answer(f"{place}.termination", level.termination, seen))
+        if not discovering:
+            answers.append(carried.answer("meta_policy", self.meta_policy.network, inputs))
+        return answers, carried.after
+
+    def _outputs(self, answers: Answers, discovering: int | None) -> Outputs:
+        """What the networks' outputs stand for."""
+        levels = self.option_levels()[:discovering]
+        callers = [level.policy(said, self.scaling) for level, said in zip(levels, answers[::2], strict=False)]
+        endings = [said.squeeze(-1) for _, said in zip(levels, answers[1::2], strict=False)]
+        top = answers[-1]
+        last = _uniform(top, levels[-1].count) if discovering else self.meta_policy(top, self.scaling)
+        return Outputs((*callers, last), tuple(endings))
 
     def initial_states(self, trajectories: int) -> dict[str, State]:
         """The states of the networks that remember before the first step, by name."""
@@ -217,6 +248,6 @@ def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
     return policy, ("control",)
 
 
-def _uniform(inputs: Inputs, options: int) -> CallerOutputs:
-    """A meta-policy that selects each of the k options with probability 1/k."""
-    return CallerOutputs(options, torch.zeros(*inputs.batch, 1, options), None)
+def _uniform(like: Tensor, options: int) -> CallerOutputs:
+    """A meta-policy that selects each of the k options with probability 1/k, at as many steps [N, T, ...]."""
+    return CallerOutputs(options, torch.zeros(*like.shape[:2], 1, options), None)

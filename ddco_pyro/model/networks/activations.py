@@ -29,10 +29,10 @@ def _another(network: nn.Module) -> tuple[int, int]:
     return (2, 1) if remembers(network) else (1, 2)
 
 
-def _zeros(shape: InputShape, trajectories: int, steps: int) -> Inputs:
+def _zeros(shape: InputShape, trajectories: int, steps: int, dtype: torch.dtype) -> Inputs:
     """Observations that are 0."""
     batch = (trajectories, steps)
-    vectors = {key: torch.zeros(*batch, size) for key, size in shape.vectors.items()}
+    vectors = {key: torch.zeros(*batch, size, dtype=dtype) for key, size in shape.vectors.items()}
     images = {key: torch.zeros(*batch, *image, dtype=torch.uint8) for key, image in shape.images.items()}
     time = torch.arange(steps).clamp(max=shape.steps - 1)  # a network may have parameters for each step
     return Inputs(vectors, images, time)
@@ -41,7 +41,11 @@ def _zeros(shape: InputShape, trajectories: int, steps: int) -> Inputs:
 def _kept(network: nn.Module, shape: InputShape, trajectories: int, steps: int) -> int:
     """Bytes of all tensors, parameters too, that are kept for the gradient."""
     batch = (trajectories, steps)
-    seen = torch.zeros(*batch, *network.reads) if isinstance(network, Head) else _zeros(shape, *batch)
+    dtype = next((parameter.dtype for parameter in network.parameters()), torch.float32)
+    if isinstance(network, Head):
+        seen: Inputs | Tensor = torch.zeros(*batch, *network.reads, dtype=dtype)
+    else:
+        seen = _zeros(shape, *batch, dtype)
     storages: dict[int, int] = {}
 
     def keep(tensor: Tensor) -> Tensor:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from operator import itemgetter
 from typing import TypeVar
 
 import torch
@@ -74,6 +75,13 @@ class Inputs:
     def select(self, names: Sequence[str]) -> Inputs:
         """These observations alone, in this order."""
         return Inputs(_of(self.vectors, names), _of(self.images, names), self.time)
+
+    def chunks(self, steps: int) -> Iterator[Inputs]:
+        """Consecutive parts of at most so many steps of time each, one step at least."""
+        size = max(steps, 1)
+        for first in range(0, self.batch[1], size):
+            part = slice(first, first + size)
+            yield self.map(itemgetter((slice(None), part)), self.time[part])
 
     def map(self, change: Callable[[Tensor], Tensor], time: Tensor) -> Inputs:
         """The same of changed arrays, at other times."""

@@ -1,0 +1,164 @@
+"""Trajectories in chunks of time: the same values and gradients as in one piece, in the memory of a chunk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from ddco_pyro.inference import total_log_likelihood
+from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import Inputs
+from ddco_pyro.spec import parse_spec
+
+SHAPES = {"state": (3,), "camera": (10, 9, 3)}
+CONV = {"network": "conv", "filters": 3, "kernel": 3, "pooled": 2, "hidden": [6]}
+BRANCHES = {
+    "network": "branches",
+    "of": {"camera": {**CONV, "dropout": 0.2}, "state": {"network": "mlp", "hidden": [4]}},
+}
+NETWORKS: dict[str, dict[str, Any]] = {
+    "mlp": {"policy": {"network": "mlp", "hidden": [8], "dropout": 0.3, "inputs": ["state"]}},
+    "conv": {"policy": {**CONV, "dropout": 0.3}},
+    "lstm over conv": {"policy": {"network": "lstm", "over": CONV, "hidden": 5}},
+    "lstm over branches, a trunk": {
+        "trunk": {"network": "lstm", "over": {**BRANCHES, "hidden": [5]}, "hidden": [4, 5]}
+    },
+    "branches": {"policy": {**BRANCHES, "hidden": [7]}},
+    "per_timestep": {"policy": {"network": "per_timestep", "hidden": [4], "inputs": ["state"]}},
+}
+TRAJECTORIES, STEPS = 2, 13
+
+
+def hierarchy(network: str, dtype: torch.dtype = torch.float64) -> Hierarchy:
+    """Two levels of options."""
+    own = NETWORKS[network]
+    level = {"policy": {"network": "linear"}, "termination": {"network": "linear"}, **own}
+    if "trunk" not in own:
+        level["termination"] = {"network": "mlp", "inputs": ["state"]}
+    upper = {"name": "upper", "count": 2, "policy": {"network": "mlp", "inputs": ["state"]}}
+    meta = {"network": "lstm", "over": {"network": "mlp", "inputs": ["state"]}, "hidden": 3}
+    levels = [{"name": "lower", "count": 3, **level}, {**upper, "termination": {"network": "mlp", "inputs": ["state"]}}]
+    spec = parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": list(SHAPES),
+            "control": {"std": {"learn": True}},
+            "hierarchy": {"levels": levels, "meta_policy": meta},
+        }
+    )
+    torch.manual_seed(0)
+    return Hierarchy(spec, SHAPES, 2, STEPS).to(dtype).train()
+
+
+def batch(dtype: torch.dtype = torch.float64) -> Batch:
+    generator = torch.Generator().manual_seed(1)
+    state = torch.randn(TRAJECTORIES, STEPS, 3, generator=generator).to(dtype)
+    camera = torch.randint(256, (TRAJECTORIES, STEPS, 10, 9, 3), generator=generator, dtype=torch.uint8)
+    actions = torch.randn(TRAJECTORIES, STEPS, 2, generator=generator).to(dtype)
+    inputs = Inputs({"state": state}, {"camera": camera}, torch.arange(STEPS))
+    return Batch(inputs, actions, torch.tensor([STEPS, STEPS - 4]))
+
+
+def value_and_gradient(model: Hierarchy, seen: Batch, discovering: int | None) -> tuple[Tensor, Tensor]:
+    """The log-likelihood, and its gradient in all parameters that it depends on."""
+    torch.manual_seed(3)
+    value = total_log_likelihood(model.tabulate(seen, discovering), seen.lengths)
+    used = list(model.parameters())
+    gradients = torch.autograd.grad(value, used, allow_unused=True, materialize_grads=True)
+    return value.detach(), torch.cat([gradient.flatten() for gradient in gradients])
+
+
+def in_chunks(monkeypatch: pytest.MonkeyPatch, model: Hierarchy, steps: int) -> None:
+    """So many steps of time in a chunk."""
+    monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", TRAJECTORIES * steps * model.step_bytes)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
+@pytest.mark.parametrize("network", NETWORKS)
+def test_chunks_give_the_same(network: str, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chunks of 1, 4 and 12 of 13 steps; without dropout, whose numbers are drawn chunk by chunk."""
+    tolerance = 1e-10 if dtype == torch.float64 else 1e-5
+    model, seen = hierarchy(network, dtype).eval(), batch(dtype)
+    for discovering in (None, 1):
+        value, gradient = value_and_gradient(model, seen, discovering)
+        for steps in (1, 4, 12):
+            in_chunks(monkeypatch, model, steps)
+            assert len(list(seen.inputs.chunks(model.steps_in_memory // TRAJECTORIES))) == -(-STEPS // steps)
+            chunked = value_and_gradient(model, seen, discovering)
+            assert abs(chunked[0] - value) <= tolerance * abs(value)
+            assert (chunked[1] - gradient).abs().max() <= tolerance * gradient.abs().max()
+        monkeypatch.undo()
+
+
+@pytest.mark.parametrize("network", ["mlp", "lstm over branches, a trunk"])
+def test_a_chunk_drops_the_same_in_both_passes(network: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With dropout: the gradient of chunks that are computed twice is that of the same chunks, all kept."""
+    model, seen = hierarchy(network), batch()
+    in_chunks(monkeypatch, model, 4)
+    again = value_and_gradient(model, seen, None)
+    monkeypatch.setattr("ddco_pyro.model.hierarchy.checkpoint", lambda call, *arguments, **_: call(*arguments))
+    kept = value_and_gradient(model, seen, None)
+    assert again[0] == kept[0]
+    assert (again[1] - kept[1]).abs().max() <= 1e-10 * kept[1].abs().max()
+    model.eval()
+    assert value_and_gradient(model, seen, None)[0] != kept[0]  # dropout matters
+
+
+def test_the_gradient_of_chunks_is_the_slope(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against finite differences of the unchunked value, along a random direction of all parameters."""
+    model, seen = hierarchy("lstm over conv").eval(), batch()
+    in_chunks(monkeypatch, model, 3)
+    gradient = value_and_gradient(model, seen, None)[1]
+    monkeypatch.undo()
+    parameters = list(model.parameters())
+    direction = torch.randn(len(gradient), generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    parts = direction.split([parameter.numel() for parameter in parameters])
+
+    def value(step: float) -> float:
+        with torch.no_grad():
+            for parameter, part in zip(parameters, parts, strict=True):
+                parameter += step * part.view_as(parameter)
+            total = float(total_log_likelihood(model.tabulate(seen), seen.lengths))
+            for parameter, part in zip(parameters, parts, strict=True):
+                parameter -= step * part.view_as(parameter)
+        return total
+
+    slope = (value(1e-6) - value(-1e-6)) / 2e-6
+    assert float(gradient @ direction) == pytest.approx(slope, rel=1e-6)
+
+
+def test_a_gradient_takes_the_memory_of_a_chunk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """900 pictures of 64 × 64, of which convolutions keep more than 100 MB."""
+    conv = {"network": "conv", "filters": 8, "hidden": []}
+    spec = {
+        "demonstrations": {"path": "unused"},
+        "observations": ["camera"],
+        "baseline": {"kind": "flat", "policy": conv},
+    }
+    model = Hierarchy(parse_spec(spec), {"camera": (64, 64, 3)}, 2, 900)
+    pictures = torch.randint(256, (1, 900, 64, 64, 3), dtype=torch.uint8)
+    seen = Batch(Inputs({}, {"camera": pictures}, torch.arange(900)), torch.randn(1, 900, 2), torch.tensor([900]))
+
+    def peak(at_once: int) -> float:
+        monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", at_once)
+        assert model.steps_in_memory > 1
+        Path("/proc/self/clear_refs").write_text("5")  # the highest mark begins anew
+        before = status("VmRSS")
+        value_and_gradient(model, seen, None)
+        return status("VmHWM") - before
+
+    peak(10**6)
+    chunked, whole = peak(2 * 10**7), peak(10**10)
+    print(f"in chunks {chunked / 1e6:.0f} MB, at once {whole / 1e6:.0f} MB")
+    assert chunked < 5e7 < 1e8 < whole
+
+
+def status(what: str) -> int:
+    """A line of this process's status, bytes."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(f"{what}:"))
