@@ -1,7 +1,7 @@
 """What it costs to train on a trajectory of pictures in chunks of time: ``python benchmarks/chunks.py``.
 
-Prints the processor's time of a gradient in chunks over that of the same gradient in one piece: on one thread, the median
-of pairs that ran one right after the other.
+Prints the processor's time of a gradient in chunks over that of the same gradient in one piece, on one thread: the
+median of pairs that ran one right after the other.
 """
 
 from __future__ import annotations

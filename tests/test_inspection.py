@@ -52,7 +52,7 @@ def test_shapes_ranges_lengths_and_constants(path: Path) -> None:
 @pytest.mark.parametrize("block", [1, 10**9])
 def test_blocks_do_not_matter(path: Path, block: int, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = inspect(path).as_json()
-    monkeypatch.setattr("ddco_pyro.data.sources.recording.BLOCK_BYTES", block)
+    monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", block)
     assert inspect(path).as_json() == whole
 
 
@@ -80,7 +80,7 @@ def test_what_a_fit_would_refuse_is_said(path: Path) -> None:
 @pytest.mark.parametrize("block", [1, 10**9])
 def test_values_that_cannot_be_used_have_a_place(path: Path, block: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the blocks; and a number that no network takes is one of them."""
-    monkeypatch.setattr("ddco_pyro.data.sources.recording.BLOCK_BYTES", block)
+    monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", block)
     with h5py.File(path, "r+") as file:
         file["data/demo_3/obs/pose"][[2, 4], 1] = np.nan, 1e300
         file["data/demo_4/obs/pose"][:, 2] = -2e30

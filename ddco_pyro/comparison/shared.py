@@ -9,6 +9,7 @@ import numpy as np
 
 from ddco_pyro.data.control_parts import difference
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.pictures import same
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.prepare import parts
@@ -87,7 +88,7 @@ def _different(mine: Demonstration, yours: Demonstration) -> str:
     both = [key for key in mine.observations if key in yours.observations]
     arrays = {f"obs/{key}": (mine.observations[key], yours.observations[key]) for key in both}
     arrays["actions"] = (mine.actions, yours.actions)
-    return ", ".join(key for key, (left, right) in arrays.items() if not np.array_equal(left, right))
+    return ", ".join(key for key, (left, right) in arrays.items() if not same(left, right))
 
 
 def _held(fit: Fit, demos: Demonstrations) -> Held:

@@ -1,4 +1,4 @@
-"""Demonstrations in memory, checked; read from and written to HDF5 files of robomimic's layout."""
+"""Demonstrations, checked, in memory but for the pictures of files; files are HDF5 of robomimic's layout."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from ddco_pyro.data.checks import check, check_alike, check_values, problems_of_masks, unknown
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import PROGRAM, Extent, refuse_too_much
+from ddco_pyro.data.pictures import Observed, Pictures
 from ddco_pyro.data.sources.recording import Recording, of_array
 from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
 
@@ -20,7 +21,8 @@ from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimi
 class Demonstration:
     """One demonstration of T steps, s_0 a_0 ... s_{T-1} a_{T-1}.
 
-    :param observations: key to [T, ...]; uint8 (images, HWC) stays as it is, other numbers become float64.
+    :param observations: key to [T, ...]; uint8 (images, HWC) stays as it is, other numbers become float64. Pictures
+        of a file are :class:`~ddco_pyro.data.pictures.Pictures`: slices of them are read when they are asked for.
     :param actions: [T, A], the controls, float64.
     :param labels: name to [T], ground-truth segments, int64.
     :param attributes: what is known of the whole demonstration, such as its seed.
@@ -29,7 +31,7 @@ class Demonstration:
     """
 
     name: str
-    observations: Mapping[str, np.ndarray]
+    observations: Mapping[str, Observed]
     actions: np.ndarray
     labels: Mapping[str, np.ndarray] = field(default_factory=dict)
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
@@ -50,29 +52,28 @@ class Demonstration:
 
     @classmethod
     def of(cls, recording: Recording) -> Demonstration:
-        """A recording, read.
+        """A recording, read; pictures stay in their file where that can be.
 
         :raises DemonstrationsError: its file is damaged, or it cannot be used.
         """
-        observations, labels = (
-            {key: column.array() for key, column in columns.items()}
-            for columns in (recording.observations, recording.labels)
-        )
+        observations = {key: column.observed() for key, column in recording.observations.items()}
+        labels = {key: column.array() for key, column in recording.labels.items()}
         return cls(recording.name, observations, recording.actions.array(), labels, recording.attributes)
 
     def recording(self) -> Recording:
         """The same as a recording, to be written."""
-        observations, labels = (
-            {key: of_array(values) for key, values in arrays.items()} for arrays in (self.observations, self.labels)
-        )
+        observations = {key: of_array(values) for key, values in self.observations.items()}
+        labels = {key: of_array(values) for key, values in self.labels.items()}
         return Recording(self.name, observations, of_array(self.actions), labels, self.attributes)
 
     def __len__(self) -> int:
         return len(self.actions)
 
 
-def _numbers(values: Any) -> np.ndarray:
+def _numbers(values: Any) -> Observed:
     """As float64, or as they are if uint8."""
+    if isinstance(values, Pictures):
+        return values
     array = np.asarray(values)
     return array if array.dtype == np.uint8 else array.astype(np.float64)
 

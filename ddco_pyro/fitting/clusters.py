@@ -96,8 +96,10 @@ def _observations(batch: Batch) -> np.ndarray:
     """Observations of every step, [steps, features]; pictures by their block means."""
     each = []
     for row, length in enumerate(batch.lengths.tolist()):
-        means = [block_means(image[row, :length]) for image in batch.inputs.images.values()]
-        each.append(torch.cat([batch.inputs.vector[row, :length], *means], dim=-1))
+        alone = batch.inputs.part(torch.tensor([row]), slice(0, length))
+        for inputs in alone.chunks(FRAMES_AT_ONCE):
+            means = [block_means(image[0]) for image in inputs.loaded().images.values()]
+            each.append(torch.cat([inputs.vector[0], *means], dim=-1))
     rows: np.ndarray = torch.cat(each).double().numpy()
     return rows
 

@@ -91,7 +91,7 @@ def _groups(demonstrations: Iterable[Demonstration], steps: int) -> Iterator[lis
     """Consecutive demonstrations of at most so many steps, padding included; one demonstration at least."""
     group: list[Demonstration] = []
     for demo in demonstrations:
-        observed = sum(array[0].nbytes for array in demo.observations.values())
+        observed = sum(array[0].nbytes for array in demo.observations.values() if isinstance(array, np.ndarray))
         at_most = min(steps, GROUP_BYTES / (COPIES * observed + INFERENCE))
         if group and (len(group) + 1) * max(len(demo), *map(len, group)) > at_most:
             yield group

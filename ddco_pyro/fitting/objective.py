@@ -74,7 +74,9 @@ class Objective:
 
         The loss is minus that per step. A batch that is long is processed in parts.
         """
-        batch, total = self.material.train.select(rows), 0.0
+        now, total = self.progress, 0.0
+        seed = self.material.seed(now.restart, now.stage, now.epoch)
+        batch = self.material.train.shifted(model.encoder.shifts, seed).select(rows)
         for part, piece in batch.pieces(model.steps_at_once):
             tables = self._tables(model, piece, self.known[0], rows[part])
             value = self._total(tables, piece)

@@ -16,6 +16,7 @@ import torch
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, extent
 from ddco_pyro.data.hdf5 import dataset_at, member, opened
 from ddco_pyro.data.memory import Work, refuse_too_much
+from ddco_pyro.data.pictures import blocks
 from ddco_pyro.errors import nearest
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.building import Dimensions, baselines, build_hierarchy
@@ -151,7 +152,8 @@ def digest(demos: Demonstrations) -> str:
         keys = sorted(demo.observations)
         sha256.update(json.dumps([demo.name, *demo.actions.shape, *keys]).encode())
         for array in (demo.actions, *(demo.observations[key] for key in keys)):
-            sha256.update(np.ascontiguousarray(array).tobytes())
+            for block in blocks(array):
+                sha256.update(np.ascontiguousarray(block).tobytes())
     return sha256.hexdigest()
 
 

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, Transform, TransformError
 from ddco_pyro.data.values import rounding
 from ddco_pyro.model.controls import ControlScaling, refuse_impossible
-from ddco_pyro.model.networks import Inputs, InputShape
+from ddco_pyro.model.frames import Frames
+from ddco_pyro.model.networks import Inputs, InputShape, ShapeError
 from ddco_pyro.spec import STEP, ObservationSpec
 
 Shapes = Mapping[str, tuple[int, ...]]
-IMAGE_DIMENSIONS = 3
 STEPS_AT_ONCE = 8192
 """Longer batches are processed in parts, in smaller ones where a step takes much memory
 (:attr:`~ddco_pyro.model.hierarchy.Hierarchy.steps_at_once`): it stays bounded, and what the networks compute stays in
@@ -51,14 +52,28 @@ class Batch:
         """The demonstrations ``rows`` [M], padded to the longest among them; their first ``at_most`` steps if given."""
         lengths = self.lengths[rows].clamp(max=at_most or int(self.lengths.max()))
         steps = int(lengths.max())
-        inputs = self.inputs.map(lambda array: array[rows, :steps], self.inputs.time[:steps])
-        return Batch(inputs, self.actions[rows, :steps], lengths)
+        return Batch(self.inputs.part(rows, slice(0, steps)), self.actions[rows, :steps], lengths)
+
+    def shifted(self, most: Mapping[str, int], seed: int) -> Batch:
+        """The same with the pictures of each demonstration moved at random.
+
+        :param most: by observation, the most pixels along either axis.
+        """
+        images = self.inputs.images
+        if not most or not isinstance(images, Frames):
+            return self
+        random = np.random.default_rng(seed)
+        shifts = {key: random.integers(-pixels, pixels + 1, (len(self), 2)) for key, pixels in most.items()}
+        inputs = Inputs(self.inputs.vectors, replace(images, shifts=shifts), self.inputs.time)
+        return replace(self, inputs=inputs)
 
 
 class ObservationEncoder(nn.Module):
     """Observations by name to one feature vector: differences appended, standardised where the spec says so.
 
     Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model.
+    Pictures are cut and scaled as the spec says when they are read, whether from a file or from memory.
+
     A dimension that never changes, or by rounding alone (:func:`~ddco_pyro.data.values.rounding`), is only centred, and
     so are the differences of one that does so within each demonstration: rounding is no feature, and what moves later
     on moves in its own units, not in multiples of a rounding.
@@ -75,8 +90,12 @@ class ObservationEncoder(nn.Module):
         super().__init__()
         shapes = {**shapes, STEP: (1,)}
         self.shapes = {spec.key: tuple(shapes[spec.key]) for spec in specs if spec.key != STEP}
-        self.specs = tuple(spec for spec in specs if len(shapes[spec.key]) < IMAGE_DIMENSIONS)
-        self.images = {spec.key: shapes[spec.key] for spec in specs if len(shapes[spec.key]) == IMAGE_DIMENSIONS}
+        self.specs = tuple(spec for spec in specs if len(shapes[spec.key]) < PICTURE_DIMENSIONS)
+        pictures = [spec for spec in specs if len(shapes[spec.key]) == PICTURE_DIMENSIONS]
+        self.transforms = {spec.key: _transform(spec) for spec in pictures}
+        self.shifts = {spec.key: spec.augment.shift for spec in pictures if spec.augment}
+        seen = {spec.key: _seen_shape(spec, shapes[spec.key]) for spec in specs}
+        self.images = {spec.key: seen[spec.key] for spec in pictures}
         self.sizes = [int(np.prod(shapes[spec.key])) * (2 if spec.differences else 1) for spec in self.specs]
         self.register_buffer("mean", torch.zeros(sum(self.sizes), dtype=torch.float64))
         self.register_buffer("std", torch.ones(sum(self.sizes), dtype=torch.float64))
@@ -121,7 +140,7 @@ class ObservationEncoder(nn.Module):
             first += size
         return np.concatenate(moves)
 
-    def features(self, observations: Mapping[str, np.ndarray], times: np.ndarray | None = None) -> np.ndarray:
+    def features(self, observations: Mapping[str, Observed], times: np.ndarray | None = None) -> np.ndarray:
         """Observations [T, ...] by name to features [T, F], not yet standardised.
 
         :param times: the number of each step [T]; 0 to T - 1 where it is not given.
@@ -142,16 +161,17 @@ class ObservationEncoder(nn.Module):
         vector = ((features - self.mean) / self.std).float()
         return dict(zip(self.keys, vector.split(self.sizes, -1), strict=True))
 
-    def inputs(self, observations: Iterable[Mapping[str, np.ndarray]], times: np.ndarray | None = None) -> Inputs:
-        """Sequences of observations, each [T_n, ...] by name, to padded network inputs; ``times`` as in
-        :meth:`features`.
+    def inputs(self, observations: Iterable[Mapping[str, Observed]], times: np.ndarray | None = None) -> Inputs:
+        """Sequences of observations, each [T_n, ...] by name, to padded network inputs, whose pictures are read when
+        they are asked for; ``times`` as in :meth:`features`.
         """
         sequences = list(observations)
         vectors = [(self.features(sequence, times) - self.mean.numpy()) / self.std.numpy() for sequence in sequences]
-        images = {key: _pad([np.asarray(sequence[key]) for sequence in sequences]) for key in self.images}
         vector = _pad(vectors).float()
-        by_key = dict(zip(self.keys, vector.split(self.sizes, -1), strict=True))
-        return Inputs(by_key, images, torch.arange(vector.shape[1]))
+        by_key, steps = dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)), vector.shape[1]
+        pictures = {key: tuple(_pictures(sequence[key]) for sequence in sequences) for key in self.images}
+        images = Frames(pictures, self.transforms, slice(0, steps)) if pictures else {}
+        return Inputs(by_key, images, torch.arange(steps))
 
 
 LARGEST_SCALED = 1e12
@@ -189,6 +209,27 @@ def refuse_unusable(demonstrations: Demonstrations, encoder: ObservationEncoder,
                 f"{demo.name}: {place} at step {step} is {sizes[step, column]:.2g} once it is scaled, and networks "
                 f"take at most {LARGEST_SCALED:g}; repair it, or leave {demo.name} out (demonstrations.exclude)"
             )
+
+
+def _transform(spec: ObservationSpec) -> Transform:
+    return Transform(spec.crop, spec.resize, spec.grey)
+
+
+def _seen_shape(spec: ObservationSpec, stored: tuple[int, ...]) -> tuple[int, ...]:
+    """What is seen of a step of an observation.
+
+    :raises ShapeError: it cannot be cut or scaled as the spec says.
+    """
+    if spec.augment and len(stored) != PICTURE_DIMENSIONS:
+        raise ShapeError(f"observations: {spec.key!r} has shape {list(stored)} at each step: augment is for pictures")
+    try:
+        return _transform(spec).shape(stored)
+    except TransformError as error:
+        raise ShapeError(f"observations: {spec.key!r} {error}") from error
+
+
+def _pictures(values: Observed) -> Observed:
+    return values if isinstance(values, Pictures) else np.asarray(values)
 
 
 def _pad(sequences: Sequence[np.ndarray]) -> Tensor:

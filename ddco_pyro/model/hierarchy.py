@@ -208,7 +208,7 @@ class Hierarchy(nn.Module):
         self, inputs: Inputs, states: States | None, discovering: int | None
     ) -> tuple[Answers, dict[str, State]]:
         """The networks' own outputs, and their states after them."""
-        carried, answers = Carried(states), []
+        inputs, carried, answers = inputs.loaded(), Carried(states), []
         for number, level in enumerate(self.option_levels()[:discovering]):
             place, trunk = f"levels.{number}", level.trunk
             seen = inputs if trunk is None else carried.answer(f"{place}.trunk", trunk, inputs)

@@ -78,7 +78,7 @@ def _trajectories(fit: Fit, demos: Demonstrations, activity: Activity) -> Pictur
     key = named or plot_trajectories.position_key(demos)
     if key is None:
         return None
-    figure = plot_trajectories.draw(activity, [demo.observations[key][:, :3] for demo in demos], key)
+    figure = plot_trajectories.draw(activity, plot_trajectories.positions(demos, key), key)
     shown = min(len(demos), plot_trajectories.MOST_TRAJECTORIES)
     caption = (
         f"{shown} demonstrations in space, coloured by the most likely option: first three numbers of observation "

@@ -29,9 +29,14 @@ MOST_STRETCHED = 4.0
 def position_key(demos: Demonstrations) -> str | None:
     """The vector of at least three numbers that moves the most (:func:`movement`); None where none of them does."""
     keys = [key for key, shape in demos.observation_shapes.items() if len(shape) == 1 and shape[0] >= 3]
-    moves = {key: movement([demo.observations[key] for demo in demos]) for key in keys}
+    moves = {key: movement([np.asarray(demo.observations[key]) for demo in demos]) for key in keys}
     best = max(moves, key=moves.__getitem__, default=None)
     return best if best is not None and moves[best] > 0 else None
+
+
+def positions(demos: Demonstrations, key: str) -> list[np.ndarray]:
+    """The first three numbers of an observation of each demonstration, [T, 3]."""
+    return [np.asarray(demo.observations[key])[:, :3] for demo in demos]
 
 
 def movement(values: Sequence[np.ndarray]) -> float:

@@ -166,7 +166,7 @@ def _demonstration(recording: Recording, fit: Fit) -> Demonstration:
             )
         _check_shape(f"{recording.name}: obs/{key}", known[key].shape[1:], tuple(shape))
     _check_shape(f"{recording.name}: actions", recording.actions.shape[1:], (fit.hierarchy.scaling.size,))
-    return Demonstration(recording.name, {key: known[key].array() for key in shapes}, recording.actions.array())
+    return Demonstration(recording.name, {key: known[key].observed() for key in shapes}, recording.actions.array())
 
 
 def _check_shape(where: str, shape: tuple[int, ...], fitted: tuple[int, ...]) -> None:

@@ -16,6 +16,7 @@ from sklearn.cluster import KMeans
 from sklearn.mixture import GaussianMixture
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.pictures import blocks
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.fitting.clusters import block_means, distinct, joined
 from ddco_pyro.model.encoding import ObservationEncoder
@@ -74,8 +75,11 @@ def _rows_of(
 
     def rows(demo: Demonstration) -> np.ndarray:
         vector = (encoder.features(demo.observations) - mean) / std
-        images = [block_means(torch.as_tensor(demo.observations[key])).double().numpy() for key in encoder.images]
-        seen = np.concatenate([vector, *images], axis=1)
+        images = [
+            torch.cat([block_means(torch.as_tensor(transform(block))) for block in blocks(demo.observations[key])])
+            for key, transform in encoder.transforms.items()
+        ]
+        seen = np.concatenate([vector, *(image.double().numpy() for image in images)], axis=1)
         scaled = (demo.actions - middle)[:, varying] / spread[varying]
         return joined(seen, scaled) if varying.any() else seen
 

@@ -57,6 +57,18 @@ STEP = "step"
 """The built-in observation: the number of the step divided by the steps of the longest training demonstration."""
 
 
+class AugmentSpec(Model):
+    """How pictures are varied while networks are trained, and at no other time."""
+
+    shift: int = Field(default=0, ge=0)
+    """Pixels, at most, by which all pictures of a trajectory are moved in an epoch, along either axis; the edge is
+    repeated."""
+
+
+Size = Annotated[Items[Count], Field(min_length=2, max_length=2)]
+Part = Annotated[Items[Annotated[int, Field(ge=0)]], Field(min_length=4, max_length=4)]
+
+
 class ObservationSpec(Model):
     """One observation that the networks see."""
 
@@ -67,6 +79,21 @@ class ObservationSpec(Model):
     standardize: bool = True
     """Shift and scale to mean 0 and standard deviation 1 over the training demonstrations; dimensions that vary by
     rounding alone, or not at all, are only shifted."""
+
+    crop: Part | None = None
+    """Pictures alone: top, left, height and width of the part that is seen, in the file's pixels; null: all of it."""
+    resize: Size | None = None
+    """Pictures alone: height and width to which what is seen is scaled, by the mean over areas; null: as it is."""
+    grey: bool = False
+    """Pictures alone: whether red, green and blue become one luminance."""
+    augment: AugmentSpec | None = None
+    """Pictures alone: how they are varied in training; null: not at all."""
+
+    @model_validator(mode="after")
+    def _something_is_left(self) -> ObservationSpec:
+        if self.crop is not None and 0 in self.crop[2:]:
+            raise invalid(("crop", "is top, left, height, width; height and width must be 1 at least"))
+        return self
 
     @model_validator(mode="after")
     def _steps_are_even(self) -> ObservationSpec:

@@ -191,7 +191,7 @@ import json, resource, sys, traceback
 from pathlib import Path
 import ddco_pyro.data.demonstrations, ddco_pyro.data.inspection, ddco_pyro.data.starting, ddco_pyro.data.importing
 from ddco_pyro.errors import BadInput
-from ddco_pyro.data.sources.recording import BLOCK_BYTES
+from ddco_pyro.data.pictures import BLOCK_BYTES
 
 def tried(what):
     try:

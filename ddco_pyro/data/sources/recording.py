@@ -14,11 +14,9 @@ from numpy.typing import ArrayLike
 
 from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
+from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, block_steps
 
 Format = Literal["robomimic", "minari", "lerobot"]
-
-BLOCK_BYTES = 16 * 2**20
-"""Most bytes of an array that are in memory at once, one step at least."""
 
 
 @dataclass(frozen=True)
@@ -27,17 +25,23 @@ class Column:
 
     :param blocks: begins anew at each call; what it yields has T steps in all.
     :param video: whether reading it means decoding a film.
+    :param kept: the same where it can be read slice by slice later on, pictures in HDF5; else None.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype
     blocks: Callable[[], Iterator[np.ndarray]]
     video: bool = False
+    kept: Pictures | None = None
 
     @property
     def image(self) -> bool:
         """Whether a step of it is a picture: uint8 [H, W, C]."""
-        return self.dtype == np.uint8 and len(self.shape) == 4
+        return is_image(self.shape, self.dtype)
+
+    def observed(self) -> Observed:
+        """The whole array, or where to read it from."""
+        return self.array() if self.kept is None else self.kept
 
     def array(self) -> np.ndarray:
         """The whole array."""
@@ -71,8 +75,15 @@ class Recording:
         yield from ((f"labels/{key}", column) for key, column in self.labels.items())
 
 
-def of_array(values: ArrayLike) -> Column:
-    """A column that is in memory already."""
+def is_image(shape: tuple[int, ...], dtype: np.dtype) -> bool:
+    """Whether a step of an array [T, ...] is a picture: uint8 [H, W, C]."""
+    return dtype == np.uint8 and len(shape) == 1 + PICTURE_DIMENSIONS
+
+
+def of_array(values: ArrayLike | Pictures) -> Column:
+    """A column that is in memory already, or of pictures in their file."""
+    if isinstance(values, Pictures):
+        return Column(values.shape, values.dtype, values.blocks, kept=values)
     array = np.asarray(values)
     return Column(array.shape, array.dtype, lambda: iter([array]))
 
@@ -90,10 +101,12 @@ def of_dataset(dataset: h5py.Dataset, where: str) -> Column:
     :raises DemonstrationsError: a step of it, or a chunk, which HDF5 reads whole, takes more memory than is allowed.
     """
     length, at_once = len(dataset), block_steps(dataset.shape[1:], dataset.dtype)
+    image = is_image(dataset.shape, dataset.dtype)
+    kept = Pictures(dataset.file.filename, dataset.name, where, dataset.shape) if image else None
     least = dataset.dtype.itemsize * max(math.prod(dataset.shape[1:]), math.prod(dataset.chunks or ()))
     refuse_too_much(least, f"{where}: to read one step", "store it in smaller steps or chunks")
 
-    def blocks() -> Iterator[np.ndarray]:
+    def read() -> Iterator[np.ndarray]:
         for start in range(0, length, at_once):
             try:
                 block = np.asarray(dataset[start : start + at_once])
@@ -101,7 +114,7 @@ def of_dataset(dataset: h5py.Dataset, where: str) -> Column:
                 raise DemonstrationsError(f"{where} cannot be read ({error}); the file may be damaged") from error
             yield block
 
-    return Column(dataset.shape, dataset.dtype, blocks)
+    return Column(dataset.shape, dataset.dtype, read, kept=kept)
 
 
 def damaged(path: Path, where: str, error: BaseException) -> DemonstrationsError:
@@ -113,8 +126,3 @@ def damaged(path: Path, where: str, error: BaseException) -> DemonstrationsError
         return error
     text = " ".join(str(error).split()) or type(error).__name__
     return DemonstrationsError(f"{path}: {where + ': ' if where else ''}cannot be read, or is damaged: {text}")
-
-
-def block_steps(shape: tuple[int, ...], dtype: np.dtype) -> int:
-    """Steps in a block of an array whose steps have this shape."""
-    return max(1, BLOCK_BYTES // max(1, math.prod(shape) * dtype.itemsize))

@@ -10,7 +10,8 @@ import av
 import numpy as np
 
 from ddco_pyro.data.hdf5 import DemonstrationsError
-from ddco_pyro.data.sources.recording import Column, block_steps
+from ddco_pyro.data.pictures import block_steps
+from ddco_pyro.data.sources.recording import Column
 
 
 def frames(path: Path, start: float = 0.0) -> Iterator[np.ndarray]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from operator import itemgetter
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from ddco_pyro.errors import nearest
+from ddco_pyro.model.frames import Frames
 
 T = TypeVar("T")
 
@@ -51,7 +51,7 @@ class InputShape:
 @dataclass(frozen=True)
 class Inputs:
     """Observations of N trajectories by name: ``vectors`` float32 [N, T, F_key]; ``images`` uint8 [N, T, H, W, C];
-    ``time`` [T] counts steps.
+    ``time`` [T] counts steps. Images may be :class:`~ddco_pyro.model.frames.Frames`; networks are given tensors.
     """
 
     vectors: Mapping[str, Tensor]
@@ -61,7 +61,9 @@ class Inputs:
     @property
     def batch(self) -> tuple[int, int]:
         """(N, T)."""
-        array = next(iter([*self.vectors.values(), *self.images.values()]))
+        if not self.vectors and isinstance(self.images, Frames):
+            return self.images.batch
+        array = next(iter([*self.vectors.values()] or [*self.images.values()]))
         return array.shape[0], array.shape[1]
 
     @cached_property
@@ -80,8 +82,21 @@ class Inputs:
         """Consecutive parts of at most so many steps of time each, one step at least."""
         size = max(steps, 1)
         for first in range(0, self.batch[1], size):
-            part = slice(first, first + size)
-            yield self.map(itemgetter((slice(None), part)), self.time[part])
+            yield self.part(slice(None), slice(first, first + size))
+
+    def part(self, rows: Tensor | slice, steps: slice) -> Inputs:
+        """Some trajectories alone, and consecutive steps of them."""
+        vectors = {key: array[rows, steps] for key, array in self.vectors.items()}
+        if isinstance(self.images, Frames):
+            return Inputs(vectors, self.images.part(rows, steps), self.time[steps])
+        return Inputs(vectors, {key: array[rows, steps] for key, array in self.images.items()}, self.time[steps])
+
+    def loaded(self) -> Inputs:
+        """The same with all images in memory.
+
+        :raises DemonstrationsError: a file cannot be read.
+        """
+        return Inputs(self.vectors, dict(self.images), self.time) if isinstance(self.images, Frames) else self
 
     def map(self, change: Callable[[Tensor], Tensor], time: Tensor) -> Inputs:
         """The same of changed arrays, at other times."""

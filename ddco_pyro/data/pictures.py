@@ -1,0 +1,186 @@
+"""Pictures that stay in their file, are read where they are needed, and are cut to what networks see."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ddco_pyro.data.hdf5 import DAMAGE, DemonstrationsError, opened
+from ddco_pyro.errors import BadInput
+
+BLOCK_BYTES = 16 * 2**20
+"""Most bytes of an array that are read at a time where all of it goes by, one step at least."""
+
+PICTURE_DIMENSIONS = 3
+"""A step of pictures is [H, W, C]."""
+
+
+class TransformError(BadInput):
+    """Pictures cannot be cut or scaled as asked."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """An array uint8 [T, H, W, C] in an HDF5 file: a slice of steps is read when it is asked for.
+
+    :param path: the file, which is opened for each slice, in whatever process asks for it.
+    :param place: of the array in it.
+    :param where: what errors call it, such as ``demo_0: obs/camera``.
+    """
+
+    path: str
+    place: str
+    where: str
+    shape: tuple[int, ...]
+
+    @property
+    def dtype(self) -> np.dtype[np.uint8]:
+        """Always uint8."""
+        return np.dtype(np.uint8)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, steps: slice) -> np.ndarray:
+        """The pictures of consecutive steps.
+
+        :raises DemonstrationsError: the file cannot be read, or has changed since.
+        """
+        first, last, _ = steps.indices(len(self))
+        with opened(self.path) as file:
+            dataset = file.get(self.place)
+            if getattr(dataset, "shape", None) != self.shape or dataset.dtype != self.dtype:
+                raise DemonstrationsError(f"{self.where} has changed since it was looked at; do the same again")
+            try:
+                return np.asarray(dataset[first:last])
+            except DAMAGE as error:
+                raise DemonstrationsError(f"{self.where} cannot be read ({error}); the file may be damaged") from error
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """All of them, in memory."""
+        return self[:].astype(dtype or self.dtype, copy=False)
+
+    def blocks(self) -> Iterator[np.ndarray]:
+        """All of them, block by block."""
+        yield from blocks(self)
+
+
+Observed = np.ndarray | Pictures
+"""An observation of a demonstration [T, ...], in memory; pictures perhaps in their file."""
+
+
+def blocks(array: Observed) -> Iterator[np.ndarray]:
+    """An array [T, ...] in blocks of consecutive steps; one in memory is a single block."""
+    if isinstance(array, np.ndarray):
+        yield array
+        return
+    at_once = block_steps(array.shape[1:], array.dtype)
+    for first in range(0, len(array), at_once):
+        yield array[first : first + at_once]
+
+
+def block_steps(shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
+    """Steps in a block of an array whose steps have this shape."""
+    return max(1, BLOCK_BYTES // max(1, math.prod(shape) * dtype.itemsize))
+
+
+def same(left: Observed, right: Observed) -> bool:
+    """Whether two arrays hold the same; what is in files is read block by block."""
+    if left.shape != right.shape:
+        return False
+    if isinstance(left, np.ndarray) and isinstance(right, np.ndarray):
+        return np.array_equal(left, right)
+    at_once = block_steps(left.shape[1:], left.dtype)
+    firsts = range(0, len(left), at_once)
+    return all(np.array_equal(left[first : first + at_once], right[first : first + at_once]) for first in firsts)
+
+
+class Transform(NamedTuple):
+    """What networks see of a picture: a part of it, then scaled, then without colours.
+
+    :param crop: top, left, height, width of the part, in the file's pixels; None for all of it.
+    :param resize: height and width that it is scaled to; None for as it is.
+    :param grey: whether red, green and blue become one luminance.
+    """
+
+    crop: tuple[int, ...] | None = None
+    resize: tuple[int, ...] | None = None
+    grey: bool = False
+
+    def shape(self, stored: Sequence[int]) -> tuple[int, ...]:
+        """[H, W, C] of what is seen of pictures of this shape.
+
+        :raises TransformError: they are no pictures, the part is not within them, or they have no three colours.
+        """
+        if self == Transform():
+            return tuple(stored)
+        if len(stored) != PICTURE_DIMENSIONS:
+            raise TransformError(
+                f"has shape {list(stored)} at each step: crop, resize and grey are for pictures [H, W, C]"
+            )
+        height, width, colours = stored
+        if self.crop is not None:
+            top, left, *size = self.crop
+            if top + size[0] > height or left + size[1] > width:
+                raise TransformError(
+                    f"crop: [{', '.join(map(str, self.crop))}] is not within {height} × {width} pixels"
+                )
+            height, width = size
+        if self.grey and colours != 3:
+            raise TransformError(f"grey: is for pictures of three colours, not {colours}")
+        return *(self.resize or (height, width)), 1 if self.grey else colours
+
+    def __call__(self, frames: np.ndarray) -> np.ndarray:
+        """Pictures [T, H, W, C] as they are seen, [T, H', W', C']."""
+        if self.crop is not None:
+            top, left, height, width = self.crop
+            frames = frames[:, top : top + height, left : left + width]
+        if self.resize is not None and frames.shape[1:3] != self.resize:
+            frames = self._resized(frames, self.resize)
+        return _grey(frames) if self.grey else frames
+
+    @staticmethod
+    def _resized(frames: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+        """Scaled by the mean over areas (cv2's INTER_AREA)."""
+        import cv2
+
+        height, width = size
+        scaled = np.empty((len(frames), height, width, frames.shape[-1]), frames.dtype)
+        for number, frame in enumerate(frames):
+            one = cv2.resize(np.ascontiguousarray(frame), (width, height), interpolation=cv2.INTER_AREA)
+            scaled[number] = one.reshape(scaled.shape[1:])
+        return scaled
+
+
+def _grey(frames: np.ndarray) -> np.ndarray:
+    """Luminance of red, green and blue (ITU-R BT.601), [T, H, W, 1]."""
+    red, green, blue = np.moveaxis(frames.astype(np.uint32), -1, 0)
+    return ((299 * red + 587 * green + 114 * blue + 500) // 1000).astype(frames.dtype)[..., None]
+
+
+def padded(
+    frames: Sequence[Observed], steps: slice, transform: Transform, shifts: np.ndarray | None = None
+) -> np.ndarray:
+    """Steps of several demonstrations as networks see them, [N, steps, H, W, C], zeros past their ends.
+
+    :param shifts: rows and columns by which the pictures of each are moved, [N, 2]; the edge is repeated.
+    :raises DemonstrationsError: a file cannot be read.
+    """
+    shape = transform.shape(frames[0].shape[1:])
+    whole = np.zeros((len(frames), steps.stop - steps.start, *shape), frames[0].dtype)
+    for row, array in enumerate(frames):
+        seen = transform(array[steps.start : max(steps.start, min(steps.stop, len(array)))])
+        whole[row, : len(seen)] = seen if shifts is None else shifted(seen, *shifts[row].tolist())
+    return whole
+
+
+def shifted(frames: np.ndarray, down: int, right: int) -> np.ndarray:
+    """Pictures [T, H, W, C] moved by whole pixels; the edge is repeated."""
+    height, width = frames.shape[1:3]
+    rows = np.clip(np.arange(height) - down, 0, height - 1)
+    columns = np.clip(np.arange(width) - right, 0, width - 1)
+    return frames[:, rows][:, :, columns]

@@ -1,0 +1,236 @@
+"""Pictures stay in their file: what is read of them, what networks see, and that a fit is the same bit for bit."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import torch
+import yaml
+from command_line import call
+
+import ddco_pyro
+from ddco_pyro.acting.window import ObservationError, Window
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.data.pictures import Pictures, Transform, shifted
+from ddco_pyro.fitting.prepare import digest
+from ddco_pyro.model.encoding import Batch, ObservationEncoder
+from ddco_pyro.spec import ObservationSpec, SpecError, parse_spec
+
+HEIGHT, WIDTH = 12, 10
+CONV = {"network": "conv", "filters": 3, "kernel": 3, "pooled": 2, "hidden": [5]}
+RAW = {"key": "camera", "crop": [1, 2, 10, 8], "resize": [5, 4], "grey": True}
+
+
+def demonstrations(number: int = 8) -> Demonstrations:
+    """In memory: short ones, and a long one."""
+    random = np.random.default_rng(0)
+
+    def one(index: int) -> Demonstration:
+        steps = 40 if index == 2 else 6 + index
+        seen = {
+            "pose": random.normal(size=(steps, 3)),
+            "camera": random.integers(0, 256, (steps, HEIGHT, WIDTH, 3), dtype=np.uint8),
+        }
+        return Demonstration(f"demo_{index}", seen, random.normal(size=(steps, 2)), {"phase": np.arange(steps) // 4})
+
+    return Demonstrations(tuple(one(index) for index in range(number)))
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("pictures") / "demos.hdf5"
+    demonstrations().write(path)
+    return path
+
+
+def spec_of(path: Path, *observations: Any, **training: Any) -> dict[str, Any]:
+    level = {"count": 2, "policy": CONV, "termination": {"network": "linear", "inputs": ["pose"]}}
+    return {
+        "demonstrations": {"path": str(path), "valid_fraction": 0.25, "labels": "phase"},
+        "observations": ["pose", *observations],
+        "hierarchy": {"levels": [level], "meta_policy": {"network": "lstm", "over": CONV, "hidden": 3}},
+        "training": {"epochs": 4, "batch_size": 3, "patience": None, **training},
+        "compare_with": [{"kind": "flat", "policy": CONV}],
+    }
+
+
+def bits(fit: ddco_pyro.Fit) -> bytes:
+    """All weights."""
+    models = (fit.hierarchy, *(beside.hierarchy for beside in fit.baselines.values()))
+    return b"".join(value.numpy().tobytes() for model in models for value in model.state_dict().values())
+
+
+# --- the file ---------------------------------------------------------------------------------------------------------
+
+
+def test_pictures_of_a_file_are_read_when_asked_for(kept: Path) -> None:
+    read, made = Demonstrations.read(kept), demonstrations()
+    for demo, original in zip(read, made, strict=True):
+        pictures = demo.observations["camera"]
+        assert isinstance(pictures, Pictures)
+        assert isinstance(demo.observations["pose"], np.ndarray)
+        np.testing.assert_array_equal(pictures[3:6], original.observations["camera"][3:6])
+        np.testing.assert_array_equal(pictures, original.observations["camera"])
+        assert len(pickle.dumps(pictures)) < 1000
+    assert read.observation_shapes == made.observation_shapes
+    assert digest(read) == digest(made)
+
+
+def test_what_was_read_is_written_again(kept: Path, tmp_path: Path) -> None:
+    Demonstrations.read(kept).write(tmp_path / "again.hdf5")
+    assert digest(Demonstrations.read(tmp_path / "again.hdf5")) == digest(demonstrations())
+
+
+def test_a_file_that_has_changed_since(tmp_path: Path) -> None:
+    path = tmp_path / "demos.hdf5"
+    demonstrations().write(path)
+    pictures = Demonstrations.read(path)[0].observations["camera"]
+    with h5py.File(path, "r+") as file:
+        del file["data/demo_0/obs/camera"]
+    with pytest.raises(DemonstrationsError, match="demo_0: obs/camera has changed since"):
+        pictures[:]
+
+
+# --- what networks see ------------------------------------------------------------------------------------------------
+
+
+def test_transform_by_hand() -> None:
+    picture = np.zeros((1, 4, 4, 3), np.uint8)
+    picture[0, 1:3, 1:3] = [[[10, 20, 30], [50, 60, 70]], [[90, 100, 110], [130, 140, 150]]]
+    cut = Transform(crop=(1, 1, 2, 2))
+    np.testing.assert_array_equal(cut(picture), picture[:, 1:3, 1:3])
+    np.testing.assert_array_equal(cut._replace(resize=(1, 1))(picture), [[[[70, 80, 90]]]])  # means
+    grey = cut._replace(grey=True)(picture)
+    np.testing.assert_array_equal(grey[0, ..., 0], [[18, 58], [98, 138]])  # 0.299 r + 0.587 g + 0.114 b = r + 8.1 here
+    for transform in (cut, cut._replace(resize=(1, 2)), Transform(grey=True), Transform(resize=(8, 7), grey=True)):
+        assert transform(picture).shape[1:] == transform.shape(picture.shape[1:])
+
+
+def test_grey_is_that_of_opencv() -> None:
+    """But for how halves are rounded."""
+    picture = np.random.default_rng(0).integers(0, 256, (1, 50, 50, 3), dtype=np.uint8)
+    theirs = cv2.cvtColor(picture[0], cv2.COLOR_RGB2GRAY).astype(int)
+    assert np.abs(Transform(grey=True)(picture)[0, ..., 0].astype(int) - theirs).max() <= 1
+
+
+def test_pictures_are_cut_and_scaled_wherever_they_are(kept: Path) -> None:
+    encoder = ObservationEncoder([ObservationSpec(**RAW)], {"camera": (HEIGHT, WIDTH, 3)})
+    assert encoder.images == {"camera": (5, 4, 1)}
+    read, made = ([demo.observations for demo in demos] for demos in (Demonstrations.read(kept), demonstrations()))
+    seen, expected = (encoder.inputs(each).loaded().images["camera"] for each in (read, made))
+    assert torch.equal(seen, expected)
+    first = made[0]["camera"][0, 1:11, 2:10]
+    scaled = cv2.resize(first, (4, 5), interpolation=cv2.INTER_AREA)
+    np.testing.assert_array_equal(seen[0, 0], Transform(grey=True)(scaled[None])[0])
+
+
+def test_shifting_repeats_the_edge() -> None:
+    picture = np.arange(9, dtype=np.uint8).reshape(1, 3, 3, 1)
+    np.testing.assert_array_equal(shifted(picture, 1, 0)[0, ..., 0], [[0, 1, 2], [0, 1, 2], [3, 4, 5]])
+    np.testing.assert_array_equal(shifted(picture, 0, -2)[0, ..., 0], [[2, 2, 2], [5, 5, 5], [8, 8, 8]])
+    np.testing.assert_array_equal(shifted(picture, 0, 0), picture)
+
+
+def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
+    spec = parse_spec(spec_of(Path("unused"), {"key": "camera", "augment": {"shift": 3}}))
+    encoder = ObservationEncoder(spec.observations, demonstrations().observation_shapes)
+    demos = demonstrations()
+    whole = Batch(encoder.inputs(demo.observations for demo in demos), torch.zeros(8, 40, 2), torch.tensor(demos.lengths))
+    for seed in (1, 2):
+        seen = whole.shifted(encoder.shifts, seed)
+        shifts = seen.inputs.images.shifts["camera"]
+        assert np.abs(shifts).max() <= 3
+        assert len(np.unique(shifts, axis=0)) > 3
+        pictures = seen.select(torch.tensor([5, 2])).inputs.loaded().images["camera"]
+        for row, n in enumerate((5, 2)):
+            expected = shifted(demos[n].observations["camera"], *shifts[n])
+            np.testing.assert_array_equal(pictures[row, : len(expected)], expected)
+    again, other = (whole.shifted(encoder.shifts, seed).inputs.images.shifts["camera"] for seed in (2, 1))
+    assert (again == shifts).all()
+    assert (other != shifts).any()
+
+
+@pytest.mark.parametrize(
+    ("observation", "message"),
+    [
+        ({"key": "camera", "crop": [3, 3, 10, 4]}, r"'camera' crop: \[3, 3, 10, 4\] is not within 12 × 10 pixels"),
+        ({"key": "pose", "grey": True}, r"'pose' has shape \[3\] at each step: crop, resize and grey are for pictures"),
+        ({"key": "pose", "augment": {"shift": 2}}, r"'pose' has shape \[3\] at each step: augment is for pictures"),
+        ({"key": "camera", "crop": [3, 3, 0, 4]}, r"observations.1.crop: is top, left, height, width; height and width"),
+        ({"key": "camera", "resize": [3]}, r"observations.1.resize: "),
+        ({"key": "camera", "zoom": 2}, r"observations.1.zoom: "),
+    ],
+)
+def test_what_cannot_be_cut_is_refused(kept: Path, observation: dict[str, Any], message: str) -> None:
+    data = spec_of(kept)
+    data["observations"] = [one for one in ("pose", "camera") if one != observation["key"]]
+    data["observations"].insert(1, observation)
+    with pytest.raises(SpecError, match=message):
+        ddco_pyro.fit(parse_spec(data))
+
+
+# --- a fit ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("initialize", ["vq", "vq_controls"])
+def test_a_streamed_fit_is_that_in_memory(kept: Path, initialize: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bit for bit, weights and numbers, in chunks of time too, with cut and shifted pictures."""
+    spec = parse_spec(spec_of(kept, {**RAW, "augment": {"shift": 1}}, initialize=initialize))
+    if initialize == "vq_controls":
+        hierarchy = ddco_pyro.fit(spec).hierarchy
+        monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", 17 * hierarchy.step_bytes)
+    streamed, whole = ddco_pyro.fit(spec), ddco_pyro.fit(spec, demonstrations())
+    assert isinstance(streamed.demonstrations[0].observations["camera"], Pictures)
+    assert bits(streamed) == bits(whole)
+    numbers = [fit.metrics | {"seconds": ...} for fit in (streamed, whole)]
+    assert numbers[0] == numbers[1]
+    assert numbers[0]["options"]
+
+
+def test_a_controller_sees_what_networks_were_trained_on(kept: Path) -> None:
+    fit = ddco_pyro.fit(parse_spec(spec_of(kept, RAW, epochs=1)))
+    demo = demonstrations()[1]
+    seen = [{key: values[step] for key, values in demo.observations.items()} for step in range(len(demo))]
+    with torch.no_grad():
+        said = fit.hierarchy(fit.hierarchy.encoder.inputs([demo.observations]))
+        window, states = Window(fit.hierarchy.encoder), None
+        for step, observation in enumerate(seen):
+            now, states = fit.hierarchy.advance(window.inputs([observation]), states)
+            for one, whole in zip(now.tensors(), said.tensors(), strict=True):
+                torch.testing.assert_close(one[0, 0], whole[0, step])
+    with pytest.raises(ObservationError, match=r"shape \(5, 4, 1\), the demonstrations had \(12, 10, 3\)"):
+        fit.controller().act(seen[0] | {"camera": np.zeros((5, 4, 1), np.uint8)})
+
+
+def test_a_damaged_picture_is_one_line(kept: Path, tmp_path: Path) -> None:
+    path = tmp_path / "damaged.hdf5"
+    path.write_bytes(kept.read_bytes())
+    with h5py.File(path) as file:
+        chunk = file["data/demo_2/obs/camera"].id.get_chunk_info(30)
+    content = bytearray(path.read_bytes())
+    content[chunk.byte_offset : chunk.byte_offset + chunk.size] = b"\xff" * chunk.size
+    path.write_bytes(content)
+    spec = tmp_path / "spec.yaml"
+    spec.write_text(yaml.safe_dump(spec_of(path, "camera")))
+    ended = call("fit", spec, "--out", tmp_path / "run")
+    assert (ended.status, ended.err.count("ddco-pyro:")) == (2, 1)
+    assert f"ddco-pyro: {path}: demo_2: obs/camera cannot be read" in ended.err.splitlines()[-1]
+
+
+def test_pictures_of_another_size_are_one_line(kept: Path, tmp_path: Path) -> None:
+    path = tmp_path / "uneven.hdf5"
+    path.write_bytes(kept.read_bytes())
+    with h5py.File(path, "r+") as file:
+        del file["data/demo_3/obs/camera"]
+        file["data/demo_3/obs/camera"] = np.zeros((9, 12, 11, 3), np.uint8)
+    spec = tmp_path / "spec.yaml"
+    spec.write_text(yaml.safe_dump(spec_of(path, "camera")))
+    ended = call("fit", spec, "--out", tmp_path / "run")
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert "demo_3: obs/camera has shape (12, 11, 3) at each step, but (12, 10, 3) in demo_0" in ended.err
