@@ -82,7 +82,7 @@ def test_a_fit_to_what_is_larger_than_memory_is_refused(eight: Path, tmp_path: P
             f"ddco-pyro: {eight}: a fit to state takes about {size} GB of memory, and 2 are allowed;"
         )
         assert "leave observations out" in ended.err
-        assert ended.err.endswith(f"or allow more with DDCO_PYRO_MEMORY={size}\n")
+        assert ended.err.endswith(f"or allow more with DDCO_PYRO_MEMORY={size}GB\n")
     assert not (tmp_path / "run").exists()
     assert call("check", spec_of(eight, "arm")).status == 0  # what is not asked for does not count
 
@@ -101,13 +101,18 @@ def test_more_can_be_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     random_demonstrations(4).write(path)
     spec = parse_spec(yaml.safe_load(spec_of(path, "pose").read_text()))
     assert demonstrations(spec).names == ("demo_0", "demo_1", "demo_2", "demo_3")
-    monkeypatch.setenv("DDCO_PYRO_MEMORY", "0.5")
+    monkeypatch.setenv("DDCO_PYRO_MEMORY", "0.5GB")
     with pytest.raises(DemonstrationsError, match=r"and 0\.5 are allowed"):
         demonstrations(spec)
-    for wrong in ("much", "-1", "0", "nan"):
+    for wrong in ("much", "-1", "0", "nan", "2 apples", "1e999"):
         monkeypatch.setenv("DDCO_PYRO_MEMORY", wrong)
-        with pytest.raises(BadInput, match=rf"DDCO_PYRO_MEMORY={wrong}: has to be a positive number of GB"):
+        with pytest.raises(
+            BadInput, match=rf"DDCO_PYRO_MEMORY={wrong}: has to be a number of bytes, or one with a unit"
+        ):
             allowed()
+    for said, meant in (("1500000000", 1.5e9), ("2GB", 2e9), ("0.5 gb", 5e8), ("700MB", 7e8)):
+        monkeypatch.setenv("DDCO_PYRO_MEMORY", said)
+        assert allowed() == meant
 
 
 def vectors(path: Path, lengths: tuple[int, ...], size: int) -> Path:
@@ -156,7 +161,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[float, float]:
 
 
 def estimated_and_measured(spec: Path, path: Path) -> tuple[float, float]:
-    ended = measured("fit", spec, "--out", spec.with_suffix(""), DDCO_PYRO_MEMORY="8")
+    ended = measured("fit", spec, "--out", spec.with_suffix(""), DDCO_PYRO_MEMORY="8GB")
     assert ended.status == 0, ended.err
     return memory_needed(load_spec(spec), path), ended.peak
 
@@ -230,7 +235,7 @@ def nothing_stored(group: h5py.Group) -> None:
 def test_what_cannot_be_read_in_blocks(
     make: Callable[[h5py.Group], None], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("DDCO_PYRO_MEMORY", "0.01")
+    monkeypatch.setenv("DDCO_PYRO_MEMORY", "10MB")
     path = tmp_path / "demos.hdf5"
     with h5py.File(path, "w") as file:
         for number in range(3):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ import ddco_pyro
 from ddco_pyro.acting.window import ObservationError, Window
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.data.pictures import Pictures, Transform, shifted
+from ddco_pyro.data.reading import Job, Readers, read
+from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.prepare import digest
 from ddco_pyro.model.encoding import Batch, ObservationEncoder
 from ddco_pyro.spec import ObservationSpec, SpecError, parse_spec
@@ -141,7 +144,9 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
     spec = parse_spec(spec_of(Path("unused"), {"key": "camera", "augment": {"shift": 3}}))
     encoder = ObservationEncoder(spec.observations, demonstrations().observation_shapes)
     demos = demonstrations()
-    whole = Batch(encoder.inputs(demo.observations for demo in demos), torch.zeros(8, 40, 2), torch.tensor(demos.lengths))
+    whole = Batch(
+        encoder.inputs(demo.observations for demo in demos), torch.zeros(8, 40, 2), torch.tensor(demos.lengths)
+    )
     for seed in (1, 2):
         seen = whole.shifted(encoder.shifts, seed)
         shifts = seen.inputs.images.shifts["camera"]
@@ -162,7 +167,10 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
         ({"key": "camera", "crop": [3, 3, 10, 4]}, r"'camera' crop: \[3, 3, 10, 4\] is not within 12 × 10 pixels"),
         ({"key": "pose", "grey": True}, r"'pose' has shape \[3\] at each step: crop, resize and grey are for pictures"),
         ({"key": "pose", "augment": {"shift": 2}}, r"'pose' has shape \[3\] at each step: augment is for pictures"),
-        ({"key": "camera", "crop": [3, 3, 0, 4]}, r"observations.1.crop: is top, left, height, width; height and width"),
+        (
+            {"key": "camera", "crop": [3, 3, 0, 4]},
+            r"observations.1.crop: is top, left, height, width; height and width",
+        ),
         ({"key": "camera", "resize": [3]}, r"observations.1.resize: "),
         ({"key": "camera", "zoom": 2}, r"observations.1.zoom: "),
     ],
@@ -206,6 +214,57 @@ def test_a_controller_sees_what_networks_were_trained_on(kept: Path) -> None:
                 torch.testing.assert_close(one[0, 0], whole[0, step])
     with pytest.raises(ObservationError, match=r"shape \(5, 4, 1\), the demonstrations had \(12, 10, 3\)"):
         fit.controller().act(seen[0] | {"camera": np.zeros((5, 4, 1), np.uint8)})
+
+
+@pytest.mark.parametrize("at_once", [1, 10**9], ids=["in chunks", "at once"])
+def test_what_is_read_ahead_is_what_is_asked_for(kept: Path, at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plan that is off would be slow, not wrong: so the order is compared, and every reading is a planned one."""
+    monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", at_once)
+    planned: list[object] = []
+    taken: list[object] = []
+    plan, take = Readers.plan, Readers.take
+
+    def planning(readers: Readers, jobs: Iterable[Job]) -> None:
+        jobs = list(jobs)
+        planned.extend(job.key for job in jobs)
+        plan(readers, jobs)
+
+    def taking(readers: Readers, job: Job) -> dict[str, np.ndarray]:
+        if readers in trained:
+            taken.append(job.key)
+        return take(readers, job)
+
+    trained: list[Readers] = []
+    monkeypatch.setattr(Readers, "plan", planning)
+    monkeypatch.setattr(Readers, "take", taking)
+    monkeypatch.setattr(Readers, "__enter__", lambda readers: trained.append(readers) or readers)
+    data = spec_of(kept, "camera", epochs=2, initialize="random", layerwise=False)
+    ddco_pyro.fit(parse_spec(data | {"compare_with": []}))
+    assert len(taken) > 4
+    assert planned == taken
+
+
+def test_workers_read_the_same(kept: Path) -> None:
+    data = spec_of(kept, {**RAW, "augment": {"shift": 1}}, initialize="random", layerwise=False)
+    alone, beside = (
+        ddco_pyro.fit(parse_spec({**data, "training": data["training"] | {"workers": workers}})) for workers in (0, 2)
+    )
+    assert bits(alone) == bits(beside)
+
+
+def test_a_worker_that_dies_is_one_line(kept: Path) -> None:
+    encoder = ObservationEncoder([ObservationSpec(key="camera")], {"camera": (HEIGHT, WIDTH, 3)})
+    frames = encoder.inputs(demo.observations for demo in Demonstrations.read(kept)).images
+    jobs = [frames.part(torch.tensor([row]), slice(0, 5)).job for row in range(8)]
+    with Readers(1) as readers:
+        readers.plan(jobs)
+        np.testing.assert_array_equal(readers.take(jobs[0])["camera"], read(jobs[0])["camera"])
+        for process in readers._pool._processes.values():
+            process.kill()
+            process.join()
+        with pytest.raises(Failed, match=r"a process that read pictures was ended from outside .* training\.workers"):
+            for job in jobs[1:]:
+                readers.take(job)
 
 
 def test_a_damaged_picture_is_one_line(kept: Path, tmp_path: Path) -> None:

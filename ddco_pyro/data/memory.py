@@ -1,9 +1,14 @@
-"""Whether demonstrations fit into memory, by their shapes: said before they are read."""
+"""How much memory a fit may take, and whether what has to be in memory fits into it: said before it is read.
+
+What networks compute, and pictures in a file, take as much as they are given (:func:`share`); vectors, controls and
+what the inference keeps of each step are there as a whole.
+"""
 
 from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -14,8 +19,10 @@ from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.errors import BadInput
 
 VARIABLE = "DDCO_PYRO_MEMORY"
-ALLOWED = 2.0
-"""GB that may be taken where ``$DDCO_PYRO_MEMORY`` says nothing else."""
+ALLOWED = "2GB"
+"""What may be taken where ``$DDCO_PYRO_MEMORY`` says nothing else."""
+
+UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 
 PROGRAM = 680e6
 """Bytes that a fit of next to nothing takes: mostly torch, Pyro and compiled code."""
@@ -31,7 +38,7 @@ INFERENCE = 5e3
 
 
 class Array(Protocol):
-    """An array that need not be in memory."""
+    """An array that need not be in memory; its pictures may stay in a file."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -47,13 +54,15 @@ class Work:
     """What training and evaluating a model takes beside the demonstrations.
 
     :param batch: trajectories in a gradient step.
-    :param steps: steps that go through the networks together, where trajectories are short enough.
+    :param steps: steps of several trajectories that go through the networks together.
+    :param chunk: steps of a long trajectory that do.
     :param bytes_per_step: bytes that the networks take for each of them.
-    :param clustered: numbers at each step that are clustered to begin with; 0 where nothing is.
+    :param clustered: numbers that are clustered to begin with.
     """
 
     batch: int
     steps: int
+    chunk: int
     bytes_per_step: int
     clustered: int
 
@@ -63,7 +72,7 @@ class Extent:
     """How much there is of demonstrations, by their headers.
 
     :param lengths: steps of each.
-    :param size: bytes of all that is read, as it is in memory.
+    :param size: bytes of all that is read, as it is in memory; pictures that stay in their file do not count.
     :param shapes: by place (``actions``, ``obs/<key>``) the shape of a step.
     :param pictures: the places that hold pictures, uint8.
     """
@@ -83,7 +92,8 @@ class Extent:
             lengths.append(arrays["actions"].shape[0] if arrays["actions"].shape else 0)
             for place, array in arrays.items():
                 plain = array.dtype == np.uint8
-                size += math.prod(array.shape) * (1 if plain else 8)
+                stays = getattr(array, "kept", None) is not None
+                size += 0 if stays else math.prod(array.shape) * (1 if plain else 8)
                 if not place.startswith("labels/"):
                     shapes[place] = max(shapes.get(place, ()), tuple(array.shape[1:]), key=math.prod)
                     pictures |= {place} if plain and len(array.shape) == 4 else set()
@@ -103,38 +113,45 @@ class Extent:
         return sum(count * (2 if place in differences else 1) for place, count in numbers.items())
 
     def step(self, differences: Collection[str] = ()) -> float:
-        """Bytes that networks are given for a step, and what is made on the way there."""
-        return (KEPT + MAKING) * self.features(differences) + self.picture_bytes
+        """Bytes of a step's vectors as networks are given them, and of what is made on the way there."""
+        return (KEPT + MAKING) * self.features(differences)
 
     def fit(self, works: Iterable[Work], differences: Collection[str] = ()) -> float:
-        """Bytes that a fit takes, about: the most that one of its models, which are trained one after the other, does.
+        """Bytes that a fit takes, about: the most that one of its models does, which are trained one after the other.
 
-        The demonstrations are there as they were read, and padded. What else there is comes one after the other: what
-        is made of them, clusters, and gradient steps.
+        The vectors are there as they were read, and padded. What else there is comes one after the other: what is made
+        of them, clusters, and gradient steps.
         """
         longest, features = max(1, *self.lengths), self.features(differences)
-        padded, given = len(self.lengths) * longest, KEPT * features + self.picture_bytes
+        padded, given = len(self.lengths) * longest, KEPT * features
         passing = [MAKING * features * padded]
         for work in works:
             batch, together = (min(n, len(self.lengths)) for n in (work.batch, max(work.steps // longest, 1)))
-            networks = together * (work.bytes_per_step + given + INFERENCE)
-            passing += [MAKING * work.clustered * sum(self.lengths), longest * (batch * given + networks)]
+            networks = min(together * longest, work.chunk) * (work.bytes_per_step + self.picture_bytes)
+            passing += [MAKING * work.clustered, longest * (batch * given + together * (given + INFERENCE)) + networks]
         return PROGRAM + self.size + padded * given + max(passing)
 
 
 def allowed() -> float:
     """Bytes that may be taken.
 
-    :raises BadInput: ``$DDCO_PYRO_MEMORY`` is not a positive number.
+    :raises BadInput: ``$DDCO_PYRO_MEMORY`` is not a positive number, perhaps with a unit.
     """
-    text = os.environ.get(VARIABLE, str(ALLOWED))
-    try:
-        gigabytes = float(text)
-    except ValueError:
-        gigabytes = math.nan
-    if not gigabytes > 0:
-        raise BadInput(f"{VARIABLE}={text}: has to be a positive number of GB")
-    return 1e9 * gigabytes
+    text = os.environ.get(VARIABLE, ALLOWED)
+    said = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([KMGT]?B)?\s*", text, re.IGNORECASE)
+    number = float(said[1]) * UNITS[(said[2] or "B").upper()] if said else 0.0
+    if not number > 0:
+        raise BadInput(f"{VARIABLE}={text}: has to be a number of bytes, or one with a unit, such as 2GB or 500MB")
+    return number
+
+
+PARTS = 5
+"""What is computed may take this part of what is left beside the program: networks are given one, clusters two."""
+
+
+def share() -> float:
+    """Bytes that networks may take for the steps that go through them together."""
+    return max(1.0, (allowed() - PROGRAM) / PARTS)
 
 
 def refuse_too_much(needed: float, what: str, remedy: str) -> None:
@@ -148,5 +165,5 @@ def refuse_too_much(needed: float, what: str, remedy: str) -> None:
         more = math.ceil(needed / 1e8) / 10
         raise DemonstrationsError(
             f"{what} takes about {more:g} GB of memory, and {allowed() / 1e9:g} are allowed; {remedy}, "
-            f"or allow more with {VARIABLE}={more:g}"
+            f"or allow more with {VARIABLE}={more:g}GB"
         )

@@ -7,13 +7,17 @@ at any level. Where some steps have labels, clusters start from the means of tho
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import numpy as np
 import torch
 from sklearn.cluster import KMeans
 from sklearn.metrics import euclidean_distances
 from torch import Tensor
 
+from ddco_pyro.data.memory import share
 from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.hierarchy import BYTES_AT_ONCE
 from ddco_pyro.model.networks.conv import POOLED
 
 
@@ -25,28 +29,63 @@ class Clusters:
     :param labels: the options of the steps that have one, 1 to m, -1 for the others, [N, T]: the clusters of these
         options start from the means of their steps, the others as k-means++ does from there.
 
-    Fewer than ``options`` clusters are found where there are fewer distinct observations.
+    Fewer than ``options`` clusters are found where there are fewer distinct observations. Of more steps than
+    :func:`most_rows` as many are drawn at random, and the clusters are theirs.
     """
 
     def __init__(
         self, batch: Batch, options: int, seed: int, controls: bool = False, labels: Tensor | None = None
     ) -> None:
         self._controls = controls
-        rows = self._rows(batch)
-        start = "k-means++" if labels is None else _Start(labels[_alive(batch)].numpy())
+        self._most = most_rows(next(self._blocks(batch)).shape[1])
+        chosen = np.ones(batch.steps, dtype=bool)
+        chosen[np.random.default_rng(seed).permutation(batch.steps)[self._most :]] = False
+        rows = np.concatenate(list(_only(chosen, self._blocks(batch))))
+        start = "k-means++" if labels is None else _Start(labels[_alive(batch)].numpy()[chosen])
         self._kmeans = KMeans(distinct(rows, options), init=start, n_init=10, random_state=seed).fit(rows)
 
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
         choices = torch.zeros(batch.inputs.batch, dtype=torch.long)
-        choices[_alive(batch)] = torch.as_tensor(self._kmeans.predict(self._rows(batch)), dtype=torch.long) + 1
+        each = [self._kmeans.predict(rows) for rows in _together(self._blocks(batch), self._most)]
+        choices[_alive(batch)] = torch.as_tensor(np.concatenate(each), dtype=torch.long) + 1
         return choices
 
-    def _rows(self, batch: Batch) -> np.ndarray:
-        seen = _observations(batch)
-        if not self._controls:
-            return seen
-        return joined(seen, batch.actions[_alive(batch)].double().numpy())
+    def _blocks(self, batch: Batch) -> Iterator[np.ndarray]:
+        """What is clustered of consecutive steps [B, F], trajectory after trajectory."""
+        for row, length in enumerate(batch.lengths.tolist()):
+            alone, first = batch.inputs.part(torch.tensor([row]), slice(0, length)), 0
+            for inputs in alone.chunks(FRAMES_AT_ONCE if alone.images else length):
+                means = [block_means(image[0]) for image in inputs.loaded().images.values()]
+                seen = torch.cat([inputs.vector[0], *means], dim=-1).double().numpy()
+                last = first + len(seen)
+                yield joined(seen, batch.actions[row, first:last].double().numpy()) if self._controls else seen
+                first = last
+
+
+def _only(chosen: np.ndarray, blocks: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """The chosen rows of each block; ``chosen`` has an entry for each row of all blocks."""
+    first = 0
+    for block in blocks:
+        yield block[chosen[first : first + len(block)]]
+        first += len(block)
+
+
+def _together(blocks: Iterable[np.ndarray], rows: int) -> Iterator[np.ndarray]:
+    """Blocks one below the other, a new one from about so many rows on."""
+    waiting: list[np.ndarray] = []
+    for block in blocks:
+        waiting.append(block)
+        if sum(map(len, waiting)) >= rows:
+            yield np.concatenate(waiting)
+            waiting = []
+    if waiting:
+        yield np.concatenate(waiting)
+
+
+def most_rows(numbers: int) -> int:
+    """The most steps, of so many numbers each, that are clustered together, for the sake of memory."""
+    return max(1, int(min(BYTES_AT_ONCE, share())) // (8 * max(1, numbers)))
 
 
 def joined(seen: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -90,18 +129,6 @@ def _alive(batch: Batch) -> Tensor:
 
 FRAMES_AT_ONCE = 64
 """Pictures whose pixels are floating-point numbers at the same time."""
-
-
-def _observations(batch: Batch) -> np.ndarray:
-    """Observations of every step, [steps, features]; pictures by their block means."""
-    each = []
-    for row, length in enumerate(batch.lengths.tolist()):
-        alone = batch.inputs.part(torch.tensor([row]), slice(0, length))
-        for inputs in alone.chunks(FRAMES_AT_ONCE):
-            means = [block_means(image[0]) for image in inputs.loaded().images.values()]
-            each.append(torch.cat([inputs.vector[0], *means], dim=-1))
-    rows: np.ndarray = torch.cat(each).double().numpy()
-    return rows
 
 
 def block_means(frames: Tensor) -> Tensor:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
+from ddco_pyro.data.reading import Readers
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.checkpoint import State
 from ddco_pyro.fitting.labels import Labels
@@ -41,6 +42,10 @@ class Material:
         hierarchy.encoder.load_state_dict(self.encoder)
         hierarchy.scaling.load_state_dict(self.scaling)
         return hierarchy.eval()
+
+    def read_by(self, readers: Readers) -> Material:
+        """The same with pictures that are in files read by these."""
+        return replace(self, train=self.train.read_by(readers), tune=self.tune.read_by(readers))
 
     def seed(self, *where: int) -> int:
         """A seed for a restart, one of its stages, or an epoch of a stage."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
+
 import torch
 from torch import Tensor
 
+from ddco_pyro.data.reading import Job
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.checkpoint import Progress
 from ddco_pyro.fitting.clusters import Clusters, EqualParts
@@ -14,6 +17,7 @@ from ddco_pyro.fitting.stages import Stage
 from ddco_pyro.fitting.upper import Constants, expected, fitted
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
 from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables
 
@@ -74,9 +78,7 @@ class Objective:
 
         The loss is minus that per step. A batch that is long is processed in parts.
         """
-        now, total = self.progress, 0.0
-        seed = self.material.seed(now.restart, now.stage, now.epoch)
-        batch = self.material.train.shifted(model.encoder.shifts, seed).select(rows)
+        batch, total = self._seen(model).select(rows), 0.0
         for part, piece in batch.pieces(model.steps_at_once):
             tables = self._tables(model, piece, self.known[0], rows[part])
             value = self._total(tables, piece)
@@ -86,12 +88,25 @@ class Objective:
             total += float(value.detach())
         return total
 
+    def read_ahead(self, model: Hierarchy, minibatches: Sequence[Tensor]) -> None:
+        """Have the pictures of an epoch's minibatches read before :meth:`ascend` asks for them."""
+        seen = self._seen(model)
+        _read_ahead(
+            model, seen, (piece for rows in minibatches for _, piece in seen.select(rows).pieces(model.steps_at_once))
+        )
+
+    def _seen(self, model: Hierarchy) -> Batch:
+        """The training demonstrations as they are seen in this epoch."""
+        now = self.progress
+        return self.material.train.shifted(model.encoder.shifts, self.material.seed(now.restart, now.stage, now.epoch))
+
     def tune(self, model: Hierarchy) -> float:
         """What is maximised of the tuning demonstrations, per step."""
+        pieces = list(self.material.tune.pieces(model.steps_at_once))
         with torch.no_grad():
+            _read_ahead(model, self.material.tune, (piece for _, piece in pieces))
             values = [
-                float(self._total(self._tables(model, piece, self.known[1], part), piece))
-                for part, piece in self.material.tune.pieces(model.steps_at_once)
+                float(self._total(self._tables(model, piece, self.known[1], part), piece)) for part, piece in pieces
             ]
         return sum(values) / self.material.tune.steps
 
@@ -120,3 +135,19 @@ class Objective:
             f"stage {self.stage.name}, epoch {self.progress.epoch + 1}: the log-likelihood of {where} is not "
             "finite; look at these demonstrations, raise control.std, or lower training.optimizer.lr"
         )
+
+
+def _read_ahead(model: Hierarchy, whole: Batch, pieces: Iterable[Batch]) -> None:
+    """Have the pictures of these pieces of a batch read in the order in which the networks will ask for them."""
+    if isinstance(whole.inputs.images, Frames):
+        whole.inputs.images.readers.plan(_jobs(model, pieces))
+
+
+def _jobs(model: Hierarchy, pieces: Iterable[Batch]) -> Iterator[Job]:
+    """Chunk after chunk; where there are several and a gradient is asked for, then once more, the last first."""
+    for piece in pieces:
+        chunks = model.chunks(piece.inputs)
+        again = chunks[::-1] if len(chunks) > 1 and model.training else []
+        for chunk in (*chunks, *again):
+            assert isinstance(chunk.images, Frames)  # it is a part of such a piece
+            yield chunk.images.job

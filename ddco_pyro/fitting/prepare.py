@@ -20,6 +20,7 @@ from ddco_pyro.data.pictures import blocks
 from ddco_pyro.errors import nearest
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.building import Dimensions, baselines, build_hierarchy
+from ddco_pyro.fitting.clusters import most_rows
 from ddco_pyro.model.encoding import STEPS_AT_ONCE
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks.conv import POOLED
@@ -194,15 +195,18 @@ def memory_needed(spec: Spec, path: Path) -> float:
     size = Dimensions(shapes, math.prod(stored.shapes["actions"]), max(1, *stored.lengths))
     try:
         with torch.random.fork_rng(devices=[]):
-            works = [_work(*model, size) for model in ((spec, build_hierarchy(spec, size)), *baselines(spec, size))]
+            models = (spec, build_hierarchy(spec, size)), *baselines(spec, size)
+            works = [_work(*model, size, sum(stored.lengths)) for model in models]
     except SpecError:  # it is said where networks are checked
-        works = [Work(spec.training.batch_size, STEPS_AT_ONCE, 0, 0)]
+        works = [Work(spec.training.batch_size, STEPS_AT_ONCE, STEPS_AT_ONCE, 0, 0)]
     return stored.fit(works, {f"obs/{observation.key}" for observation in spec.observations if observation.differences})
 
 
-def _work(spec: Spec, hierarchy: Hierarchy, dimensions: Dimensions) -> Work:
-    """What training a model takes."""
+def _work(spec: Spec, hierarchy: Hierarchy, dimensions: Dimensions, steps: int) -> Work:
+    """What training a model on so many steps takes."""
     features = len(hierarchy.encoder.mean) + sum(shape[-1] * POOLED**2 for shape in hierarchy.encoder.images.values())
     kind = spec.training.initialize if hierarchy.depth else "random"
-    clustered = {"random": 0, "equal_parts": 0, "vq": features, "vq_controls": features + dimensions.control_size}[kind]
-    return Work(spec.training.batch_size, hierarchy.steps_at_once, hierarchy.step_bytes, clustered)
+    numbers = {"random": 0, "equal_parts": 0, "vq": features, "vq_controls": features + dimensions.control_size}[kind]
+    clustered = min(steps, most_rows(numbers)) * numbers
+    chunk = hierarchy.steps_in_memory
+    return Work(spec.training.batch_size, hierarchy.steps_at_once, chunk, hierarchy.step_bytes, clustered)

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from ddco_pyro.data.reading import Readers
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
 from ddco_pyro.fitting.checkpoint import Restart, copy_of, optimizer_state, restore_optimizer
 from ddco_pyro.fitting.convergence import StageEnd, share
@@ -48,8 +49,9 @@ def advance(
     :param checkpoint: where it is kept at the end of epochs.
     :raises TrainingError: a log-likelihood is not finite.
     """
-    with one_thread():
-        return restart, Training(material, restart, checkpoint, on_event).run(until, time.monotonic() + seconds)
+    deadline = time.monotonic() + seconds
+    with one_thread(), Readers(material.spec.training.workers) as readers:
+        return restart, Training(material.read_by(readers), restart, checkpoint, on_event).run(until, deadline)
 
 
 class Training:
@@ -117,7 +119,9 @@ class Training:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self._material.seed(now.restart, now.stage, now.epoch))
             model.train()
-            for rows in torch.randperm(len(self._material.train)).split(self.spec.training.batch_size):
+            minibatches = torch.randperm(len(self._material.train)).split(self.spec.training.batch_size)
+            objective.read_ahead(model, minibatches)
+            for rows in minibatches:
                 optimizer.zero_grad(set_to_none=True)
                 total += objective.ascend(model, rows)
                 if self.spec.training.clip_gradient is not None:

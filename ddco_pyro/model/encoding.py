@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, Transform, TransformError
+from ddco_pyro.data.reading import Readers
 from ddco_pyro.data.values import rounding
 from ddco_pyro.model.controls import ControlScaling, refuse_impossible
 from ddco_pyro.model.frames import Frames
@@ -59,13 +60,19 @@ class Batch:
 
         :param most: by observation, the most pixels along either axis.
         """
-        images = self.inputs.images
-        if not most or not isinstance(images, Frames):
-            return self
         random = np.random.default_rng(seed)
         shifts = {key: random.integers(-pixels, pixels + 1, (len(self), 2)) for key, pixels in most.items()}
-        inputs = Inputs(self.inputs.vectors, replace(images, shifts=shifts), self.inputs.time)
-        return replace(self, inputs=inputs)
+        return self._with(lambda images: replace(images, shifts=shifts))
+
+    def read_by(self, readers: Readers) -> Batch:
+        """The same with pictures that are in files read by these."""
+        return self._with(lambda images: replace(images, readers=readers) if images.stored else images)
+
+    def _with(self, change: Callable[[Frames], Frames]) -> Batch:
+        images = self.inputs.images
+        if not isinstance(images, Frames):
+            return self
+        return replace(self, inputs=Inputs(self.inputs.vectors, change(images), self.inputs.time))
 
 
 class ObservationEncoder(nn.Module):
@@ -170,7 +177,8 @@ class ObservationEncoder(nn.Module):
         vector = _pad(vectors).float()
         by_key, steps = dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)), vector.shape[1]
         pictures = {key: tuple(_pictures(sequence[key]) for sequence in sequences) for key in self.images}
-        images = Frames(pictures, self.transforms, slice(0, steps)) if pictures else {}
+        rows = tuple(range(len(sequences)))
+        images = Frames(pictures, self.transforms, rows, slice(0, steps)) if pictures else {}
         return Inputs(by_key, images, torch.arange(steps))
 
 

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from ddco_pyro.data.control_parts import ControlPart, all_gaussian
+from ddco_pyro.data.memory import share
 from ddco_pyro.model.controls import ControlScaling, ControlStd
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch, ObservationEncoder, Shapes
 from ddco_pyro.model.networks import Inputs, InputShape, build, build_trunk, named
@@ -25,7 +26,8 @@ from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
 
 BYTES_AT_ONCE = 256 * 10**6
-"""Most bytes that networks take for the steps that go through them together, one step at least."""
+"""Most bytes that networks take for the steps that go through them together, one step at least; less where less memory
+is allowed (:func:`ddco_pyro.data.memory.share`)."""
 
 Emits = Literal["options", "control"]
 
@@ -169,7 +171,7 @@ class Hierarchy(nn.Module):
     @property
     def steps_in_memory(self) -> int:
         """Steps that networks can be trained on at a time: longer trajectories are processed in chunks of time."""
-        return max(1, BYTES_AT_ONCE // max(1, self.step_bytes))
+        return max(1, int(min(BYTES_AT_ONCE, share())) // max(1, self.step_bytes))
 
     @property
     def steps_at_once(self) -> int:
@@ -184,7 +186,7 @@ class Hierarchy(nn.Module):
 
         :param discovering: d gives levels 1 to d alone under a uniform meta-policy (layer-wise training, SM 2.3).
         """
-        chunks = list(inputs.chunks(self.steps_in_memory // inputs.batch[0]))
+        chunks = self.chunks(inputs)
         if len(chunks) == 1:
             return self.advance(inputs, None, discovering)[0]
         answers: list[Answers] = []
@@ -193,6 +195,10 @@ class Hierarchy(nn.Module):
             said, states = checkpoint(self._answers, chunk, states, discovering, use_reentrant=False)
             answers.append(said)
         return self._outputs([torch.cat(each, dim=1) for each in zip(*answers, strict=True)], discovering)
+
+    def chunks(self, inputs: Inputs) -> list[Inputs]:
+        """The chunks of time in which they go through the networks; a single one where they are short enough."""
+        return list(inputs.chunks(self.steps_in_memory // inputs.batch[0]))
 
     def advance(
         self, inputs: Inputs, states: States | None, discovering: int | None = None

@@ -146,8 +146,9 @@ def _refuse_too_long(recording: Recording, fit: Fit, before: int) -> None:
     extent = Extent.of([{"actions": recording.actions, **seen}])
     (steps,) = extent.lengths
     differences = {f"obs/{observation.key}" for observation in fit.spec.observations if observation.differences}
-    each = extent.step(differences) + fit.hierarchy.step_bytes + INFERENCE
-    needed = PROGRAM + extent.size + steps * each + FOUND * fit.hierarchy.depth * (before + steps)
+    each, networks = extent.step(differences) + INFERENCE, min(steps, fit.hierarchy.steps_in_memory)
+    needed = PROGRAM + extent.size + steps * each + networks * fit.hierarchy.step_bytes
+    needed += FOUND * fit.hierarchy.depth * (before + steps)
     refuse_too_much(needed, f"{recording.name}: segmenting its {steps} steps", "divide it, or the file")
 
 

@@ -273,6 +273,9 @@ class TrainingSpec(Model):
     """Part of the training demonstrations set aside for tuning: to stop early and to choose among restarts."""
     patience: Count | None = 20
     """Epochs without improvement before a stage stops; null for never."""
+    workers: int = Field(default=0, ge=0)
+    """Processes that read pictures ahead while networks are trained; 0: they are read in between. The result is the
+    same for any number."""
     clip_gradient: Positive | None = None
     """Largest norm of a gradient; null for no limit."""
     labels: LabelsSpec | None = None

@@ -96,7 +96,7 @@ class Inputs:
 
         :raises DemonstrationsError: a file cannot be read.
         """
-        return Inputs(self.vectors, dict(self.images), self.time) if isinstance(self.images, Frames) else self
+        return Inputs(self.vectors, self.images.loaded(), self.time) if isinstance(self.images, Frames) else self
 
     def map(self, change: Callable[[Tensor], Tensor], time: Tensor) -> Inputs:
         """The same of changed arrays, at other times."""
