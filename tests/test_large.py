@@ -195,6 +195,50 @@ def test_a_fit_takes_what_was_estimated(
     assert more >= 0.6 * (estimate - small[0])
 
 
+def camera(path: Path, demonstrations: int, steps: int, height: int, width: int) -> Path:
+    """Pictures of noise, stored as they are; the same ones in each demonstration."""
+    random = np.random.default_rng(0)
+    block = random.integers(0, 256, (steps, height, width, 3), dtype=np.uint8)
+    with h5py.File(path, "w") as file:
+        for index in range(demonstrations):
+            file[f"data/demo_{index}/obs/seen"] = block
+            file[f"data/demo_{index}/actions"] = random.normal(size=(steps, 3))
+    return path
+
+
+def flat_fit(path: Path, **observation: object) -> Path:
+    """A spec that is soon fitted: one epoch of a flat policy."""
+    policy = {"network": "conv", "filters": 4, "hidden": [8]}
+    data = {
+        "demonstrations": {"path": str(path), "valid_fraction": 0.2},
+        "observations": [{"key": "seen", **observation}],
+        "baseline": {"kind": "flat", "policy": policy},
+        "training": {"epochs": 1},
+    }
+    spec = path.with_suffix(".yaml")
+    spec.write_text(yaml.safe_dump(data))
+    return spec
+
+
+def test_a_fit_to_pictures_stays_within_what_is_allowed(tmp_path: Path) -> None:
+    """290 MB of pictures; what they take on the way through networks is a multiple of that."""
+    path = camera(tmp_path / "demos.hdf5", 3, 420, 240, 320)
+    ended = measured("fit", flat_fit(path), "--out", tmp_path / "run", DDCO_PYRO_MEMORY="850MB")
+    print(f"{path.stat().st_size / 1e6:.0f} MB of pictures: {ended.peak / 1e6:.0f} MB at most")
+    assert ended.status == 0, ended.err
+    assert ended.peak < 850e6
+
+
+@pytest.mark.slow
+def test_eight_gigabytes_of_pictures_are_fitted(tmp_path: Path) -> None:
+    path = camera(tmp_path / "demos.hdf5", 9, 970, 480, 640)
+    assert path.stat().st_size > 8 * GIGABYTE
+    ended = measured("fit", flat_fit(path, resize=[24, 32]), "--out", tmp_path / "run")
+    print(f"{path.stat().st_size / 1e9:.1f} GB of pictures: {ended.peak / 1e6:.0f} MB at most")
+    assert ended.status == 0, ended.err
+    assert ended.peak < LIMIT
+
+
 def test_a_demonstration_that_cannot_be_segmented_is_refused(toy_run, tmp_path: Path) -> None:
     path = toy_like(tmp_path / "long.hdf5", 2, 1_000_000)
     ended = call("segment", toy_run.folder, path, "--in-place")

@@ -14,6 +14,7 @@ import pytest
 import torch
 import yaml
 from command_line import call
+from killing import struck
 
 import ddco_pyro
 from ddco_pyro.acting.window import ObservationError, Window
@@ -21,9 +22,10 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, Demonst
 from ddco_pyro.data.pictures import Pictures, Transform, shifted
 from ddco_pyro.data.reading import Job, Readers, read
 from ddco_pyro.errors import Failed
+from ddco_pyro.export import runner, write_numpy
 from ddco_pyro.fitting.prepare import digest
 from ddco_pyro.model.encoding import Batch, ObservationEncoder
-from ddco_pyro.spec import ObservationSpec, SpecError, parse_spec
+from ddco_pyro.spec import ObservationSpec, SpecError, parse_spec, with_overrides
 
 HEIGHT, WIDTH = 12, 10
 CONV = {"network": "conv", "filters": 3, "kernel": 3, "pooled": 2, "hidden": [5]}
@@ -216,6 +218,20 @@ def test_a_controller_sees_what_networks_were_trained_on(kept: Path) -> None:
         fit.controller().act(seen[0] | {"camera": np.zeros((5, 4, 1), np.uint8)})
 
 
+@pytest.mark.parametrize("cut", [{}, {"crop": [1, 2, 10, 8], "resize": [5, 4]}, {"grey": True}])
+def test_an_exported_controller_takes_the_same_pictures(kept: Path, cut: dict[str, Any], tmp_path: Path) -> None:
+    """Those of the file: it cuts and scales them itself, as the run's controller does."""
+    spec = parse_spec(spec_of(kept, {"key": "camera", **cut}, epochs=1, layerwise=False, initialize="random"))
+    fit = ddco_pyro.fit(with_overrides(spec, {"compare_with": []}))
+    write_numpy(fit, tmp_path)
+    ours, theirs = fit.controller(), runner.Runner(tmp_path)
+    ours.reset(0)
+    demo = demonstrations()[3]
+    for step in range(len(demo)):
+        seen = {key: values[step] for key, values in demo.observations.items()}
+        np.testing.assert_allclose(theirs.act(seen), ours.act(seen), atol=1e-5)
+
+
 @pytest.mark.parametrize("at_once", [1, 10**9], ids=["in chunks", "at once"])
 def test_what_is_read_ahead_is_what_is_asked_for(kept: Path, at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A plan that is off would be slow, not wrong: so the order is compared, and every reading is a planned one."""
@@ -265,6 +281,23 @@ def test_a_worker_that_dies_is_one_line(kept: Path) -> None:
         with pytest.raises(Failed, match=r"a process that read pictures was ended from outside .* training\.workers"):
             for job in jobs[1:]:
                 readers.take(job)
+
+
+def test_killed_while_workers_read(kept: Path, tmp_path: Path) -> None:
+    """SIGKILL in the third epoch; called again, it ends with the bits of an undisturbed fit."""
+    data = spec_of(kept, "camera", epochs=4, initialize="random", layerwise=False, workers=1)
+    spec = tmp_path / "spec.yaml"
+    spec.write_text(yaml.safe_dump(data | {"compare_with": []}))
+    strike = "os.kill(os.getpid(), signal.SIGKILL)"
+    status, _ = struck(("fit", spec, "--out", "killed"), tmp_path, "EpochEnded", 3, strike)
+    assert status == -9
+    assert (tmp_path / "killed" / "checkpoints" / "restart-0.safetensors").exists()
+    assert not (tmp_path / "killed" / "model.safetensors").exists()
+    for name in ("killed", "whole"):
+        ended = call("fit", spec, "--out", tmp_path / name)
+        assert ended.status == 0, ended.err
+    for name in ("model.safetensors", "history.csv"):
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
 def test_a_damaged_picture_is_one_line(kept: Path, tmp_path: Path) -> None:

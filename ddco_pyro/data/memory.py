@@ -99,11 +99,6 @@ class Extent:
                     pictures |= {place} if plain and len(array.shape) == 4 else set()
         return cls(tuple(lengths), size, shapes, frozenset(pictures))
 
-    @property
-    def picture_bytes(self) -> int:
-        """Bytes of all pictures of a step."""
-        return sum(math.prod(self.shapes[place]) for place in self.pictures)
-
     def features(self, differences: Collection[str] = ()) -> int:
         """Numbers of a step that are no pictures.
 
@@ -127,7 +122,7 @@ class Extent:
         passing = [MAKING * features * padded]
         for work in works:
             batch, together = (min(n, len(self.lengths)) for n in (work.batch, max(work.steps // longest, 1)))
-            networks = min(together * longest, work.chunk) * (work.bytes_per_step + self.picture_bytes)
+            networks = min(together * longest, work.chunk) * work.bytes_per_step
             passing += [MAKING * work.clustered, longest * (batch * given + together * (given + INFERENCE)) + networks]
         return PROGRAM + self.size + padded * given + max(passing)
 

@@ -111,6 +111,10 @@ class Transform(NamedTuple):
     resize: tuple[int, ...] | None = None
     grey: bool = False
 
+    def as_data(self) -> dict[str, Any]:
+        """What there is of it, as plain data."""
+        return {key: value for key, value in self._asdict().items() if value}
+
     def shape(self, stored: Sequence[int]) -> tuple[int, ...]:
         """[H, W, C] of what is seen of pictures of this shape.
 
@@ -172,9 +176,13 @@ def padded(
     """
     shape = transform.shape(frames[0].shape[1:])
     whole = np.zeros((len(frames), steps.stop - steps.start, *shape), frames[0].dtype)
+    at_once = block_steps(frames[0].shape[1:], frames[0].dtype)
     for row, array in enumerate(frames):
-        seen = transform(array[steps.start : max(steps.start, min(steps.stop, len(array)))])
-        whole[row, : len(seen)] = seen if shifts is None else shifted(seen, *shifts[row].tolist())
+        last = min(steps.stop, len(array))
+        for first in range(steps.start, last, at_once):
+            seen = transform(array[first : min(first + at_once, last)])
+            at = first - steps.start
+            whole[row, at : at + len(seen)] = seen if shifts is None else shifted(seen, *shifts[row].tolist())
     return whole
 
 

@@ -146,8 +146,9 @@ def _about(hierarchy: Hierarchy, control: RolloutSpec) -> dict[str, Any]:
                 "shape": list(shape),
                 "image": key in encoder.images,
                 "differences": key in vectors and vectors[key].differences,
+                **(encoder.transforms[key].as_data() if key in encoder.images else {}),
             }
-            for key, shape in [*((key, encoder.shapes.get(key, (1,))) for key in vectors), *encoder.images.items()]
+            for key, shape in ((key, encoder.shapes.get(key, (1,))) for key in [*vectors, *encoder.images])
         ],
         "step": {"key": STEP, "longest": float(encoder.longest)} if STEP in vectors else None,
         "features": dict(zip(encoder.keys, encoder.sizes, strict=True)),

@@ -105,7 +105,7 @@ def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generato
         observations[spec.key] = values.reshape(steps, *shape)
         at += size
     return observations | {
-        key: random.integers(0, 256, (steps, *shape), dtype=np.uint8) for key, shape in encoder.images.items()
+        key: random.integers(0, 256, (steps, *encoder.shapes[key]), dtype=np.uint8) for key in encoder.images
     }
 
 

@@ -66,7 +66,7 @@ class Runner:
             observation = {**observation, built_in["key"]: np.array([self.time / built_in["longest"]])}
         now = {spec["key"]: _checked(observation, spec) for spec in self.about["observations"]}
         features = self._features(now, self._last or now)
-        images = {spec["key"]: now[spec["key"]] for spec in self.about["observations"] if spec["image"]}
+        images = {spec["key"]: _picture(now[spec["key"]], spec) for spec in self.about["observations"] if spec["image"]}
         self.outputs, self._state = self._networks(features, self.time, images, self._state)
         outputs = self.outputs
         generator = np.random.default_rng([self.seed, self.time])
@@ -191,6 +191,34 @@ KINDS: dict[str, Callable[[Part, np.ndarray, np.ndarray, np.ndarray | None], np.
     "binary": _binary,
     "categorical": _categorical,
 }
+
+
+def _picture(picture: np.ndarray, spec: Mapping[str, Any]) -> np.ndarray:
+    """A picture [H, W, C] as networks see it: a part of it, scaled, without colours, where it is so."""
+    if "crop" in spec:
+        top, left, height, width = spec["crop"]
+        picture = picture[top : top + height, left : left + width]
+    if "resize" in spec and picture.shape[:2] != tuple(spec["resize"]):
+        picture = _resized(picture, *spec["resize"])
+    if spec.get("grey"):
+        red, green, blue = np.moveaxis(picture.astype(np.uint32), -1, 0)
+        picture = ((299 * red + 587 * green + 114 * blue + 500) // 1000).astype(np.uint8)[..., None]
+    return picture
+
+
+def _resized(picture: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Scaled by the mean over areas.
+
+    :raises ImportError: there is no cv2.
+    """
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError(
+            "pictures are scaled with cv2, which is missing: pip install opencv-python-headless"
+        ) from error
+    scaled = cv2.resize(np.ascontiguousarray(picture), (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(scaled, np.uint8).reshape(height, width, -1)
 
 
 def _checked(observation: Mapping[str, Any], spec: Mapping[str, Any]) -> np.ndarray:
