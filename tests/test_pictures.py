@@ -81,6 +81,8 @@ def test_pictures_of_a_file_are_read_when_asked_for(kept: Path) -> None:
         assert isinstance(pictures, Pictures)
         assert isinstance(demo.observations["pose"], np.ndarray)
         np.testing.assert_array_equal(pictures[3:6], original.observations["camera"][3:6])
+        np.testing.assert_array_equal(pictures[-1], original.observations["camera"][-1])
+        np.testing.assert_array_equal(pictures[1:6:2], original.observations["camera"][1:6:2])
         np.testing.assert_array_equal(pictures, original.observations["camera"])
         assert len(pickle.dumps(pictures)) < 1000
     assert read.observation_shapes == made.observation_shapes
@@ -279,8 +281,7 @@ def test_a_worker_that_dies_is_one_line(kept: Path) -> None:
             process.kill()
             process.join()
         with pytest.raises(Failed, match=r"a process that read pictures was ended from outside .* training\.workers"):
-            for job in jobs[1:]:
-                readers.take(job)
+            list(map(readers.take, jobs[1:]))
 
 
 def test_killed_while_workers_read(kept: Path, tmp_path: Path) -> None:

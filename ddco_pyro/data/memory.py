@@ -140,13 +140,16 @@ def allowed() -> float:
     return number
 
 
-PARTS = 5
-"""What is computed may take this part of what is left beside the program: networks are given one, clusters two."""
+MARGIN = 100e6
+"""Bytes for blocks of files on their way, and for what the allocator does not give back."""
+
+PARTS = 4.75
+"""Networks are given one of so many parts of what is left; clusters take two, and what the inference keeps the rest."""
 
 
 def share() -> float:
     """Bytes that networks may take for the steps that go through them together."""
-    return max(1.0, (allowed() - PROGRAM) / PARTS)
+    return max(1.0, (allowed() - PROGRAM - MARGIN) / PARTS)
 
 
 def refuse_too_much(needed: float, what: str, remedy: str) -> None:

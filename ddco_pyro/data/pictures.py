@@ -45,18 +45,21 @@ class Pictures:
     def __len__(self) -> int:
         return self.shape[0]
 
-    def __getitem__(self, steps: slice) -> np.ndarray:
-        """The pictures of consecutive steps.
+    def __getitem__(self, steps: slice | int) -> np.ndarray:
+        """The pictures of some steps, or the picture of one.
 
         :raises DemonstrationsError: the file cannot be read, or has changed since.
         """
-        first, last, _ = steps.indices(len(self))
+        if not isinstance(steps, slice):
+            step = range(len(self))[steps]
+            return np.asarray(self[step : step + 1][0])
+        first, last, stride = steps.indices(len(self))
         with opened(self.path) as file:
             dataset = file.get(self.place)
             if getattr(dataset, "shape", None) != self.shape or dataset.dtype != self.dtype:
                 raise DemonstrationsError(f"{self.where} has changed since it was looked at; do the same again")
             try:
-                return np.asarray(dataset[first:last])
+                return np.asarray(dataset[first:last:stride])
             except DAMAGE as error:
                 raise DemonstrationsError(f"{self.where} cannot be read ({error}); the file may be damaged") from error
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -102,7 +103,8 @@ def of_dataset(dataset: h5py.Dataset, where: str) -> Column:
     """
     length, at_once = len(dataset), block_steps(dataset.shape[1:], dataset.dtype)
     image = is_image(dataset.shape, dataset.dtype)
-    kept = Pictures(dataset.file.filename, dataset.name, where, dataset.shape) if image else None
+    path = os.path.abspath(dataset.file.filename)  # it may be read by a process that runs elsewhere
+    kept = Pictures(path, dataset.name, where, dataset.shape) if image else None
     least = dataset.dtype.itemsize * max(math.prod(dataset.shape[1:]), math.prod(dataset.chunks or ()))
     refuse_too_much(least, f"{where}: to read one step", "store it in smaller steps or chunks")
 
