@@ -60,25 +60,39 @@ def fit(
     spec: SpecPath,
     out: Annotated[Path | None, typer.Option(help="The run folder; by default runs/SPEC-TIME.")] = None,
     overrides: Overrides = [],  # noqa: B006
-    jobs: Annotated[int, typer.Option(help="Processes that train restarts; -1 is one for each core.")] = -1,
+    jobs: Annotated[
+        int | None,
+        typer.Option(help="Processes that train restarts side by side; -1, the default, is one for each core."),
+    ] = None,
+    processes: Annotated[
+        int | None,
+        typer.Option(help="Processes that share each gradient step, at most training.shards; under torchrun its own."),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Where --out holds this run whole, show it again.")] = False,
     allow_code: AllowCode = False,
 ) -> None:
     """Fit the spec's hierarchy and its baselines; write the run folder with its report.
 
-    An unfinished run of this very spec in --out is continued.
+    An unfinished run of this very spec in --out is continued, with any number of processes.
     """
     loaded = load_spec(spec, overrides, allow_code)
     from ddco_pyro.cli import console
+    from ddco_pyro.fitting.launching import follow_torchrun, requested
     from ddco_pyro.fitting.run import fit_run
     from ddco_pyro.report import write_report
 
+    ranks = requested(processes)
+    if ranks.rank > 0:
+        follow_torchrun(ranks)
+        return
+    if jobs is None:
+        jobs = -1 if ranks.size == 1 else 1
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     with (
         _continued(f"fit {folder / 'spec.yaml'} --out {folder} --resume{_allowed(loaded)}", folder),
         console.Progress() as progress,
     ):
-        fitted = fit_run(loaded, None, folder, progress, jobs, resume)
+        fitted = fit_run(loaded, None, folder, progress, jobs, resume, processes=ranks.size)
     console.log_likelihoods(fitted.metrics)
     _warn(fitted)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")

@@ -48,5 +48,5 @@ class Material:
         return replace(self, train=self.train.read_by(readers), tune=self.tune.read_by(readers))
 
     def seed(self, *where: int) -> int:
-        """A seed for a restart, one of its stages, or an epoch of a stage."""
+        """A seed for a restart, one of its stages, an epoch of a stage, or a shard of one of its minibatches."""
         return int(np.random.SeedSequence([self.spec.seed, *where]).generate_state(1)[0])

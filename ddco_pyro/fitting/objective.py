@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from ddco_pyro.fitting.checkpoint import Progress
 from ddco_pyro.fitting.clusters import Clusters, EqualParts
 from ddco_pyro.fitting.duration import log_duration_prior
 from ddco_pyro.fitting.material import Material
+from ddco_pyro.fitting.ranks import ALONE, Ranks
 from ddco_pyro.fitting.stages import Stage
 from ddco_pyro.fitting.upper import Constants, expected, fitted
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
@@ -37,8 +39,8 @@ class Objective:
     place of the log-likelihood.
     """
 
-    def __init__(self, material: Material, progress: Progress, stage: Stage) -> None:
-        self.material, self.progress, self.stage = material, progress, stage
+    def __init__(self, material: Material, progress: Progress, stage: Stage, ranks: Ranks = ALONE) -> None:
+        self.material, self.progress, self.stage, self.ranks = material, progress, stage, ranks
         self.known: tuple[Known, Known] = {}, {}
         self.constants: Constants | None = None
         labels = material.labels
@@ -72,11 +74,13 @@ class Objective:
                 ]
             self.constants = fitted(pieces, self.material.seed(self.progress.restart, self.progress.stage))
 
-    def ascend(self, model: Hierarchy, rows: Tensor) -> float:
+    def ascend(self, model: Hierarchy, rows: Tensor, steps: int | None = None) -> float:
         """Add the gradient of the loss of some training demonstrations to the parameters'; what they add to what is
         maximised.
 
         The loss is minus that per step. A batch that is long is processed in parts.
+
+        :param steps: of the minibatch that they are a shard of; None where they are all of it.
         """
         batch, total = self._seen(model).select(rows), 0.0
         for part, piece in batch.pieces(model.steps_at_once):
@@ -84,15 +88,15 @@ class Objective:
             value = self._total(tables, piece)
             if not bool(torch.isfinite(value.detach())):
                 raise self._not_finite(tables, piece, rows[part])
-            (-value / batch.steps).backward()
+            (-value / (steps or batch.steps)).backward()
             total += float(value.detach())
         return total
 
-    def read_ahead(self, model: Hierarchy, minibatches: Sequence[Tensor]) -> None:
-        """Have the pictures of an epoch's minibatches read before :meth:`ascend` asks for them."""
+    def read_ahead(self, model: Hierarchy, shards: Sequence[Tensor]) -> None:
+        """Have the pictures of shards of an epoch's minibatches read before :meth:`ascend` asks for them."""
         seen = self._seen(model)
         _read_ahead(
-            model, seen, (piece for rows in minibatches for _, piece in seen.select(rows).pieces(model.steps_at_once))
+            model, seen, (piece for rows in shards for _, piece in seen.select(rows).pieces(model.steps_at_once))
         )
 
     def _seen(self, model: Hierarchy) -> Batch:
@@ -104,11 +108,12 @@ class Objective:
         """What is maximised of the tuning demonstrations, per step."""
         pieces = list(self.material.tune.pieces(model.steps_at_once))
         with torch.no_grad():
-            _read_ahead(model, self.material.tune, (piece for _, piece in pieces))
-            values = [
-                float(self._total(self._tables(model, piece, self.known[1], part), piece)) for part, piece in pieces
-            ]
-        return sum(values) / self.material.tune.steps
+            _read_ahead(model, self.material.tune, (piece for _, piece in self.ranks.own(pieces)))
+            values = self.ranks.each(partial(self._tuned, model, *piece) for piece in pieces)
+            return sum(values) / self.material.tune.steps
+
+    def _tuned(self, model: Hierarchy, rows: Tensor, batch: Batch) -> float:
+        return float(self._total(self._tables(model, batch, self.known[1], rows), batch))
 
     def _tables(self, model: Hierarchy, batch: Batch, known: Known, rows: Tensor) -> Tables:
         tables = model.tabulate(batch, self.stage.discovering)

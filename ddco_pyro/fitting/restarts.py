@@ -24,6 +24,7 @@ from ddco_pyro.fitting.convergence import StageEnd, summary
 from ddco_pyro.fitting.labels import Labels
 from ddco_pyro.fitting.material import Material
 from ddco_pyro.fitting.processes import pool, results, useful_jobs
+from ddco_pyro.fitting.ranks import ALONE, Ranks
 from ddco_pyro.fitting.training import advance
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -45,6 +46,7 @@ class Trainer:
 
     :param checkpoints: the folder in which each restart is kept at the end of epochs; None for nowhere.
     :param jobs: processes that train restarts; -1 is one for each core. The result is the same for any number.
+    :param ranks: processes that train each restart together instead, of which this is the first (:func:`follow`).
     :raises DemonstrationsError: a number is too large for networks.
     :raises SpecError: there are no labels where the spec names some, or more than options.
     """
@@ -58,7 +60,9 @@ class Trainer:
         checkpoints: Path | None = None,
         on_event: OnEvent = ignore,
         jobs: int = 1,
+        ranks: Ranks = ALONE,
     ) -> None:
+        self.ranks = ranks
         self.spec, self.checkpoints, self.on_event = spec, checkpoints, on_event
         self.jobs = useful_jobs(jobs, spec.training.restarts)
         with torch.random.fork_rng(devices=[]):
@@ -80,6 +84,7 @@ class Trainer:
         :raises TrainingError: where a log-likelihood is not finite.
         """
         self.restarts = [self._begun(number) for number in range(self.spec.training.restarts)]
+        self.ranks.share(self.material)
         left, epochs = list(range(len(self.restarts))), self.spec.training.halving
         while epochs is not None and len(left) > 1:
             before = len(self.history)
@@ -88,6 +93,7 @@ class Trainer:
             self._stop([number for number in left if number not in better], tell=len(self.history) > before)
             left, epochs = better, 2 * epochs
         self._train(left, None)
+        self.ranks.share(None)
         model = self.material.hierarchy(self.best)
         model.load_state_dict(self.restarts[self.best].states["best"])
         return model.eval()
@@ -142,8 +148,9 @@ class Trainer:
         left = [number for number in numbers if not self.restarts[number].progress.done]
         if self.jobs == 1 or len(left) < 2:
             for number in left:
-                path = self._path(number)
-                self._keep(advance(self.material, self.restarts[number], until, math.inf, path, self.on_event)[0])
+                restart, path = self.restarts[number], self._path(number)
+                self.ranks.share((restart, until))
+                self._keep(advance(self.material, restart, until, math.inf, path, self.on_event, self.ranks)[0])
             return
         with pool(self.jobs) as parallel:
             while left:
@@ -162,6 +169,16 @@ class Trainer:
         path = self._path(number)
         if path is not None:
             restart.write(path)
+
+
+def follow(ranks: Ranks) -> None:
+    """Train along with the first process: each restart that its :class:`Trainer` trains, of each model, until it says
+    that this was all.
+    """
+    while (material := ranks.share()) is not None:
+        while (work := ranks.share()) is not None:
+            restart, until = work
+            advance(material, restart, until, ranks=ranks)
 
 
 def best_until(progress: Progress, epochs: int) -> float:

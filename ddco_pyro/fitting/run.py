@@ -23,11 +23,13 @@ from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, ignore
 from ddco_pyro.fitting import labels
 from ddco_pyro.fitting.building import Dimensions, baseline_spec, check_networks, named_baselines, parameters
 from ddco_pyro.fitting.fit import Fit, RunError, is_finished, load, model_name
+from ddco_pyro.fitting.launching import check_processes, together
 from ddco_pyro.fitting.metrics import evaluate, supervisor
 from ddco_pyro.fitting.objective import TrainingError
 from ddco_pyro.fitting.prepare import demonstrations as read_demonstrations
 from ddco_pyro.fitting.prepare import digest, dimensions, known_demonstrations, parts, seen
 from ddco_pyro.fitting.processes import check_jobs
+from ddco_pyro.fitting.ranks import ALONE, Ranks
 from ddco_pyro.fitting.restarts import Trainer
 from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.inference.threads import one_thread
@@ -44,6 +46,7 @@ def fit(
     out: str | Path | None = None,
     on_event: OnEvent = ignore,
     jobs: int = 1,
+    processes: int = 1,
 ) -> Fit:
     """Fit a spec's hierarchy and its baselines to demonstrations, and evaluate them.
 
@@ -67,7 +70,9 @@ def fit(
     :param on_event: is told how it goes on.
     :param jobs: processes that train restarts, -1 for one on each core; the result is the same for any number. In a
         script, more than one needs the usual ``if __name__ == "__main__":``.
-    :raises BackendError: ``jobs`` is not a number of processes.
+    :param processes: processes that share the work of each gradient step instead, at most ``training.shards``; the
+        result is the same for any number.
+    :raises BackendError: so many processes cannot share the work.
     :raises SpecError: something in the spec does not fit the demonstrations.
     :raises DemonstrationsError: they cannot be used.
     :raises RunError: the folder holds something else.
@@ -77,10 +82,16 @@ def fit(
     if isinstance(demonstrations, Demonstrations):
         path = {"demonstrations.path": str(folder / "demonstrations.hdf5")} if folder else {}
         return fit_run(
-            with_overrides(spec, path), seen(spec, demonstrations), folder, on_event, jobs, keep=demonstrations
+            with_overrides(spec, path),
+            seen(spec, demonstrations),
+            folder,
+            on_event,
+            jobs,
+            keep=demonstrations,
+            processes=processes,
         )
     path = {} if demonstrations is None else {"demonstrations.path": str(demonstrations)}
-    return fit_run(with_overrides(spec, path), None, folder, on_event, jobs)
+    return fit_run(with_overrides(spec, path), None, folder, on_event, jobs, processes=processes)
 
 
 def fit_run(
@@ -91,6 +102,7 @@ def fit_run(
     jobs: int = 1,
     resume: bool = True,
     keep: Demonstrations | None = None,
+    processes: int = 1,
 ) -> Fit:
     """:func:`fit`, with everything that can be refused refused before anything is collected, trained or written.
 
@@ -99,6 +111,7 @@ def fit_run(
     :param keep: demonstrations that the run is to have a copy of, in the file that the spec names.
     """
     check_jobs(jobs)
+    check_processes(processes, jobs, spec.training.shards)
     clock = _Clock()
     with clock("demonstrations"):
         demos = known_demonstrations(spec) if demos is None else demos
@@ -106,7 +119,9 @@ def fit_run(
         if demos is not None:
             labels.used(spec, demos)
     if folder is None:
-        return _fit(spec, demos or read_demonstrations(spec, on_event), None, on_event, jobs, clock)
+        demos = demos or read_demonstrations(spec, on_event)
+        with together(processes) as ranks:
+            return _fit(spec, demos, None, on_event, jobs, ranks, clock)
     claim(folder, spec, resume)
     with only_one(folder):
         if keep is not None:
@@ -118,7 +133,8 @@ def fit_run(
                 old.unlink()
         with clock("demonstrations"):
             demos = demos or read_demonstrations(spec, on_event)
-        return _fit(spec, demos, folder, on_event, jobs, clock)
+        with together(processes) as ranks:
+            return _fit(spec, demos, folder, on_event, jobs, ranks, clock)
 
 
 def _keep(demos: Demonstrations, path: Path) -> None:
@@ -135,6 +151,7 @@ def _fit(
     folder: Path | None,
     on_event: OnEvent,
     jobs: int,
+    ranks: Ranks,
     clock: _Clock,
     name: str | None = None,
 ) -> Fit:
@@ -143,13 +160,14 @@ def _fit(
     dimensions = Dimensions.of(demos)
     with clock("training"):
         checkpoints = folder / "checkpoints" if folder else None
-        trained = train(spec, dimensions, split["train"], on_event, checkpoints, split.get("valid"), name, jobs)
+        held_out = split.get("valid")
+        trained = train(spec, dimensions, split["train"], on_event, checkpoints, held_out, name, jobs, ranks)
     if folder:
         _write_history(folder, trained.history)
         _write_model(folder, trained.hierarchy, dimensions)
     with clock("baselines"):
         beside = {
-            name: _baseline(baseline_spec(spec, baseline, dimensions), demos, folder, on_event, jobs, name)
+            name: _baseline(baseline_spec(spec, baseline, dimensions), demos, folder, on_event, jobs, ranks, name)
             for name, baseline in named_baselines(spec).items()
         }
     fitted = Fit(spec, trained.hierarchy, {}, folder, demos, beside)
@@ -171,14 +189,16 @@ def _fit(
     return replace(fitted, metrics=json.loads(json.dumps(metrics)))  # as they are read back
 
 
-def _baseline(spec: Spec, demos: Demonstrations, run: Path | None, on_event: OnEvent, jobs: int, name: str) -> Fit:
+def _baseline(
+    spec: Spec, demos: Demonstrations, run: Path | None, on_event: OnEvent, jobs: int, ranks: Ranks, name: str
+) -> Fit:
     """A baseline trained beside, in a folder of its own where the run has one; nothing where it was done before."""
     folder = run / "baselines" / name if run else None
     if folder:
         claim(folder, spec)
         if is_finished(folder):
             return load(folder, allow_code=True)
-    return _fit(spec, demos, folder, on_event, jobs, _Clock(), name)
+    return _fit(spec, demos, folder, on_event, jobs, ranks, _Clock(), name)
 
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
@@ -233,6 +253,7 @@ def train(
     held_out: Demonstrations | None = None,
     name: str | None = None,
     jobs: int = 1,
+    ranks: Ranks = ALONE,
 ) -> Trained:
     """Train the spec's model on these demonstrations, of which ``training.tune_fraction`` are used to tune.
 
@@ -240,13 +261,14 @@ def train(
     :param held_out: demonstrations that will be evaluated; whether they can be is known before training.
     :param name: what the model is called in events.
     :param jobs: processes that train restarts; -1 is one for each core.
+    :param ranks: processes that train each restart together.
     :raises DemonstrationsError: a number is too large for networks.
     :raises TrainingError: a log-likelihood is not finite, or the engines disagree.
     """
     name, budget = name or model_name(spec), spec.training
     kept, tune = demos.split(budget.tune_fraction, spec.seed)
     with one_thread():
-        trainer = Trainer(spec, dimensions, kept, tune, checkpoints, on_event, jobs)
+        trainer = Trainer(spec, dimensions, kept, tune, checkpoints, on_event, jobs, ranks)
         if held_out is not None:
             refuse_unusable(held_out, trainer.first.encoder, trainer.first.scaling)
         check = _check_engines(trainer)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,8 @@ from ddco_pyro.fitting.checkpoint import Restart, copy_of, optimizer_state, rest
 from ddco_pyro.fitting.convergence import StageEnd, share
 from ddco_pyro.fitting.material import Material
 from ddco_pyro.fitting.objective import Objective
+from ddco_pyro.fitting.ranks import ALONE, Ranks
+from ddco_pyro.fitting.shards import ascend, cut
 from ddco_pyro.fitting.stages import Stage, plan
 from ddco_pyro.fitting.upper import Constants
 from ddco_pyro.inference.threads import one_thread
@@ -41,25 +44,31 @@ def advance(
     seconds: float = math.inf,
     checkpoint: Path | None = None,
     on_event: OnEvent = ignore,
+    ranks: Ranks = ALONE,
 ) -> tuple[Restart, bool]:
     """Train a restart further, on one thread; the restart, and whether it came as far as it was to.
 
     :param until: so many epochs of the last stage; None for all that patience and budget allow.
     :param seconds: about how long it may take; an epoch of each stage that it comes to is made in any case.
     :param checkpoint: where it is kept at the end of epochs.
+    :param ranks: the processes that do this together, all of them without a limit of time.
     :raises TrainingError: a log-likelihood is not finite.
     """
     deadline = time.monotonic() + seconds
     with one_thread(), Readers(material.spec.training.workers) as readers:
-        return restart, Training(material.read_by(readers), restart, checkpoint, on_event).run(until, deadline)
+        training = Training(material.read_by(readers), restart, checkpoint, on_event, ranks)
+        return restart, training.run(until, deadline)
 
 
 class Training:
     """A restart in training."""
 
-    def __init__(self, material: Material, restart: Restart, checkpoint: Path | None, on_event: OnEvent) -> None:
+    def __init__(
+        self, material: Material, restart: Restart, checkpoint: Path | None, on_event: OnEvent, ranks: Ranks
+    ) -> None:
         self.spec, self.progress = material.spec, restart.progress
         self._material, self._restart, self._checkpoint, self._on_event = material, restart, checkpoint, on_event
+        self._ranks = ranks
         self._saved_at = -np.inf  # the first epoch is saved
 
     def run(self, until: int | None, deadline: float) -> bool:
@@ -84,7 +93,7 @@ class Training:
         """Whether it has ended, rather than come to the epoch ``until`` or the deadline."""
         now, training, states = self.progress, self.spec.training, self._restart.states
         cap = share(training.epochs, sum(end["epochs"] for end in now.ended), stages_left)
-        objective = Objective(self._material, now, stage)
+        objective = Objective(self._material, now, stage, self._ranks)
         parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
         optimizer = _optimizer(training.optimizer, parameters)
         if now.epoch > 0:
@@ -117,13 +126,15 @@ class Training:
         """One pass over the training demonstrations; the log-likelihood per step seen on the way."""
         now, total = self.progress, 0.0
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self._material.seed(now.restart, now.stage, now.epoch))
+            place = now.restart, now.stage, now.epoch
+            torch.manual_seed(self._material.seed(*place))
             model.train()
             minibatches = torch.randperm(len(self._material.train)).split(self.spec.training.batch_size)
-            objective.read_ahead(model, minibatches)
-            for rows in minibatches:
-                optimizer.zero_grad(set_to_none=True)
-                total += objective.ascend(model, rows)
+            seeds = (partial(self._material.seed, *place, number) for number in range(len(minibatches)))
+            shards = [cut(rows, self.spec.training.shards, seed) for rows, seed in zip(minibatches, seeds, strict=True)]
+            objective.read_ahead(model, [shard.rows for each in shards for shard in self._ranks.own(each)])
+            for rows, each in zip(minibatches, shards, strict=True):
+                total += ascend(objective, model, parameters, each, int(self._material.train.lengths[rows].sum()))
                 if self.spec.training.clip_gradient is not None:
                     nn.utils.clip_grad_norm_(parameters, self.spec.training.clip_gradient)
                 optimizer.step()

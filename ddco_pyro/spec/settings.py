@@ -264,6 +264,9 @@ class TrainingSpec(Model):
     patience."""
     batch_size: Count = 16
     """Trajectories in each gradient step."""
+    shards: Count = 1
+    """Parts of a minibatch, which at most as many processes may share (``fit --processes``); its gradient is the sum of
+    theirs. Results depend on this number, by rounding and by what dropout draws, and not on that of processes."""
     restarts: Count = 1
     """Independent initialisations; the best on the tuning demonstrations is kept."""
     halving: Count | None = 50

@@ -1,0 +1,260 @@
+"""Several processes that share each gradient step: the same bits for any number, after a kill too, and no hang."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from killing import struck
+
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.errors import BadInput
+from ddco_pyro.fitting.building import Dimensions
+from ddco_pyro.fitting.checkpoint import Progress
+from ddco_pyro.fitting.launching import check_processes, requested, together
+from ddco_pyro.fitting.objective import Objective, TrainingError
+from ddco_pyro.fitting.restarts import Trainer
+from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.shards import ascend, cut
+from ddco_pyro.fitting.stages import plan
+from ddco_pyro.model.encoding import STEPS_AT_ONCE
+from ddco_pyro.spec import dump_spec, parse_spec
+
+DROPPING = {"network": "mlp", "hidden": [6], "dropout": 0.3}
+TRAINING = {"shards": 4, "batch_size": 5, "epochs": 16, "restarts": 2, "halving": 2, "optimizer": {"lr": 0.03}}
+"""Minibatches of 5 and of 3 demonstrations: a shard has two or one, or is empty."""
+
+TORCHRUN = Path(sys.executable).with_name("torchrun")
+
+
+def make_spec(path="unused.hdf5", **training):
+    return parse_spec(
+        {
+            "demonstrations": {"path": str(path)},
+            "observations": ["state"],
+            "control": {"std": 0.5, "scale": "none"},
+            "hierarchy": {
+                "levels": [{"count": 2, "policy": DROPPING, "termination": {"network": "linear"}}],
+                "meta_policy": {"network": "linear"},
+            },
+            "training": {**TRAINING, **training},
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def demos():
+    """Of unequal lengths."""
+    random = np.random.default_rng(0)
+    return Demonstrations(
+        tuple(
+            Demonstration(f"demo_{n}", {"state": random.normal(size=(t, 3))}, random.normal(size=(t, 2)))
+            for n, t in enumerate(random.integers(4, 9, 10).tolist())
+        )
+    )
+
+
+# --- a gradient from shards -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rows", [8, 3, 1])
+@pytest.mark.parametrize(("dtype", "close"), [(torch.float32, 1e-6), (torch.float64, 1e-12)])
+def test_the_gradient_of_four_shards_is_that_of_one(demos, rows, dtype, close):
+    material = Trainer(make_spec(), Dimensions.of(demos), *demos.split(0.2, 0)).material
+    model = material.hierarchy(0)
+    assert model.step_bytes > 0  # counted while it is as it was built
+    inputs = material.train.inputs.map(lambda array: array.to(dtype), material.train.inputs.time)
+    material, model = replace(material, train=replace(material.train, inputs=inputs)), model.to(dtype)
+    objective = Objective(material, Progress(0), plan(material.spec, 1)[-1])
+    parameters = list(model.parameters())
+    minibatch, results = torch.randperm(8, generator=torch.Generator().manual_seed(rows))[:rows], []
+    steps = int(material.train.lengths[minibatch].sum())
+    for count in (1, 4):
+        shards = cut(minibatch, count, int)
+        assert len(shards) == min(count, rows)
+        assert torch.cat([shard.rows for shard in shards]).tolist() == minibatch.tolist()
+        value = ascend(objective, model, parameters, shards, steps)
+        results.append((value, [parameter.grad.clone() for parameter in parameters]))
+    (value, gradients), (other, others) = results
+    assert other == pytest.approx(value, rel=close)
+    largest = max(float(gradient.abs().max()) for gradient in gradients)
+    assert largest > 0.01
+    for gradient, shared in zip(gradients, others, strict=True):
+        torch.testing.assert_close(shared, gradient, rtol=close, atol=close * largest)
+
+
+# --- the same bits ----------------------------------------------------------------------------------------------------
+
+
+def make(spec, demos, long, folder=None, **processes):
+    """A trainer that tunes on two demonstrations, ``long`` ones in two pieces."""
+    train, tune = demos.split(0.2, 0)
+    if long:
+        random, steps = np.random.default_rng(1), STEPS_AT_ONCE // 2 + 1
+        draw = [(random.normal(size=(steps, 3)), random.normal(size=(steps, 2))) for _ in range(2)]
+        tune = Demonstrations(tuple(Demonstration(f"long_{n}", {"state": s}, a) for n, (s, a) in enumerate(draw)))
+    return Trainer(spec, Dimensions.of(demos), train, tune, folder, **processes)
+
+
+def trained(trainer):
+    """The history, the summary, the model, and the checkpoints."""
+    state = {name: value.tolist() for name, value in trainer.run().state_dict().items()}
+    return trainer.history, trainer.summary, state, contents(trainer.checkpoints)
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+MODELS = [{}, {"optimizer": {"name": "momentum"}, "clip_gradient": 0.1, "duration": {"mean": 4}}]
+
+
+def test_three_processes_give_the_same_bits(demos, tmp_path):
+    """Two models in turn, trained by the same processes; then one with a demonstration that is spoilt in the shard of
+    another process, which raises what is raised here.
+    """
+    spoilt = {}
+    for name in ("alone", "shared"):
+        spoilt[name] = make(make_spec(shards=3, batch_size=8), demos, False)
+        train = spoilt[name].material.train
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(spoilt[name].material.seed(0, 0, 0))  # restart, stage, epoch
+            train.actions[torch.randperm(len(train))[-1]] = torch.nan
+
+    def share():
+        with together(3) as ranks:
+            for number, training in enumerate(MODELS):
+                folders = [tmp_path / f"{number}-{name}" for name in ("alone", "shared")]
+                alone = trained(make(make_spec(**training), demos, number == 1, folders[0]))
+                assert trained(make(make_spec(**training), demos, number == 1, folders[1], ranks=ranks)) == alone
+            spoilt["shared"].ranks = ranks
+            spoilt["shared"].run()
+
+    with pytest.raises(TrainingError) as shared:
+        share()
+    with pytest.raises(TrainingError, match=r"the log-likelihood of demo_\d is not finite") as alone:
+        spoilt["alone"].run()
+    assert str(shared.value) == str(alone.value)
+
+
+def test_shards_decide_what_dropout_draws_and_processes_do_not(demos):
+    """Another number of shards is another training."""
+    histories = []
+    for shards in (1, 4):
+        trainer = make(make_spec(shards=shards, epochs=4), demos, False)
+        trainer.run()
+        histories.append(trainer.history)
+    assert histories[0] != histories[1]
+
+
+# --- the command line -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def whole(demos, tmp_path_factory):
+    """A spec, and the run of it by a single process."""
+    folder = tmp_path_factory.mktemp("whole")
+    demos.write(folder / "demos.hdf5")
+    spec = make_spec(folder / "demos.hdf5", patience=None)
+    (folder / "spec.yaml").write_text(dump_spec(spec))
+    fit(folder / "spec.yaml", out=folder / "run")
+    return folder / "spec.yaml", folder / "run"
+
+
+def assert_same_run(folder, run):
+    for name in ("spec.yaml", "model.safetensors", "history.csv", "checkpoints/restart-0.safetensors"):
+        assert (folder / name).read_bytes() == (run / name).read_bytes(), name
+
+
+KILL_THE_OTHER = (
+    "import multiprocessing, time; os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL); "
+    "open('killed', 'w').write(str(time.monotonic()))"
+)
+KILL_THE_FIRST = (
+    "import multiprocessing, sys; print(multiprocessing.active_children()[0].pid, file=sys.stderr, flush=True); "
+    "os.kill(os.getpid(), signal.SIGKILL)"
+)
+
+
+def test_killed_on_two_processes_and_resumed_on_one(whole, tmp_path):
+    """First another process dies, which is said; then the first, which the other does not outlive."""
+    spec, run = whole
+    folder = tmp_path / "run"
+    command = ["fit", spec, "--out", folder, "--processes", "2"]
+    status, err = struck(command, tmp_path, "EpochEnded", 5, KILL_THE_OTHER)
+    assert time.monotonic() - float((tmp_path / "killed").read_text()) < 60  # seconds, where the machine is idle
+    assert status == 1
+    said = [line for line in err.splitlines() if line.startswith("ddco-pyro: ")]
+    assert len(said) == 1
+    assert said[0].startswith("ddco-pyro: a process that trained together with this one was ended from outside")
+    assert "Traceback" not in err
+    assert (folder / "checkpoints" / "restart-0.safetensors").exists()
+    status, err = struck(command, tmp_path, "EpochEnded", 5, KILL_THE_FIRST)
+    assert status == -signal.SIGKILL
+    assert_ends(int(next(line for line in err.splitlines() if line.isdigit())))
+    assert not (folder / "model.safetensors").exists()
+    fit(spec, out=folder)
+    assert_same_run(folder, run)
+
+
+def assert_ends(pid):
+    """An orphan, which nobody waits for."""
+    for _ in range(600):
+        try:
+            os.kill(pid, 0)
+            ended = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        except (ProcessLookupError, FileNotFoundError):
+            return
+        if ended:
+            return
+        time.sleep(0.1)
+    os.kill(pid, signal.SIGKILL)
+    pytest.fail("the other process goes on alone")
+
+
+def test_two_processes_of_torchrun(whole, tmp_path):
+    spec, run = whole
+    folder = tmp_path / "run"
+    ended = subprocess.run(
+        [TORCHRUN, "--standalone", "--nproc-per-node", "2", "-m", "ddco_pyro.cli", "fit", spec, "--out", folder],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.count("report: ") == 1
+    assert_same_run(folder, run)
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "problem"),
+    [
+        ((0, 1, 4), "--processes 0: give a number of processes"),
+        ((2, -1, 4), "--jobs trains restarts side by side, --processes shares the work of each gradient step"),
+        ((3, 1, 2), "--processes 3: a minibatch is cut into training.shards=2, .* add --set training.shards=3 "),
+    ],
+)
+def test_what_cannot_be_shared_is_refused(given, problem):
+    with pytest.raises(BadInput, match=f"^{problem}"):
+        check_processes(*given)
+
+
+def test_torchrun_decides_how_many_there_are(monkeypatch):
+    for name, value in {"RANK": 1, "WORLD_SIZE": 2, "MASTER_ADDR": "here", "MASTER_PORT": 1}.items():
+        monkeypatch.setenv(name, str(value))
+    assert requested(None) == requested(2)
+    assert (requested(2).rank, requested(2).size) == (1, 2)
+    with pytest.raises(BadInput, match=r"^--processes 3: torchrun started 2; leave it out$"):
+        requested(3)
