@@ -38,7 +38,8 @@ def cut(rows: Tensor, count: int, seed: Callable[[int], int]) -> list[Shard]:
     """
     if count == 1:
         return [Shard(rows, None)]
-    return [Shard(part, seed(number)) for number, part in enumerate(rows.tensor_split(count)) if len(part)]
+    parts = rows.tensor_split(min(count, len(rows)))
+    return [Shard(part, seed(number)) for number, part in enumerate(parts)]
 
 
 def ascend(
