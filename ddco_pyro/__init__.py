@@ -6,14 +6,25 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ddco_pyro import inference
+    from ddco_pyro import encoding, inference
     from ddco_pyro.acting.controller import Controller
     from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
     from ddco_pyro.fitting.fit import Fit, load
     from ddco_pyro.fitting.run import fit
     from ddco_pyro.spec import Spec, load_spec
 
-__all__ = ["Controller", "Demonstration", "Demonstrations", "Fit", "Spec", "fit", "inference", "load", "load_spec"]
+__all__ = [
+    "Controller",
+    "Demonstration",
+    "Demonstrations",
+    "Fit",
+    "Spec",
+    "encoding",
+    "fit",
+    "inference",
+    "load",
+    "load_spec",
+]
 
 _MODULES = {
     "Controller": "acting.controller",
@@ -29,8 +40,8 @@ _MODULES = {
 
 def __getattr__(name: str) -> Any:
     """Imports what is asked for when it is asked for: torch takes seconds, and ``--help`` needs none of it."""
-    if name == "inference":
-        return importlib.import_module("ddco_pyro.inference")
+    if name in ("encoding", "inference"):
+        return importlib.import_module(f"ddco_pyro.{name}")
     if name in _MODULES:
         return getattr(importlib.import_module(f"ddco_pyro.{_MODULES[name]}"), name)
     raise AttributeError(f"module 'ddco_pyro' has no attribute {name!r}")

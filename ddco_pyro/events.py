@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class DemonstrationsDone:
-    """So many of the demonstrations have been collected, imported or segmented."""
+    """So many of the demonstrations have been collected, imported, segmented or encoded."""
 
     done: int
     total: int
@@ -31,6 +31,14 @@ class EpochEnded:
     epoch: int
     train: float
     tune: float
+
+
+@dataclass(frozen=True)
+class UpdatesDone:
+    """So many gradient steps are done; mean loss of the last ones."""
+
+    done: int
+    loss: float
 
 
 @dataclass(frozen=True)
@@ -85,6 +93,7 @@ Event = (
     DemonstrationsDone
     | TrainingBegan
     | EpochEnded
+    | UpdatesDone
     | RestartStopped
     | TrainingEnded
     | SelectionBegan

@@ -34,6 +34,7 @@ EXAMPLES: dict[Callable[..., None], str] = {
     demos.inspect: "inspect mine.hdf5",
     demos.init: "init mine.hdf5 --out mine.yaml",
     demos.import_: "import pusht --out demos.hdf5",
+    demos.encode: "encode demos.hdf5 --observation camera --encoder random_conv --out encoded.hdf5",
     outputs.segment: "segment runs/mine mine.hdf5 --html segments.html",
     outputs.export: "export runs/mine --out controller --onnx",
 }

@@ -28,6 +28,7 @@ from ddco_pyro.events import (
     SelectionBegan,
     TrainingBegan,
     TrainingEnded,
+    UpdatesDone,
 )
 from ddco_pyro.fitting.convergence import effort
 
@@ -126,6 +127,8 @@ class Progress(_Bar):
             case EpochEnded():
                 note = f"{event.stage}: training {event.train:.3f}, tuning {event.tune:.3f} nats/step"
                 self.advance(self._done + 1, note)
+            case UpdatesDone(done, loss):
+                self.advance(done, f"loss {loss:.2g}")
             case RestartStopped(restart, epochs):
                 self._say(f"restart {restart} stopped after {epochs} epochs of its last stage: others are better")
             case TrainingEnded():

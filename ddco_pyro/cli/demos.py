@@ -1,4 +1,4 @@
-"""What comes in: ``collect``, ``inspect``, ``init`` and ``import``."""
+"""What comes in: ``collect``, ``inspect``, ``init``, ``import`` and ``encode``."""
 
 from __future__ import annotations
 
@@ -127,3 +127,42 @@ def import_(
     for name, reason in imported.left_out.items():
         print(f"left out {name}: {reason}", file=sys.stderr)
     print(f"{out}: {len(imported.names)} demonstrations")
+
+
+def encode(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="An HDF5 file of demonstrations.")],
+    observation: Annotated[str, typer.Option(metavar="KEY", help="The pictures to encode.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="The HDF5 file to write.", show_default=False)],
+    encoder: Annotated[
+        str, typer.Option(metavar="NAME", help="random_conv, autoencoder, or module:Class of your own.")
+    ] = "random_conv",
+    size: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Principal components to keep; 64 unless there are fewer features.", show_default=False
+        ),
+    ] = None,
+    name: Annotated[
+        str | None,
+        typer.Option("--as", metavar="NAME", help="The new observation; KEY_features by default.", show_default=False),
+    ] = None,
+    updates: Annotated[int, typer.Option(min=1, help="Gradient steps of the autoencoder.")] = 2000,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 2, help="Of weights, and of the order of pictures.")] = 0,
+    allow_code: Annotated[
+        bool, typer.Option("--allow-code", help="Import the user code that --encoder names.")
+    ] = False,
+) -> None:
+    """Write demonstrations with features, a vector, in the place of pictures; goes on where it was interrupted.
+
+    The encoder is written beside, in OUT.encoder: ddco_pyro.encoding.load reads it for acting.
+    """
+    from ddco_pyro.cli import console
+    from ddco_pyro.encoding import Encoding
+    from ddco_pyro.encoding import encode as write
+
+    encoding = Encoding(observation, encoder, size, seed, name, updates)
+    with console.Progress("encoding") as progress:
+        encoded = write(file, out, encoding, progress, allow_code)
+    about = encoded.about
+    of = f"{about.size} of {about.features} features, {about.explained:.1%} of their variance"
+    print(f"{out}: {encoded.demonstrations} demonstrations, obs/{encoding.key}: {of}; the encoder: {encoded.folder}")

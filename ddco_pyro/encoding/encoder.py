@@ -1,0 +1,115 @@
+"""An encoder of pictures with its principal components, in memory and as a folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from pydantic import ValidationError
+
+from ddco_pyro.data.files import Damaged, whole_folder
+from ddco_pyro.data.tensors import read_tensors, write_tensors
+from ddco_pyro.encoding.networks import BUILT_IN, Convolutions
+from ddco_pyro.encoding.projection import Projection
+from ddco_pyro.encoding.user import Features, imported, see_name
+from ddco_pyro.errors import BadInput
+from ddco_pyro.spec.types import Count, Items, Model, Seed
+
+ABOUT, TENSORS = "encoder.json", "encoder.safetensors"
+AGAIN = "write it again with ddco-pyro encode"
+
+
+class About(Model):
+    """What an encoder is, beside its weights."""
+
+    version: Literal[1] = 1
+    encoder: str
+    """``random_conv``, ``autoencoder`` or ``module:Class``."""
+    observation: str
+    """The key of the pictures it was made for."""
+    picture: Items[Count]
+    """[H, W, C]."""
+    features: Count
+    """Features of a picture before they are reduced."""
+    size: Count
+    """Features that come out."""
+    seed: Seed
+    explained: float = 1.0
+    """Share of the features' variance in the training demonstrations that is kept."""
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """A picture to a vector: call it with uint8 [H, W, C], it gives float32 [size]."""
+
+    about: About
+    features: Features
+    projection: Projection | None
+    network: Convolutions | None = None
+
+    def __call__(self, picture: np.ndarray) -> np.ndarray:
+        """The features that a policy, fitted to them, reads in place of the picture.
+
+        :raises BadInput: it is not such a picture.
+        """
+        picture = np.asarray(picture)
+        if picture.dtype != np.uint8 or picture.shape != self.about.picture:
+            raise BadInput(
+                f"{self.about.observation}: is {picture.dtype} {picture.shape}; this encoder reads uint8 "
+                f"{self.about.picture}"
+            )
+        return self.reduced(self.features(picture[None]))[0]
+
+    def reduced(self, features: np.ndarray) -> np.ndarray:
+        """Features as the encoder gives them, [M, F], to float32 [M, size]."""
+        return features.astype(np.float32) if self.projection is None else self.projection(features)
+
+    def write(self, folder: Path) -> None:
+        """Write it as a folder, whole or not at all; a user's encoder is named there, not kept."""
+        tensors = {f"network/{key}": value for key, value in self.network.state_dict().items()} if self.network else {}
+        if self.projection is not None:
+            tensors["mean"] = torch.from_numpy(self.projection.mean)
+            tensors["components"] = torch.from_numpy(self.projection.components)
+        with whole_folder(folder) as temporary:
+            (temporary / ABOUT).write_text(self.about.model_dump_json(indent=1) + "\n", encoding="utf-8")
+            write_tensors(temporary / TENSORS, tensors, {})
+
+
+def about_of(folder: Path) -> About:
+    """What the encoder in a folder is.
+
+    :raises BadInput: there is none, or it is damaged.
+    """
+    if not (folder / ABOUT).is_file():
+        raise BadInput(f"{folder}: is no encoder, it has no {ABOUT}; name the folder FILE.encoder beside a file")
+    try:
+        return About.model_validate_json((folder / ABOUT).read_bytes())
+    except ValidationError as error:
+        raise Damaged(folder / ABOUT, " ".join(str(error).split()), AGAIN) from error
+
+
+def load(folder: str | Path, allow_code: bool = False) -> Encoder:
+    """An encoder that ``ddco-pyro encode`` has written beside its file, ``FILE.encoder``.
+
+    :param allow_code: import the user's encoder that it names.
+    :raises BadInput: there is none, it is damaged, or it names user code and that is not allowed.
+    """
+    folder = Path(folder)
+    about = about_of(folder)
+    see_name(about.encoder, allow_code)
+    tensors, _ = read_tensors(folder / TENSORS, AGAIN)
+    projection = None
+    if "components" in tensors:
+        projection = Projection(tensors["mean"].numpy(), tensors["components"].numpy(), about.explained)
+    if about.encoder not in BUILT_IN:
+        return Encoder(about, imported(about.encoder), projection)
+    network = Convolutions(about.encoder, about.picture, about.seed)
+    weights = {key.removeprefix("network/"): value for key, value in tensors.items() if key.startswith("network/")}
+    try:
+        network.load_state_dict(weights)
+    except RuntimeError as error:
+        raise Damaged(folder / TENSORS, " ".join(str(error).split()), AGAIN) from error
+    return Encoder(about, network.encode, projection, network)

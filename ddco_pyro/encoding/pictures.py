@@ -1,0 +1,108 @@
+"""The pictures of a file's demonstrations, read a few at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import chain, islice
+
+import numpy as np
+
+from ddco_pyro.data.checks import check, check_alike, problems_of_masks
+from ddco_pyro.data.hdf5 import DemonstrationsError
+from ddco_pyro.data.sources import Column, Recording, Source
+from ddco_pyro.errors import nearest
+
+AT_ONCE = 32
+"""Pictures that an encoder gets at once, whatever the size of the blocks in which they are read: a network's numbers
+depend, in their last bits, on how many there are."""
+
+BUFFER_BYTES = 16 * 2**20
+"""Pictures that are drawn from at random while they are read in order, :data:`AT_ONCE` of them at least."""
+
+
+class Pictures:
+    """The pictures [H, W, C] under one observation key of an open file.
+
+    :param source: an open file of demonstrations.
+    :param key: the observation.
+    :raises DemonstrationsError: it is missing or no picture, or the demonstrations cannot be used or differ.
+    """
+
+    def __init__(self, source: Source, key: str) -> None:
+        self._source, self.key, self.names = source, key, source.names
+        first = source.recording(self.names[0])
+        if key not in first.observations:
+            known = [name for name, column in first.observations.items() if column.image]
+            there = ", ".join(known) or "none"
+            raise DemonstrationsError(f"there is no observation {key!r}{nearest(key, known)}; pictures are: {there}")
+        if not first.observations[key].image:
+            column = first.observations[key]
+            had = f"{column.dtype} {[*column.shape]}"
+            raise DemonstrationsError(f"obs/{key} is {had}; pictures are uint8 [steps, height, width, channels]")
+        self._lengths: dict[str, int] = {}
+        for name in self.names:
+            recording = source.recording(name)
+            check(recording)
+            check_alike(recording, first)
+            if not recording.observations[key].image:
+                raise DemonstrationsError(f"{name}: obs/{key} is no picture, in {first.name} it is")
+            self._lengths[name] = recording.actions.shape[0]
+        self.shape = first.observations[key].shape[1:]
+        if not math.prod(self.shape):
+            raise DemonstrationsError(f"obs/{key}: pictures of shape {self.shape} are empty")
+        self.training = self._training()
+
+    def _training(self) -> tuple[str, ...]:
+        """Names of the demonstrations to train with: of ``mask/train``, else those not in ``mask/valid``."""
+        masks = self._source.masks
+        for problem in problems_of_masks(masks, self.names):
+            raise DemonstrationsError(problem)
+        held_out = set(masks.get("valid", ()))
+        names = masks["train"] if "train" in masks else tuple(name for name in self.names if name not in held_out)
+        if not names:
+            raise DemonstrationsError("no demonstration is left to train with; change the masks")
+        return tuple(names)
+
+    @property
+    def number(self) -> int:
+        """Pictures of all training demonstrations."""
+        return sum(self._lengths[name] for name in self.training)
+
+    def recording(self, name: str) -> Recording:
+        """A demonstration."""
+        return self._source.recording(name)
+
+    def of(self, name: str) -> Iterator[np.ndarray]:
+        """The pictures of a demonstration in order, [M, H, W, C]."""
+        return batches(self.recording(name).observations[self.key], AT_ONCE)
+
+    def at_random(self, seed: int, epoch: int) -> Iterator[np.ndarray]:
+        """Every training picture once, in an order that follows from the seed and the epoch, [H, W, C].
+
+        Demonstrations come in random order, and their pictures leave a buffer at random.
+        """
+        random = np.random.default_rng((seed, epoch))
+        names = [self.training[index] for index in random.permutation(len(self.training))]
+        size = min(self.number, max(AT_ONCE, BUFFER_BYTES // math.prod(self.shape)))
+        buffer = np.empty((size, *self.shape), np.uint8)
+        frames = chain.from_iterable(chain.from_iterable(map(self.of, names)))
+        for place, frame in enumerate(islice(frames, size)):
+            buffer[place] = frame
+        for frame in frames:
+            drawn = random.integers(size)
+            yield buffer[drawn].copy()
+            buffer[drawn] = frame
+        yield from (buffer[rest].copy() for rest in random.permutation(size))
+
+
+def batches(column: Column, size: int) -> Iterator[np.ndarray]:
+    """An array in pieces of ``size`` steps, the last of which may be shorter, however long its blocks are."""
+    rest = np.empty((0, *column.shape[1:]), column.dtype)
+    for block in column.blocks():
+        rest = np.concatenate([rest, block]) if len(rest) else block
+        whole = len(rest) // size * size
+        yield from (rest[start : start + size] for start in range(0, whole, size))
+        rest = rest[whole:].copy()
+    if len(rest):
+        yield rest

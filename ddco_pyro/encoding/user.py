@@ -1,0 +1,92 @@
+"""A user's encoder, ``module:Class``: imported where that is allowed, and tried before it is used."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ddco_pyro.encoding.networks import BUILT_IN
+from ddco_pyro.errors import BadInput, nearest
+
+Features = Callable[[np.ndarray], np.ndarray]
+"""uint8 pictures [N, H, W, C] to features [N, F]."""
+
+TOLERANCE = 1e-3
+"""Of the largest feature: two calls on the same picture may differ by so much, alone or among others."""
+
+
+def see_name(name: str, allow_code: bool) -> None:
+    """See that an encoder of this name may be made.
+
+    :raises BadInput: there is none, or it is user code and that is not allowed.
+    """
+    if name in BUILT_IN:
+        return
+    if ":" not in name:
+        known = ", ".join(BUILT_IN)
+        raise BadInput(f"there is no encoder {name!r}{nearest(name, BUILT_IN)}; take {known}, or your own module:Class")
+    if not allow_code:
+        raise BadInput(
+            f"encoder {name!r} would import user code; pass --allow-code if you trust it (in Python: allow_code=True)"
+        )
+
+
+def imported(name: str) -> Features:
+    """``Class()`` of a user's ``module:Class``, whose features are checked at each call.
+
+    :raises BadInput: it cannot be imported or made; when called, if it fails or gives something else than features.
+    """
+    module, _, attribute = name.partition(":")
+    try:
+        own: Any = getattr(importlib.import_module(module), attribute)()
+    except Exception as error:  # whatever the user's code raises
+        raise BadInput(f"encoder {name!r} cannot be imported or made: {_said(error)}") from error
+    if not callable(own):
+        raise BadInput(f"encoder {name!r}: what {attribute}() gives cannot be called; it needs __call__(pictures)")
+
+    def features(pictures: np.ndarray) -> np.ndarray:
+        try:
+            values = np.asarray(own(pictures))
+        except Exception as error:
+            raise BadInput(f"encoder {name!r} fails on pictures {[*pictures.shape]}: {_said(error)}") from error
+        _see(name, values, len(pictures))
+        return values
+
+    return features
+
+
+def _see(name: str, values: np.ndarray, number: int) -> None:
+    if values.dtype.kind != "f":
+        raise BadInput(f"encoder {name!r} gives {values.dtype}; it has to give floats")
+    if values.ndim != 2 or len(values) != number or not values.shape[1]:
+        raise BadInput(
+            f"encoder {name!r} gives shape {values.shape} for {number} pictures; it has to be ({number}, features)"
+        )
+    if not np.isfinite(values.astype(np.float32)).all():
+        raise BadInput(f"encoder {name!r} gives features that are NaN or infinite in float32")
+
+
+def try_out(name: str, features: Features, pictures: np.ndarray) -> None:
+    """See that an encoder says the same of a picture when it is asked again, and when it is asked of it alone.
+
+    :raises BadInput: it does not, or fails.
+    """
+    first = features(pictures)
+    allowed = TOLERANCE * np.abs(first).max()
+    if not _close(first, features(pictures), allowed):
+        raise BadInput(f"encoder {name!r} gives other features when it is called again; switch off dropout and noise")
+    if not _close(first[:1], features(pictures[:1]), allowed):
+        raise BadInput(
+            f"encoder {name!r} gives other features of a picture among others than alone; switch to evaluation mode"
+        )
+
+
+def _close(some: np.ndarray, other: np.ndarray, allowed: float) -> bool:
+    return some.shape == other.shape and bool((np.abs(some - other) <= allowed).all())
+
+
+def _said(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

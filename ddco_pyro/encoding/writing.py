@@ -1,0 +1,253 @@
+"""A file of demonstrations with features in place of its pictures; what was killed goes on where it was.
+
+While ``out.hdf5`` is made, the folder ``.out.hdf5.encoding`` holds the autoencoder's checkpoint and the features of
+every demonstration before they are reduced: each picture goes through the encoder once. Principal components follow
+from those, and the file is put together at the end.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from ddco_pyro.data.files import only_one, write_text
+from ddco_pyro.data.hdf5 import DemonstrationsError, opened
+from ddco_pyro.data.resumable import parts_of
+from ddco_pyro.data.sources import Column, Recording, format_of
+from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
+from ddco_pyro.encoding.encoder import About, Encoder, about_of
+from ddco_pyro.encoding.networks import BUILT_IN, Convolutions
+from ddco_pyro.encoding.pictures import Pictures, batches
+from ddco_pyro.encoding.projection import Projection, principal_components
+from ddco_pyro.encoding.training import UPDATES, train
+from ddco_pyro.encoding.user import Features, imported, see_name, try_out
+from ddco_pyro.errors import BadInput
+from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
+from ddco_pyro.inference.threads import one_thread
+
+MADE = "encoded"
+"""Attribute of a file: what decided its contents."""
+
+SIZE = 64
+"""Features are reduced to so many unless a size is given."""
+
+ROWS = 1024
+"""Rows of features that are reduced at once."""
+
+_KEY, _IDENTITY, _CHECKPOINT, _UNREDUCED = "features", "identity.json", "autoencoder.safetensors", "features.hdf5"
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How pictures become a vector.
+
+    :param observation: the key of the pictures, uint8 [T, H, W, C].
+    :param encoder: ``random_conv``, ``autoencoder``, or a user's ``module:Class``.
+    :param size: principal components that are kept; by default :data:`SIZE`, or all features as they are where they
+        are no more than that.
+    :param name: the new observation's key; ``<observation>_features`` by default.
+    :param updates: gradient steps of the autoencoder.
+    """
+
+    observation: str
+    encoder: str = "random_conv"
+    size: int | None = None
+    seed: int = 0
+    name: str | None = None
+    updates: int = UPDATES
+
+    @property
+    def key(self) -> str:
+        """The new observation's key."""
+        return self.name or f"{self.observation}_features"
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """What was written: the file, the encoder's folder, and what the encoder is."""
+
+    path: Path
+    folder: Path
+    about: About
+    demonstrations: int
+
+
+def encode(
+    path: str | Path, out: str | Path, encoding: Encoding, on_event: OnEvent = ignore, allow_code: bool = False
+) -> Encoded:
+    """Write ``out``: the demonstrations of ``path`` with features in place of the pictures, and ``out.encoder`` beside.
+
+    Principal components, and the autoencoder, see the training demonstrations alone: ``mask/train``, else all that are
+    not in ``mask/valid``. Memory holds one block of pictures.
+
+    :raises DemonstrationsError: the demonstrations cannot be used, or the observation is missing or no picture.
+    :raises BadInput: ``out`` is there already and is something else; the encoder cannot be used, or gives fewer
+        features than ``size``.
+    """
+    path, out = Path(path), Path(out)
+    see_name(encoding.encoder, allow_code)
+    if (form := format_of(path)) != "robomimic":
+        raise BadInput(f"{path}: is a {form} dataset; first: ddco-pyro import {path} --out demos.hdf5")
+    with open_robomimic(path) as source, one_thread() if encoding.encoder in BUILT_IN else nullcontext():
+        job = _Job(source, path, out, encoding, on_event)
+        return job.already() or job.run()
+
+
+class _Job:
+    """The encoding of one file: ``folder`` is where it stands, ``beside`` where the encoder goes."""
+
+    def __init__(self, source: Robomimic, path: Path, out: Path, encoding: Encoding, on_event: OnEvent) -> None:
+        self.source, self.out, self.encoding, self.on_event = source, out, encoding, on_event
+        self.pictures = Pictures(source, encoding.observation)
+        if encoding.key in source.recording(source.names[0]).observations:
+            raise DemonstrationsError(f"obs/{encoding.key} is there already; choose another name with --as")
+        self.network, self.features = _encoder(encoding, self.pictures)
+        self.about = _about(encoding, self.pictures, self.features)
+        self.identity = _identity(path, encoding)
+        self.beside, self.folder = out.with_name(f"{out.name}.encoder"), out.with_name(f".{out.name}.encoding")
+
+    def already(self) -> Encoded | None:
+        """What an earlier call has written; None where there is nothing.
+
+        :raises BadInput: something else is there.
+        """
+        if not self.out.exists():
+            if self.beside.exists() and not self.folder.exists():
+                raise BadInput(f"{self.beside}: is there already; remove it, or choose another --out")
+            return None
+        with opened(self.out) as file:
+            if file.attrs.get(MADE) != _digest(self.identity):
+                raise BadInput(f"{self.out}: is there already and is not this encoding; choose another --out")
+        if self.folder.exists():
+            with only_one(self.folder):
+                shutil.rmtree(self.folder)
+        return self._encoded(about_of(self.beside))
+
+    def run(self) -> Encoded:
+        """Encode every demonstration, reduce the features, and write what comes of it."""
+        with only_one(self.folder):
+            known = self.folder / _IDENTITY
+            if not known.exists() or known.read_text(encoding="utf-8") != self.identity:
+                for old in self.folder.iterdir():
+                    shutil.rmtree(old) if old.is_dir() else old.unlink()
+                write_text(known, self.identity)
+            try:
+                encoder = self._fitted()
+                encoder.write(self.beside)
+                self._write(encoder)
+            finally:
+                if self.out.exists() or [path.name for path in self.folder.iterdir()] == [_IDENTITY]:
+                    shutil.rmtree(self.folder)
+        return self._encoded(encoder.about)
+
+    def _encoded(self, about: About) -> Encoded:
+        return Encoded(self.out, self.beside, about, len(self.source.names))
+
+    def _fitted(self) -> Encoder:
+        """The encoder with its projection, once every demonstration has been encoded."""
+        if self.network is not None and self.encoding.encoder == "autoencoder":
+            checkpoint = self.folder / _CHECKPOINT
+            train(self.network, self.pictures, self.encoding.seed, self.encoding.updates, checkpoint, self.on_event)
+        self._encode_all()
+        projection = self._projection()
+        explained = projection.explained if projection else 1.0
+        about = self.about.model_copy(update={"explained": explained})
+        return Encoder(about, self.features, projection, self.network)
+
+    def _encode_all(self) -> None:
+        """The features of every demonstration, before they are reduced."""
+        with parts_of(self.folder / _UNREDUCED, self.identity, at_most=1) as parts:
+            if parts is None:
+                return
+            for name in self.source.names[len(parts.done) :]:
+                recording = self.source.recording(name)
+                shape = (recording.actions.shape[0], self.about.features)
+                column = Column(shape, np.dtype(np.float32), partial(self._features_of, name))
+                parts.add(Recording(name, {_KEY: column}, recording.actions))
+                self.on_event(DemonstrationsDone(len(parts.done), len(self.source.names)))
+            parts.finish({}, {})
+
+    def _features_of(self, name: str) -> Iterator[np.ndarray]:
+        for block in self.pictures.of(name):
+            values = self.features(block)
+            if values.shape[1] != self.about.features:
+                raise BadInput(
+                    f"encoder {self.about.encoder!r} gives {values.shape[1]} features in {name}, and "
+                    f"{self.about.features} in {self.pictures.training[0]}; it has to give as many of every picture"
+                )
+            yield values.astype(np.float32)
+
+    def _unreduced(self, source: Robomimic, name: str) -> Iterator[np.ndarray]:
+        return batches(source.recording(name).observations[_KEY], ROWS)
+
+    def _projection(self) -> Projection | None:
+        if self.encoding.size is None and self.about.size == self.about.features:
+            return None
+        with open_robomimic(self.folder / _UNREDUCED) as source, one_thread():
+            rows = (block for name in self.pictures.training for block in self._unreduced(source, name))
+            return principal_components(rows, self.about.size)
+
+    def _write(self, encoder: Encoder) -> None:
+        attributes = {**self.source.attributes, MADE: _digest(self.identity)}
+        unreduced = open_robomimic(self.folder / _UNREDUCED)
+        with unreduced as features, one_thread(), robomimic_file(self.out, attributes, self.source.masks) as data:
+            for name in self.source.names:
+                recording = self.source.recording(name)
+                shape = (recording.actions.shape[0], self.about.size)
+                blocks = partial(map, encoder.reduced, self._unreduced(features, name))
+                others = {key: column for key, column in recording.observations.items() if key != self.pictures.key}
+                observations = {**others, self.encoding.key: Column(shape, np.dtype(np.float32), blocks)}
+                write_recording(data, replace(recording, observations=observations))
+
+
+def _encoder(encoding: Encoding, pictures: Pictures) -> tuple[Convolutions | None, Features]:
+    """The encoder, which has been tried on the first training pictures; the network where it is built in."""
+    if encoding.encoder in BUILT_IN:
+        network = Convolutions(encoding.encoder, pictures.shape, encoding.seed)
+        return network, network.encode
+    features = imported(encoding.encoder)
+    try_out(encoding.encoder, features, next(pictures.of(pictures.training[0])))
+    return None, features
+
+
+def _about(encoding: Encoding, pictures: Pictures, features: Features) -> About:
+    """What the encoder is.
+
+    :raises BadInput: there are fewer features, or training pictures, than the size that is asked for.
+    """
+    number = features(next(pictures.of(pictures.training[0]))).shape[1]
+    size = encoding.size or min(SIZE, number, pictures.number)
+    if size > number:
+        raise BadInput(f"--size {size}: encoder {encoding.encoder!r} gives {number} features; take at most as many")
+    if size > pictures.number:
+        raise BadInput(f"--size {size}: there are {pictures.number} training pictures; take at most as many")
+    return About(
+        encoder=encoding.encoder,
+        observation=encoding.observation,
+        picture=pictures.shape,
+        features=number,
+        size=size,
+        seed=encoding.seed,
+    )
+
+
+def _identity(path: Path, encoding: Encoding) -> str:
+    """What decides the contents of the file: a user's module too, by its own source."""
+    stat = path.stat()
+    module = sys.modules.get(encoding.encoder.partition(":")[0])
+    code = Path(module.__file__).read_bytes() if module is not None and module.__file__ else b""
+    facts = {"file": [str(path.resolve()), stat.st_size, stat.st_mtime_ns], "code": hashlib.sha256(code).hexdigest()}
+    return json.dumps(facts | asdict(encoding))
+
+
+def _digest(identity: str) -> str:
+    return hashlib.sha256(identity.encode()).hexdigest()

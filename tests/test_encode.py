@@ -1,0 +1,390 @@
+"""Pictures encoded as vectors: against torch, scikit-learn and planted places; whole, in pieces, and after a kill."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from command_line import call
+from planted import make_spec, make_trainer, make_truth, plant
+from safetensors.torch import load_file
+from sklearn.decomposition import PCA
+from sklearn.linear_model import LinearRegression
+from sklearn.metrics import normalized_mutual_info_score
+
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.files import Damaged
+from ddco_pyro.data.sources import recording
+from ddco_pyro.encoding import Encoding, encode, load, training
+from ddco_pyro.encoding.projection import principal_components
+from ddco_pyro.errors import BadInput
+from ddco_pyro.events import DemonstrationsDone, UpdatesDone
+from ddco_pyro.inference import segment
+from ddco_pyro.model.encoding import encode as prepare
+
+SIZE, STEPS = 20, 8
+
+
+def dots(places):
+    """Pictures [T, H, W, 2] of a dot at places [T, 2] from -1 to 1, on a grey ground."""
+    axis = np.linspace(-1, 1, SIZE)
+    distance = (axis[:, None] - places[:, :1, None]) ** 2 + (axis - places[:, 1:, None]) ** 2
+    return np.stack([255 * np.exp(-distance / 0.03), np.full_like(distance, 80)], -1).astype(np.uint8)
+
+
+def followed(number, seed=0, masks=True):
+    """A dot moves along a line through a picture; ``place`` is where it is, from -1 to 1."""
+    random, demos = np.random.default_rng(seed), []
+    for n in range(number):
+        steps = STEPS + n % 3
+        place = np.linspace(*random.uniform(-0.8, 0.8, (2, 2)), steps)
+        pictures = dots(place)
+        observations = {"camera": pictures, "other": pictures[:, ::5, ::5], "place": place}
+        labels = {"phase": np.arange(steps) % 2}
+        demos.append(Demonstration(f"demo_{n}", observations, place[:, ::-1], labels, {"seed": n}))
+    names = [demo.name for demo in demos]
+    split = {"train": tuple(names[: -number // 4]), "valid": tuple(names[-number // 4 :])}
+    return Demonstrations(tuple(demos), split if masks else {}, {"task": "dots", "control_frequency": 20})
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    path = tmp_path_factory.mktemp("dots") / "dots.hdf5"
+    followed(24).write(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    path = tmp_path_factory.mktemp("small") / "small.hdf5"
+    followed(6).write(path)
+    return path
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "out.hdf5"
+
+
+def together(demos, key):
+    return np.concatenate([demo.observations[key] for demo in demos])
+
+
+def contents(out):
+    """Every array and attribute of the file, and every byte beside it."""
+    arrays = {}
+    with h5py.File(out) as file:
+        file.visititems(
+            lambda name, node: arrays.update({name: node[()].tolist() if isinstance(node, h5py.Dataset) else None})
+        )
+    beside = {path.name: path.read_bytes() for path in out.with_name(f"{out.name}.encoder").iterdir()}
+    return arrays, beside
+
+
+# --- what comes out ---------------------------------------------------------------------------------------------------
+
+
+def held_out_accuracy(out):
+    """R² of the dot's place as a linear map of the features, in demonstrations that were held out of everything."""
+    train, valid = Demonstrations.read(out).split(0.2, 0)
+    places = LinearRegression().fit(together(train, "camera_features"), together(train, "place"))
+    return places.score(together(valid, "camera_features"), together(valid, "place"))
+
+
+def test_random_convolutions_say_where_the_dot_is(source, out):
+    encode(source, out, Encoding("camera", "random_conv", size=16))
+    assert held_out_accuracy(out) > 0.9
+
+
+def test_an_autoencoder_says_where_the_dot_is(source, out):
+    """It gives the picture from that: better than the best picture that never changes, which cannot show a dot."""
+    seen = []
+    encode(source, out, Encoding("camera", "autoencoder", size=16, updates=200), seen.append)
+    assert held_out_accuracy(out) > 0.9
+    pictures = together(Demonstrations.read(source).split(0.2, 0)[0], "camera") / 255
+    losses = [event.loss for event in seen if isinstance(event, UpdatesDone)]
+    assert len(losses) == 4
+    assert losses[-1] < 0.8 * pictures.var(0).mean()
+
+
+def test_options_are_recovered_from_features(tmp_path, out):
+    """Planted in a plane, and seen as pictures of a dot alone."""
+    truth = make_truth(make_spec((3,)))
+    demos, choices = plant(truth, 40, 20, seed=1)
+    drawn = [Demonstration(demo.name, {"camera": dots(demo.observations["state"])}, demo.actions) for demo in demos]
+    Demonstrations(tuple(drawn)).write(tmp_path / "planted.hdf5")
+    encode(tmp_path / "planted.hdf5", out, Encoding("camera", size=8, name="state"))
+    spec = make_spec((3,), epochs=150, restarts=1, initialize="vq_controls")
+    found = make_trainer(spec, Demonstrations.read(out), tmp_path / "fit").run()
+    batch = prepare(Demonstrations.read(out), found.encoder, found.scaling)
+    segments = segment(found.tabulate(batch), batch.lengths)[0]
+    assert normalized_mutual_info_score(choices.flatten(), segments.flatten()) > 0.5
+
+
+def test_all_but_the_pictures_stays(small, out):
+    before = Demonstrations.read(small)
+    assert encode(small, out, Encoding("camera", size=5)).demonstrations == 6
+    after = Demonstrations.read(out)
+    assert (after.masks, after.names) == (before.masks, before.names)
+    assert before.attributes.items() <= after.attributes.items()
+    assert after.observation_shapes == {"other": (4, 4, 2), "place": (2,), "camera_features": (5,)}
+    labelled = [Demonstrations.read(path, labels=["phase"]) for path in (small, out)]
+    for demo, other in zip(*labelled, strict=True):
+        np.testing.assert_array_equal(demo.actions, other.actions)
+        np.testing.assert_array_equal(demo.labels["phase"], other.labels["phase"])
+        np.testing.assert_array_equal(demo.observations["other"], other.observations["other"])
+        np.testing.assert_array_equal(demo.observations["place"], other.observations["place"])
+        assert demo.attributes == other.attributes
+    with h5py.File(out) as file:
+        assert file["data/demo_0/obs/camera_features"].dtype == np.float32
+
+
+def test_two_cameras_one_after_the_other(small, out, tmp_path):
+    encode(small, out, Encoding("camera", size=5))
+    encode(out, tmp_path / "both.hdf5", Encoding("other", size=3, name="wrist"))
+    shapes = Demonstrations.read(tmp_path / "both.hdf5").observation_shapes
+    assert shapes == {"place": (2,), "camera_features": (5,), "wrist": (3,)}
+
+
+def test_random_convolutions_written_out(small, out):
+    folder = encode(small, out, Encoding("camera", seed=3)).folder
+    weights, picture = load_file(folder / "encoder.safetensors"), together(Demonstrations.read(small), "camera")[7]
+    maps = torch.from_numpy(picture).permute(2, 0, 1)[None] / 255
+    for layer, stride, padding in (("convolutions.picture", 2, 2), ("deeper.picture.0", 1, 1)):
+        weight, bias = (weights[f"network/maps.{layer}.{name}"] for name in ("weight", "bias"))
+        maps = torch.relu(torch.nn.functional.conv2d(maps, weight, bias, stride, padding))
+    share = torch.exp(maps[0]) / torch.exp(maps[0]).sum((1, 2), keepdim=True)
+    axis = torch.linspace(-1, 1, SIZE // 2)
+    expected = torch.stack([(share.sum(2) * axis).sum(1), (share.sum(1) * axis).sum(1)], 1).flatten()
+    assert expected.shape == (128,)
+    np.testing.assert_allclose(load(folder).features(picture[None])[0], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1, 4, 9])
+def test_principal_components_are_those_of_all_rows_at_once(size):
+    random = np.random.default_rng(0)
+    rows = 100 + random.normal(size=(500, 9)) @ random.normal(size=(9, 9))
+    ours, theirs = principal_components(np.array_split(rows.astype(np.float32), 13), size), PCA(size).fit(rows)
+    projected, expected = ours(rows), theirs.transform(rows)
+    np.testing.assert_allclose(projected * np.sign((projected * expected).sum(0)), expected, atol=1e-4)
+    np.testing.assert_allclose(ours.explained, theirs.explained_variance_ratio_.sum(), rtol=1e-6)
+
+
+def test_components_see_the_training_demonstrations_alone(small, out):
+    folder = encode(small, out, Encoding("camera", "user_encoders:Means", size=2), allow_code=True).folder
+    train, _ = Demonstrations.read(small).split(0.2, 0)
+    pictures = together(train, "camera").astype(float)
+    rows = np.concatenate([pictures.mean((1, 2)), pictures[:, : SIZE // 2].mean((1, 2))], 1)
+    everything = load_file(folder / "encoder.safetensors")
+    np.testing.assert_allclose(everything["mean"], rows.mean(0), rtol=1e-6)
+    np.testing.assert_allclose(everything["components"].abs(), np.abs(PCA(2).fit(rows).components_), atol=1e-4)
+
+
+@pytest.mark.parametrize("encoder", ["random_conv", "autoencoder", "user_encoders:Means"])
+def test_a_picture_that_is_seen_while_acting(small, out, encoder):
+    folder = encode(small, out, Encoding("camera", encoder, size=3, updates=2), allow_code=True).folder
+    loaded, pictures = load(folder, allow_code=True), together(Demonstrations.read(small), "camera")
+    one_by_one = np.stack([loaded(picture) for picture in pictures])
+    assert one_by_one.dtype == np.float32
+    np.testing.assert_allclose(one_by_one, together(Demonstrations.read(out), "camera_features"), rtol=1e-4, atol=1e-5)
+    with pytest.raises(BadInput, match=r"camera: is float64 \(20, 20, 2\); this encoder reads uint8 \(20, 20, 2\)"):
+        loaded(pictures[0] / 255)
+
+
+# --- in pieces --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoder", ["random_conv", "autoencoder"])
+def test_blocks_of_any_size(small, tmp_path, monkeypatch, encoder):
+    encoding, results = Encoding("camera", encoder, size=4, updates=3), []
+    for size in (2**24, 1, 3 * SIZE * SIZE * 2):
+        monkeypatch.setattr(recording, "BLOCK_BYTES", size)
+        encode(small, tmp_path / f"{size}.hdf5", encoding)
+        results.append(contents(tmp_path / f"{size}.hdf5"))
+    assert results[0] == results[1] == results[2]
+
+
+def test_another_seed_is_another_encoder(small, tmp_path):
+    made = [encode(small, tmp_path / f"{seed}.hdf5", Encoding("camera", seed=seed)).path for seed in (0, 1)]
+    features = [together(Demonstrations.read(path), "camera_features") for path in made]
+    assert not np.allclose(*features)
+
+
+def killed(path, out, encoding, kind, after):
+    """Encode in another process, which kills itself at an event."""
+    left = after
+
+    def strike(event):
+        nonlocal left
+        left -= isinstance(event, kind)
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    process = multiprocessing.get_context("fork").Process(target=encode, args=(path, out, encoding, strike))
+    process.start()
+    process.join(600)
+    assert process.exitcode == -signal.SIGKILL
+    assert not out.exists()
+
+
+def test_killed_again_and_again(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "KEPT_EVERY", 2)
+    encoding = Encoding("camera", "autoencoder", size=4, updates=9)
+    encode(small, tmp_path / "whole.hdf5", encoding)
+    out, seen = tmp_path / "killed.hdf5", []
+    killed(small, out, encoding, UpdatesDone, 3)
+    killed(small, out, encoding, DemonstrationsDone, 2)
+    killed(small, out, encoding, DemonstrationsDone, 2)
+    encode(small, out, encoding, seen.append)
+    assert [event.done for event in seen if isinstance(event, DemonstrationsDone)] == [5, 6]
+    assert not [event for event in seen if isinstance(event, UpdatesDone)]
+    assert contents(out) == contents(tmp_path / "whole.hdf5")
+    assert sorted(path.name for path in tmp_path.iterdir() if "killed" in path.name) == [
+        "killed.hdf5",
+        "killed.hdf5.encoder",
+    ]
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_the_command(small, out):
+    arguments = ("encode", small, "--observation", "camera", "--size", 6, "--out", out)
+    ended = call(*arguments)
+    assert ended.status == 0
+    assert ended.out.startswith(f"{out}: 6 demonstrations, obs/camera_features: 6 of 128 features, 9")
+    before = contents(out)
+    assert call(*arguments).status == 0
+    assert contents(out) == before
+    other = call(*arguments, "--seed", 1)
+    assert (other.status, contents(out)) == (2, before)
+    assert "is there already and is not this encoding; choose another --out" in other.err
+
+
+OWN = "user_encoders:"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--observation", "camra"], "there is no observation 'camra' (did you mean 'camera'?); pictures are: camera"),
+        (
+            ["--observation", "place"],
+            "obs/place is float64 [8, 2]; pictures are uint8 [steps, height, width, channels]",
+        ),
+        (["--size", "129"], "--size 129: encoder 'random_conv' gives 128 features; take at most as many"),
+        (["--size", "60"], "--size 60: there are 35 training pictures; take at most as many"),
+        (["--as", "place"], "obs/place is there already; choose another name with --as"),
+        (["--encoder", "random"], "there is no encoder 'random' (did you mean 'random_conv'?); take random_conv, "),
+        (["--encoder", f"{OWN}Nothing"], "cannot be imported or made: module 'user_encoders' has no attribute"),
+        (["--encoder", f"{OWN}NotMade"], "cannot be imported or made: no weights"),
+        (["--encoder", f"{OWN}NotCallable"], "cannot be called; it needs __call__(pictures)"),
+        (["--encoder", f"{OWN}Raises"], "fails on pictures [8, 20, 20, 2]: expected 224 x 224 pixels"),
+        (["--encoder", f"{OWN}Integers"], "gives int64; it has to give floats"),
+        (["--encoder", f"{OWN}Flat"], "gives shape (8,) for 8 pictures; it has to be (8, features)"),
+        (["--encoder", f"{OWN}NotFinite"], "gives features that are NaN or infinite"),
+        (["--encoder", f"{OWN}Noisy"], "gives other features when it is called again"),
+        (["--encoder", f"{OWN}Together"], "gives other features of a picture among others than alone"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:divide by zero")
+def test_what_cannot_be_used(small, out, options, message):
+    ended = call("encode", small, "--observation", "camera", "--allow-code", *options, "--out", out)
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert message in ended.err
+    assert not list(out.parent.iterdir())
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:2000])
+
+
+def without_a_picture(path):
+    with h5py.File(path, "r+") as file:
+        del file["data/demo_3/obs/camera"]
+
+
+def shorter(path):
+    with h5py.File(path, "r+") as file:
+        pictures = file["data/demo_3/obs/camera"][:-1]
+        del file["data/demo_3/obs/camera"]
+        file["data/demo_3/obs/camera"] = pictures
+
+
+def unknown_in_a_mask(path):
+    with h5py.File(path, "r+") as file:
+        del file["mask/train"]
+        file["mask/train"] = [b"demo_77"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (cut, "cannot be read as HDF5, or is damaged"),
+        (without_a_picture, "demo_3: obs/camera is missing, which demo_0 has"),
+        (shorter, "demo_3: obs/camera has 7 steps, but actions has 8"),
+        (unknown_in_a_mask, "mask/train: there is no demonstration 'demo_77'"),
+        (Path.unlink, "there is no such file"),
+    ],
+)
+def test_demonstrations_that_cannot_be_used(small, tmp_path, out, change, message):
+    path = shutil.copy(small, tmp_path / "changed.hdf5")
+    change(Path(path))
+    ended = call("encode", path, "--observation", "camera", "--out", out)
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert message in ended.err
+    assert not [file for file in tmp_path.iterdir() if "out" in file.name]
+
+
+def test_what_was_not_written_here_stays(small, out):
+    out.write_bytes(b"mine")
+    assert call("encode", small, "--observation", "camera", "--out", out).status == 2
+    assert out.read_bytes() == b"mine"
+    out.unlink()
+    (out.parent / "out.hdf5.encoder").mkdir()
+    ended = call("encode", small, "--observation", "camera", "--out", out)
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert "out.hdf5.encoder: is there already" in ended.err
+
+
+def test_features_that_only_later_pictures_spoil(tmp_path, out):
+    demos = followed(2)
+    demos[1].observations["camera"][:] = 255
+    demos.write(tmp_path / "bright.hdf5")
+    with pytest.raises(BadInput, match="gives features that are NaN or infinite in float32"):
+        encode(tmp_path / "bright.hdf5", out, Encoding("camera", f"{OWN}LaterNotFinite"), allow_code=True)
+    assert not out.exists()
+    assert not out.with_name("out.hdf5.encoder").exists()
+
+
+def test_user_code_needs_permission(small, out):
+    ended = call("encode", small, "--observation", "camera", "--encoder", f"{OWN}Means", "--out", out)
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert "would import user code; pass --allow-code" in ended.err
+    assert not list(out.parent.iterdir())
+    folder = encode(small, out, Encoding("camera", f"{OWN}Means"), allow_code=True).folder
+    with pytest.raises(BadInput, match="would import user code"):
+        load(folder)
+
+
+def test_a_damaged_encoder(small, out):
+    folder = encode(small, out, Encoding("camera", size=2)).folder
+    weights = bytearray((folder / "encoder.safetensors").read_bytes())
+    weights[-1] ^= 1
+    (folder / "encoder.safetensors").write_bytes(weights)
+    with pytest.raises(Damaged, match="write it again with ddco-pyro encode"):
+        load(folder)
+    about = json.loads((folder / "encoder.json").read_text())
+    (folder / "encoder.json").write_text(json.dumps(about | {"version": 2}))
+    with pytest.raises(Damaged, match=r"encoder\.json: is damaged"):
+        load(folder)
+    with pytest.raises(BadInput, match="is no encoder"):
+        load(folder.parent)
