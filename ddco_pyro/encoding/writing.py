@@ -87,7 +87,8 @@ def encode(
     """Write ``out``: the demonstrations of ``path`` with features in place of the pictures, and ``out.encoder`` beside.
 
     Principal components, and the autoencoder, see the training demonstrations alone: ``mask/train``, else all that are
-    not in ``mask/valid``. Memory holds one block of pictures.
+    not in ``mask/valid``. Memory holds one block of pictures, and
+    another to draw from while an autoencoder is trained.
 
     :raises DemonstrationsError: the demonstrations cannot be used, or the observation is missing or no picture.
     :raises BadInput: ``out`` is there already and is something else; the encoder cannot be used, or gives fewer
