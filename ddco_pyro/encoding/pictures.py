@@ -10,7 +10,8 @@ import numpy as np
 
 from ddco_pyro.data.checks import check, check_alike, problems_of_masks
 from ddco_pyro.data.hdf5 import DemonstrationsError
-from ddco_pyro.data.sources import Column, Recording, Source
+from ddco_pyro.data.sources import Column
+from ddco_pyro.data.sources.robomimic import Robomimic
 from ddco_pyro.errors import nearest
 
 AT_ONCE = 32
@@ -29,7 +30,7 @@ class Pictures:
     :raises DemonstrationsError: it is missing or no picture, or the demonstrations cannot be used or differ.
     """
 
-    def __init__(self, source: Source, key: str) -> None:
+    def __init__(self, source: Robomimic, key: str) -> None:
         self._source, self.key, self.names = source, key, source.names
         first = source.recording(self.names[0])
         if key not in first.observations:
@@ -69,13 +70,9 @@ class Pictures:
         """Pictures of all training demonstrations."""
         return sum(self._lengths[name] for name in self.training)
 
-    def recording(self, name: str) -> Recording:
-        """A demonstration."""
-        return self._source.recording(name)
-
     def of(self, name: str) -> Iterator[np.ndarray]:
         """The pictures of a demonstration in order, [M, H, W, C]."""
-        return batches(self.recording(name).observations[self.key], AT_ONCE)
+        return batches(self._source.recording(name, (self.key,), ()).observations[self.key], AT_ONCE)
 
     def at_random(self, seed: int, epoch: int) -> Iterator[np.ndarray]:
         """Every training picture once, in an order that follows from the seed and the epoch, [H, W, C].
