@@ -134,9 +134,9 @@ def allowed() -> float:
     """
     text = os.environ.get(VARIABLE, ALLOWED)
     said = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([KMGT]?B)?\s*", text, re.IGNORECASE)
-    number = float(said[1]) * UNITS[(said[2] or "B").upper()] if said else 0.0
+    number = float(said[1]) * UNITS[(said[2] or "GB").upper()] if said else 0.0
     if not number > 0:
-        raise BadInput(f"{VARIABLE}={text}: has to be a number of bytes, or one with a unit, such as 2GB or 500MB")
+        raise BadInput(f"{VARIABLE}={text}: has to be a number of GB, or one with a unit, such as 2GB or 500MB")
     return number
 
 
