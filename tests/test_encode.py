@@ -20,7 +20,6 @@ from sklearn.linear_model import LinearRegression
 from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.sources import recording
 from ddco_pyro.encoding import Encoding, encode, load, training
 from ddco_pyro.encoding.projection import principal_components
 from ddco_pyro.errors import BadInput
@@ -178,7 +177,7 @@ def test_a_picture_that_is_seen_while_acting(small, out, encoder):
 def test_blocks_of_any_size(small, tmp_path, monkeypatch, encoder):
     encoding, results = Encoding("camera", encoder, size=4, updates=3), []
     for size in (2**24, 1, 3 * SIZE * SIZE * 2):
-        monkeypatch.setattr(recording, "BLOCK_BYTES", size)
+        monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", size)
         encode(small, tmp_path / f"{size}.hdf5", encoding)
         results.append(contents(tmp_path / f"{size}.hdf5"))
     assert results[0] == results[1] == results[2]
@@ -188,7 +187,7 @@ def test_memory_holds_a_block_of_pictures(tmp_path, out, monkeypatch):
     """Of a demonstration of 17 MB."""
     pictures, controls = np.zeros((400, 120, 120, 3), np.uint8), np.zeros((400, 1))
     Demonstrations((Demonstration("demo_0", {"camera": pictures}, controls),)).write(tmp_path / "long.hdf5")
-    monkeypatch.setattr(recording, "BLOCK_BYTES", 2**20)
+    monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", 2**20)
     tracemalloc.start()
     try:
         encode(tmp_path / "long.hdf5", out, Encoding("camera", f"{OWN}Means"), allow_code=True)

@@ -147,7 +147,7 @@ class Scripted:
     def __init__(self, curves):
         self.curves = curves
 
-    def __call__(self, material, restart, until, seconds=0.0, checkpoint=None, on_event=None):
+    def __call__(self, material, restart, until, seconds=0.0, checkpoint=None, on_event=None, ranks=None):
         progress = restart.progress
         curve = self.curves[progress.restart]
         progress.start = curve[0]

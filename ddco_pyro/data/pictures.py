@@ -45,14 +45,16 @@ class Pictures:
     def __len__(self) -> int:
         return self.shape[0]
 
-    def __getitem__(self, steps: slice | int) -> np.ndarray:
-        """The pictures of some steps, or the picture of one.
+    def __getitem__(self, steps: Any) -> np.ndarray:
+        """The pictures of some steps, or the picture of one; indexed in any other way it is all of them that are read.
 
         :raises DemonstrationsError: the file cannot be read, or has changed since.
         """
-        if not isinstance(steps, slice):
+        if isinstance(steps, int | np.integer):
             step = range(len(self))[steps]
             return np.asarray(self[step : step + 1][0])
+        if not isinstance(steps, slice):
+            return np.asarray(np.asarray(self)[steps])
         first, last, stride = steps.indices(len(self))
         with opened(self.path) as file:
             dataset = file.get(self.place)
