@@ -33,7 +33,7 @@ KEPT = 4.0
 MAKING = 16.0
 """Bytes that a number takes on the way there, two float64, or while it is clustered: float64 and k-means' copy."""
 
-BACKWARD = 2.0
+BACKWARD = 1.75
 """Bytes that a gradient step takes for a byte that networks keep of a step: its gradient is there for a while too."""
 
 INFERENCE = 5e3
