@@ -33,8 +33,9 @@ KEPT = 4.0
 MAKING = 16.0
 """Bytes that a number takes on the way there, two float64, or while it is clustered: float64 and k-means' copy."""
 
-BACKWARD = 1.75
-"""Bytes that a gradient step takes for a byte that networks keep of a step: its gradient is there for a while too."""
+BACKWARD, AGAIN = 1.5, 2.25
+"""Bytes that a gradient step takes for a byte that networks keep of a step, whose gradient is there for a while too; and where
+a trajectory is so long that its chunks are computed again."""
 
 INFERENCE = 5e3
 """Bytes that inference takes for a step of trajectories that are processed together."""
@@ -125,7 +126,8 @@ class Extent:
         passing = [MAKING * features * padded]
         for work in works:
             batch, together = (min(n, len(self.lengths)) for n in (work.batch, max(work.steps // longest, 1)))
-            networks = BACKWARD * min(together * longest, work.chunk) * work.bytes_per_step
+            taken = AGAIN if longest > work.chunk else BACKWARD
+            networks = taken * min(together * longest, work.chunk) * work.bytes_per_step
             passing += [MAKING * work.clustered, longest * (batch * given + together * (given + INFERENCE)) + networks]
         return PROGRAM + self.size + padded * given + max(passing)
 
