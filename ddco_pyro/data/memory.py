@@ -34,8 +34,8 @@ MAKING = 16.0
 """Bytes that a number takes on the way there, two float64, or while it is clustered: float64 and k-means' copy."""
 
 BACKWARD, AGAIN = 1.5, 2.25
-"""Bytes that a gradient step takes for a byte that networks keep of a step, whose gradient is there for a while too; and where
-a trajectory is so long that its chunks are computed again."""
+"""Bytes that a gradient step takes for a byte that networks keep of a step, whose gradient is there for a while too;
+and where a trajectory is so long that its chunks are computed again."""
 
 INFERENCE = 5e3
 """Bytes that inference takes for a step of trajectories that are processed together."""
