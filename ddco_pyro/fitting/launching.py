@@ -14,7 +14,7 @@ from multiprocessing.process import BaseProcess
 
 from torch import distributed
 
-from ddco_pyro.errors import Failed
+from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.fitting.processes import BackendError
 from ddco_pyro.fitting.ranks import ALONE, LostProcess, Ranks, connected
 from ddco_pyro.fitting.restarts import follow
@@ -86,7 +86,7 @@ def follow_torchrun(ranks: Ranks) -> None:
             follow(ranks)
     except LostProcess:
         raise
-    except Failed:
+    except (BadInput, Failed):
         sys.exit(1)  # the first process has met the same, and says so
 
 
@@ -147,5 +147,5 @@ def _follow(ranks: Ranks, port: int) -> None:
             store.set(_name(ranks.rank), "")
         with _joined(store, ranks):
             follow(ranks)
-    except Failed:
+    except (BadInput, Failed):
         sys.exit(1)  # the first process says what went wrong
