@@ -284,6 +284,7 @@ def test_a_worker_that_dies_is_one_line(kept: Path) -> None:
             list(map(readers.take, jobs[1:]))
 
 
+@pytest.mark.slow
 def test_killed_while_workers_read(kept: Path, tmp_path: Path) -> None:
     """SIGKILL in the third epoch; called again, it ends with the bits of an undisturbed fit."""
     data = spec_of(kept, "camera", epochs=4, initialize="random", layerwise=False, workers=1)

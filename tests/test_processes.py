@@ -184,6 +184,7 @@ KILL_THE_FIRST = (
 )
 
 
+@pytest.mark.slow
 def test_killed_on_two_processes_and_resumed_on_one(whole, tmp_path):
     """First another process dies, which is said; then the first, which the other does not outlive."""
     spec, run = whole

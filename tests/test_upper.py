@@ -29,7 +29,12 @@ def random_constants(tables, seed=0):
 
 
 @pytest.mark.parametrize(
-    ("counts", "hybrid"), [((2, 2), (False, False)), ((2, 3), (True, True)), ((2, 2, 2), (False,) * 3)]
+    ("counts", "hybrid"),
+    [
+        ((2, 2), (False, False)),
+        ((2, 3), (True, True)),
+        pytest.param((2, 2, 2), (False,) * 3, marks=pytest.mark.slow),  # compiling takes most of it
+    ],
 )
 def test_an_iteration_divides_counts_over_every_path(monkeypatch, counts, hybrid):
     """Selections and terminations counted on one path after another, each weighted by its probability."""
