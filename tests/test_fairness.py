@@ -18,12 +18,13 @@ import ddco_pyro
 from ddco_pyro.comparison import compare, write
 from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.fitting.rollouts import roll_out
+from ddco_pyro.fitting.run import fit
 from ddco_pyro.fitting.widths import nearest_widths
 from ddco_pyro.report import unconverged, write_report
 from ddco_pyro.selection import Workers, select
 from ddco_pyro.selection.choice import as_data, choose
 from ddco_pyro.selection.table import HEAD, cells, markdown
-from ddco_pyro.spec import dump_spec
+from ddco_pyro.spec import SpecError, dump_spec, with_overrides
 
 BASELINES = ["flat", "flat_equal", "per_timestep"]
 
@@ -52,6 +53,43 @@ def still(spec, tmp_path_factory):
         "--set", "compare_with=[flat]",
     )  # fmt: skip
     return ddco_pyro.load(folder), ended
+
+
+# --- each its own optimiser -------------------------------------------------------------------------------------------
+
+OWN = {"kind": "flat", "policy": {"hidden": [8]}, "optimizer": {"lr": 0.03}}
+
+
+def test_a_baseline_beside_trains_as_it_would_alone(toy_spec, tmp_path):
+    """What its own optimiser does not say is as in the spec's."""
+    shared = {"training.optimizer.weight_decay": 0.01, "training.epochs": 4}
+    beside = fit(with_overrides(toy_spec, shared | {"compare_with": [OWN]}), out=tmp_path / "beside").baselines["flat"]
+    alone = {"hierarchy": None, "baseline": {**OWN, "optimizer": None}, "compare_with": []}
+    spec = with_overrides(toy_spec, shared | alone | {"training.optimizer.lr": 0.03})
+    assert (
+        beside.metrics["log_likelihood_per_step"]
+        == fit(spec, out=tmp_path / "alone").metrics["log_likelihood_per_step"]
+    )
+    assert beside.spec.training == spec.training
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        (
+            {"compare_with": [OWN | {"optimizer": {"schedule": "cosine"}}], "training.epochs": None},
+            "compare_with.0.optimizer.schedule: cosine falls to 0 at the end of training.epochs, which is null",
+        ),
+        (
+            {"hierarchy": None, "baseline": OWN, "compare_with": []},
+            "baseline.optimizer: is for baselines in compare_with; say it in training.optimizer",
+        ),
+    ],
+)
+def test_an_optimiser_that_cannot_be_a_baselines_own(toy_spec, changes, problem):
+    with pytest.raises(SpecError) as caught:
+        with_overrides(toy_spec, changes)
+    assert problem in str(caught.value)
 
 
 # --- equal in size ----------------------------------------------------------------------------------------------------

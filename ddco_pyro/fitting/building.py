@@ -166,12 +166,15 @@ def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
 
 
 def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) -> Spec:
-    """The spec of a baseline trained beside: the same but for the model.
+    """The spec of a baseline trained beside: the same but for the model, and what it says of the optimiser.
 
     :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
     """
     grid = spec.selection.model_copy(update={"grid": {}})  # it is about the hierarchy
-    training = spec.training.model_copy(update={"labels": None, "duration": None})  # they are about options
+    own = baseline.optimizer.model_dump(exclude_unset=True) if baseline.optimizer else {}
+    optimizer = spec.training.optimizer.model_copy(update=own)
+    training = spec.training.model_copy(update={"optimizer": optimizer, "labels": None, "duration": None})
+    baseline = baseline.model_copy(update={"optimizer": None})
     model = {"hierarchy": None, "baseline": baseline, "compare_with": ()}
     alone = spec.model_copy(update={**model, "training": training, "selection": grid})
     if baseline.kind != "flat_equal":

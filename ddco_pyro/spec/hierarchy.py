@@ -8,6 +8,7 @@ from pydantic import Field, field_validator, model_validator
 
 from ddco_pyro.spec.messages import invalid
 from ddco_pyro.spec.networks import MetaPolicySpec, NetworkSpec, PolicySpec
+from ddco_pyro.spec.settings import OptimizerSpec
 from ddco_pyro.spec.types import Count, Emission, Items, Model, bare
 
 HEADS = ("linear", "mlp")
@@ -81,6 +82,9 @@ class BaselineSpec(Model):
     one factor, until it has as many parameters as the hierarchy; ``per_timestep``: one policy for each time step."""
     policy: NetworkSpec = NetworkSpec()
     """The policy's network, π."""
+    optimizer: OptimizerSpec | None = None
+    """In ``compare_with``: what of ``training.optimizer`` is otherwise for this baseline, so that each model can have
+    what suits it; null: nothing."""
 
     @model_validator(mode="after")
     def _can_be_widened(self) -> BaselineSpec:

@@ -73,6 +73,7 @@ class Spec(Model):
             *self._nothing_observed(),
             *self._unknown_trajectory(),
             *self._nothing_held_out(),
+            *self._own_optimizers(),
             *self._labels_of_other_levels(),
             *self._labelled_level(),
             *self._durations(),
@@ -100,6 +101,14 @@ class Spec(Model):
     def _nothing_held_out(self) -> Iterator[tuple[str, str]]:
         if self.compare_with and self.demonstrations.valid_fraction == 0:
             yield "compare_with", "needs demonstrations held out to compare on; raise demonstrations.valid_fraction"
+
+    def _own_optimizers(self) -> Iterator[tuple[str, str]]:
+        if self.baseline and self.baseline.optimizer:
+            yield "baseline.optimizer", "is for baselines in compare_with; say it in training.optimizer"
+        for number, baseline in enumerate(self.compare_with):
+            if baseline.optimizer and baseline.optimizer.schedule == "cosine" and self.training.epochs is None:
+                where = f"compare_with.{number}.optimizer.schedule"
+                yield where, "cosine falls to 0 at the end of training.epochs, which is null"
 
     def _labels_of_other_levels(self) -> Iterator[tuple[str, str]]:
         names = self.demonstrations.labels
