@@ -1,0 +1,75 @@
+"""One cell of the labels study: a task of Meta-World, a number of labelled demonstrations and a training seed.
+
+    python studies/arena_labels_cell.py TASK LABELLED SEED [--set KEY=VALUE]... [--runs DIR]
+
+As a cell of the arena with 50 demonstrations, but with as many options as the expert has phases, and the phases of so
+many demonstrations given to training.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from apart import HELD_OUT
+from arena_cell import LABELS, ArenaCell, fitted_cell, sawyer
+from arena_segments import flat
+from cells import Cell, Settings
+
+from ddco_pyro.fitting.agreement import agreement
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.prepare import parts
+
+TRAINED = 50
+DEFAULTS = Settings({"demonstrations": 70, "noise": 0.1}, Path("runs/arena"))
+
+
+@dataclass(frozen=True)
+class LabelsCell(Cell):
+    """A task, how many demonstrations have their labels, and the seed that chooses them and trains."""
+
+    script = "arena_labels_cell.py"
+
+    task: str
+    labelled: int
+    seed: int
+
+    def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
+        """Fit, and say how well options agree with phases on held-out demonstrations."""
+        own = settings.values
+        source = sawyer(settings).collected(
+            self.task, number=own["demonstrations"], held_out=HELD_OUT, noise=own["noise"]
+        )
+        kinds = phases(source)
+        changes = [*settings.overrides, "compare_with=[]", f"hierarchy.levels.0.count={len(kinds)}"]
+        if self.labelled:
+            changes.append(f"training.labels={{level: option, from: {LABELS}, count: {self.labelled}}}")
+        fitted = fitted_cell(ArenaCell(self.task, TRAINED, self.seed), source, tuple(changes), folder)
+        return {
+            "phases": len(kinds),
+            "log_likelihood_per_step": fitted.metrics["log_likelihood_per_step"],
+            "converged": fitted.metrics["training"]["converged"],
+            "measures": measured(fitted, kinds),
+        }
+
+
+def phases(source: Path) -> list[int]:
+    """The labels of a file of demonstrations that are phases, sorted: option 1 is the first of them."""
+    with h5py.File(source) as file:
+        return sorted({int(label) for demo in file["data"].values() for label in demo[f"labels/{LABELS}"][()]} - {-1})
+
+
+def measured(fitted: Fit, kinds: list[int]) -> dict[str, float]:
+    """Measures on held-out demonstrations; ``named``: the part of the steps whose option is the phase of its number."""
+    valid = parts(fitted.spec, fitted.demonstrations)["valid"]
+    truth = [demo.labels[LABELS] for demo in valid]
+    segments = [own[own >= 0] for own in fitted.segment(valid)[0]]
+    right = np.concatenate([np.take(kinds, own - 1) == phase for own, phase in zip(segments, truth, strict=True)])
+    return flat(agreement(segments, truth)) | {"named": float(right.mean())}
+
+
+if __name__ == "__main__":
+    LabelsCell.main(__doc__, DEFAULTS)
