@@ -324,10 +324,10 @@ def test_a_command_ends_with_its_status_and_finds_tasks_beside_it(spec):
 
 
 def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
-    longer = with_set("compare_with=[]", "training.epochs=240", "training.patience=null")
+    longer = with_set("compare_with=[]", "training.epochs=60", "training.patience=null")
     folder = tmp_path / "cut"
     interrupt = "os.kill(os.getpid(), signal.SIGINT)"
-    status, err = struck(["fit", spec, "--out", folder, *longer], HERE, "EpochEnded", 100, interrupt)
+    status, err = struck(["fit", spec, "--out", folder, *longer], HERE, "EpochEnded", 25, interrupt)
     assert status == 1
     assert not (folder / "model.safetensors").exists()
     said, _, command = err.splitlines()[-1].partition("; continue with: ddco-pyro ")
@@ -337,7 +337,7 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
     for name in ("model.safetensors", "history.csv", "spec.yaml"):
         assert (folder / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     rows = (folder / "history.csv").read_text().splitlines()
-    assert len(rows) == 1 + 4 * 60
+    assert len(rows) == 1 + 60
 
 
 LIGHT = """

@@ -164,13 +164,14 @@ def estimated_and_measured(spec: Path, path: Path) -> tuple[float, float]:
     return memory_needed(load_spec(spec), path), ended.peak
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "lengths", "size", "network"),
     [
         pytest.param(pictures, (300, 300, 20, 20, 20), 84, CONV, id="long demonstrations of pictures"),
-        pytest.param(pictures, (30,) * 30, 84, CONV, id="many of them", marks=pytest.mark.slow),
-        pytest.param(vectors, (500,) * 60, 200, LINEAR, id="many observations", marks=pytest.mark.slow),
-        pytest.param(vectors, (20_000,) * 5, 4, WIDE, id="long demonstrations", marks=pytest.mark.slow),
+        pytest.param(pictures, (30,) * 30, 84, CONV, id="many of them"),
+        pytest.param(vectors, (500,) * 60, 200, LINEAR, id="many observations"),
+        pytest.param(vectors, (20_000,) * 5, 4, WIDE, id="long demonstrations"),
     ],
 )
 def test_a_fit_takes_what_was_estimated(

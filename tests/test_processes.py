@@ -221,6 +221,7 @@ def assert_ends(pid):
     pytest.fail("the other process goes on alone")
 
 
+@pytest.mark.slow
 def test_two_processes_of_torchrun(whole, tmp_path):
     spec, run = whole
     folder = tmp_path / "run"

@@ -223,6 +223,7 @@ def written(folder):
 KILL = "os.killpg(0, signal.SIGKILL)"
 
 
+@pytest.mark.slow
 def test_a_killed_selection_goes_on_and_gives_the_same(tmp_path):
     """kill -9 of the whole process group when some folds are done; what was done is not done again."""
     spec = written(tmp_path)
