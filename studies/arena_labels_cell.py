@@ -21,6 +21,7 @@ from cells import Cell, Settings
 
 from ddco_pyro.fitting.agreement import agreement
 from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.labels import option_labels
 from ddco_pyro.fitting.prepare import parts
 
 TRAINED = 50
@@ -63,12 +64,18 @@ def phases(source: Path) -> list[int]:
 
 
 def measured(fitted: Fit, kinds: list[int]) -> dict[str, float]:
-    """Measures on held-out demonstrations; ``named``: the part of the steps whose option is the phase of its number."""
+    """Measures on held-out demonstrations; ``named``: the part of the steps whose option stands for their phase.
+
+    Options that no label names, because it was in none of the labelled demonstrations, are wrong; where nothing is
+    labelled, options stand for phases by their numbers.
+    """
     valid = parts(fitted.spec, fitted.demonstrations)["valid"]
     truth = [demo.labels[LABELS] for demo in valid]
     segments = [own[own >= 0] for own in fitted.segment(valid)[0]]
-    right = np.concatenate([np.take(kinds, own - 1) == phase for own, phase in zip(segments, truth, strict=True)])
-    return flat(agreement(segments, truth)) | {"named": float(right.mean())}
+    names = next(iter(option_labels(fitted.metrics).values()), dict(enumerate(kinds, start=1)))
+    right = [names.get(option) == phase for own, phases in zip(segments, truth, strict=True)
+             for option, phase in zip(own.tolist(), phases.tolist(), strict=True)]  # fmt: skip
+    return flat(agreement(segments, truth)) | {"named": float(np.mean(right))}
 
 
 if __name__ == "__main__":
