@@ -1,4 +1,4 @@
-"""The command line: ``ddco-pyro check | collect | fit | select | compare | rollout | report``.
+"""The command line: ``ddco-pyro check | collect | fit | select | merge | compare | rollout | report``.
 
 Every command ends with 0 (done), 1 (failed) or 2 (bad input), and says in one line what is wrong, where, and what to
 do; ``--debug`` shows the traceback. A file for each group of commands; they import what they need when they are called.
@@ -28,6 +28,7 @@ EXAMPLES: dict[Callable[..., None], str] = {
     demos.collect: "collect specs/needle.yaml --out needle.hdf5",
     fits.fit: "fit specs/needle.yaml --set training.epochs=50 --out runs/short",
     fits.select: "select specs/mine.yaml --set selection.grid.hierarchy.levels.0.count=[1,2,4,8]",
+    fits.merge: "merge runs/mine --options 2 4",
     runs.compare: "compare runs/needle runs/needle/baselines/flat runs/other",
     runs.rollout: "rollout runs/needle --episodes 200 --video",
     runs.report: "report runs/needle",

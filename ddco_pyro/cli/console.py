@@ -35,6 +35,7 @@ from ddco_pyro.fitting.convergence import effort
 if TYPE_CHECKING:
     from ddco_pyro.fitting.building import Dimensions
     from ddco_pyro.fitting.labels import Labels
+    from ddco_pyro.fitting.merging import Pair
     from ddco_pyro.model.hierarchy import Hierarchy
     from ddco_pyro.selection import Choice
     from ddco_pyro.spec import Spec
@@ -210,6 +211,15 @@ def log_likelihoods(metrics: Mapping[str, Any]) -> None:
     for name, training in words.trainings(metrics).items():
         if beside := words.restarts(training):
             Console().print(Text(f"{name}: {beside}"), soft_wrap=True)
+
+
+def merged(pair: Pair, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
+    """Which options are one now, and what that does to the likelihood of what was held out."""
+    first, second = pair.options
+    apart = "" if pair.divergence is None else f", {pair.divergence:.2f} nats per step apart"
+    values = [_number(metrics["log_likelihood_per_step"]["valid"]) for metrics in (before, after)]
+    text = f"options {first} and {second}{apart}, are one: held out {values[0]} before, {values[1]} now"
+    Console().print(Text(text), soft_wrap=True)
 
 
 def _difference(paired: Mapping[str, float]) -> str:

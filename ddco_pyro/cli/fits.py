@@ -1,4 +1,4 @@
-"""From a spec to a fit: ``check``, ``fit`` and ``select``."""
+"""From a spec to a fit: ``check``, ``fit``, ``select`` and ``merge``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli.options import AllowCode, Overrides, SpecPath
+from ddco_pyro.cli.options import AllowCode, Overrides, RunPath, SpecPath
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
 
 if TYPE_CHECKING:
@@ -146,6 +146,38 @@ def select(
     _warn(fitted)
     print(f"selection: {folder / 'selection.json'}")
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
+
+
+def merge(
+    run: RunPath,
+    options: Annotated[
+        tuple[int, int] | None,
+        typer.Option(help="Numbers of the two options; by default those that act most alike.", show_default=False),
+    ] = None,
+    level: Annotated[str | None, typer.Option(help="Name of their level; by default the lowest.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The run folder; by default RUN-merged.")] = None,
+    jobs: Annotated[int, typer.Option(help="Processes that train restarts; -1 is one for each core.")] = -1,
+    allow_code: AllowCode = False,
+) -> None:
+    """Make two options of a run one, and fit again from its segments; write a run folder of its own.
+
+    Called again, an unfinished one is continued.
+    """
+    from ddco_pyro.cli import console
+    from ddco_pyro.fitting import merging
+    from ddco_pyro.fitting.fit import load
+    from ddco_pyro.report import write_report
+
+    before = load(run, allow_code)
+    pair = merging.chosen(before, level, options)
+    folder = out or run.with_name(f"{run.name}-merged")
+    with console.Progress() as progress:
+        fitted = merging.merge(before, pair, folder, progress, jobs)
+    console.log_likelihoods(fitted.metrics)
+    console.merged(pair, before.metrics, fitted.metrics)
+    _warn(fitted)
+    print(f"report: {write_report(fitted, fitted.demonstrations)}")
+    print(f"next: ddco-pyro compare {shlex.quote(str(run))} {shlex.quote(str(folder))}{_allowed(fitted.spec)}")
 
 
 @contextmanager

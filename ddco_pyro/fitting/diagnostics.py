@@ -27,7 +27,8 @@ Kind = Literal["unused", "redundant", "dominating", "never_persisting", "high_fi
 ADVICE: Mapping[Kind, str] = {
     "unused": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select), or start "
     "from clusters with training.initialize: vq and try more restarts.",
-    "redundant": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select). If "
+    "redundant": "Make them one and see what it costs (ddco-pyro merge), or compare hierarchy.levels.*.count by "
+    "cross-validation (ddco-pyro select). If "
     "they should differ, start from clusters of observations and controls (training.initialize: vq_controls) or lower "
     "control.std, below which differences do not count.",
     "dominating": "Start from clusters (training.initialize: vq), train layer by layer (training.layerwise: true), or "

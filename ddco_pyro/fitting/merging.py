@@ -1,0 +1,128 @@
+"""Two options of a run made one, and training continued from there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.errors import BadInput
+from ddco_pyro.events import OnEvent, ignore
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.run import fit
+from ddco_pyro.spec import Spec, with_overrides
+from ddco_pyro.spec.messages import nearest
+
+LABELS = "merged"
+"""Name of the labels that say which option each step begins with."""
+
+
+class MergeError(BadInput):
+    """Options that cannot be merged."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two options of a level.
+
+    :param level: 0 is the lowest.
+    :param options: their numbers, 1 is the first; the second becomes the first.
+    :param divergence: how differently they act, nats per step over the time that one of them is active; None where one
+        of them is never active.
+    """
+
+    level: int
+    options: tuple[int, int]
+    divergence: float | None
+
+
+def merge(run: Fit, pair: Pair, out: str | Path | None = None, on_event: OnEvent = ignore, jobs: int = 1) -> Fit:
+    """The run's spec with an option less, fitted to its demonstrations from its segments with two options as one.
+
+    The other levels are trained anew. The new run keeps a copy of the demonstrations, with the labels it began from.
+
+    :param out: its folder; None to write nothing.
+    :raises MergeError: the level would have no option left, or has been trained from labels.
+    """
+    changed = merged_spec(run.spec, pair.level)
+    return fit(changed, merged_labels(run, pair), out=out, on_event=on_event, jobs=jobs)
+
+
+def chosen(run: Fit, level: str | None = None, options: tuple[int, int] | None = None) -> Pair:
+    """The pair that is meant: by default the two options of a level that act most alike.
+
+    :param level: its name; by default the lowest.
+    :raises MergeError: there is no such level, or there are no such options.
+    """
+    levels = run.spec.hierarchy.levels if run.spec.hierarchy else ()
+    names = [one.name for one in levels]
+    if not names:
+        raise MergeError(f"{_place(run)}: is a policy without options; there are none to merge")
+    if level is not None and level not in names:
+        raise MergeError(f"there is no level {level!r}{nearest(level, names)}; there is: {', '.join(names)}")
+    number = 0 if level is None else names.index(level)
+    count, alike = levels[number].count, _divergences(run, number)
+    if options is None:
+        if not alike:
+            raise MergeError(
+                f"{_place(run)}: no two options of level {names[number]!r} are used; there are none to merge"
+            )
+        options = min(alike, key=alike.__getitem__)
+    first, second = sorted(options)
+    if not 1 <= first < second <= count:
+        asked = f"{options[0]} and {options[1]}"
+        raise MergeError(f"options {asked} of level {names[number]!r}: give two different ones from 1 to {count}")
+    return Pair(number, (first, second), alike.get((first, second)))
+
+
+def _divergences(run: Fit, level: int) -> dict[tuple[int, int], float]:
+    """How differently each two options of a level act, where both are used."""
+    rows: list[dict[str, Any]] = run.metrics["divergences"][level]
+    return {(row["options"][0], row["options"][1]): row["divergence"] for row in rows if row["divergence"] is not None}
+
+
+def merged_spec(spec: Spec, level: int) -> Spec:
+    """The spec with an option less at a level (0 is the lowest), whose options begin from labels.
+
+    :raises MergeError: there is one option, or its options are named by labels already.
+    """
+    assert spec.hierarchy is not None  # or there would be no pair
+    own = spec.hierarchy.levels[level]
+    if own.count == 1:
+        raise MergeError(f"level {own.name!r} has one option; there are none to merge")
+    if spec.training.labels is not None and spec.training.labels.hold:
+        raise MergeError("training.labels says which options there are; join two of the labels in the file instead")
+    changes: dict[str, Any] = {
+        f"hierarchy.levels.{level}.count": own.count - 1,
+        "training.labels": {"level": own.name, "from": LABELS, "hold": False},
+    }
+    if spec.training.initialize == "random":  # which would not begin from anything
+        changes["training.initialize"] = "vq"
+    return with_overrides(spec, changes)
+
+
+def merged_labels(run: Fit, pair: Pair) -> Demonstrations:
+    """The run's demonstrations, labelled by their most likely options from 0 on, of which two are one.
+
+    Where a caller acts itself (choice 0) the label is -1: nothing is said.
+    """
+    demos = run.demonstrations
+    first, second = pair.options
+
+    def renumbered(choices: np.ndarray) -> np.ndarray:
+        joined = np.where(choices == second, first, choices)
+        return np.where(joined > second, joined - 1, joined) - 1
+
+    segments = run.segment(demos)[pair.level]
+    each = zip(demos, segments, strict=True)
+    labelled = (
+        replace(demo, labels=dict(demo.labels) | {LABELS: renumbered(choices[: len(demo)])}) for demo, choices in each
+    )
+    return replace(demos, demonstrations=tuple(labelled))
+
+
+def _place(run: Fit) -> str:
+    return str(run.folder) if run.folder else "the fit"
