@@ -3,7 +3,8 @@
     python studies/needle_curve.py [--counts 10 20 40 80] [--seeds 3] [--episodes 60] [--jobs 2] [--set KEY=VALUE]...
 
 Trains on the first demonstrations of each training seed of ``needle_success.py``, whose results stand beside as those
-with 100 where they are there. Resumable as that study is. Writes ``curve.json``, ``curve.md`` and ``curve.png``.
+with 100 where they are there, as does what was kept of other numbers. Resumable as that study is. Writes
+``curve.json``, ``curve.md`` and ``curve.png``.
 """
 
 from __future__ import annotations
@@ -72,7 +73,8 @@ def main() -> None:
     cells = [(seed, count) for count in arguments.counts for seed in range(arguments.seeds)]
     Parallel(n_jobs=arguments.jobs)(delayed(run_seed)(*cell, arguments, made_by) for cell in cells)
     curve, records = {}, []
-    for count in [*arguments.counts, ALL]:
+    others = {int(path.name.split("-")[1]) for path in arguments.out.glob("count-*-seed-*.json")}
+    for count in sorted({*arguments.counts, *others, ALL}):
         paths = [kept_at(arguments.out, seed, count) for seed in range(arguments.seeds)]
         kept = [json.loads(path.read_text()) for path in paths if path.exists()]
         if kept:
