@@ -1,20 +1,20 @@
 """The studies of planar pushing (paper §5.1): each fits and rolls out many small cells, and can be stopped and resumed
 (but for the sweep of settings before them).
 
-    python studies/pushing_studies.py sweep
+    python studies/pushing_studies.py sweep [--methods ...]
     python studies/pushing_studies.py sample_complexity [--seeds 5] [--limited] [--jobs 2] [--runs DIR] [--out DIR]
         [--demonstrations 20 40 80] [--options 1 2 4 8] [--methods "flat MLP" "DDCO MLP"]
     python studies/pushing_studies.py number_of_options
     python studies/pushing_studies.py augmentation
     python studies/pushing_studies.py variants [--variants "exact hand" "std 0.5"]
 
-``sweep`` chooses every method's learning rate by held-out likelihood on demonstrations of development seeds, then its
-execution (mean or sampled controls; most likely or sampled options) by goals in development episodes, and writes
-``pushing_settings.json`` beside this file. ``variants`` changes one thing at a time for every method alike. A study
-writes NAME.csv, NAME.png and NAME.md from all cells that are done; it goes through the grid one seed after the other.
-``--limited`` adds rollouts with at most 250 steps for each goal. ``--demonstrations``, ``--options``, ``--methods`` and
-``--variants`` run a part of the grid; what is written has every cell of the grid that is done, and says of how many
-seeds. ``--summarize`` runs nothing.
+``sweep`` chooses every method's learning rate and weight decay by held-out likelihood on demonstrations of development
+seeds, then its execution (mean or sampled controls; sampled, most likely or marginal options) by goals in development
+episodes, and writes ``pushing_settings.json`` beside this file; fits that are done are kept. ``variants`` changes one
+thing at a time for every method alike. A study writes NAME.csv, NAME.png and NAME.md from all cells that are done; it
+goes through the grid one seed after the other. ``--limited`` adds rollouts with at most 250 steps for each goal.
+``--demonstrations``, ``--options``, ``--methods`` and ``--variants`` run a part of the grid; what is written has every
+cell of the grid that is done, and says of how many seeds. ``--summarize`` runs nothing.
 """
 
 from __future__ import annotations
@@ -51,14 +51,18 @@ from pushing_results import grouped, write
 
 from ddco_pyro.acting.lockstep import play
 from ddco_pyro.data.files import write_text
+from ddco_pyro.data.tensors import read_tensors, write_tensors
+from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec
 
 COUNTS = (5, 20, 40, 80)
 OPTIONS = (1, 2, 3, 4, 5, 6, 7, 8)
-RATES = (2e-3, 5e-3, 1e-2)
-EXECUTIONS = tuple(itertools.product(("mean", "sample"), ("sample", "most_likely")))
+OPTIMIZERS = tuple({"training.optimizer.lr": rate, "training.optimizer.weight_decay": decay}
+                   for rate, decay in itertools.product((5e-3, 1e-2), (0.0, 1e-3, 1e-2)))  # fmt: skip
+EXECUTIONS = (*itertools.product(("mean",), ("sample", "most_likely", "marginal")), ("sample", "sample"))
+"""Of the control, and of options; sampled controls ruin every policy, whatever the options."""
 SWEPT_DEMONSTRATIONS, SWEPT_SEEDS, SWEPT_EPISODES = 40, (0, 1), 12
 OWN_OPTIONS = {"DDCO linear": 5, "DDCO MLP": 2, "hybrid MLP": 2}  # what the specs say
 
@@ -95,29 +99,35 @@ STUDIES: dict[str, Callable[[int], list[Cell]]] = {
 }
 
 
-def candidate(name: str, rate: float, seed: int, folder: Path) -> tuple[Cell, Spec, Hierarchy]:
-    """A method fitted with a learning rate to the demonstrations of a development seed."""
+def candidate(name: str, number: int, seed: int, folder: Path) -> tuple[Cell, Spec, Hierarchy]:
+    """A method fitted with an optimiser of the grid to the demonstrations of a development seed."""
     torch.set_num_threads(1)
     cell = Cell(name, OWN_OPTIONS.get(name), SWEPT_DEMONSTRATIONS, seed)
-    spec = spec_of(cell, {"training.optimizer.lr": rate})
+    spec = spec_of(cell, OPTIMIZERS[number])
     demos = pool(folder, spec, development=True)
     demos = demos.select(demos.names[:SWEPT_DEMONSTRATIONS])
-    hierarchy, _ = fit(spec, demos, folder / "sweep" / f"{cell.name}-{rate}.checkpoint")
+    path = folder / "sweep" / f"{cell.name}-{number}.safetensors"
+    if path.exists():
+        hierarchy = build_hierarchy(spec, Dimensions.of(demos))
+        hierarchy.load_state_dict(read_tensors(path)[0])
+        return cell, spec, hierarchy.eval()
+    hierarchy, _ = fit(spec, demos, path.with_suffix(".checkpoints"))
+    write_tensors(path, hierarchy.state_dict(), {})
     return cell, spec, hierarchy
 
 
-def try_rate(name: str, rate: float, seed: int, folder: Path) -> dict[str, Any]:
-    """Held-out likelihood with a learning rate."""
-    _, spec, hierarchy = candidate(name, rate, seed, folder)
+def try_optimizer(name: str, number: int, seed: int, folder: Path) -> dict[str, Any]:
+    """Held-out likelihood with an optimiser of the grid."""
+    _, spec, hierarchy = candidate(name, number, seed, folder)
     value = per_step(Fit(spec, hierarchy), held_out(folder, spec, development=True))
-    return {"method": name, "rate": rate, "seed": seed, "held_out": value}
+    return {"method": name, "number": number, **OPTIMIZERS[number], "seed": seed, "held_out": value}
 
 
-def try_executions(name: str, rate: float, seed: int, folder: Path) -> list[dict[str, Any]]:
+def try_executions(name: str, number: int, seed: int, folder: Path) -> list[dict[str, Any]]:
     """Goals in development episodes with every execution; a flat policy has no options to be sampled."""
-    cell, spec, hierarchy = candidate(name, rate, seed, folder)
+    cell, spec, hierarchy = candidate(name, number, seed, folder)
     first, found = DEVELOPMENT_EPISODES + 1000 * seed, []
-    for control, options in EXECUTIONS if cell.options else EXECUTIONS[::2]:
+    for control, options in EXECUTIONS if cell.options else EXECUTIONS[::3]:
         rollout = spec.rollout.model_copy(update={"control": control, "options": options})
         episodes = play(pushing.task, hierarchy, rollout, range(first, first + SWEPT_EPISODES))
         goals = float(np.mean(summary(episodes)["goals"]))
@@ -125,22 +135,27 @@ def try_executions(name: str, rate: float, seed: int, folder: Path) -> list[dict
     return found
 
 
-def sweep(folder: Path, jobs: int) -> None:
-    """Choose every method's learning rate and execution from the same grids."""
+def sweep(folder: Path, jobs: int, names: Sequence[str]) -> None:
+    """Choose every method's optimiser and execution from the same grids; what was chosen for other methods stays."""
     for seed in SWEPT_SEEDS:
         spec = spec_of(Cell("flat MLP", None, SWEPT_DEMONSTRATIONS, seed), {})
         pool(folder, spec, development=True)
         held_out(folder, spec, development=True)
-    grid = list(itertools.product(METHODS, RATES, SWEPT_SEEDS))
-    rates = Parallel(n_jobs=jobs)(delayed(try_rate)(*one, folder) for one in grid)
-    chosen = {name: {"training.optimizer.lr": best(rates, name, "held_out", "rate")[0]} for name in METHODS}
-    pairs = [(name, *own.values(), seed, folder) for name, own in chosen.items() for seed in SWEPT_SEEDS]
+    grid = list(itertools.product(names, range(len(OPTIMIZERS)), SWEPT_SEEDS))
+    fits = Parallel(n_jobs=jobs)(delayed(try_optimizer)(*one, folder) for one in grid)
+    numbers = {name: best(fits, name, "held_out", "number")[0] for name in names}
+    pairs = [(name, number, seed, folder) for name, number in numbers.items() for seed in SWEPT_SEEDS]
     executions = list(itertools.chain(*Parallel(n_jobs=jobs)(delayed(try_executions)(*one) for one in pairs)))
-    for name, own in chosen.items():
+    before = json.loads(SETTINGS.read_text())
+    chosen = before["chosen"] | {name: dict(OPTIMIZERS[number]) for name, number in numbers.items()}
+    for name in names:
         control, options = best(executions, name, "goals", "control", "options")
-        own |= {"rollout.control": control, "rollout.options": options}
-    found = {"command": "python studies/pushing_studies.py sweep", "chosen": chosen, "rates": rates}
-    write_text(SETTINGS, json.dumps(found | {"executions": executions}, indent=1) + "\n")
+        chosen[name] |= {"rollout.control": control, "rollout.options": options}
+    rows = {"fits": fits, "executions": executions}
+    others = {key: [row for row in before.get(key, ()) if row["method"] not in names] for key in rows}
+    command = shlex.join(["python", "studies/pushing_studies.py", "sweep", "--methods", *names])
+    found = {"command": command, "chosen": chosen, **{key: others[key] + rows[key] for key in rows}}
+    write_text(SETTINGS, json.dumps(found, indent=1) + "\n")
 
 
 def best(rows: Sequence[dict[str, Any]], name: str, measure: str, *keys: str) -> tuple[Any, ...]:
@@ -177,7 +192,7 @@ def main() -> None:
     arguments = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"
     if arguments.study == "sweep":
-        sweep(arguments.runs, arguments.jobs)
+        sweep(arguments.runs, arguments.jobs, arguments.methods)
         return
     command = command_of(arguments)
     made_by = record(command)
