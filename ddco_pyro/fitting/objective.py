@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
+from statistics import median
 
 import torch
 from torch import Tensor
@@ -105,12 +106,15 @@ class Objective:
         return self.material.train.shifted(model.encoder.shifts, self.material.seed(now.restart, now.stage, now.epoch))
 
     def tune(self, model: Hierarchy) -> float:
-        """What is maximised of the tuning demonstrations, per step."""
-        pieces = list(self.material.tune.pieces(model.steps_at_once))
+        """What is maximised of the tuning demonstrations, per step: the mean, or the median over demonstrations."""
+        tune, by_median = self.material.tune, self.material.spec.training.tune_by == "median"
+        pieces = list(tune.pieces(1 if by_median else model.steps_at_once))  # one demonstration each
         with torch.no_grad():
-            _read_ahead(model, self.material.tune, (piece for _, piece in self.ranks.own(pieces)))
-            values = self.ranks.each(partial(self._tuned, model, *piece) for piece in pieces)
-            return sum(values) / self.material.tune.steps
+            _read_ahead(model, tune, (piece for _, piece in self.ranks.own(pieces)))
+            values = list(self.ranks.each(partial(self._tuned, model, *piece) for piece in pieces))
+        if by_median:
+            return median(value / piece.steps for value, (_, piece) in zip(values, pieces, strict=True))
+        return sum(values) / tune.steps
 
     def _tuned(self, model: Hierarchy, rows: Tensor, batch: Batch) -> float:
         return float(self._total(self._tables(model, batch, self.known[1], rows), batch))

@@ -274,6 +274,9 @@ class TrainingSpec(Model):
     stopped; of those that are left again after twice as many, and so on. Null: all are trained to the end."""
     tune_fraction: Fraction = 0.1
     """Part of the training demonstrations set aside for tuning: to stop early and to choose among restarts."""
+    tune_by: Literal["mean", "median"] = "mean"
+    """What of the tuning demonstrations decides: the ``mean`` over their steps of what is maximised, or the ``median``
+    over demonstrations, which one odd demonstration among a few cannot decide."""
     patience: Count | None = 20
     """Epochs without improvement before a stage stops; null for never."""
     workers: int = Field(default=0, ge=0)
