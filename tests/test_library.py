@@ -91,6 +91,14 @@ def test_demonstrations_from_memory_are_kept_with_the_run(commanded: Path, tmp_p
         ddco_pyro.fit(spec, two_skills(seed=1), out=folder)
 
 
+def test_demonstrations_in_another_order_are_the_same(in_memory: ddco_pyro.Fit, tmp_path: Path) -> None:
+    """That of their names, as in a file; so a run goes on from what it keeps of them."""
+    backwards = Demonstrations(tuple(reversed(two_skills())))
+    fit = ddco_pyro.fit(in_memory.spec, backwards, out=tmp_path / "run")
+    assert numbers(fit) == numbers(in_memory)
+    assert numbers(ddco_pyro.fit(in_memory.spec, backwards, out=tmp_path / "run")) == numbers(fit)
+
+
 def test_the_spec_says_what_is_seen_of_demonstrations_from_memory(in_memory: ddco_pyro.Fit) -> None:
     """Another observation, and a demonstration that is left out."""
     records = [*two_skills(), Demonstration("other", two_skills()[0].observations, two_skills()[0].actions)]

@@ -18,6 +18,7 @@ import torch
 from ddco_pyro.data.control_parts import measure
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import leftovers, only_one, write_text
+from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.tensors import write_tensors
 from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, ignore
 from ddco_pyro.fitting import labels
@@ -63,8 +64,8 @@ def fit(
     'runs/mine'
 
     :param spec: a spec, or its YAML file; one that names user code is given by ``load_spec(path, allow_code=True)``.
-    :param demonstrations: in memory, or the HDF5 file to use instead of ``demonstrations.path``; None for those that
-        the spec names.
+    :param demonstrations: in memory, in any order, or the HDF5 file to use instead of ``demonstrations.path``; None for
+        those that the spec names.
     :param out: the run folder, as ``ddco-pyro fit`` makes it, with demonstrations from memory kept in it; None to write
         nothing. A folder that holds part of this run is continued; one that holds all of it is left as it is.
     :param on_event: is told how it goes on.
@@ -80,6 +81,7 @@ def fit(
     """
     spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else Path(out)
     if isinstance(demonstrations, Demonstrations):
+        demonstrations = demonstrations.select(sorted(demonstrations.names, key=natural))  # as they are read back
         path = {"demonstrations.path": str(folder / "demonstrations.hdf5")} if folder else {}
         return fit_run(
             with_overrides(spec, path),
