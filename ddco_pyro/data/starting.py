@@ -110,6 +110,7 @@ def _lines(inspection: Inspection, path: str) -> Iterator[str]:
     batch = _batch(lengths)
     yield f"  epochs: {_epochs(lengths, batch)}                      # of all stages together, at most"
     yield f"  patience: {PATIENCE}                      # a stage stops after so many epochs without improvement"
+    yield "  tune_by: median                   # of the tuning demonstrations, which one odd one cannot decide"
     yield f"  batch_size: {batch}                    # demonstrations in a gradient step"
     yield "# Is the hierarchy worth it? Policies without options, trained beside it with the same budget."
     yield "compare_with:"
