@@ -70,7 +70,7 @@ def roll_out(
                 on_event(EpisodeEnded(name, total))
             continue
         outcomes = []
-        for episode in run_episodes(str(fit.spec.task), policy, seeds, film, jobs):
+        for episode in run_episodes(str(fit.spec.task), policy, seeds, film, jobs, fit.spec.observed, ()):
             outcomes.append(episode.outcome)
             if episode.frames:
                 write_film(_film(fit, name, episode.seed), episode)
