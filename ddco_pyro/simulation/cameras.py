@@ -47,7 +47,8 @@ class Watched(dm_env.Environment):
     def observation_spec(self) -> dict[str, specs.Array]:
         """What each observation is."""
         pictures = {
-            name: specs.BoundedArray((*camera.size, 3), np.uint8, 0, 255, name) for name, camera in self._cameras.items()
+            name: specs.BoundedArray((*camera.size, 3), np.uint8, 0, 255, name)
+            for name, camera in self._cameras.items()
         }
         return {**self._environment.observation_spec(), **pictures}
 
