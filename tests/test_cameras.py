@@ -50,7 +50,7 @@ def spec_of(*observations, **parts):
 def test_an_episode_is_drawn_where_its_pictures_are_observed():
     """The pictures are those of the states before each control, and all else is as without them."""
     seen, blind = (run_episode(watched, "supervisor", 3, observed=names).record for names in (["camera"], ["offsets"]))
-    assert DRAWN == list(range(len(seen) + 1))
+    assert list(range(len(seen) + 1)) == DRAWN
     assert seen.observations.keys() - blind.observations.keys() == {"camera"}
     np.testing.assert_array_equal(seen.actions, blind.actions)
     environment = toy_task.task.load(3)

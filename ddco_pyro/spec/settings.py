@@ -87,8 +87,8 @@ class ObservationSpec(Model):
     grey: bool = False
     """Pictures alone: whether red, green and blue become one luminance."""
     frames: Count = 1
-    """Pictures alone: how many are seen together, the last one and those before it, along the channels; before the first
-    step the first one is repeated. A single picture does not tell how fast anything moves."""
+    """Pictures alone: how many are seen together, the last one and those before it, along the channels; before the
+    first step the first one is repeated. A single picture does not tell how fast anything moves."""
     augment: AugmentSpec | None = None
     """Pictures alone: how they are varied in training; null: not at all."""
 
