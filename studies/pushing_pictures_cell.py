@@ -3,8 +3,8 @@
     python studies/pushing_pictures_cell.py METHOD OPTIONS COUNT SEED [--updates 1000] [--episodes 5] [--runs DIR]
 
 OPTIONS is 0 for a flat policy. Demonstrations and evaluation episodes are those of ``pushing_studies.py`` with the same
-seeds. Pictures are drawn three times as fine as they are seen, 48 x 64, and reduced by means. Keeps a JSON with held-out
-log-likelihoods, what came of each episode, and the seconds that everything took.
+seeds. Pictures are drawn three times as fine as they are seen, 48 x 64, and reduced by means. Keeps a JSON with
+held-out log-likelihoods, what came of each episode, and the seconds that everything took.
 """
 
 from __future__ import annotations

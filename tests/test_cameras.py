@@ -13,8 +13,10 @@ import ddco_pyro
 from ddco_pyro.acting.lockstep import play
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import Pictures
+from ddco_pyro.data.sources.video import frames
 from ddco_pyro.fitting.prepare import dimensions
 from ddco_pyro.fitting.rollouts import roll_out
+from ddco_pyro.report import write_report
 from ddco_pyro.simulation import collect as collecting
 from ddco_pyro.simulation.environments import TaskEnvironment
 from ddco_pyro.simulation.episodes import run_episode
@@ -92,8 +94,11 @@ def test_a_spec_with_a_camera_is_checked_fitted_and_rolled_out(tmp_path):
     assert dimensions(spec).shapes["camera"] == (48, 65, 3)
     fit = ddco_pyro.fit(spec, out=tmp_path / "run")
     DRAWN.clear()
-    measured = roll_out(fit, 2, jobs=1)["methods"]["flat"]["measures"]["success"]
+    measured = roll_out(fit, 2, film=1, jobs=1)["methods"]["flat"]["measures"]["success"]
     assert DRAWN
+    film, looks = (list(frames(fit.folder / "videos" / place / "flat-1000.mp4")) for place in ("", "saliency"))
+    assert len(film) == len(looks) + 1  # the end is seen by nobody
+    assert "<h2>What it looks at</h2>" in write_report(fit, fit.demonstrations).read_text()
     alone = play(watched, fit.hierarchy, RolloutSpec(), range(1000, 1002))
     assert [one.outcome["success"] for one in alone].count(1.0) == measured["successes"]
 
