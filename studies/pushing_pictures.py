@@ -54,9 +54,8 @@ def _own_options(method: str) -> int:
     return 0 if method.endswith("_flat") else OWN_OPTIONS[method.partition("_")[0]]
 
 
-def main() -> None:
-    """Run one study."""
-    parser = described(__doc__)
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Which study, which part of it, and where it is kept."""
     parser.add_argument("study", choices=STUDIES)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
@@ -67,6 +66,12 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="cells at a time; each works on one thread")
     parser.add_argument("--out", type=Path, default=Path("docs/results/pushing_pictures"))
     DEFAULTS.add_to(parser)
+
+
+def main() -> None:
+    """Run one study."""
+    parser = described(__doc__)
+    arguments(parser)
     printed(lambda: run(parser.parse_args()))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -50,14 +51,19 @@ def row_of(cell: Any, results: dict[str, Any]) -> Row:
 
 
 def page(study: str, rows: Sequence[Row], missing: Sequence[str], made_by: str) -> str:
-    """The table, the differences, and what has not been measured."""
+    """The table, the differences, and what has not been measured.
+
+    :param missing: names of cells.
+    """
     across = ACROSS[study]
     lines = [made_by, "", "Means over training seeds with 95 % t intervals; the last column is the number of seeds. "]
     lines[-1] += f"Policies from the state, on the same demonstrations and episodes: `{STATE}`."
     ordered = sorted(rows, key=lambda row: (row["method"], -row[across], row["seed"]))
     lines += ["", *table(ordered, COLUMNS, "method", across), "", *differences(rows, across)]
     if missing:
-        lines += ["", f"Not measured yet, {len(missing)} cells: {', '.join(missing)}."]
+        kinds = Counter(name.partition("-")[0] for name in missing)
+        left = ", ".join(f"{count} of {method}" for method, count in kinds.items())
+        lines += ["", f"Not measured yet: {len(missing)} cells, {left}."]
     return "\n".join(lines) + "\n"
 
 
