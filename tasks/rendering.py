@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import weakref
 
 import numpy as np
 
@@ -30,15 +31,23 @@ except _ERRORS as error:
     raise _no_opengl(error) from error
 
 
+_CAMERAS: weakref.WeakKeyDictionary[mujoco.Physics, dict[tuple[str, int, int], mujoco.Camera]]
+_CAMERAS = weakref.WeakKeyDictionary()
+"""What a simulation has been seen with: to make a camera takes as long as to draw a small picture. They hold the
+simulation by a proxy, so that it goes when nobody else has it."""
+
+
 def render(physics: mujoco.Physics, camera: str, height: int, width: int) -> np.ndarray:
     """What ``camera`` sees, uint8 [height, width, 3].
 
     :raises NoOpenGL: names the packages to install.
     """
     try:
-        seen = mujoco.Camera(physics, height, width, camera, max_geom=MAX_GEOMS)
-        picture: np.ndarray = seen.render()
-        seen.scene.free()
+        kept = _CAMERAS.setdefault(physics, {})
+        if (camera, height, width) not in kept:
+            proxy = weakref.proxy(physics)
+            kept[camera, height, width] = mujoco.Camera(proxy, height, width, camera, max_geom=MAX_GEOMS)
+        picture: np.ndarray = kept[camera, height, width].render()
         return picture
     except _ERRORS as error:
         raise _no_opengl(error) from error

@@ -36,12 +36,16 @@ def make(
     meta_policy=None,
     **rollout,
 ):
-    """A run that was never fitted: random weights, observations with a mean and a spread."""
+    """A run that was never fitted: random weights, observations with a mean and a spread.
+
+    :param camera: whether there are pictures, or how they are cut.
+    """
     policy = network if isinstance(network, dict) else {"network": network}
     levels = [
         {"name": f"level-{d}", "count": k, "policy": policy | ({"emits": list(emits)} if d else {})}
         for d, k in enumerate(counts)
     ]
+    pictures = [{"key": "camera", **(camera if isinstance(camera, dict) else {})}] if camera else []
     endings = endings or {"network": network if network in ("conv", "per_timestep") else "linear"}
     model = {
         "hierarchy": {
@@ -52,7 +56,7 @@ def make(
     spec = parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5"},
-            "observations": [{"key": "state", "differences": True}, "goal", *built_in, *(["camera"] if camera else [])],
+            "observations": [{"key": "state", "differences": True}, "goal", *built_in, *pictures],
             "control": {"std": {"learn": True}},
             "rollout": rollout,
             **(model if counts else {"baseline": {"kind": "flat", "policy": policy}}),
@@ -88,7 +92,7 @@ FITS = {
     "linear": make("linear", options="most_likely"),
     "mlp": make("mlp", control="sample", options="sample"),
     "per_timestep": make("per_timestep", steps=30),
-    "conv": make("conv", camera=True),
+    "conv": make("conv", camera={"crop": [1, 2, 7, 9], "resize": [6, 8], "frames": 3}, options="sample"),
     "hybrid": make("mlp", (2, 3), ("options", "control"), control="sample"),
     "three levels": make("mlp", (2, 3, 2), ("options", "control")),
     "marginal": make("mlp", (2, 3, 2), ("options", "control"), options="marginal"),
@@ -98,7 +102,13 @@ FITS = {
         {"network": "lstm", "over": CONVOLUTIONS}, camera=True, endings=CONVOLUTIONS, steps=30, options="sample"
     ),
     "trunk": make(
-        "linear", (2, 3), ("options", "control"), True, trunk=BRANCHES, meta_policy=BRANCHES, built_in=("step",)
+        "linear",
+        (2, 3),
+        ("options", "control"),
+        {"resize": [7, 6], "grey": True, "frames": 2},
+        trunk=BRANCHES,
+        meta_policy=BRANCHES,
+        built_in=("step",),
     ),
     "several convolutions": make(
         CONVOLUTIONS, camera=True, endings={"network": "linear", "inputs": ["step", "goal"]}, built_in=("step",)

@@ -29,7 +29,7 @@ from ddco_pyro.spec import ObservationSpec, SpecError, parse_spec, with_override
 
 HEIGHT, WIDTH = 12, 10
 CONV = {"network": "conv", "filters": 3, "kernel": 3, "pooled": 2, "hidden": [5]}
-RAW = {"key": "camera", "crop": [1, 2, 10, 8], "resize": [5, 4], "grey": True}
+RAW = {"key": "camera", "crop": [1, 2, 10, 8], "resize": [5, 4], "grey": True, "frames": 2}
 
 
 def demonstrations(number: int = 8) -> Demonstrations:
@@ -119,6 +119,24 @@ def test_transform_by_hand() -> None:
         assert transform(picture).shape[1:] == transform.shape(picture.shape[1:])
 
 
+def test_pictures_are_seen_behind_those_before_them(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Along the channels, the oldest first, and the first one repeated, wherever a trajectory is cut."""
+    monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", 3 * HEIGHT * WIDTH * 3)
+    spec = ObservationSpec(key="camera", grey=True, frames=3)
+    encoder = ObservationEncoder([spec], {"camera": (HEIGHT, WIDTH, 3)})
+    assert encoder.images == {"camera": (HEIGHT, WIDTH, 3)}
+    demos = demonstrations()
+    for each in (Demonstrations.read(kept), demos):
+        frames = encoder.inputs(demo.observations for demo in each).images
+        whole, part = frames["camera"], frames.part(torch.tensor([2]), slice(6, 11))["camera"]
+        grey = Transform(grey=True)(demos[2].observations["camera"])
+        for step in range(12):
+            expected = np.concatenate([grey[max(step - back, 0)] for back in (2, 1, 0)], axis=-1)
+            np.testing.assert_array_equal(whole[2, step], expected)
+            if 6 <= step < 11:
+                np.testing.assert_array_equal(part[0, step - 6], expected)
+
+
 def test_grey_is_that_of_opencv() -> None:
     """But for how halves are rounded."""
     picture = np.random.default_rng(0).integers(0, 256, (1, 50, 50, 3), dtype=np.uint8)
@@ -127,7 +145,7 @@ def test_grey_is_that_of_opencv() -> None:
 
 
 def test_pictures_are_cut_and_scaled_wherever_they_are(kept: Path) -> None:
-    encoder = ObservationEncoder([ObservationSpec(**RAW)], {"camera": (HEIGHT, WIDTH, 3)})
+    encoder = ObservationEncoder([ObservationSpec(**RAW | {"frames": 1})], {"camera": (HEIGHT, WIDTH, 3)})
     assert encoder.images == {"camera": (5, 4, 1)}
     read, made = ([demo.observations for demo in demos] for demos in (Demonstrations.read(kept), demonstrations()))
     seen, expected = (encoder.inputs(each).loaded().images["camera"] for each in (read, made))
@@ -169,7 +187,7 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
     ("observation", "message"),
     [
         ({"key": "camera", "crop": [3, 3, 10, 4]}, r"'camera' crop: \[3, 3, 10, 4\] is not within 12 × 10 pixels"),
-        ({"key": "pose", "grey": True}, r"'pose' has shape \[3\] at each step: crop, resize and grey are for pictures"),
+        ({"key": "pose", "grey": True}, r"'pose' has shape \[3\] at each step: crop, resize, grey and frames are for"),
         ({"key": "pose", "augment": {"shift": 2}}, r"'pose' has shape \[3\] at each step: augment is for pictures"),
         (
             {"key": "camera", "crop": [3, 3, 0, 4]},
@@ -220,7 +238,7 @@ def test_a_controller_sees_what_networks_were_trained_on(kept: Path) -> None:
         fit.controller().act(seen[0] | {"camera": np.zeros((5, 4, 1), np.uint8)})
 
 
-@pytest.mark.parametrize("cut", [{}, {"crop": [1, 2, 10, 8], "resize": [5, 4]}, {"grey": True}])
+@pytest.mark.parametrize("cut", [{}, {"crop": [1, 2, 10, 8], "resize": [5, 4], "frames": 3}, {"grey": True}])
 def test_an_exported_controller_takes_the_same_pictures(kept: Path, cut: dict[str, Any], tmp_path: Path) -> None:
     """Those of the file: it cuts and scales them itself, as the run's controller does."""
     spec = parse_spec(spec_of(kept, {"key": "camera", **cut}, epochs=1, layerwise=False, initialize="random"))

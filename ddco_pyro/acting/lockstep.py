@@ -29,11 +29,12 @@ class Played:
 def play(
     task: Task, hierarchy: Hierarchy, spec: RolloutSpec, seeds: Sequence[int], keep: Sequence[str] = ()
 ) -> list[Played]:
-    """One episode from each seed, as a :class:`ddco_pyro.acting.controller.Controller` acts in it alone.
+    """One episode from each seed, as a :class:`ddco_pyro.acting.controller.Controller` acts in it alone; of the task's
+    cameras those that the hierarchy observes are drawn.
 
     :param keep: names of the observations to keep.
     """
-    environments = [task.load(seed) for seed in seeds]
+    environments = [task.watched(seed, hierarchy.encoder.shapes) for seed in seeds]
     try:
         controller = Controller.from_spec(hierarchy, spec)
         controller.reset_all(seeds)

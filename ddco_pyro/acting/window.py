@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -17,11 +18,13 @@ class ObservationError(BadInput):
 
 
 class Window:
-    """The last observations are remembered for the encoder's differences; ``time`` counts the observations seen."""
+    """The last observations are remembered for the encoder's differences and stacked pictures; ``time`` counts the
+    observations seen.
+    """
 
     def __init__(self, encoder: ObservationEncoder) -> None:
         self.encoder, self.time = encoder, 0
-        self._last: Sequence[dict[str, np.ndarray]] | None = None
+        self._last: deque[list[dict[str, np.ndarray]]] = deque(maxlen=encoder.steps_seen)
 
     def inputs(self, observations: Sequence[Mapping[str, np.ndarray]]) -> Inputs:
         """The networks' inputs for an observation of each of N episodes, T = 1.
@@ -32,14 +35,15 @@ class Window:
             {key: self._checked(observation, key, shape) for key, shape in self.encoder.shapes.items()}
             for observation in observations
         ]
-        pairs = zip(self._last or now, now, strict=True)
-        both = self.encoder.inputs(
-            ({key: np.stack([old[key], new[key]]) for key in new} for old, new in pairs),
-            np.array([self.time, self.time]),
+        self._last.append(now)
+        episodes = zip(*self._last, strict=True)
+        recent = self.encoder.inputs(
+            ({key: np.stack([seen[key] for seen in episode]) for key in self.encoder.shapes} for episode in episodes),
+            np.full(len(self._last), self.time),
         )
-        latest = both.part(slice(None), slice(1, 2)).loaded()
+        latest = recent.part(slice(None), slice(-1, None)).loaded()
         inputs = Inputs(latest.vectors, latest.images, torch.tensor([self.time]))
-        self._last, self.time = now, self.time + 1
+        self.time += 1
         return inputs
 
     def _checked(self, observation: Mapping[str, np.ndarray], key: str, shape: tuple[int, ...]) -> np.ndarray:

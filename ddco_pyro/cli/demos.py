@@ -47,7 +47,8 @@ def collect(
 
     own = loaded.demonstrations.path
     with console.Progress() as progress:
-        path = record(loaded.demonstrated_task, loaded.demonstrations, out or (Path(own) if own else None), progress)
+        kept = out or (Path(own) if own else None)
+        path = record(loaded.demonstrated_task, loaded.demonstrations, kept, progress, loaded.observed)
     print(path)
 
 

@@ -105,20 +105,22 @@ def same(left: Observed, right: Observed) -> bool:
 
 
 class Transform(NamedTuple):
-    """What networks see of a picture: a part of it, then scaled, then without colours.
+    """What networks see of a picture: a part of it, then scaled, then without colours, then beside those before it.
 
     :param crop: top, left, height, width of the part, in the file's pixels; None for all of it.
     :param resize: height and width that it is scaled to; None for as it is.
     :param grey: whether red, green and blue become one luminance.
+    :param frames: pictures that are seen together, the last one and those before it.
     """
 
     crop: tuple[int, ...] | None = None
     resize: tuple[int, ...] | None = None
     grey: bool = False
+    frames: int = 1
 
     def as_data(self) -> dict[str, Any]:
         """What there is of it, as plain data."""
-        return {key: value for key, value in self._asdict().items() if value}
+        return {key: value for key, value in self._asdict().items() if value != self._field_defaults[key]}
 
     def shape(self, stored: Sequence[int]) -> tuple[int, ...]:
         """[H, W, C] of what is seen of pictures of this shape.
@@ -129,7 +131,7 @@ class Transform(NamedTuple):
             return tuple(stored)
         if len(stored) != PICTURE_DIMENSIONS:
             raise TransformError(
-                f"has shape {list(stored)} at each step: crop, resize and grey are for pictures [H, W, C]"
+                f"has shape {list(stored)} at each step: crop, resize, grey and frames are for pictures [H, W, C]"
             )
         height, width, colours = stored
         if self.crop is not None:
@@ -141,16 +143,32 @@ class Transform(NamedTuple):
             height, width = size
         if self.grey and colours != 3:
             raise TransformError(f"grey: is for pictures of three colours, not {colours}")
-        return *(self.resize or (height, width)), 1 if self.grey else colours
+        return *(self.resize or (height, width)), self.frames * (1 if self.grey else colours)
+
+    def seen(self, array: Observed, steps: slice) -> Iterator[np.ndarray]:
+        """Consecutive steps of pictures [T, H, W, C] as they are seen, [steps, H', W', C'], block by block.
+
+        :raises DemonstrationsError: a file cannot be read.
+        """
+        last, at_once = min(steps.stop, len(array)), block_steps(array.shape[1:], array.dtype)
+        for first in range(steps.start, last, at_once):
+            before = min(self.frames - 1, first)
+            yield self(array[first - before : min(first + at_once, last)])[before:]
 
     def __call__(self, frames: np.ndarray) -> np.ndarray:
-        """Pictures [T, H, W, C] as they are seen, [T, H', W', C']."""
+        """Pictures [T, H, W, C] from a first step on as they are seen, [T, H', W', C']."""
         if self.crop is not None:
             top, left, height, width = self.crop
             frames = frames[:, top : top + height, left : left + width]
         if self.resize is not None and frames.shape[1:3] != self.resize:
             frames = self._resized(frames, self.resize)
-        return _grey(frames) if self.grey else frames
+        return self._together(_grey(frames) if self.grey else frames)
+
+    def _together(self, frames: np.ndarray) -> np.ndarray:
+        """Each picture behind those before it, the oldest first, along the channels; the first one is repeated."""
+        rows = np.arange(len(frames))
+        each = [frames[np.maximum(rows - back, 0)] for back in reversed(range(self.frames))]
+        return np.concatenate(each, axis=-1) if len(each) > 1 else frames
 
     @staticmethod
     def _resized(frames: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
@@ -181,13 +199,11 @@ def padded(
     """
     shape = transform.shape(frames[0].shape[1:])
     whole = np.zeros((len(frames), steps.stop - steps.start, *shape), frames[0].dtype)
-    at_once = block_steps(frames[0].shape[1:], frames[0].dtype)
     for row, array in enumerate(frames):
-        last = min(steps.stop, len(array))
-        for first in range(steps.start, last, at_once):
-            seen = transform(array[first : min(first + at_once, last)])
-            at = first - steps.start
+        at = 0
+        for seen in transform.seen(array, steps):
             whole[row, at : at + len(seen)] = seen if shifts is None else shifted(seen, *shifts[row].tolist())
+            at += len(seen)
     return whole
 
 

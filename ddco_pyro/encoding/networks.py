@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ddco_pyro.model.networks.conv import Conv
+from ddco_pyro.model.networks.conv import SHARPNESS, Conv
 from ddco_pyro.model.networks.inputs import Inputs, InputShape
 from ddco_pyro.spec import ConvolutionLayer
 
@@ -22,10 +22,6 @@ TARGET = 32
 """The decoder gives the picture reduced to at most so many rows and columns."""
 
 HIDDEN = 128
-
-SHARPNESS = 10.0
-"""An autoencoder begins with maps this many times as strong as drawn: under a softmax of weak maps all places are
-nearly the same, and training is slow."""
 
 
 class Convolutions(nn.Module):
@@ -43,6 +39,8 @@ class Convolutions(nn.Module):
             torch.manual_seed(seed)
             images = InputShape({}, {_KEY: tuple(shape)})
             self.maps = Conv(images, None, 1, (), 0.0, 0, 0, layers, "spatial_softmax", 0)
+        if kind == "random_conv":  # nothing will train them, and strong maps that are random tell less
+            self.maps.strengthen(1 / SHARPNESS)
         self.features = self.maps.features
 
     def forward(self, pictures: Tensor) -> Tensor:
@@ -65,9 +63,6 @@ class Autoencoder(nn.Module):
     def __init__(self, encoder: Convolutions, shape: Sequence[int], seed: int) -> None:
         super().__init__()
         self.encoder = encoder
-        with torch.no_grad():
-            for parameter in encoder.maps.deeper.parameters():
-                parameter.mul_(SHARPNESS)
         self.target = (min(TARGET, shape[0]), min(TARGET, shape[1]))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed + 1)

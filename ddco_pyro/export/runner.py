@@ -53,6 +53,7 @@ class Runner:
         self.terminations: tuple[float, ...] = ()
         self.outputs: Outputs = {}
         self._last: dict[str, np.ndarray] | None = None
+        self._pictures: dict[str, list[np.ndarray]] = {}
         self._marginal: np.ndarray | None = None
         self._state = [np.array(part["values"], part["kind"]).reshape(part["shape"]) for part in self.about["state"]]
 
@@ -66,7 +67,9 @@ class Runner:
             observation = {**observation, built_in["key"]: np.array([self.time / built_in["longest"]])}
         now = {spec["key"]: _checked(observation, spec) for spec in self.about["observations"]}
         features = self._features(now, self._last or now)
-        images = {spec["key"]: _picture(now[spec["key"]], spec) for spec in self.about["observations"] if spec["image"]}
+        images = {
+            spec["key"]: self._recent(now[spec["key"]], spec) for spec in self.about["observations"] if spec["image"]
+        }
         self.outputs, self._state = self._networks(features, self.time, images, self._state)
         outputs = self.outputs
         generator = np.random.default_rng([self.seed, self.time])
@@ -78,6 +81,13 @@ class Runner:
         )
         self._last, self.time = now, self.time + 1
         return self._control(outputs, generator)
+
+    def _recent(self, picture: np.ndarray, spec: Mapping[str, Any]) -> np.ndarray:
+        """The picture as networks see it, behind those before it where they see more than one."""
+        cut = _picture(picture, spec)
+        before = self._pictures.get(spec["key"], [cut] * spec.get("frames", 1))
+        self._pictures[spec["key"]] = seen = [*before[1:], cut]
+        return np.concatenate(seen, axis=-1)
 
     def _features(self, now: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray]) -> np.ndarray:
         parts = [np.zeros(0)]

@@ -45,14 +45,14 @@ def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
         return Dimensions.of(demos)
     assert spec.demonstrated_task is not None  # or they would be in a file
     task = find_task(spec.demonstrated_task)
-    environment = task.load(spec.demonstrations.seed)
+    environment = task.watched(spec.demonstrations.seed, spec.observed)
     try:
         shapes = {name: tuple(array.shape) for name, array in environment.observation_spec().items()}
         size = Dimensions(shapes, environment.action_spec().shape[0], task.steps)
     finally:
         environment.close()
     own = spec.demonstrations
-    collected = Path(own.path) if own.path else cache_path(task, spec.demonstrated_task, own)
+    collected = Path(own.path) if own.path else cache_path(task, spec.demonstrated_task, own, spec.observed)
     if not collected.exists():
         return size
     known = Dimensions.of(Demonstrations.read(collected, [], exclude=own.exclude))
@@ -88,7 +88,8 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
     if in_file(spec):
         path = Path(str(own.path))
     else:
-        path = collect(str(spec.demonstrated_task), own, Path(own.path) if own.path else None, on_event)
+        kept = Path(own.path) if own.path else None
+        path = collect(str(spec.demonstrated_task), own, kept, on_event, spec.observed)
     _refuse_what_cannot_be_read(spec, path)
     return Demonstrations.read(path, spec.observed, _labels(spec), own.exclude)
 

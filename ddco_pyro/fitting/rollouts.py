@@ -7,15 +7,18 @@ import hashlib
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ddco_pyro.acting.controller import Controller
+from ddco_pyro.acting.saliency import Looking
 from ddco_pyro.data.files import write_text
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit, RunError
 from ddco_pyro.fitting.records import Unfinished, read_record
 from ddco_pyro.fitting.run import write_metrics
-from ddco_pyro.simulation.episodes import paired_difference, run_episodes, summarize
+from ddco_pyro.simulation.episodes import paired_difference, run_episode, run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task
 
@@ -70,9 +73,10 @@ def roll_out(
                 on_event(EpisodeEnded(name, total))
             continue
         outcomes = []
-        for episode in run_episodes(str(fit.spec.task), policy, seeds, film, jobs):
+        for episode in run_episodes(str(fit.spec.task), policy, seeds, film, jobs, fit.spec.observed, ()):
             outcomes.append(episode.outcome)
             if episode.frames:
+                _film_looks(fit, name, policy, episode.seed)
                 write_film(_film(fit, name, episode.seed), episode)
             on_event(EpisodeEnded(name, total))
         rolled.keep(name, outcomes)
@@ -87,6 +91,14 @@ def roll_out(
     write_metrics(folder, fit.metrics)
     rolled.end()
     return results
+
+
+def _film_looks(fit: Fit, name: str, policy: Policy | str, seed: int) -> None:
+    """Film what a fitted policy looks at, in the episode of a seed; nothing where it sees no pictures."""
+    if isinstance(policy, Controller) and policy.hierarchy.encoder.images:
+        looking = Looking(policy)
+        again = run_episode(find_task(str(fit.spec.task)), looking, seed, observed=fit.spec.observed, keep=())
+        write_film(fit.run_folder / "videos" / "saliency" / f"{name}-{seed}.mp4", replace(again, frames=looking.frames))
 
 
 def _film(fit: Fit, name: str, seed: int) -> Path:

@@ -110,6 +110,11 @@ class ObservationEncoder(nn.Module):
             self.register_buffer("longest", torch.ones((), dtype=torch.float64))
 
     @property
+    def steps_seen(self) -> int:
+        """Steps of which the features and pictures of one are made: it, and those before it."""
+        return max([2, *(transform.frames for transform in self.transforms.values())])
+
+    @property
     def keys(self) -> list[str]:
         """The vectors, in the spec's order."""
         return [spec.key for spec in self.specs]
@@ -220,7 +225,7 @@ def refuse_unusable(demonstrations: Demonstrations, encoder: ObservationEncoder,
 
 
 def _transform(spec: ObservationSpec) -> Transform:
-    return Transform(spec.crop, spec.resize, spec.grey)
+    return Transform(spec.crop, spec.resize, spec.grey, spec.frames)
 
 
 def _seen_shape(spec: ObservationSpec, stored: tuple[int, ...]) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ from ddco_pyro.drawing.pictures import style
 from ddco_pyro.drawing.templates import render
 from ddco_pyro.drawing.words import unconverged
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.report import activity, demonstration_list, dimensions, option_figures, sections
+from ddco_pyro.report import activity, demonstration_list, dimensions, looks, option_figures, sections
 from ddco_pyro.report.sections import degeneracies
 
 __all__ = ["degeneracies", "unconverged", "write_report"]
@@ -34,6 +34,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             "learning": sections.learning(fit),
             "options": option_figures.options(fit, demos, active, metrics) if active else None,
             "agreement": sections.agreement(fit, metrics),
+            "looks": looks.section(fit, demos),
             "branches": sections.branches(fit, metrics),
             "warnings": sections.warnings(fit, metrics),
             "films": sections.films(fit),

@@ -16,7 +16,6 @@ from sklearn.cluster import KMeans
 from sklearn.mixture import GaussianMixture
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.pictures import blocks
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.fitting.clusters import block_means, distinct, joined
 from ddco_pyro.model.encoding import ObservationEncoder
@@ -76,7 +75,12 @@ def _rows_of(
     def rows(demo: Demonstration) -> np.ndarray:
         vector = (encoder.features(demo.observations) - mean) / std
         images = [
-            torch.cat([block_means(torch.as_tensor(transform(block))) for block in blocks(demo.observations[key])])
+            torch.cat(
+                [
+                    block_means(torch.as_tensor(block))
+                    for block in transform.seen(demo.observations[key], slice(0, len(demo)))
+                ]
+            )
             for key, transform in encoder.transforms.items()
         ]
         seen = np.concatenate([vector, *(image.double().numpy() for image in images)], axis=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,45 +24,66 @@ def cache_folder() -> Path:
     return Path(own) if own else Path(general) / "ddco-pyro"
 
 
-def cache_path(task: Task, name: str, spec: DemonstrationsSpec) -> Path:
-    """Where demonstrations of this task, policy, number and seeds are kept: the name changes with the task's code."""
-    return cache_folder() / "demonstrations" / f"{task.name}-{_identity(task, name, spec)[:16]}.hdf5"
+EPISODES_WITH_PICTURES = 8
+"""Episodes whose pictures are in memory at a time: they are compressed one after the other, more slowly than they are
+drawn."""
 
 
-def _identity(task: Task, name: str, spec: DemonstrationsSpec) -> str:
+def cache_path(task: Task, name: str, spec: DemonstrationsSpec, observed: Collection[str] = ()) -> Path:
+    """Where demonstrations of this task, policy, number, seeds and cameras are kept: the name changes with the task's
+    code.
+    """
+    return cache_folder() / "demonstrations" / f"{task.name}-{_identity(task, name, spec, observed)[:16]}.hdf5"
+
+
+def _identity(task: Task, name: str, spec: DemonstrationsSpec, observed: Collection[str]) -> str:
     """A digest of all that decides what is recorded."""
-    digest = hashlib.sha256(json.dumps([name, spec.supervisor, spec.count, spec.seed]).encode())
+    facts = [name, spec.supervisor, spec.count, spec.seed, *task.seen_by_cameras(observed)]
+    digest = hashlib.sha256(json.dumps(facts).encode())
     for source in sorted(task.sources):
         digest.update(hashlib.sha256(source.read_bytes()).digest())
     return digest.hexdigest()
 
 
-def collect(task_name: str, spec: DemonstrationsSpec, path: Path | None = None, on_event: OnEvent = ignore) -> Path:
+def collect(
+    task_name: str,
+    spec: DemonstrationsSpec,
+    path: Path | None = None,
+    on_event: OnEvent = ignore,
+    observed: Collection[str] = (),
+) -> Path:
     """Record ``spec.count`` demonstrations, unless the file is there already; the path of the file.
 
     Each is kept as soon as it is recorded: after an interruption the next call goes on with those that are missing.
 
     The root of the file says how often the supervisor succeeded itself (``supervisor``, as JSON).
 
+    :param observed: the spec's observations: of the task's cameras those among them are recorded.
     :raises DemonstrationsError: the task has no such scripted policy.
     """
     task = find_task(task_name)
     if spec.supervisor not in task.policies:
         known = ", ".join(sorted(task.policies))
         raise DemonstrationsError(f"task {task.name!r} has no policy {spec.supervisor!r} to record (it has: {known})")
-    path = path or cache_path(task, task_name, spec)
+    path = path or cache_path(task, task_name, spec, observed)
     if path.exists():
         return path
-    with parts_of(path, _identity(task, task_name, spec), wait=True, at_most=1) as parts:
+    at_once = EPISODES_WITH_PICTURES if task.seen_by_cameras(observed) else spec.count
+    with parts_of(path, _identity(task, task_name, spec, observed), wait=True, at_most=1) as parts:
         if parts is None:
             return path
         seeds = range(spec.seed + len(parts.done), spec.seed + spec.count)
-        for episode in run_episodes(task_name, spec.supervisor, seeds):
-            parts.add(episode.record.recording())
-            on_event(DemonstrationsDone(len(parts.done), spec.count))
+        for some in _slices(seeds, at_once):
+            for episode in run_episodes(task_name, spec.supervisor, some, observed=observed):
+                parts.add(episode.record.recording())
+                on_event(DemonstrationsDone(len(parts.done), spec.count))
         attributes = {"task": task.name, "policy": spec.supervisor, "supervisor": json.dumps(_summary(task, parts))}
         parts.finish(attributes, {})
     return path
+
+
+def _slices(seeds: Sequence[int], size: int) -> Iterator[Sequence[int]]:
+    return (seeds[first : first + size] for first in range(0, len(seeds), size))
 
 
 def _summary(task: Task, parts: Parts) -> dict[str, Any]:

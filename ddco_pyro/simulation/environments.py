@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -34,14 +35,15 @@ class TaskEnvironment(gymnasium.Env[Observation, np.ndarray]):
     start from. The last step's ``info`` has the task's measures, such as ``success``.
 
     :param task: a registered name or ``module:name``, as :func:`ddco_pyro.simulation.task.find_task` takes it.
+    :param observed: the task's cameras that observations have pictures of.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (as Gymnasium has it)
 
-    def __init__(self, task: str, render_mode: str | None = None) -> None:
+    def __init__(self, task: str, render_mode: str | None = None, observed: Collection[str] = ()) -> None:
         self.task = find_task(task)
-        self.render_mode = render_mode
-        self._environment = self.task.load(0)
+        self.render_mode, self._observed = render_mode, observed
+        self._environment = self.task.watched(0, observed)
         shapes = self._environment.observation_spec()
         boxes: Any = spaces.Dict({name: _box(spec) for name, spec in shapes.items()})
         self.observation_space = boxes
@@ -53,7 +55,8 @@ class TaskEnvironment(gymnasium.Env[Observation, np.ndarray]):
         """Begin an episode; without a seed at an initial state drawn from the seeds before."""
         super().reset(seed=seed)
         self._environment.close()
-        self._environment = self.task.load(int(self.np_random.integers(2**31)) if seed is None else seed)
+        seed = int(self.np_random.integers(2**31)) if seed is None else seed
+        self._environment = self.task.watched(seed, self._observed)
         return _observation(self._environment.reset()), {}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

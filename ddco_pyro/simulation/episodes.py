@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,9 +29,20 @@ class Episode:
     frames: list[np.ndarray] = field(default_factory=list)
 
 
-def run_episode(task: Task, policy: Policy | str, seed: int, film: bool = False) -> Episode:
-    """Run one episode from the initial state that ``seed`` draws, with a policy or the task's scripted one so named."""
-    environment = task.load(seed)
+def run_episode(
+    task: Task,
+    policy: Policy | str,
+    seed: int,
+    film: bool = False,
+    observed: Collection[str] = (),
+    keep: Collection[str] | None = None,
+) -> Episode:
+    """Run one episode from the initial state that ``seed`` draws, with a policy or the task's scripted one so named.
+
+    :param observed: what the policy or the record needs; of the task's cameras those named here are drawn.
+    :param keep: the observations to record; all of them if None.
+    """
+    environment = task.watched(seed, observed)
     try:
         actor = task.policies[policy](environment) if isinstance(policy, str) else policy
         actor.reset(seed)
@@ -40,7 +51,8 @@ def run_episode(task: Task, policy: Policy | str, seed: int, film: bool = False)
         controls, choices, labels, frames = [], [], [], []
         while not step.last():
             frames += [task.frame(environment)] if film else []
-            seen.append({key: np.array(value) for key, value in step.observation.items()})
+            kept = step.observation.keys() if keep is None else step.observation.keys() & set(keep)
+            seen.append({key: np.array(step.observation[key]) for key in kept})
             control = np.array(actor.act(step.observation), dtype=np.float64)
             controls.append(np.array(getattr(actor, "intended", control), dtype=np.float64))
             choices.append(getattr(actor, "choices", ()))
@@ -61,19 +73,28 @@ def run_episode(task: Task, policy: Policy | str, seed: int, film: bool = False)
 
 
 def run_episodes(
-    task: str, policy: Policy | str, seeds: Sequence[int], film: int = 0, jobs: int = -1
+    task: str,
+    policy: Policy | str,
+    seeds: Sequence[int],
+    film: int = 0,
+    jobs: int = -1,
+    observed: Collection[str] = (),
+    keep: Collection[str] | None = None,
 ) -> Iterable[Episode]:
     """Episodes from each seed in turn, in parallel processes; the first ``film`` of them with frames.
 
     :param task: the task's name, as :func:`ddco_pyro.simulation.task.find_task` takes it.
+    :param observed: as ``keep``, those of :func:`run_episode`.
     """
-    calls = (delayed(_run_named)(task, policy, seed, number < film) for number, seed in enumerate(seeds))
+    calls = (
+        delayed(_run_named)(task, policy, seed, number < film, observed, keep) for number, seed in enumerate(seeds)
+    )
     episodes: Iterable[Episode] = Parallel(n_jobs=jobs, return_as="generator")(calls)
     return episodes
 
 
-def _run_named(task: str, policy: Policy | str, seed: int, film: bool) -> Episode:
-    return run_episode(find_task(task), policy, seed, film)
+def _run_named(task: str, *how: Any) -> Episode:
+    return run_episode(find_task(task), *how)
 
 
 def summarize(task: Task, outcomes: Sequence[Mapping[str, float]]) -> dict[str, dict[str, Any]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -18,6 +18,7 @@ import dm_env
 import numpy as np
 
 from ddco_pyro.errors import BadInput
+from ddco_pyro.simulation.cameras import Camera, Watched
 from ddco_pyro.spec.types import TASKS
 
 SUCCESS = "success"
@@ -55,6 +56,8 @@ class Task:
     :param steps: the most control steps that an episode can have, where that is known; 1 otherwise.
     :param measures: the kind of each measure in ``outcome``: a ``"rate"`` is 0 or 1 in every episode, a ``"mean"`` any
         number. Without it every measure is a mean but ``success``, which is always a rate.
+    :param cameras: observations that are pictures, by name. One is drawn where a spec observes it (:meth:`watched`),
+        and nowhere else: a picture takes longer than a step of simulation.
     :raises OutcomeError: ``measures`` has another kind, or calls ``success`` a mean.
     """
 
@@ -66,6 +69,7 @@ class Task:
     sources: tuple[Path, ...] = field(default=())
     steps: int = 1
     measures: Mapping[str, Kind] = field(default_factory=dict)
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse a wrong declaration."""
@@ -74,6 +78,17 @@ class Task:
                 raise self._wrong(f"{name} is declared a {kind!r}; it has to be a 'rate' or a 'mean'")
         if self.kind(SUCCESS) != "rate":
             raise self._wrong(f"{SUCCESS} is a rate, by which methods are compared; call the mean otherwise")
+
+    def watched(self, seed: int, observed: Collection[str]) -> dm_env.Environment:
+        """A fresh environment as ``load`` makes it, whose observations also have what the cameras among ``observed``
+        see.
+        """
+        cameras = {name: self.cameras[name] for name in self.seen_by_cameras(observed)}
+        return Watched(self.load(seed), cameras) if cameras else self.load(seed)
+
+    def seen_by_cameras(self, observed: Collection[str]) -> list[str]:
+        """Those of some observations that are pictures of this task's cameras."""
+        return [name for name in self.cameras if name in observed]
 
     def kind(self, measure: str) -> Kind:
         """Whether a measure is a rate or a mean."""

@@ -86,6 +86,9 @@ class ObservationSpec(Model):
     """Pictures alone: height and width to which what is seen is scaled, by the mean over areas; null: as it is."""
     grey: bool = False
     """Pictures alone: whether red, green and blue become one luminance."""
+    frames: Count = 1
+    """Pictures alone: how many are seen together, the last one and those before it, along the channels; before the
+    first step the first one is repeated. A single picture does not tell how fast anything moves."""
     augment: AugmentSpec | None = None
     """Pictures alone: how they are varied in training; null: not at all."""
 

@@ -19,6 +19,7 @@ from dm_control.rl import control
 from dm_control.suite import base
 from dm_env import specs
 
+from ddco_pyro.simulation.cameras import Camera
 from ddco_pyro.simulation.task import Kind, Task
 
 from ..rendering import render
@@ -45,6 +46,7 @@ REST_SPEED = 0.02  # m/s
 TOPPLED = np.pi / 4  # rad
 
 FRAME_SIZE = (240, 320)
+CAMERA_SIZE = (480, 640)  # of the observed pictures (paper §5.1)
 SHARED_SOURCES = ("planning.py", "rendering.py")
 
 
@@ -229,6 +231,11 @@ def frame(environment: dm_env.Environment) -> np.ndarray:
     return render(environment.physics, "side", *FRAME_SIZE)
 
 
+def camera(height: int, width: int) -> Camera:
+    """The scene from the side: arm, box and goal, and nothing else that tells the state."""
+    return Camera((height, width), lambda environment: render(environment.physics, "side", height, width))
+
+
 def load(seed: int) -> Environment:
     """2000 steps, however long a goal takes."""
     return _load(Pushing(random=seed))
@@ -253,7 +260,8 @@ MEASURES: dict[str, Kind] = {"success": "rate", "goals": "mean", "topples": "mea
 
 def _task(name: str, load: Callable[[int], Environment], steps: int) -> Task:
     sources = (HERE / "pushing.xml", *sorted(HERE.glob("*.py")), *(HERE.parent / name for name in SHARED_SOURCES))
-    return Task(name, load, supervisor.POLICIES, outcome, frame, sources, steps, MEASURES)
+    cameras = {"camera": camera(*CAMERA_SIZE)}
+    return Task(name, load, supervisor.POLICIES, outcome, frame, sources, steps, MEASURES, cameras)
 
 
 task = _task("pushing", load, STEPS)

@@ -9,6 +9,7 @@ import dm_env
 import numpy as np
 from dm_env import specs
 
+from ddco_pyro.simulation.cameras import Camera
 from ddco_pyro.simulation.task import Task
 
 STEPS = 12
@@ -110,6 +111,16 @@ task = Task(
     sources=(Path(__file__),),
     measures={"success": "rate", "error": "mean"},
 )
+DRAWN: list[int] = []
+"""The times at which the camera of ``watched`` has drawn a picture in this process."""
+
+
+def _draw(environment: Point) -> np.ndarray:
+    DRAWN.append(environment.time)
+    return frame(environment)
+
+
+watched = replace(task, cameras={"camera": Camera((48, 65), _draw)})
 short = replace(task, name="short", load=lambda seed: Point(seed, 5), steps=5)
 
 SPEC = """

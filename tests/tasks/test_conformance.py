@@ -87,6 +87,16 @@ def test_frame_is_a_picture_of_something(task: Task, supervised) -> None:
     assert picture.std() > 10
 
 
+def test_cameras_follow_their_spec(task: Task) -> None:
+    environment = task.watched(3, task.cameras)
+    seen, spec = environment.reset().observation, environment.observation_spec()
+    for name, camera in task.cameras.items():
+        spec[name].validate(seen[name])
+        assert seen[name].shape == (*camera.size, 3)
+        assert seen[name].std() > 10
+    environment.close()
+
+
 def test_sources_exist_and_hold_the_task(task: Task) -> None:
     assert task.sources
     assert all(source.is_file() for source in task.sources)

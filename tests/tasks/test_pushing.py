@@ -372,3 +372,19 @@ def test_arm_box_and_goal_are_in_the_picture(environment: Environment, height: i
     assert goal[:, half:].sum() > 0.0005 * height * width
     assert goal[:, :half].sum() == 0
     assert arm.sum() > 0.005 * height * width
+
+
+def test_a_picture_shows_where_things_are_and_nothing_else(environment: Environment) -> None:
+    """Neither how fast they move nor what has happened in the episode."""
+    angles = pushing_geometry.inverse(np.array([0.0, 0.5]), 0.0)
+    draw = task.cameras["camera"].draw
+    arrange(environment, angles, -0.3, 0.3)
+    before = draw(environment)
+    assert before.shape == (480, 640, 3)
+    for _ in range(5):
+        environment.step(np.array([0.5, -0.5, 0.5]))
+    environment.task.counts.goals += 3
+    assert (draw(environment) != before).any()
+    arrange(environment, angles, -0.3, 0.3)
+    environment.physics.data.qvel[:] = 1.0
+    np.testing.assert_array_equal(draw(environment), before)

@@ -18,14 +18,19 @@ from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import Spec, load_spec
 
 SPECS = sorted((Path(__file__).parents[2] / "specs").glob("pushing*.yaml"))
-LEVELS = {"flat_linear": 0, "flat_mlp": 0, "linear": 1, "mlp": 1, "hybrid": 1, "3level": 2}
+LEVELS = {
+    "flat_linear": 0, "flat_mlp": 0, "linear": 1, "mlp": 1, "hybrid": 1, "3level": 2, "image_ff": 1, "image_ff_flat": 0,
+    "image_ff_hybrid": 1, "image_rnn": 1, "image_rnn_flat": 0, "image_rnn_hybrid": 1,
+}  # fmt: skip
+CAMERAS = {"camera": pushing.camera(48, 64)}
 
 
 @pytest.fixture(scope="module")
 def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file with four demonstrations."""
     path = tmp_path_factory.mktemp("pushing") / "demonstrations.hdf5"
-    episodes = [run_episode(pushing.single, "scripted_noisy", seed) for seed in range(4)]
+    single = replace(pushing.single, cameras=CAMERAS)
+    episodes = [run_episode(single, "scripted_noisy", seed, observed=CAMERAS) for seed in range(4)]
     Demonstrations(tuple(one.record for one in episodes)).write(path)
     return path
 
@@ -39,15 +44,19 @@ def test_all_specs_are_here() -> None:
     assert {path.stem.removeprefix("pushing_") for path in SPECS} == set(LEVELS)
 
 
-@pytest.mark.parametrize("path", SPECS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=[pytest.mark.slow] if "image" in path.stem else []) for path in SPECS],
+    ids=lambda path: path.stem,
+)
 def test_specs_fit_and_act(path: Path, demonstrations: Path, tmp_path: Path) -> None:
     found = fit(short(path, demonstrations), out=tmp_path / "run")
     assert found.metrics["engine_check"]["value"] < 1e-6
-    brief = replace(pushing.limited, load=lambda seed: pushing.load_single(seed))
+    brief = replace(pushing.limited, load=lambda seed: pushing.load_single(seed), cameras=CAMERAS)
     (episode,) = play(brief, found.hierarchy, found.spec.rollout, [0], keep=("tip",))
     levels = LEVELS[path.stem.removeprefix("pushing_")]
     assert episode.choices.shape == (len(episode.observations["tip"]), levels)
-    lowest = 0 if path.stem == "pushing_hybrid" else 1
+    lowest = 0 if path.stem.endswith("hybrid") else 1
     assert not levels or episode.choices.min() >= lowest
     assert np.ptp(episode.observations["tip"], axis=0).max() > 1e-3  # the arm moves
 

@@ -12,6 +12,10 @@ from ddco_pyro.model.networks.numpy_form import NumpyForm, arrays_of, joined, pe
 from ddco_pyro.model.networks.stacked import Perceptrons, options_last
 from ddco_pyro.spec import ConvolutionLayer, Pool
 
+SHARPNESS = 10.0
+"""Under a softmax maps begin so many times as strong as drawn: under one of weak maps all places are nearly the same,
+and training is slow."""
+
 POOLED = 8
 """Blocks by side to whose means a picture is reduced where it is clustered."""
 
@@ -55,6 +59,8 @@ class Conv(nn.Module):
                 if rest
             }
         )
+        if pool == "spatial_softmax":
+            self.strengthen(SHARPNESS)
         maps = sum(self._map_features(key, size) for key, size in shape.images.items())
         self.layers = Perceptrons(copies, shape.vector + maps, hidden, outputs, dropout)
         self.features = self.layers.features
@@ -76,6 +82,13 @@ class Conv(nn.Module):
         facts = {"kind": "convolutions", "key": key, "copies": self.copies, "layers": strides}
         arrays = arrays_of({str(number): layer for number, layer in enumerate(layers)})
         return facts | {"pool": self.pool, "pooled": self.pooled}, arrays
+
+    def strengthen(self, factor: float) -> None:
+        """Make the last maps of each picture stronger by a factor."""
+        with torch.no_grad():
+            for key in self.convolutions:
+                for parameter in self._layers(key)[-1].parameters():
+                    parameter.mul_(factor)
 
     def _layers(self, key: str) -> list[nn.Conv2d]:
         layers = [self.convolutions[key], *(self.deeper[key].children() if key in self.deeper else ())]

@@ -1,0 +1,94 @@
+"""What a policy looks at: how much the control of the active option changes with each pixel (Simonyan et al., 2014)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ddco_pyro.acting.controller import Controller
+from ddco_pyro.acting.window import Window
+from ddco_pyro.drawing.heat import overlaid
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.networks.state import States
+
+
+class Look(NamedTuple):
+    """A picture [H, W, C] as networks see it, uint8, and how much the control changes with each pixel, [H, W]."""
+
+    picture: np.ndarray
+    saliency: np.ndarray
+
+
+class Saliency:
+    """Follows an episode: :meth:`step` with each observation and the options that are active then.
+
+    The saliency of a pixel is the norm of ∂μ/∂x over the numbers μ of the active caller's control, in scaled units, and
+    the colours x of the pixel, of all pictures that are seen together; what is remembered of earlier steps is constant.
+    """
+
+    def __init__(self, hierarchy: Hierarchy) -> None:
+        self.hierarchy = hierarchy.eval()
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self._window = Window(self.hierarchy.encoder)
+        self._states: States | None = None
+
+    def step(self, observation: Mapping[str, np.ndarray], choices: Sequence[int]) -> dict[str, Look]:
+        """What is looked at, by the key of the pictures.
+
+        :param choices: the active choice of each level, lowest first; 0 for control by the caller.
+        :raises ObservationError: an observation is missing or has an unseen shape.
+        """
+        seen = self._window.inputs([observation])
+        images = {key: image.float().requires_grad_() for key, image in seen.images.items()}
+        with torch.enable_grad():
+            outputs, states = self.hierarchy.advance(Inputs(seen.vectors, images, seen.time), self._states)
+            self._states = {name: tuple(part.detach() for part in state) for name, state in states.items()}
+            level = next((number for number, choice in enumerate(choices) if choice), len(choices))
+            emission = outputs.emissions[level]
+            assert emission is not None  # whoever is active emits the control
+            numbers = emission.numbers[0, 0, choices[level] - 1 if level < len(choices) else 0]
+            squared = {key: torch.zeros(image.shape[2:4]) for key, image in images.items()}
+            for number in numbers:
+                slopes = torch.autograd.grad(number, [*images.values()], retain_graph=True, allow_unused=True)
+                for key, slope in zip(images, slopes, strict=True):
+                    if slope is not None:  # the caller reads this picture
+                        squared[key] += slope[0, 0].square().sum(-1)
+        return {
+            key: Look(self._last(key, seen.images[key][0, 0].numpy()), squared[key].sqrt().numpy()) for key in images
+        }
+
+    def _last(self, key: str, pictures: np.ndarray) -> np.ndarray:
+        """The newest of the pictures that are seen together."""
+        return pictures[..., -(pictures.shape[-1] // self.hierarchy.encoder.transforms[key].frames) :]
+
+
+class Looking:
+    """A controller that acts as it does, and whose ``frames`` show what it looks at, uint8 [H, W, 3] at each step."""
+
+    def __init__(self, controller: Controller) -> None:
+        self._controller, self._saliency = controller, Saliency(controller.hierarchy)
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode."""
+        self._controller.reset(seed)
+        self._saliency.reset()
+        self.frames: list[np.ndarray] = []
+
+    def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The controller's control [A]."""
+        control = self._controller.act(observation)
+        looks = self._saliency.step(observation, self.choices)
+        self.frames.append(np.hstack([overlaid(*look) for look in looks.values()]))
+        return control
+
+    @property
+    def choices(self) -> tuple[int, ...]:
+        """The active choice of each level."""
+        return self._controller.choices

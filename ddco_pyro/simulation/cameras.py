@@ -1,0 +1,69 @@
+"""A task's cameras: pictures that are drawn where an observation asks for them, and at no other time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import dm_env
+import numpy as np
+from dm_env import specs
+
+
+@dataclass(frozen=True)
+class Camera:
+    """An observation that is a picture.
+
+    :param size: height and width of its pictures, pixels.
+    :param draw: what it sees of an environment as it is now, uint8 [height, width, 3].
+    """
+
+    size: tuple[int, int]
+    draw: Callable[[dm_env.Environment], np.ndarray]
+
+
+class Watched(dm_env.Environment):
+    """An environment whose observations have the pictures of ``cameras`` too, by name; all else is as it was."""
+
+    def __init__(self, environment: dm_env.Environment, cameras: Mapping[str, Camera]) -> None:
+        self._environment, self._cameras = environment, dict(cameras)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._environment, name)
+
+    def reset(self) -> dm_env.TimeStep:
+        """Begin an episode."""
+        return self._seen(self._environment.reset())
+
+    def step(self, action: Any) -> dm_env.TimeStep:
+        """One control step."""
+        return self._seen(self._environment.step(action))
+
+    def _seen(self, step: dm_env.TimeStep) -> dm_env.TimeStep:
+        pictures = {name: camera.draw(self._environment) for name, camera in self._cameras.items()}
+        return step._replace(observation={**step.observation, **pictures})
+
+    def observation_spec(self) -> dict[str, specs.Array]:
+        """What each observation is."""
+        pictures = {
+            name: specs.BoundedArray((*camera.size, 3), np.uint8, 0, 255, name)
+            for name, camera in self._cameras.items()
+        }
+        return {**self._environment.observation_spec(), **pictures}
+
+    def action_spec(self) -> Any:
+        """That of the environment."""
+        return self._environment.action_spec()
+
+    def reward_spec(self) -> Any:
+        """That of the environment."""
+        return self._environment.reward_spec()
+
+    def discount_spec(self) -> Any:
+        """That of the environment."""
+        return self._environment.discount_spec()
+
+    def close(self) -> None:
+        """End the simulation."""
+        self._environment.close()

@@ -1,0 +1,108 @@
+"""Pushing from pictures (paper §5.1, SM 1.2, SM 1.5): goals against demonstrations, options, and augmentation.
+
+    python studies/pushing_pictures.py demonstrations|options|augmentation [--seeds 3] [--methods ff ff_flat ...]
+        [--counts 80 40 20 10] [--options 1 2 3 4 5 6] [--updates 1000] [--episodes 5] [--set KEY=VALUE]...
+        [--summarize] [--minutes 60] [--jobs 1] [--out DIR] [--runs DIR]
+
+Does cells one seed after the other, and begins none after so many minutes; what this code has done with these settings
+is not done again. Writes ``NAME.json``, ``NAME.md`` and ``NAME.png`` of all cells that are done, and says which are
+not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pushing_pictures_results as shown
+from cells import Settings, described, printed
+from joblib import Parallel, delayed
+from provenance import record, sentence, text
+from pushing_pictures_cell import DEFAULTS, METHODS, PictureCell
+
+from ddco_pyro.data.files import write_text
+
+STUDIES = {
+    "demonstrations": ("ff_flat", "ff", "rnn_flat", "rnn", "ff_one_flat", "ff_one"),
+    "options": ("ff", "rnn"),
+    "augmentation": ("ff", "ff_hybrid", "rnn", "rnn_hybrid"),
+}
+"""The methods of each."""
+
+OWN_OPTIONS = {"ff": 2, "rnn": 4}
+"""What the supplement says; the text has them the other way round."""
+
+COUNT = 40
+"""Demonstrations where their number is not what is varied."""
+
+
+def cells(own: argparse.Namespace) -> list[PictureCell]:
+    """All of a study, one seed after the other."""
+    methods = [name for name in STUDIES[own.study] if name in own.methods]
+    if own.study == "demonstrations":
+        product = itertools.product(range(own.seeds), own.counts, methods)
+        return [PictureCell(name, _own_options(name), count, seed) for seed, count, name in product]
+    grid = itertools.product(range(own.seeds), own.options, methods)
+    return [PictureCell(name, options, COUNT, seed) for seed, options, name in grid]
+
+
+def _own_options(method: str) -> int:
+    return 0 if method.endswith("_flat") else OWN_OPTIONS[method.partition("_")[0]]
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Which study, which part of it, and where it is kept."""
+    parser.add_argument("study", choices=STUDIES)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
+    parser.add_argument("--counts", type=int, nargs="+", default=[80, 40, 20, 10])
+    parser.add_argument("--options", type=int, nargs="+", default=[1, 2, 3, 4, 5, 6])
+    parser.add_argument("--summarize", action="store_true", help="do nothing that is not done")
+    parser.add_argument("--minutes", type=float, default=float("inf"))
+    parser.add_argument("--jobs", type=int, default=1, help="cells at a time; each works on one thread")
+    parser.add_argument("--out", type=Path, default=Path("docs/results/pushing_pictures"))
+    DEFAULTS.add_to(parser)
+
+
+def main() -> None:
+    """Run one study."""
+    parser = described(__doc__)
+    arguments(parser)
+    printed(lambda: run(parser.parse_args()))
+
+
+def run(own: argparse.Namespace) -> str:
+    """Do what is not done yet, and write what there is; the page."""
+    settings, asked = DEFAULTS.given(own), cells(own)
+    made_by, until = record(asked[0].command(settings)), time.monotonic() + 60 * own.minutes
+    if not own.summarize:
+        Parallel(n_jobs=own.jobs, verbose=10)(delayed(_begun)(cell, settings, made_by, until) for cell in asked)
+    return write(own, settings, asked)
+
+
+def _begun(cell: PictureCell, settings: Settings, made_by: dict[str, str], until: float) -> None:
+    if time.monotonic() < until:
+        cell.run(settings, made_by)
+
+
+def write(own: argparse.Namespace, settings: Settings, asked: Sequence[PictureCell]) -> str:
+    """Write what there is of a study; the page."""
+    paths = {cell: cell.path(settings) for cell in asked}
+    done = {cell: json.loads(path.read_text()) for cell, path in paths.items() if path.exists()}
+    missing = [cell.name for cell in asked if cell not in done]
+    rows = [shown.row_of(cell, content["results"]) for cell, content in done.items()]
+    records = [content["provenance"][0] for content in done.values()]
+    command = f"python studies/pushing_pictures.py {own.study} --seeds {own.seeds} {settings.words()}"
+    page = shown.page(own.study, rows, missing, sentence(command, records))
+    write_text(own.out / f"{own.study}.json", text({"cells": rows, "missing": missing}, records))
+    write_text(own.out / f"{own.study}.md", page)
+    shown.draw(own.study, rows, own.out / f"{own.study}.png")
+    return page
+
+
+if __name__ == "__main__":
+    main()

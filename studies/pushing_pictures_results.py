@@ -1,0 +1,108 @@
+"""What the cells of pushing from pictures say together: means over training seeds, their intervals, and a figure."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from pushing_results import grouped, over_seeds, table
+
+from ddco_pyro.data.files import whole_file
+
+Row = dict[str, Any]
+
+STATE = "docs/results/pushing/sample_complexity.md"
+COLUMNS = {
+    "goals": ("goals", "{:.1f}"),
+    "topples": ("topples", "{:.1f}"),
+    "lost": ("lost", "{:.1f}"),
+    "held-out nats/step": ("held_out", "{:.3f}"),
+    "training nats/step": ("train", "{:.3f}"),
+    "steps an option lasts": ("dwell", "{:.0f}"),
+    "steps under own control": ("own_control", "{:.2f}"),
+    "parameters": ("parameters", "{:.0f}"),
+    "minutes": ("minutes", "{:.1f}"),
+    "of them processor, fit": ("processor", "{:.1f}"),
+}
+ACROSS = {"demonstrations": "count", "options": "options", "augmentation": "options"}
+"""What each study varies."""
+
+
+def row_of(cell: Any, results: dict[str, Any]) -> Row:
+    """A cell in a line: means over its episodes."""
+    seconds, episodes = results["seconds"], results["episodes"]
+    return {
+        **asdict(cell),
+        **results["log_likelihood_per_step"],
+        **{name: float(np.mean(episodes[name])) for name in ("goals", "topples", "lost")},
+        "episodes": len(episodes["goals"]),
+        "dwell": episodes["dwell"],
+        "own_control": episodes["own_control"],
+        "parameters": results["parameters"],
+        "minutes": (seconds["fit"] + seconds["play"]) / 60,
+        "processor": seconds["fit_processor"] / 60,
+    }
+
+
+def page(study: str, rows: Sequence[Row], missing: Sequence[str], made_by: str) -> str:
+    """The table, the differences, and what has not been measured.
+
+    :param missing: names of cells.
+    """
+    across = ACROSS[study]
+    lines = [made_by, "", "Means over training seeds with 95 % t intervals; the last column is the number of seeds. "]
+    lines[-1] += f"Policies from the state, on the same demonstrations and episodes: `{STATE}`."
+    ordered = sorted(rows, key=lambda row: (row["method"], -row[across], row["seed"]))
+    lines += ["", *table(ordered, COLUMNS, "method", across), "", *differences(rows, across)]
+    if missing:
+        kinds = Counter(name.partition("-")[0] for name in missing)
+        left = ", ".join(f"{count} of {method}" for method, count in kinds.items())
+        lines += ["", f"Not measured yet: {len(missing)} cells, {left}."]
+    return "\n".join(lines) + "\n"
+
+
+def differences(rows: Sequence[Row], across: str) -> list[str]:
+    """Each hierarchy minus the flat policy of equal size, paired by seed."""
+    lines = []
+    for (method, count), own in grouped(rows, "method", "count").items():
+        flat = {row["seed"]: row for row in rows if row["method"] == f"{method}_flat" and row["count"] == count}
+        pairs = [(row, flat[row["seed"]]) for row in own if row["seed"] in flat]
+        if pairs and across == "count":
+            said = [f"{_difference(pairs, 'goals', '{:.1f}')} goals"]
+            said.append(f"{_difference(pairs, 'held_out', '{:.3f}')} held-out nats/step")
+            lines.append(
+                f"- {method} minus flat of equal size, {count} demonstrations, paired by seed ({len(pairs)}): "
+                f"{', '.join(said)}."
+            )
+    return lines
+
+
+def _difference(pairs: Sequence[tuple[Row, Row]], measure: str, form: str) -> str:
+    mean, half, _ = over_seeds([{measure: ours[measure] - theirs[measure]} for ours, theirs in pairs], measure)
+    return form.format(mean) + ("" if np.isnan(half) else f" ± {form.format(half)}")
+
+
+def draw(study: str, rows: Sequence[Row], path: Path) -> None:
+    """Goals, held-out likelihood and the meta-policy's own control against what is varied."""
+    across = ACROSS[study]
+    measures = {"goals": "goals in 2000 steps", "held_out": "held-out nats/step"}
+    if study == "augmentation":
+        measures["own_control"] = "steps under own control"
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (measure, label) in zip(figure.subplots(1, len(measures)), measures.items(), strict=True):
+        for (method,), own in grouped(rows, "method").items():
+            groups = grouped(sorted(own, key=lambda row: row[across]), across)
+            found = [over_seeds(group, measure) for group in groups.values()]
+            places, means = [place for (place,) in groups], [mean for mean, _, _ in found]
+            axes.errorbar(places, means, [half for _, half, _ in found], marker="o", ms=4, capsize=2, label=method)
+        axes.set(xlabel={"count": "demonstrations", "options": "options k"}[across], ylabel=label)
+    figure.axes[0].legend(fontsize=8)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=120, format="png")

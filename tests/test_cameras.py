@@ -1,0 +1,118 @@
+"""Pictures of a task's cameras: drawn where a spec observes them, and nowhere else."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+import toy_task
+from joblib import parallel_config
+from toy_task import DRAWN, watched
+
+import ddco_pyro
+from ddco_pyro.acting.lockstep import play
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.pictures import Pictures
+from ddco_pyro.data.sources.video import frames
+from ddco_pyro.fitting.prepare import dimensions
+from ddco_pyro.fitting.rollouts import roll_out
+from ddco_pyro.report import write_report
+from ddco_pyro.simulation import collect as collecting
+from ddco_pyro.simulation.environments import TaskEnvironment
+from ddco_pyro.simulation.episodes import run_episode
+from ddco_pyro.spec import DemonstrationsSpec, RolloutSpec, parse_spec
+
+TASK = "toy_task:watched"
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    """Nothing is drawn yet, and nothing collected; all that is drawn is drawn in this process."""
+    monkeypatch.setenv("DDCO_PYRO_CACHE", str(tmp_path / "cache"))
+    DRAWN.clear()
+    with parallel_config(backend="sequential"):
+        yield
+
+
+def spec_of(*observations, **parts):
+    policy = {"network": "conv", "filters": 2, "pool": "spatial_softmax", "hidden": [4]}
+    return parse_spec(
+        {
+            "task": TASK,
+            "demonstrations": {"count": 4, "valid_fraction": 0.25},
+            "observations": list(observations),
+            "baseline": {"kind": "flat", "policy": policy if "camera" in observations else {"network": "linear"}},
+            "training": {"epochs": 1},
+            "rollout": {"episodes": 2},
+            **parts,
+        }
+    )
+
+
+def test_an_episode_is_drawn_where_its_pictures_are_observed():
+    """The pictures are those of the states before each control, and all else is as without them."""
+    seen, blind = (run_episode(watched, "supervisor", 3, observed=names).record for names in (["camera"], ["offsets"]))
+    assert list(range(len(seen) + 1)) == DRAWN
+    assert seen.observations.keys() - blind.observations.keys() == {"camera"}
+    np.testing.assert_array_equal(seen.actions, blind.actions)
+    environment = toy_task.task.load(3)
+    environment.reset()
+    for control, picture in zip(seen.actions, seen.observations["camera"], strict=True):
+        np.testing.assert_array_equal(picture, toy_task.frame(environment))
+        environment.step(control)
+
+
+def test_what_is_not_kept_is_not_recorded():
+    record = run_episode(watched, "supervisor", 3, observed=["camera"], keep=["offsets"]).record
+    assert [*record.observations] == ["offsets"]
+
+
+def test_pictures_are_collected_where_the_spec_observes_them(monkeypatch):
+    """Compressed and a frame in each chunk; in slices as long as memory allows; in a file of their own."""
+    monkeypatch.setattr(collecting, "EPISODES_WITH_PICTURES", 2)
+    spec = DemonstrationsSpec(count=5, seed=20)
+    blind = collecting.collect(TASK, spec, observed=["offsets"])
+    path = collecting.collect(TASK, spec, observed=["camera"])
+    assert path != blind
+    assert blind == collecting.cache_path(watched, TASK, spec)
+    with h5py.File(path) as file:
+        dataset = file["data/demo_22/obs/camera"]
+        assert (dataset.dtype, dataset.chunks, dataset.compression) == (np.uint8, (1, 48, 65, 3), "gzip")
+    read, without = Demonstrations.read(path), Demonstrations.read(blind)
+    assert read.names == without.names == tuple(f"demo_{seed}" for seed in range(20, 25))
+    for demo, other in zip(read, without, strict=True):
+        np.testing.assert_array_equal(demo.actions, other.actions)
+        assert isinstance(demo.observations["camera"], Pictures)
+        seed = int(demo.name.removeprefix("demo_"))
+        record = run_episode(watched, "supervisor", seed, observed=["camera"]).record
+        np.testing.assert_array_equal(demo.observations["camera"], record.observations["camera"])
+
+
+def test_a_spec_with_a_camera_is_checked_fitted_and_rolled_out(tmp_path):
+    """Its shape is known before anything is collected, and all that act see the camera."""
+    spec = spec_of("offsets", "camera")
+    assert dimensions(spec).shapes["camera"] == (48, 65, 3)
+    fit = ddco_pyro.fit(spec, out=tmp_path / "run")
+    DRAWN.clear()
+    measured = roll_out(fit, 2, film=1, jobs=1)["methods"]["flat"]["measures"]["success"]
+    assert DRAWN
+    film, looks = (list(frames(fit.folder / "videos" / place / "flat-1000.mp4")) for place in ("", "saliency"))
+    assert len(film) == len(looks) + 1  # the end is seen by nobody
+    assert "<h2>What it looks at</h2>" in write_report(fit, fit.demonstrations).read_text()
+    alone = play(watched, fit.hierarchy, RolloutSpec(), range(1000, 1002))
+    assert [one.outcome["success"] for one in alone].count(1.0) == measured["successes"]
+
+
+def test_without_the_camera_nothing_is_drawn(tmp_path):
+    fit = ddco_pyro.fit(spec_of("offsets"), out=tmp_path / "run")
+    roll_out(fit, 2, jobs=1)
+    assert DRAWN == []
+
+
+def test_a_gymnasium_environment_has_the_cameras_it_is_asked_for():
+    environment = TaskEnvironment(TASK, observed=["camera"])
+    assert environment.observation_space["camera"].shape == (48, 65, 3)
+    seen, _ = environment.reset(seed=1)
+    assert environment.observation_space.contains({key: np.asarray(value) for key, value in seen.items()})
+    assert "camera" not in TaskEnvironment(TASK).reset(seed=1)[0]
+    environment.close()

@@ -1,0 +1,84 @@
+"""The study of pushing from pictures: which cells it has, in which order, and what it says of them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pushing_pictures as study
+import pytest
+from cells import described
+from pushing_pictures_cell import DEFAULTS, PictureCell, spec_of
+from pushing_pictures_results import differences, row_of
+
+
+def results(goals, held_out):
+    return {
+        "log_likelihood_per_step": {"train": held_out + 0.1, "held_out": held_out},
+        "episodes": {"goals": goals, "topples": [0.0, 1.0], "lost": [0.0, 0.0], "dwell": None, "own_control": None},
+        "parameters": 7,
+        "seconds": {"fit": 90.0, "fit_processor": 30.0, "play": 30.0},
+    }
+
+
+def arguments(name, *words):
+    parser = described("")
+    study.arguments(parser)
+    return parser.parse_args([name, *words])
+
+
+def test_a_row_has_means_over_episodes():
+    row = row_of(PictureCell("ff", 2, 80, 1), results([4.0, 1.0], -3.0))
+    assert (row["goals"], row["topples"], row["minutes"], row["processor"]) == (2.5, 0.5, 2.0, 0.5)
+
+
+def test_differences_are_paired_by_seed_and_number():
+    """2.5 − 1 and 4 − 3.5 goals: 1 ± 12.706 · 0.5."""
+    rows = [
+        row_of(PictureCell(method, options, count, seed), results(goals, -3.0 - seed * (method == "ff_flat")))
+        for method, options, count, seed, goals in [
+            ("ff", 2, 40, 0, [4.0, 1.0]),
+            ("ff", 2, 40, 1, [4.0, 4.0]),
+            ("ff", 2, 80, 0, [9.0, 9.0]),
+            ("ff_flat", 0, 40, 0, [1.0, 1.0]),
+            ("ff_flat", 0, 40, 1, [3.0, 4.0]),
+        ]
+    ]
+    (line,) = differences(rows, "count")
+    assert line.startswith("- ff minus flat of equal size, 40 demonstrations, paired by seed (2): 1.0 ± 6.4 goals")
+    assert "0.500 ± 6.353 held-out" in line
+
+
+def test_cells_of_a_seed_come_before_those_of_the_next():
+    asked = study.cells(arguments("demonstrations", "--methods", "ff", "ff_flat", "--counts", "80", "20"))
+    assert [(cell.seed, cell.count, cell.method, cell.options) for cell in asked[:5]] == [
+        (0, 80, "ff_flat", 0), (0, 80, "ff", 2), (0, 20, "ff_flat", 0), (0, 20, "ff", 2), (1, 80, "ff_flat", 0),
+    ]  # fmt: skip
+    assert {cell.method for cell in study.cells(arguments("augmentation"))} == {"ff", "ff_hybrid", "rnn", "rnn_hybrid"}
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "frames", "emits"),
+    [("ff", 3, 2, ("options",)), ("ff_one", 2, 1, ("options",)), ("rnn_hybrid", 4, 1, ("options", "control"))],
+)
+def test_specs_of_cells(method, options, frames, emits):
+    """72 demonstrations to train on, two in a step: 36 steps an epoch."""
+    spec = spec_of(PictureCell(method, options, 80, 1), DEFAULTS)
+    assert spec.observations[0].frames == frames
+    assert spec.hierarchy.levels[0].count == options
+    assert spec.hierarchy.meta_policy.emits == emits
+    assert spec.training.epochs == 28
+
+
+def test_what_is_not_done_is_said(tmp_path: Path):
+    cell = PictureCell("ff_flat", 0, 80, 0)
+    own = arguments("demonstrations", "--summarize", "--out", str(tmp_path), "--runs", str(tmp_path / "runs"))
+    content = {"provenance": [{"command": "x", "commit": "y", "dirty": False, "code": "z", "files": 1}]}
+    path = cell.path(replace(DEFAULTS, runs=tmp_path / "runs"))
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(content | {"results": results([2.0, 1.0], -3.0)}))
+    page = study.run(own)
+    assert "| ff_flat | 80 | 1.5 |" in page
+    assert "Not measured yet: 71 cells, 12 of ff, 12 of rnn_flat," in page
+    assert (tmp_path / "demonstrations.png").stat().st_size > 5000
