@@ -23,7 +23,7 @@ from ddco_pyro.simulation.task import Task
 from .. import psm
 from ..rendering import render
 from . import camera, candidates, supervisor
-from .geometry import CUPS, NEUTRAL_TURN, upright
+from .geometry import CUPS, IMAGE_SIZE, NEUTRAL_TURN, upright
 from .instrument import Instrument
 from .objects import KINDS, scene
 from .physics import MOVE_TIME, SETTLE_TIME, Physics
@@ -47,6 +47,7 @@ class BinPicking(base.Task):
         self.trials = Trials(kinds)
         self.jaw_open = True
         self._grasp = np.zeros(6)
+        self._masks = np.zeros((IMAGE_SIZE, IMAGE_SIZE, len(camera.EYES)), np.uint8)
 
     def initialize_episode(self, physics: Physics) -> None:
         """The objects dropped into the bin, the gripper open over one of the cups."""
@@ -58,6 +59,7 @@ class BinPicking(base.Task):
         self.jaw_open = self._was_open = True
         self._held: frozenset[int] = frozenset()
         self._lifted: frozenset[int] | None = None
+        self._left = physics.objects
         self._masks = camera.masks(physics)
         self._next_candidate()
 
@@ -90,14 +92,12 @@ class BinPicking(base.Task):
 
     def _end_trial(self, physics: Physics, released: bool) -> None:
         places, lifted = physics.places(), self._lifted or frozenset()
-        if released:
-            where = [places[number] for number in sorted(self._held)] or [physics.gripper_place()]
-            self.trials.add(Attempt(lifted, self._held, tuple(where)))
-        else:
-            self.trials.add(Attempt(lifted, physics.held(), ()))
+        held = self._held if released else physics.held()
+        where = [places[number] for number in sorted(held)] or [physics.gripper_place()]
+        self.trials.add(Attempt(self._left, lifted, held, tuple(where) if released else ()))
         self._lifted = None
-        left = [number for number, place in enumerate(places) if place not in CUPS]
-        if not left:
+        self._left = sum(place not in CUPS for place in places)
+        if not self._left:
             self.trials.end = End.CLEARED
         elif self.trials.missed():
             self.trials.end = End.MISSED
@@ -168,7 +168,7 @@ def frame(environment: dm_env.Environment) -> np.ndarray:
     return render(environment.physics, "overview", *FRAME_SIZE)
 
 
-def load(seed: int, instrument: int = 0) -> Environment:
+def load(seed: int, instrument: int = 1) -> Environment:
     """A fresh environment whose objects and episodes depend on the seed alone, with the instrument of that number."""
     random = np.random.RandomState(seed)
     kinds = [KINDS[number] for number in random.randint(len(KINDS), size=random.randint(FEWEST, MOST + 1))]
@@ -182,7 +182,7 @@ MEASURES = Trials(()).measures()
 RATES = {"success", "cleared"}
 
 
-def make_task(name: str, instrument: int = 0) -> Task:
+def make_task(name: str, instrument: int = 1) -> Task:
     """The task with the instrument of that number in the arm."""
     shared = (HERE.parent / name for name in SHARED_SOURCES)
     return Task(
@@ -198,4 +198,4 @@ def make_task(name: str, instrument: int = 0) -> Task:
 
 
 task = make_task("bin_picking")
-other_instrument = make_task("bin_picking_instrument_1", instrument=1)
+other_instrument = make_task("bin_picking_other_instrument", instrument=2)

@@ -15,8 +15,8 @@ from .. import psm
 
 BACKLASH = np.array([0.0015, 0.0015, 0.00015, 0.01, 0.01, 0.01])
 """By how much a motor can run ahead of its joint in either direction: 0.26 mm at the gripper for the first two."""
-BIAS = np.array([0.006, 0.006, 0.0008, 0.02, 0.02, 0.02])
-"""Standard deviations between instruments: about 1 mm at the gripper in each direction."""
+BIAS = np.array([0.015, 0.015, 0.001, 0.03, 0.03, 0.03])
+"""Standard deviations between instruments: 2.6 mm at the gripper sideways, 1 mm along the shaft."""
 
 
 @dataclass(frozen=True)

@@ -58,12 +58,14 @@ class Physics(mujoco.Physics):
         self.slack = np.zeros(6)
         self.motors = self.instrument.motors(joints, self.slack)
         self.set_control(servo)
+        self.forward()  # a step begins with the forces of what was there before
 
     def place_object(self, number: int, position: np.ndarray, quaternion: np.ndarray) -> None:
         """Put an object at a pose, at rest."""
         name = f"object_{number}"
         self.named.data.qpos[name] = np.concatenate([position, quaternion])
         self.named.data.qvel[name] = 0.0
+        self.forward()
 
     def drop(self, random: np.random.RandomState) -> None:
         """Drop the objects into the bin, one after another, and let them come to rest."""

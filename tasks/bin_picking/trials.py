@@ -27,12 +27,14 @@ class End(Enum):
 class Attempt:
     """A grasp, from where the jaws closed to where they opened.
 
+    :param before: how many objects were in the bin.
     :param lifted: the objects that the jaws first lifted.
     :param carried: those that they held when they opened.
     :param places: where the latter then were, or where the gripper was that held none; empty where the jaws did not
         open before the trial's time was over.
     """
 
+    before: int
     lifted: frozenset[int]
     carried: frozenset[int]
     places: tuple[str, ...]
