@@ -14,10 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from .geometry import FOCAL_LENGTH, CAMERA_HEIGHT, nearest_turn
+from .geometry import CAMERA_HEIGHT, FOCAL_LENGTH, nearest_turn
 
 WEIGHTS = Path(__file__).parent / "grasp_classifier.json"
-DRAWN = 24  # points of the mask among which the best is taken
+DRAWN = 24  # points of the mask, of which one in the better half is taken
 FEWEST_PIXELS = 20  # of objects; fewer are not seen
 AXIS_RADIUS = 10  # pixels about a point that say in which direction the wire runs there
 CENTRE_RADIUS = 4  # pixels about a point whose centre is taken for the wire's axis
@@ -86,12 +86,15 @@ class Classifier:
         return cls(np.array(kept["weights"]), float(kept["intercept"]))
 
     def scores(self, mask: np.ndarray, candidates: list[Candidate]) -> np.ndarray:
-        """The probability [N] that each grasp takes exactly one object."""
+        """The probability [N] that each grasp takes something."""
         inputs = np.array([features(mask, candidate) for candidate in candidates])
         return np.asarray(1.0 / (1.0 + np.exp(-(inputs @ self.weights + self.intercept))))
 
 
-def best(mask: np.ndarray, random: np.random.RandomState) -> Candidate | None:
-    """The best of some points drawn on a mask uint8 [H, W]; None where nothing is seen."""
+def sample(mask: np.ndarray, random: np.random.RandomState) -> Candidate | None:
+    """One of the better half of points drawn on a mask uint8 [H, W]; None where nothing is seen."""
     drawn = draw(mask, random)
-    return drawn[int(np.argmax(Classifier.load().scores(mask, drawn)))] if drawn else None
+    if not drawn:
+        return None
+    ranked = np.argsort(-Classifier.load().scores(mask, drawn), kind="stable")
+    return drawn[ranked[random.randint(len(drawn) // 2)]]

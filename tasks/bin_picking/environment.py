@@ -107,7 +107,7 @@ class BinPicking(base.Task):
     def _next_candidate(self) -> None:
         """Draw the grasp of the next trial from what is seen."""
         left = self._masks[..., 0]
-        candidate = candidates.best(left, self.random)
+        candidate = candidates.sample(left, self.random)
         if candidate is None:
             self.trials.end = End.UNSEEN
             return

@@ -20,7 +20,7 @@ from .geometry import CUPS, GRASP_HEIGHT, NEUTRAL_TURN, SHOWING, lying_at, uprig
 from .objects import ACCEPTED
 from .physics import Physics
 
-JAW_OPEN = 1.1  # rad, between the jaws: 11 mm between the pads
+JAW_OPEN = 1.25  # rad, between the jaws: 12 mm between the pads
 OVER_CUP = 0.026  # m, the gripper's height where it lets go
 CARRY_HEIGHT = 0.034  # m
 APPROACH_HEIGHTS = (0.025, 0.009, 0.0)  # m above the grasp, way points 0 to 2; the jaws close in the next
