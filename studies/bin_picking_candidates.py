@@ -1,9 +1,9 @@
 """The classifier of grasp candidates: labelled images, its weights, and its precision on other images.
 
-    python studies/bin_picking_candidates.py [--images 40] [--candidates 10] [--jobs 2]
+    python studies/bin_picking_candidates.py [--images 40] [--others 20] [--candidates 8] [--jobs 2]
 
-An image is a pile of 3 to 8 objects; its labels are what came of simulated grasps, one after another from the same pile,
-at points drawn on what is seen: a person would have marked them by hand. Writes the weights that the task reads
+An image is a pile of 3 to 8 objects; its labels are what came of simulated grasps at points drawn on what is seen, one
+after another from the same pile: a person would have marked them by hand. Writes the weights that the task reads
 (``tasks/bin_picking/grasp_classifier.json``), and ``docs/results/bin_picking/candidates.json`` and ``.md``.
 """
 
@@ -115,11 +115,13 @@ def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--images", type=int, default=40)
-    parser.add_argument("--candidates", type=int, default=10)
+    parser.add_argument("--others", type=int, default=20)
+    parser.add_argument("--candidates", type=int, default=8)
     parser.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args()
-    command = f"python studies/bin_picking_candidates.py --images {arguments.images} --candidates {arguments.candidates}"
-    seeds = [first + number for first in (TRAINING, TESTING) for number in range(arguments.images)]
+    sizes = f"--images {arguments.images} --others {arguments.others} --candidates {arguments.candidates}"
+    command = f"python studies/bin_picking_candidates.py {sizes}"
+    seeds = [*range(TRAINING, TRAINING + arguments.images), *range(TESTING, TESTING + arguments.others)]
     images = Parallel(n_jobs=arguments.jobs, verbose=5)(delayed(labelled)(seed, arguments.candidates) for seed in seeds)
     own, others = images[: arguments.images], images[arguments.images :]
     model = fitted(own)

@@ -1,9 +1,9 @@
 """Surgical bin picking: clear a foam bin of tangled pins, suturing needles and wires, each into its cup.
 
-After the paper's second physical experiment (Physical Experiment 2 and SM 1.4). A da Vinci-like arm whose motors say
-where its joints are only inexactly takes objects out of a bin, one grasp after another; in each control step it is given
-six joint angles and the jaw, moves there and settles. It is seen through its encoders and through a stereo pair 650 mm
-above the bin. An episode is a whole bin. Simulated lengths are metres; what is observed is in millimetres and pixels.
+After the paper's second physical experiment (Physical Experiment 2 and SM 1.4). A da Vinci-like arm with inexact
+encoders takes objects out of a bin, one grasp after another; in each control step it is given six joint angles and the
+jaw, moves there and settles. It is seen through its encoders and through a stereo pair 650 mm above the bin. An episode
+is a whole bin. Simulated lengths are metres; what is observed is in millimetres and pixels.
 """
 
 from __future__ import annotations
@@ -40,11 +40,15 @@ SHARED_SOURCES = ("psm.py", "rendering.py", "vision.py")
 
 
 class BinPicking(base.Task):
-    """Starts, observes and rewards an episode; keeps what became of the attempts in ``trials``."""
+    """Starts, observes and rewards an episode.
+
+    ``trials`` has what became of the attempts, ``left`` how many objects were in the bin when the trial at hand began.
+    """
 
     def __init__(self, kinds: list[str], random: np.random.RandomState) -> None:
         super().__init__(random=random)
         self.trials = Trials(kinds)
+        self.left = len(kinds)
         self.jaw_open = True
         self._grasp = np.zeros(6)
         self._masks = np.zeros((IMAGE_SIZE, IMAGE_SIZE, len(camera.EYES)), np.uint8)
@@ -59,7 +63,7 @@ class BinPicking(base.Task):
         self.jaw_open = self._was_open = True
         self._held: frozenset[int] = frozenset()
         self._lifted: frozenset[int] | None = None
-        self._left = physics.objects
+        self.left = physics.objects
         self._masks = camera.masks(physics)
         self._next_candidate()
 
@@ -94,10 +98,10 @@ class BinPicking(base.Task):
         places, lifted = physics.places(), self._lifted or frozenset()
         held = self._held if released else physics.held()
         where = [places[number] for number in sorted(held)] or [physics.gripper_place()]
-        self.trials.add(Attempt(self._left, lifted, held, tuple(where) if released else ()))
+        self.trials.add(Attempt(self.left, lifted, held, tuple(where) if released else ()))
         self._lifted = None
-        self._left = sum(place not in CUPS for place in places)
-        if not self._left:
+        self.left = sum(place not in CUPS for place in places)
+        if not self.left:
             self.trials.end = End.CLEARED
         elif self.trials.missed():
             self.trials.end = End.MISSED

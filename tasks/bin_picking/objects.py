@@ -5,6 +5,7 @@ An object's frame has its origin in the middle of the object and x along it; len
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -31,7 +32,7 @@ def parts(kind: str) -> list[Part]:
         return [(ends[0], ends[1], PIN_RADIUS), (ends[1], head, HEAD_RADIUS)]
     corners = _arc() if kind == "needle" else _zigzag()
     radius = NEEDLE_RADIUS if kind == "needle" else WIRE_RADIUS
-    return [(start, end, radius) for start, end in zip(corners[:-1], corners[1:], strict=True)]
+    return [(start, end, radius) for start, end in itertools.pairwise(corners)]
 
 
 def _arc() -> np.ndarray:
@@ -58,9 +59,10 @@ def parking(number: int) -> np.ndarray:
 
 
 def _body(number: int, kind: str) -> str:
+    contact = 'contype="1" conaffinity="1" condim="3" friction=".4 .0005 .0001" solref=".004 1"'
     geoms = "".join(
-        f'<geom type="capsule" fromto="{_numbers(start)} {_numbers(end)}" size="{radius:g}" contype="1" conaffinity="1" '
-        f'material="object" density="{DENSITY:g}" condim="3" friction=".4 .0005 .0001" solref=".004 1" group="1"/>'
+        f'<geom type="capsule" fromto="{_numbers(start)} {_numbers(end)}" size="{radius:g}" {contact} '
+        f'material="object" density="{DENSITY:g}" group="1"/>'
         for start, end, radius in parts(kind)
     )
     place = _numbers(parking(number))

@@ -14,10 +14,10 @@ from .geometry import FOAM_DEPTH, place_of
 from .instrument import Instrument, slack_after
 
 SET_POINT_TIME = 0.02  # s, between interpolated set points
-MOVE_TIME = 0.30  # s, to reach the goal of a control step
-SETTLE_TIME = 0.16  # s, before observing
-DROP_TIME = 0.30  # s, from one dropped object to the next
-REST_TIME = 0.50  # s, after the last
+MOVE_TIME = 0.26  # s, to reach the goal of a control step
+SETTLE_TIME = 0.10  # s, before observing
+DROP_TIME = 0.24  # s, from one dropped object to the next
+REST_TIME = 0.40  # s, after the last
 
 DROP_HEIGHT = 0.020  # m
 DROP_CENTRE = np.array([0.0, -0.006])  # m
@@ -151,8 +151,6 @@ class Physics(mujoco.Physics):
         """Whether the jaws are in the foam, of the bin or its walls, further than it gives way."""
         gripper = self.gripper().position
         return place_of(gripper) == "bin" and gripper[2] - PAD_HALF_LENGTH < -FOAM_DEPTH
-
-
 
     def gripper_place(self) -> str:
         """Where the gripper is, as for an object."""

@@ -1,8 +1,8 @@
 """Scripted policies of bin picking: the open-loop plan of a trial, and the supervisor that corrects it.
 
 The paper's demonstrations came from an open-loop policy that a person interrupted when it was about to fail; the
-adjustment was carried on. A key let the robot stop in place and drop what it held, which was nothing or several objects.
-Here the person is replaced by a corrector that sees the true state.
+adjustment was carried on. A key let the robot stop in place and drop what it held where that was nothing or several
+objects. Here the person is replaced by a corrector that sees the true state.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ddco_pyro.simulation.task import Observation
 from .. import psm
 from ..psm import Pose
 from .geometry import CUPS, GRASP_HEIGHT, NEUTRAL_TURN, SHOWING, lying_at, upright
-from .objects import ACCEPTED
+from .objects import ACCEPTED, KINDS
 from .physics import Physics
 
 JAW_OPEN = 1.25  # rad, between the jaws: 12 mm between the pads
@@ -123,14 +123,16 @@ class Supervisor(OpenLoop):
     here on. What it holds decides what follows: one object is carried to its cup; with none or several the jaws open in
     place, and the next trial starts from there.
 
-    As with a person, what it does is coarser than what it means to do. ``intended`` is the control it meant, and is what
-    is recorded: demonstrations show how to come back from an inexact move without teaching the inexactness.
+    As with a person, what it does is coarser than what it means to do. ``intended`` is the control it meant, which is
+    recorded: demonstrations show how to come back from an inexact move without teaching the inexactness.
     """
 
     def __init__(self, environment: dm_env.Environment) -> None:
         super().__init__(environment)
         self._physics: Physics = environment.physics
+        self._task = environment.task
         self._kinds: list[str] = environment.task.trials.kinds
+        self._held: frozenset[int] = frozenset()
 
     def reset(self, seed: int) -> None:
         """Forget plan and corrections; ``seed`` decides how inexact the moves are."""
@@ -141,6 +143,7 @@ class Supervisor(OpenLoop):
 
     def act(self, observation: Observation) -> np.ndarray:
         """The next set points [7]."""
+        self._held = self._physics.held()
         self._follow(observation)
         way_point, planned = self._plan[self._step], self._planned()
         reached = psm.forward(self._physics.predicted(planned + self._correction))
@@ -149,11 +152,18 @@ class Supervisor(OpenLoop):
         self.intended = np.append(planned + self._correction, way_point.open)
         return np.append(self._physics.command(psm.inverse(self._by_hand(way_point))), way_point.open)
 
+    @property
+    def annotations(self) -> dict[str, int]:
+        """Besides the phase, before the step just decided: how many objects were ``held``, the ``kind`` of a single one
+        (-1 otherwise), and how many were ``left`` in the bin when the trial began.
+        """
+        kind = KINDS.index(self._kinds[min(self._held)]) if len(self._held) == 1 else -1
+        return super().annotations | {"held": len(self._held), "kind": kind, "left": self._task.left}
+
     def _rest(self) -> list[WayPoint]:
-        held = self._physics.held()
-        if len(held) != 1:
+        if len(self._held) != 1:
             return RECOVERY
-        return cup_plan("accept" if self._kinds[min(held)] == ACCEPTED else "reject")
+        return cup_plan("accept" if self._kinds[min(self._held)] == ACCEPTED else "reject")
 
     def _by_hand(self, way_point: WayPoint) -> Pose:
         """The gripper pose that a person achieves who wants another one."""

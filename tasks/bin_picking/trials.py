@@ -58,7 +58,8 @@ class Attempt:
 @dataclass
 class Trials:
     """The attempts in a bin with objects of these kinds, how many control steps the trial at hand has had, and how the
-    bin ended."""
+    bin ended.
+    """
 
     kinds: Sequence[str]
     attempts: list[Attempt] = field(default_factory=list)
@@ -78,11 +79,11 @@ class Trials:
     def measures(self) -> dict[str, float]:
         """Counts over the bin, and how it ended.
 
-        ``success``: it was cleared, and every object into its own cup; ``cleared``: into either. Of attempts: ``single``,
-        ``empty`` and ``several`` by how many objects were first lifted, ``slipped`` where fewer were left when the jaws
-        opened. An attempt that holds one object when the jaws open is to be delivered (``due_cups``, of them ``kept`` not
-        dropped into the bin, ``delivered`` into a cup and ``sorted`` into its own), another one is to be recovered from
-        (``due_recoveries``, of them ``recovered``): opened over the bin.
+        ``success``: it was cleared, and every object into its own cup; ``cleared``: into either. Of attempts:
+        ``single``, ``empty`` and ``several`` by how many objects were first lifted, ``slipped`` where fewer were left
+        when the jaws opened. One that holds one object when the jaws open is to be delivered (``due_cups``, of them
+        ``kept`` not dropped into the bin, ``delivered`` into a cup and ``sorted`` into its own), another one is to be
+        recovered from (``due_recoveries``, of them ``recovered``): opened over the bin.
         """
         attempts = [attempt for attempt in self.attempts if attempt.places]
         loaded = [attempt for attempt in attempts if len(attempt.carried) == 1]

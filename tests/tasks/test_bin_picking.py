@@ -1,5 +1,6 @@
 """Bin picking against independent truths: MuJoCo's cameras, a dead band in small steps, grasps and mishaps by hand."""
 
+import itertools
 from collections.abc import Iterator
 
 import cv2
@@ -90,7 +91,7 @@ def test_objects_are_as_thick_and_long_as_the_paper_says(kind: str) -> None:
     thickness = [2e3 * radius for _, _, radius in parts]
     assert min(thickness) >= 1.0
     assert max(thickness) <= 3.0
-    for (_, end, _), (start, _, _) in zip(parts[:-1], parts[1:], strict=True):
+    for (_, end, _), (start, _, _) in itertools.pairwise(parts):
         np.testing.assert_allclose(end, start, atol=1e-12)  # a chain
     length = sum(np.linalg.norm(end - start) for start, end, _ in parts)
     assert 0.02 < length < 0.03
@@ -248,10 +249,9 @@ def test_measures_of_attempts() -> None:
         Attempt(1, frozenset({2}), frozenset({2}), ()),  # never let go
     ]
     trials = Trials(["pin", "wire", "needle"], attempts, end=End.MISSED)
-    expected = {
-        "success": 0, "cleared": 0, "ended_missed": 1, "objects": 3, "attempts": 7, "single": 3, "empty": 2, "several": 2,
-        "slipped": 1, "due_cups": 3, "kept": 2, "delivered": 2, "sorted": 1, "due_recoveries": 3, "recovered": 2,
-    }  # fmt: skip
+    expected = {"success": 0, "cleared": 0, "ended_missed": 1, "objects": 3, "attempts": 7, "single": 3, "empty": 2}
+    expected |= {"several": 2, "slipped": 1, "due_cups": 3, "kept": 2, "delivered": 2, "sorted": 1}
+    expected |= {"due_recoveries": 3, "recovered": 2}
     found = trials.measures()
     assert {name: found[name] for name in expected} == expected
     assert not trials.missed()
