@@ -56,7 +56,7 @@ class Fitted(Cell):
         """The bins of every method, and how long fit and rollouts took."""
         bins = int(settings.values["bins"])
         changes = [f"seed={self.seed}", f"rollout.seed={STARTS + 1000 * self.seed}", *settings.overrides]
-        changes += [] if (self.spec, self.seed) == ("bin_picking", 0) else ["rollout.policies=[]"]
+        changes += ["rollout.policies=[]"]
         changes += ["compare_with=[]"] if self.spec == "bin_picking_hybrid" else []
         begun = time.perf_counter()
         fitted = fit(load_spec(SPECS[self.spec], changes), out=folder)
