@@ -45,7 +45,7 @@ def grasps(demos: Demonstrations) -> dict[str, Any]:
     """Of all grasps that were shown, how many took something and exactly one; of those that took something with five
     objects in the bin, how many took more.
     """
-    shown = [(demo.labels["left"][t], demo.labels["held"][t]) for demo in demos for t in decisions(demo)]
+    shown = [(int(demo.labels["left"][t]), int(demo.labels["held"][t])) for demo in demos for t in decisions(demo)]
     five = [held for left, held in shown if left == 5 and held]
     return {
         "something": rate(sum(held > 0 for _, held in shown), len(shown)),
