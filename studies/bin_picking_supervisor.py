@@ -1,0 +1,125 @@
+"""The demonstrator of bin picking: how many objects its grasps take, how its bins end, and what a picture tells.
+
+    python studies/bin_picking_supervisor.py
+
+Collects the demonstrations of ``specs/bin_picking.yaml``, unless they have been. What is held at the moment of decision
+is also read from the observed masks alone, by a classifier that is tested on bins it was not trained on: it says how
+much of that a policy can know. Writes ``docs/results/bin_picking/supervisor.json`` and ``.md``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ddco_tasks.bin_picking.objects import KINDS
+from ddco_tasks.bin_picking.supervisor import PHASES
+from provenance import record, sentence, text
+from sklearn.ensemble import ExtraTreesClassifier
+from sklearn.model_selection import GroupKFold, cross_val_predict
+
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.files import write_text
+from ddco_pyro.simulation.collect import collect
+from ddco_pyro.simulation.episodes import rate
+from ddco_pyro.spec import load_spec
+
+COMMAND = "python studies/bin_picking_supervisor.py"
+SPEC = "specs/bin_picking.yaml"
+OUT = Path("docs/results/bin_picking")
+FOLDS = 5
+PAPER = {"something": "94 %", "two of five": "32 %", "three of five": "14 %", "four or more of five": "0.5 %"}
+
+
+def decisions(demo: Demonstration) -> np.ndarray:
+    """The steps after what is held was shown: a recovery, or the first step of carrying."""
+    phase = demo.labels["phase"]
+    after = np.flatnonzero(np.diff(phase, prepend=phase[0])) if len(phase) else np.zeros(0, int)
+    return np.array([t for t in after if PHASES[phase[t]] in ("recover", "carry")], int)
+
+
+def grasps(demos: Demonstrations) -> dict[str, Any]:
+    """Of all grasps that were shown, how many took something and exactly one; of those that took something with five
+    objects in the bin, how many took more.
+    """
+    shown = [(int(demo.labels["left"][t]), int(demo.labels["held"][t])) for demo in demos for t in decisions(demo)]
+    five = [held for left, held in shown if left == 5 and held]
+    return {
+        "something": rate(sum(held > 0 for _, held in shown), len(shown)),
+        "exactly one": rate(sum(held == 1 for _, held in shown), len(shown)),
+        "two of five": rate(five.count(2), len(five)),
+        "three of five": rate(five.count(3), len(five)),
+        "four or more of five": rate(sum(held > 3 for held in five), len(five)),
+    }
+
+
+def from_pictures(demos: Demonstrations) -> dict[str, Any]:
+    """How often the masks alone say what is held; every bin is predicted from the others."""
+    masks, held, bins = [], [], []
+    for number, demo in enumerate(demos):
+        for t in decisions(demo):
+            masks.append(np.asarray(demo.observations["image"][int(t)]).ravel() > 0)
+            held.append(_name(demo, t))
+            bins.append(number)
+    trees = ExtraTreesClassifier(500, random_state=0)
+    said = cross_val_predict(trees, np.array(masks), np.array(held), groups=bins, cv=GroupKFold(FOLDS))
+    confused = Counter(zip(held, said.tolist(), strict=True))
+    right = sum(count for (truth, guess), count in confused.items() if truth == guess)
+    return {
+        "accuracy": rate(right, len(held)),
+        "held, said": [[*pair, count] for pair, count in sorted(confused.items())],
+    }
+
+
+def _name(demo: Demonstration, t: int) -> str:
+    kind, held = demo.labels["kind"][t], demo.labels["held"][t]
+    return KINDS[kind] if held == 1 else "several" if held else "nothing"
+
+
+def page(results: dict[str, Any], made_by: str) -> str:
+    """The results as Markdown."""
+    lines = [made_by, "", f"{results['demonstrations']} bins, {results['steps']} control steps.", ""]
+    lines += ["| its grasps took | here | paper |", "|---|---|---|"]
+    lines += [f"| {name} | {said(one)} | {PAPER.get(name, '-')} |" for name, one in results["grasps"].items()]
+    lines += ["", "*Of five*: with five in the bin, of the grasps that took something. Wilson 95 % intervals.", ""]
+    lines += ["| its bins | here |", "|---|---|"]
+    lines += [f"| {name} | {said(one)} |" for name, one in results["bins"].items() if "rate" in one]
+    lines += [f"| {name}, mean | {one['mean']:.2f} |" for name, one in results["bins"].items() if "mean" in one]
+    pictures = results["from pictures"]
+    lines += ["", f"What is held, read from the observed masks by trees over pixels: {said(pictures['accuracy'])}.", ""]
+    lines += ["| held | said | times |", "|---|---|--:|"]
+    lines += [f"| {held} | {name} | {count} |" for held, name, count in pictures["held, said"]]
+    return "\n".join(lines) + "\n"
+
+
+def said(one: dict[str, Any]) -> str:
+    """A rate with its counts and interval."""
+    if not one["trials"]:
+        return "-"
+    low, high = one["interval"]
+    return f"{one['rate']:.1%} ({one['successes']} of {one['trials']}; {low:.1%} to {high:.1%})"
+
+
+def main() -> None:
+    """Run the study."""
+    made_by = record(COMMAND)
+    path = collect("bin_picking", load_spec(SPEC).demonstrations)
+    demos = Demonstrations.read(path, ["image"], labels=("phase", "held", "kind", "left"))
+    results = {
+        "demonstrations": len(demos),
+        "steps": sum(demos.lengths),
+        "grasps": grasps(demos),
+        "bins": json.loads(str(demos.attributes["supervisor"])),
+        "from pictures": from_pictures(demos),
+    }
+    shown = page(results, sentence(COMMAND, [made_by]))
+    write_text(OUT / "supervisor.json", text(results, [made_by]))
+    write_text(OUT / "supervisor.md", shown)
+    print(shown)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+"""Where things are: bin, cups, the places of a trial's way points, and the pixels of the overhead stereo pair.
+
+Metres and radians; pixels are counted from the centre of the upper left one. The world's origin is the centre of the
+bin's floor, x points towards the reject cup, y away from the arm.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..psm import Pose, rotation
+
+BIN_OUTSIDE = 0.029  # half the side of the bin, with its walls
+BIN_INSIDE = 0.025
+CUPS = {"accept": np.array([-0.061, 0.0]), "reject": np.array([0.061, 0.0])}
+CUP_INSIDE = 0.026  # half the side
+FOAM_DEPTH = 0.006  # the foam gives way so far under the jaws
+
+NEUTRAL_TURN = np.pi / 4  # of the gripper about the vertical, where it shows what it holds and lets it go
+GRASP_HEIGHT = 0.003  # of the middle of the pads
+SHOWING = np.array([0.0, 0.014, 0.030])  # over a margin of the bin, clear of the pile
+
+IMAGE_SIZE = 256  # pixels by side, as rendered
+CAMERA_HEIGHT = 0.650
+BASELINE = 0.005
+FIELD_OF_VIEW = np.deg2rad(5.6364)
+FOCAL_LENGTH = IMAGE_SIZE / 2 / np.tan(FIELD_OF_VIEW / 2)  # pixels
+MIDDLE = (IMAGE_SIZE - 1) / 2
+OBJECT_HEIGHT = 0.001  # of what lies on the floor; its depth in the pictures is taken for this
+
+
+def upright(turn: float, position: np.ndarray) -> Pose:
+    """A gripper that points straight down at ``position`` [3] and is turned by ``turn`` (rad) about the vertical."""
+    return Pose(rotation(2, turn), position)
+
+
+def nearest_turn(turn: float) -> float:
+    """The turn within a right angle of the neutral one that brings the jaws into the same line."""
+    return float(turn - np.pi * np.round((turn - NEUTRAL_TURN) / np.pi))
+
+
+def project(points: np.ndarray, right: bool = False) -> np.ndarray:
+    """Pixels [..., 2] (column, row) of points [..., 3] in the picture of the left or the right eye."""
+    eye = np.array([BASELINE / 2 if right else -BASELINE / 2, 0.0, CAMERA_HEIGHT])
+    seen = np.asarray(points) - eye
+    scale = FOCAL_LENGTH / -seen[..., 2]
+    return np.stack([MIDDLE + scale * seen[..., 0], MIDDLE - scale * seen[..., 1]], axis=-1)
+
+
+def lying_at(pixel: np.ndarray) -> np.ndarray:
+    """The point [3] of a lying object that the left eye sees at ``pixel`` [2]."""
+    scale = (CAMERA_HEIGHT - OBJECT_HEIGHT) / FOCAL_LENGTH
+    x, y = (pixel[0] - MIDDLE) * scale - BASELINE / 2, (MIDDLE - pixel[1]) * scale
+    return np.array([x, y, OBJECT_HEIGHT])
+
+
+def place_of(position: np.ndarray) -> str:
+    """Where a point [3] is: ``bin``, ``accept``, ``reject``, or ``outside`` of all of them."""
+    if np.all(np.abs(position[:2]) < BIN_OUTSIDE):
+        return "bin"
+    return next((name for name, cup in CUPS.items() if np.all(np.abs(position[:2] - cup) < CUP_INSIDE)), "outside")
