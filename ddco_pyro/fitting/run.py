@@ -19,6 +19,7 @@ from ddco_pyro.data.control_parts import measure
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import leftovers, only_one, write_text
 from ddco_pyro.data.hdf5 import natural
+from ddco_pyro.data.memory import allowed
 from ddco_pyro.data.tensors import write_tensors
 from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, ignore
 from ddco_pyro.fitting import labels
@@ -114,6 +115,7 @@ def fit_run(
     """
     check_jobs(jobs)
     check_processes(processes, jobs, spec.training.shards)
+    allowed()
     clock = _Clock()
     with clock("demonstrations"):
         demos = known_demonstrations(spec) if demos is None else demos
