@@ -285,6 +285,12 @@ class TrainingSpec(Model):
     workers: int = Field(default=0, ge=0)
     """Processes that read pictures ahead while networks are trained; 0: they are read in between. The result is the
     same for any number."""
+    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    """Where networks live in training and evaluation: ``cpu``, ``cuda`` (a GPU), or ``auto``: a GPU where there is one.
+    Exact inference stays on the processor. Last digits depend on it."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """``bfloat16``: networks multiply in bfloat16 in gradient steps (torch's autocast), which is faster on most GPUs;
+    parameters, inference, tuning and everything after training are as with ``float32``."""
     clip_gradient: Positive | None = None
     """Largest norm of a gradient; null for no limit."""
     labels: LabelsSpec | None = None
