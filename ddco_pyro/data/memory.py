@@ -35,7 +35,11 @@ MAKING = 16.0
 
 BACKWARD, AGAIN = 1.5, 2.25
 """Bytes that a gradient step takes for a byte that networks keep of a step, whose gradient is there for a while too;
-and where a trajectory is so long that its chunks are computed again."""
+and where a trajectory is so long that its chunks are computed again, or blocks are small (:data:`SMALL`)."""
+
+SMALL = 160e6
+"""Networks that take less for their steps have tensors of less than 32 MB each. Once freed those stay in the C
+library's heap, in holes that the next ones fill in part, and not alike from run to run; larger ones are given back."""
 
 INFERENCE = 5e3
 """Bytes that inference takes for a step of trajectories that are processed together."""
@@ -126,8 +130,8 @@ class Extent:
         passing = [MAKING * features * padded]
         for work in works:
             batch, together = (min(n, len(self.lengths)) for n in (work.batch, max(work.steps // longest, 1)))
-            taken = AGAIN if longest > work.chunk else BACKWARD
-            networks = taken * min(together * longest, work.chunk) * work.bytes_per_step
+            kept = min(together * longest, work.chunk) * work.bytes_per_step
+            networks = (AGAIN if longest > work.chunk or kept < SMALL else BACKWARD) * kept
             passing += [MAKING * work.clustered, longest * (batch * given + together * (given + INFERENCE)) + networks]
         return PROGRAM + self.size + padded * given + max(passing)
 
