@@ -180,7 +180,7 @@ def _pictures(folder: Path) -> Path:
         "demonstrations": {"path": str(folder / "pictures.hdf5")},
         "observations": [{"key": "camera", "augment": {"shift": 1}}],
         "baseline": {"kind": "flat", "policy": policy},
-        "training": {"epochs": 150, "patience": None, "shards": 2, "batch_size": 4, "workers": 1},
+        "training": {"epochs": 60, "patience": None, "shards": 2, "batch_size": 4, "workers": 1},
     }
     (folder / "pictures.yaml").write_text(yaml.safe_dump(data))
     return folder / "pictures.yaml"

@@ -286,8 +286,7 @@ class TrainingSpec(Model):
     """Processes that read pictures ahead while networks are trained; 0: they are read in between. The result is the
     same for any number."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
-    """Where networks live in training and evaluation: ``cpu``, ``cuda`` (a GPU), or ``auto``: a GPU where there is one.
-    Exact inference stays on the processor. Last digits depend on it."""
+    """Where networks are trained and evaluated: ``cpu``, ``cuda`` (a GPU), or ``auto``: a GPU where there is one."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """``bfloat16``: networks multiply in bfloat16 in gradient steps (torch's autocast), which is faster on most GPUs;
     parameters, inference, tuning and everything after training are as with ``float32``."""
