@@ -27,10 +27,11 @@ demo: opengl $(DEMO)
 test: lint
 	$(BIN)/pytest -n 2 --dist worksteal -q
 
-# Ratios against other tools, measured side by side; writes benchmarks/latest.json and docs/performance.md.
+# Ratios against other tools, measured side by side; writes benchmarks/*.json and the tables of docs/performance.md.
 bench: $(DEMO)
 	$(PIP) -e '.[bench]'
 	$(BIN)/python benchmarks/performance.py
+	$(BIN)/python benchmarks/throughput.py
 
 docs: $(DEMO)
 	$(PIP) -e '.[docs,export]'

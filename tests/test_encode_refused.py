@@ -107,6 +107,13 @@ def test_what_was_not_written_here_stays(small, out):
     assert call("encode", small, "--observation", "camera", "--out", out).status == 2
     assert out.read_bytes() == b"mine"
     out.unlink()
+    out.mkdir()
+    ended = call("encode", small, "--observation", "camera", "--out", out)
+    assert (ended.status, ended.err) == (
+        2,
+        f"ddco-pyro: {out}: is there already and is no file; choose another --out\n",
+    )
+    out.rmdir()
     (out.parent / "out.hdf5.encoder").mkdir()
     ended = call("encode", small, "--observation", "camera", "--out", out)
     assert (ended.status, ended.err.count("\n")) == (2, 1)

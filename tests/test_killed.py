@@ -20,6 +20,7 @@ import yaml
 from killing import Kept, Killed, until_done, whole
 from random_demonstrations import demonstrations
 
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.tensors import read_tensors
 
@@ -137,6 +138,12 @@ def cases(tmp_path_factory: pytest.TempPathFactory, toy_run) -> dict[str, Case]:
             same_run,
             epochs,
         ),
+        "fit to pictures": Case(
+            ("fit", _pictures(folder), "--out", "seen", "--resume", "--processes", "2"),
+            "seen",
+            same_run,
+            epochs,
+        ),
         "select": Case(
             ("select", folder / "grid.yaml", "--out", "selected", "--jobs", "2"),
             "selected",
@@ -157,6 +164,26 @@ def cases(tmp_path_factory: pytest.TempPathFactory, toy_run) -> dict[str, Case]:
             (folder / "toy.hdf5",),
         ),
     }
+
+
+def _pictures(folder: Path) -> Path:
+    """A spec whose pictures are read ahead, in two processes, by a worker of each."""
+    random = np.random.default_rng(0)
+
+    def one(number: int) -> Demonstration:
+        seen = {"camera": random.integers(0, 256, (9, 12, 10, 3), dtype=np.uint8)}
+        return Demonstration(f"demo_{number}", seen, random.normal(size=(9, 2)))
+
+    Demonstrations(tuple(one(number) for number in range(10))).write(folder / "pictures.hdf5")
+    policy = {"network": "conv", "filters": 2, "kernel": 3, "pooled": 2, "hidden": [4], "dropout": 0.1}
+    data = {
+        "demonstrations": {"path": str(folder / "pictures.hdf5")},
+        "observations": [{"key": "camera", "augment": {"shift": 1}}],
+        "baseline": {"kind": "flat", "policy": policy},
+        "training": {"epochs": 60, "patience": None, "shards": 2, "batch_size": 4, "workers": 1},
+    }
+    (folder / "pictures.yaml").write_text(yaml.safe_dump(data))
+    return folder / "pictures.yaml"
 
 
 def _toy_demonstrations(folder: Path) -> Path:
@@ -187,7 +214,9 @@ def test_killed_and_called_again(cases: dict[str, Case], tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["collect", "import", "fit", "select", "segment", "segment in place"])
+@pytest.mark.parametrize(
+    "name", ["collect", "import", "fit", "fit to pictures", "select", "segment", "segment in place"]
+)
 def test_killed_at_very_many_moments(cases: dict[str, Case], tmp_path: Path, name: str) -> None:
     found: list[Killed] = []
     while sum(one.total for one in found) < 10:  # sixty in all; a moment that comes after the end kills nothing

@@ -138,13 +138,13 @@ CONV = {"network": "conv", "filters": 16, "hidden": [8]}
 
 
 def fit_of(path: Path, network: dict[str, object]) -> Path:
-    """A spec that is soon fitted: one epoch for clusters, one for everything."""
+    """A spec that is soon fitted; with perceptrons in so many epochs that what freed tensors leave has settled."""
     levels = [{"count": 2, "policy": network, "termination": network}]
     data = {
         "demonstrations": {"path": str(path), "valid_fraction": 0.2},
         "observations": [{"key": "seen", "differences": network is not CONV}],
         "hierarchy": {"levels": levels, "meta_policy": network},
-        "training": {"epochs": 1, "layerwise": False, "initialize": "vq_controls"},
+        "training": {"epochs": 10 if network is WIDE else 1, "layerwise": False, "initialize": "vq_controls"},
     }
     spec = path.with_suffix(".yaml")
     spec.write_text(yaml.safe_dump(data))

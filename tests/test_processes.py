@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from command_line import call
 from killing import struck
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
@@ -251,6 +252,34 @@ def test_two_processes_of_torchrun(whole, tmp_path):
 def test_what_cannot_be_shared_is_refused(given, problem):
     with pytest.raises(BadInput, match=f"^{problem}"):
         check_processes(*given)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (["--processes", "0"], "--processes 0: give a number of processes"),
+        (["--processes", "8"], "--processes 8: a minibatch is cut into training.shards=4"),
+        (["--processes", "2", "--jobs", "2"], "--jobs trains restarts side by side"),
+        (["--set", "training.shards=0"], "training.shards: must be at least 1, got 0"),
+        (["--set", "training.workers=-1"], "training.workers: must be at least 0, got -1"),
+        (["--set", "training.upper_levels=nonsense"], "training.upper_levels: must be clusters or segments, got"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_one_line(tmp_path, arguments, problem):
+    spec = tmp_path / "spec.yaml"
+    spec.write_text(dump_spec(make_spec()))
+    ended = call("fit", spec, "--out", tmp_path / "run", *arguments)
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert problem in ended.err
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_unknown_limit_of_memory_is_said_before_anything_is_done(tmp_path, monkeypatch, toy_spec):
+    """Nothing is collected for a spec whose task has yet to be tried."""
+    monkeypatch.setenv("DDCO_PYRO_MEMORY", "much")
+    with pytest.raises(BadInput, match=r"^DDCO_PYRO_MEMORY=much: has to be a number of GB"):
+        fit(toy_spec, out=tmp_path / "run", on_event=lambda event: pytest.fail(f"{event} was done"))
+    assert not (tmp_path / "run").exists()
 
 
 def test_torchrun_decides_how_many_there_are(monkeypatch):

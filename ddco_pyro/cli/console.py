@@ -185,6 +185,15 @@ def control(size: Dimensions, hierarchy: Hierarchy) -> None:
         Console().print(Text(note), soft_wrap=True)
 
 
+def device(spec: Spec) -> None:
+    """Where networks live, where the spec leaves that open or names a GPU."""
+    from ddco_pyro.fitting.devices import described, device_of
+
+    if spec.training.device != "cpu":
+        where = f"networks: on {described(device_of(spec.training))}, {spec.training.precision} in gradient steps"
+        Console().print(Text(where), soft_wrap=True)
+
+
 def labels(spec: Spec, used: Labels | None) -> None:
     """For which label each option stands, where training uses labels."""
     from ddco_pyro.drawing.words import option_name

@@ -53,6 +53,7 @@ def check(
     print(dump_spec(loaded), end="")
     console.dimensions(loaded, size, hierarchy, baselines(loaded, size))
     console.control(size, hierarchy)
+    console.device(loaded)
     console.labels(loaded, labels)
 
 

@@ -37,6 +37,11 @@ BACKWARD, AGAIN = 1.5, 2.25
 """Bytes that a gradient step takes for a byte that networks keep of a step, whose gradient is there for a while too;
 and where a trajectory is so long that its chunks are computed again."""
 
+SMALL, HOLED = 160e6, 3.0
+"""Networks that take less than this for their steps have tensors of less than 32 MB each; and what they then take
+instead of ``BACKWARD``. Once freed those tensors stay in the C library's heap, in holes that the next ones fill in
+part, and not alike from run to run; larger ones are given back."""
+
 INFERENCE = 5e3
 """Bytes that inference takes for a step of trajectories that are processed together."""
 
@@ -126,8 +131,8 @@ class Extent:
         passing = [MAKING * features * padded]
         for work in works:
             batch, together = (min(n, len(self.lengths)) for n in (work.batch, max(work.steps // longest, 1)))
-            taken = AGAIN if longest > work.chunk else BACKWARD
-            networks = taken * min(together * longest, work.chunk) * work.bytes_per_step
+            kept = min(together * longest, work.chunk) * work.bytes_per_step
+            networks = kept * (HOLED if kept < SMALL else AGAIN if longest > work.chunk else BACKWARD)
             passing += [MAKING * work.clustered, longest * (batch * given + together * (given + INFERENCE)) + networks]
         return PROGRAM + self.size + padded * given + max(passing)
 

@@ -96,6 +96,8 @@ def encode(
     """
     path, out = Path(path), Path(out)
     see_name(encoding.encoder, allow_code)
+    if out.exists() and not out.is_file():
+        raise BadInput(f"{out}: is there already and is no file; choose another --out")
     if (form := format_of(path)) != "robomimic":
         raise BadInput(f"{path}: is a {form} dataset; first: ddco-pyro import {path} --out demos.hdf5")
     with open_robomimic(path) as source, one_thread() if encoding.encoder in BUILT_IN else nullcontext():

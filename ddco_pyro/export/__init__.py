@@ -24,7 +24,7 @@ from ddco_pyro.export.recording import MOST, record, tolerance
 from ddco_pyro.export.runner import TOLERANCE
 from ddco_pyro.export.weights import weights_and_networks
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.hierarchy import HOST, Hierarchy
 from ddco_pyro.model.links import TERMINATION_BOUND
 from ddco_pyro.spec import STEP, RolloutSpec
 
@@ -74,7 +74,7 @@ def write_numpy(fit: Fit, folder: Path) -> bool:
 
     :returns: whether numpy can evaluate every network; else there is no ``weights.npz``.
     """
-    hierarchy = fit.hierarchy.eval()
+    hierarchy = fit.hierarchy.place(HOST).eval()
     program = StepProgram(hierarchy).eval()
     weights, about = weights_and_networks(hierarchy)
     about |= _about(hierarchy, fit.spec.rollout) | {"outputs": program.names, "state": _state(program)}

@@ -106,7 +106,7 @@ def _watched(branch: nn.Module) -> Iterator[list[Tensor]]:
     given: list[Tensor] = []
 
     def keep(_: nn.Module, __: Any, output: Any) -> None:
-        given.append(output if isinstance(output, Tensor) else output[0])
+        given.append((output if isinstance(output, Tensor) else output[0]).cpu())
 
     handle = branch.register_forward_hook(keep)
     try:
@@ -121,8 +121,9 @@ def _replaced(branch: nn.Module, lengths: Tensor) -> Iterator[None]:
 
     def replace(_: nn.Module, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
         inputs: Inputs = arguments[0]
-        alive = inputs.time < lengths[:, None]
-        order = torch.randperm(int(alive.sum()), generator=torch.Generator().manual_seed(SEED))
+        device = inputs.time.device
+        alive = inputs.time < lengths[:, None].to(device)
+        order = torch.randperm(int(alive.sum()), generator=torch.Generator().manual_seed(SEED)).to(device)
 
         def shuffled(array: Tensor) -> Tensor:
             changed = array.clone()

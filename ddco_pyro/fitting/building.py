@@ -12,6 +12,7 @@ from torch import nn
 from ddco_pyro.data.control_dimensions import ControlDimension, all_constant, control_dimensions
 from ddco_pyro.data.control_parts import ControlPart, control_parts, refuse_unknown_dimensions
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.fitting.devices import device_of
 from ddco_pyro.fitting.widths import nearest_widths
 from ddco_pyro.model.encoding import Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -133,10 +134,11 @@ def parameters(network: nn.Module) -> int:
 def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
     """The spec's networks, after those of its baselines were made too.
 
-    :raises SpecError: something in the spec does not fit the observations or the control.
+    :raises SpecError: something in the spec does not fit the observations, the control or this machine.
     """
     hierarchy = build_hierarchy(spec, dimensions)
     baselines(spec, dimensions)
+    device_of(spec.training)
     return hierarchy
 
 

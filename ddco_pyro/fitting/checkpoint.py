@@ -24,6 +24,7 @@ class Progress:
     ``start`` is the tuning log-likelihood per step from before this stage, ``best`` that of its best epoch, ``ended``
     has a :class:`ddco_pyro.fitting.convergence.StageEnd` for each stage that has ended, ``history`` a row for each
     epoch. Where all stages have ended (``done``), ``epoch``, ``start`` and ``best`` are still those of the last.
+    ``device`` is the kind of device that its networks were trained on.
     """
 
     restart: int
@@ -35,6 +36,7 @@ class Progress:
     done: bool = False
     ended: list[dict[str, Any]] = field(default_factory=list)
     history: list[dict[str, Any]] = field(default_factory=list)
+    device: str = "cpu"
 
     @property
     def tune(self) -> Sequence[float]:
@@ -71,15 +73,15 @@ class Restart:
 
 
 def copy_of(model: nn.Module) -> State:
-    """The tensors of a model as they are now."""
-    return {name: value.detach().clone() for name, value in model.state_dict().items()}
+    """The tensors of a model as they are now, on the host."""
+    return {name: value.detach().cpu().clone() for name, value in model.state_dict().items()}
 
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> State:
-    """The optimiser's tensors by ``<parameter>.<name>``, as they are now."""
+    """The optimiser's tensors by ``<parameter>.<name>``, as they are now, on the host."""
     state = optimizer.state_dict()["state"]
     return {
-        f"{index}.{name}": torch.as_tensor(value).clone()
+        f"{index}.{name}": torch.as_tensor(value).cpu().clone()
         for index, values in state.items()
         for name, value in values.items()
         if value is not None

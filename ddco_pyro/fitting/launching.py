@@ -145,6 +145,7 @@ def _follow(ranks: Ranks, port: int) -> None:
         with connected():
             store = distributed.TCPStore(HERE, port, ranks.size, is_master=False)
             store.set(_name(ranks.rank), "")
+        os.environ["LOCAL_RANK"] = str(ranks.rank)  # as torchrun does
         with _joined(store, ranks):
             follow(ranks)
     except (BadInput, Failed):

@@ -11,6 +11,7 @@ import torch
 from ddco_pyro.data.reading import Readers
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.checkpoint import State
+from ddco_pyro.fitting.devices import device_of
 from ddco_pyro.fitting.labels import Labels
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -35,13 +36,13 @@ class Material:
     labels: Labels | None = None
 
     def hierarchy(self, restart: int) -> Hierarchy:
-        """A restart's hierarchy before any training, in evaluation mode."""
+        """A restart's hierarchy before any training, in evaluation mode, its networks on the spec's device."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed(restart))
             hierarchy = build_hierarchy(self.spec, self.dimensions)
         hierarchy.encoder.load_state_dict(self.encoder)
         hierarchy.scaling.load_state_dict(self.scaling)
-        return hierarchy.eval()
+        return hierarchy.place(device_of(self.spec.training)).eval()
 
     def read_by(self, readers: Readers) -> Material:
         """The same with pictures that are in files read by these."""

@@ -17,10 +17,12 @@ from typing import Any
 import torch
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.errors import BadInput
 from ddco_pyro.events import EpochEnded, OnEvent, RestartStopped, ignore
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.checkpoint import Progress, Restart
 from ddco_pyro.fitting.convergence import StageEnd, summary
+from ddco_pyro.fitting.devices import described, device_of
 from ddco_pyro.fitting.labels import Labels
 from ddco_pyro.fitting.material import Material
 from ddco_pyro.fitting.processes import pool, results, useful_jobs
@@ -37,6 +39,10 @@ DEAD = (
     "a process that trained a restart was ended from outside (too little memory?); what was trained is kept in a run "
     "folder: continue with the same command, with fewer --jobs if memory was short"
 )
+
+
+class OtherDevice(BadInput):
+    """A restart was begun on another kind of device than it is to be continued on."""
 
 
 class Trainer:
@@ -114,7 +120,8 @@ class Trainer:
         ends = [StageEnd(**end) for end in self.restarts[self.best].progress.ended]
         updates = math.ceil(len(self.material.train) / self.spec.training.batch_size)
         spent = [len(restart.progress.history) for restart in self.restarts]
-        return summary(self.spec.training, ends, updates, self.best, spent, self.stopped)
+        made = summary(self.spec.training, ends, updates, self.best, spent, self.stopped)
+        return made | {"device": self.restarts[self.best].progress.device}
 
     @property
     def _whole(self) -> list[Restart]:
@@ -124,9 +131,18 @@ class Trainer:
         """A restart as it was kept, or as it begins.
 
         :raises Damaged: it does not hold what was written.
+        :raises OtherDevice: it was begun on another kind of device.
         """
-        path = self._path(number)
-        return Restart.read(path) if path is not None and path.exists() else Restart(Progress(number))
+        path, device = self._path(number), described(device_of(self.spec.training))
+        if path is None or not path.exists():
+            return Restart(Progress(number, device=device))
+        restart = Restart.read(path)
+        if restart.progress.device != device:
+            raise OtherDevice(
+                f"{path}: was trained on {restart.progress.device}, and networks are on {device} here, where the last "
+                "digits differ; continue it there, or remove it: this restart then begins anew"
+            )
+        return restart
 
     def _path(self, number: int) -> Path | None:
         return None if self.checkpoints is None else self.checkpoints / f"restart-{number}.safetensors"

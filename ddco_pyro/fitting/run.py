@@ -19,10 +19,13 @@ from ddco_pyro.data.control_parts import measure
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import leftovers, only_one, write_text
 from ddco_pyro.data.hdf5 import natural
+from ddco_pyro.data.memory import allowed
 from ddco_pyro.data.tensors import write_tensors
 from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, ignore
 from ddco_pyro.fitting import labels
 from ddco_pyro.fitting.building import Dimensions, baseline_spec, check_networks, named_baselines, parameters
+from ddco_pyro.fitting.checkpoint import copy_of
+from ddco_pyro.fitting.devices import repeatable
 from ddco_pyro.fitting.fit import Fit, RunError, is_finished, load, model_name
 from ddco_pyro.fitting.launching import check_processes, together
 from ddco_pyro.fitting.metrics import evaluate, supervisor
@@ -114,6 +117,7 @@ def fit_run(
     """
     check_jobs(jobs)
     check_processes(processes, jobs, spec.training.shards)
+    allowed()
     clock = _Clock()
     with clock("demonstrations"):
         demos = known_demonstrations(spec) if demos is None else demos
@@ -173,7 +177,7 @@ def _fit(
             for name, baseline in named_baselines(spec).items()
         }
     fitted = Fit(spec, trained.hierarchy, {}, folder, demos, beside)
-    with clock("evaluation"):
+    with clock("evaluation"), repeatable(fitted.hierarchy.device):
         metrics = evaluate(fitted, split, demos)
     metrics |= {
         "engine_check": trained.check._asdict(),
@@ -313,7 +317,7 @@ def _write_model(folder: Path, hierarchy: Hierarchy, dimensions: Dimensions) -> 
         "steps": str(dimensions.steps),
         "control": json.dumps([part.as_data() for part in hierarchy.scaling.parts]),
     }
-    write_tensors(folder / "model.safetensors", hierarchy.state_dict(), metadata)
+    write_tensors(folder / "model.safetensors", copy_of(hierarchy), metadata)
 
 
 def _write_history(folder: Path, rows: Sequence[dict[str, Any]]) -> None:

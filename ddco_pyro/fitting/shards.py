@@ -62,7 +62,7 @@ def ascend(
         total += value
         sums = [_sum(*pair) for pair in zip(sums, gradients, strict=True)]
     for parameter, gradient in zip(parameters, sums, strict=True):
-        parameter.grad = None if gradient is None else torch.from_numpy(gradient)
+        parameter.grad = None if gradient is None else torch.from_numpy(gradient).to(parameter.device)
     return total
 
 
@@ -75,7 +75,7 @@ def _part(
     if shard.seed is not None:
         torch.manual_seed(shard.seed)
     value = objective.ascend(model, shard.rows, steps)
-    return value, [None if parameter.grad is None else parameter.grad.numpy() for parameter in parameters]
+    return value, [None if parameter.grad is None else parameter.grad.cpu().numpy() for parameter in parameters]
 
 
 def _sum(before: np.ndarray | None, gradient: np.ndarray | None) -> np.ndarray | None:

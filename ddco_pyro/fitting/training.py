@@ -24,6 +24,7 @@ from ddco_pyro.data.reading import Readers
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
 from ddco_pyro.fitting.checkpoint import Restart, copy_of, optimizer_state, restore_optimizer
 from ddco_pyro.fitting.convergence import StageEnd, share
+from ddco_pyro.fitting.devices import device_of, generators, repeatable
 from ddco_pyro.fitting.material import Material
 from ddco_pyro.fitting.objective import Objective
 from ddco_pyro.fitting.ranks import ALONE, Ranks
@@ -55,7 +56,8 @@ def advance(
     :raises TrainingError: a log-likelihood is not finite.
     """
     deadline = time.monotonic() + seconds
-    with one_thread(), Readers(material.spec.training.workers) as readers:
+    device = device_of(material.spec.training)
+    with one_thread(), repeatable(device), Readers(material.spec.training.workers) as readers:
         training = Training(material.read_by(readers), restart, checkpoint, on_event, ranks)
         return restart, training.run(until, deadline)
 
@@ -125,7 +127,7 @@ class Training:
     ) -> float:
         """One pass over the training demonstrations; the log-likelihood per step seen on the way."""
         now, total = self.progress, 0.0
-        with torch.random.fork_rng(devices=[]):
+        with torch.random.fork_rng(devices=generators(model.device)):
             place = now.restart, now.stage, now.epoch
             torch.manual_seed(self._material.seed(*place))
             model.train()

@@ -6,6 +6,7 @@ A baseline is a hierarchy without option levels whose meta-policy emits control.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from functools import cached_property
 from types import MappingProxyType
 from typing import Literal
@@ -28,6 +29,9 @@ from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
 BYTES_AT_ONCE = 256 * 10**6
 """Most bytes that networks take for the steps that go through them together, one step at least; less where less memory
 is allowed (:func:`ddco_pyro.data.memory.share`)."""
+
+HOST = torch.device("cpu")
+"""Where everything but networks is: tables, inference, emissions and their spreads."""
 
 Emits = Literal["options", "control"]
 
@@ -116,7 +120,8 @@ class Hierarchy(nn.Module):
         parts: tuple[ControlPart, ...] | None = None,
     ) -> None:
         super().__init__()
-        self.steps = steps
+        self.steps, self.device = steps, HOST
+        self._reduced = spec.training.precision == "bfloat16"
         self.encoder = ObservationEncoder(spec.observations, shapes)
         varying = [dimension for dimension in range(control_size) if dimension not in constant]
         parts = all_gaussian(varying) if parts is None else parts
@@ -130,6 +135,15 @@ class Hierarchy(nn.Module):
         network, emits = _meta_policy(spec)
         with named("hierarchy.meta_policy" if levels else "baseline.policy"):
             self.meta_policy = Caller(network, emits, below, shape, spec.control, scaling, copies=1)
+
+    def place(self, device: torch.device) -> Hierarchy:
+        """Have the networks, and nothing else, on a device. Whatever calls them gives and gets tensors on the host."""
+        if device != self.device:
+            _ = self.step_bytes  # counted on the host: chunks are the same wherever networks are
+            for network in self.networks().values():
+                network.to(device)
+            self.device = device
+        return self
 
     @property
     def depth(self) -> int:
@@ -191,8 +205,9 @@ class Hierarchy(nn.Module):
             return self.advance(inputs, None, discovering)[0]
         answers: list[Answers] = []
         states: States | None = None
+        there = torch.empty(0, device=self.device)  # the device whose random numbers are drawn again
         for chunk in chunks:
-            said, states = checkpoint(self._answers, chunk, states, discovering, use_reentrant=False)
+            said, states = checkpoint(self._answers, chunk, states, discovering, there, use_reentrant=False)
             answers.append(said)
         return self._outputs([torch.cat(each, dim=1) for each in zip(*answers, strict=True)], discovering)
 
@@ -211,17 +226,21 @@ class Hierarchy(nn.Module):
         return self._outputs(answers, discovering), after
 
     def _answers(
-        self, inputs: Inputs, states: States | None, discovering: int | None
+        self, inputs: Inputs, states: States | None, discovering: int | None, _: Tensor | None = None
     ) -> tuple[Answers, dict[str, State]]:
-        """The networks' own outputs, and their states after them."""
-        inputs, carried, answers = inputs.loaded(), Carried(states), []
-        for number, level in enumerate(self.option_levels()[:discovering]):
-            place, trunk = f"levels.{number}", level.trunk
-            seen = inputs if trunk is None else carried.answer(f"{place}.trunk", trunk, inputs)
-            answers.append(carried.answer(f"{place}.policy", level.policy.network, seen))
-            answers.append(carried.answer(f"{place}.termination", level.termination, seen))
-        if not discovering:
-            answers.append(carried.answer("meta_policy", self.meta_policy.network, inputs))
+        """The networks' own outputs, and their states after them, which stay where the networks are."""
+        inputs, carried, answers = inputs.loaded().to(self.device), Carried(states), []
+        reduced = self._reduced and self.training
+        with torch.autocast(self.device.type, torch.bfloat16) if reduced else nullcontext():
+            for number, level in enumerate(self.option_levels()[:discovering]):
+                place, trunk = f"levels.{number}", level.trunk
+                seen = inputs if trunk is None else carried.answer(f"{place}.trunk", trunk, inputs)
+                answers.append(carried.answer(f"{place}.policy", level.policy.network, seen))
+                answers.append(carried.answer(f"{place}.termination", level.termination, seen))
+            if not discovering:
+                answers.append(carried.answer("meta_policy", self.meta_policy.network, inputs))
+        if reduced or self.device != HOST:
+            answers = [said.float().to(HOST) if reduced else said.to(HOST) for said in answers]
         return answers, carried.after
 
     def _outputs(self, answers: Answers, discovering: int | None) -> Outputs:

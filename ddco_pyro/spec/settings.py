@@ -268,8 +268,8 @@ class TrainingSpec(Model):
     batch_size: Count = 16
     """Trajectories in each gradient step."""
     shards: Count = 1
-    """Parts of a minibatch, which at most as many processes may share (``fit --processes``); its gradient is the sum of
-    theirs. Results depend on this number, by rounding and by what dropout draws, and not on that of processes."""
+    """Parts of a minibatch, which at most as many processes may share (``fit --processes``). Results depend on this
+    number, by rounding and by what dropout draws, and not on that of processes."""
     restarts: Count = 1
     """Independent initialisations; the best on the tuning demonstrations is kept."""
     halving: Count | None = 50
@@ -283,8 +283,11 @@ class TrainingSpec(Model):
     patience: Count | None = 20
     """Epochs without improvement before a stage stops; null for never."""
     workers: int = Field(default=0, ge=0)
-    """Processes that read pictures ahead while networks are trained; 0: they are read in between. The result is the
-    same for any number."""
+    """Processes that read pictures ahead; 0: they are read in between. The result is the same for any number."""
+    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    """Where networks are trained and evaluated: ``cpu``, ``cuda`` (a GPU), or ``auto``: a GPU where there is one."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """``bfloat16``: networks multiply in it in gradient steps alone (torch's autocast)."""
     clip_gradient: Positive | None = None
     """Largest norm of a gradient; null for no limit."""
     labels: LabelsSpec | None = None

@@ -105,7 +105,7 @@ class Conv(nn.Module):
     def _pool(self, maps: Tensor) -> Tensor:
         """[M, K · filters, H, W] to [M, K · filters, features of a map]."""
         if self.pool == "mean":
-            return nn.functional.adaptive_avg_pool2d(maps, self.pooled)
+            return _field_means(maps, self.pooled)
         return maps if self.pool == "flatten" else _spatial_softmax(maps)
 
     def _map_features(self, key: str, size: tuple[int, ...]) -> int:
@@ -125,6 +125,21 @@ class Conv(nn.Module):
 def _convolution(layer: ConvolutionLayer, channels: int, copies: int, groups: int = 1) -> nn.Conv2d:
     size = copies * layer.filters
     return nn.Conv2d(channels, size, layer.kernel, layer.stride, layer.padding, groups=groups)
+
+
+def _field_means(maps: Tensor, count: int) -> Tensor:
+    """The means of ``count`` × ``count`` fields of each map [..., H, W], [..., count, count]."""
+    if maps.device.type == "cpu":
+        return nn.functional.adaptive_avg_pool2d(maps, count)
+    rows, columns = (_shares(length, count).to(maps) for length in maps.shape[-2:])
+    return rows @ maps @ columns.mT  # on a GPU torch's own adds gradients in no fixed order
+
+
+def _shares(length: int, count: int) -> Tensor:
+    """Which part each place has in the mean of each field, cut as ``adaptive_avg_pool2d`` does, [count, length]."""
+    field, place = torch.arange(count)[:, None], torch.arange(length)
+    inside = (place >= field * length // count) & (place < -(-(field + 1) * length // count))
+    return inside / inside.sum(1, keepdim=True)
 
 
 def _spatial_softmax(maps: Tensor) -> Tensor:

@@ -98,6 +98,12 @@ class Inputs:
         """
         return Inputs(self.vectors, self.images.loaded(), self.time) if isinstance(self.images, Frames) else self
 
+    def to(self, device: torch.device) -> Inputs:
+        """The same on a device; images, which have to be in memory, go there as they are, uint8."""
+        if self.time.device == device:
+            return self
+        return self.map(lambda array: array.to(device), self.time.to(device))
+
     def map(self, change: Callable[[Tensor], Tensor], time: Tensor) -> Inputs:
         """The same of changed arrays, at other times."""
         vectors, images = (

@@ -1,0 +1,56 @@
+"""On which device networks live: what ``training.device`` stands for on this machine."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from ddco_pyro.model.hierarchy import HOST
+from ddco_pyro.spec import SpecError, TrainingSpec
+
+WORKSPACE = "CUBLAS_WORKSPACE_CONFIG"
+"""Without it cuBLAS may add in another order each time; read when CUDA is used first."""
+
+
+def device_of(training: TrainingSpec) -> torch.device:
+    """The device that a spec asks for; of several GPUs each process of a machine has its own (``LOCAL_RANK``).
+
+    :raises SpecError: there is none.
+    """
+    if training.device == "cpu" or (training.device == "auto" and not torch.cuda.is_available()):
+        return HOST
+    if not torch.cuda.is_available():
+        raise SpecError(
+            f"training.device: cuda: torch {torch.__version__} has no GPU here; say cpu, or auto for a GPU where there "
+            "is one"
+        )
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)) % torch.cuda.device_count())
+
+
+def described(device: torch.device) -> str:
+    """Its kind, and which of that kind where it matters: what a run's bits depend on."""
+    return f"cuda ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else device.type
+
+
+def generators(device: torch.device) -> list[torch.device]:
+    """The devices beside the host whose generators draw in training (``torch.random.fork_rng``)."""
+    return [device] if device.type == "cuda" else []
+
+
+@contextmanager
+def repeatable(device: torch.device) -> Iterator[None]:
+    """Inside, a GPU gives the same bits each time, and float32 is float32 (no TF32); nothing changes on the host."""
+    if device.type != "cuda":
+        yield
+        return
+    os.environ.setdefault(WORKSPACE, ":4096:8")
+    before = torch.are_deterministic_algorithms_enabled()
+    torch.use_deterministic_algorithms(True)
+    try:
+        with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
+            yield
+    finally:
+        torch.use_deterministic_algorithms(before)

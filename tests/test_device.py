@@ -1,0 +1,267 @@
+"""Networks on a device, everything else on the host; the same fit wherever that is, and a clear line where it is not.
+
+Without a GPU a double stands for one (``elsewhere``): it computes here, and refuses what a GPU would refuse.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from command_line import call
+from elsewhere import THERE, Device, Elsewhere
+
+import ddco_pyro
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.export import export
+from ddco_pyro.fitting import devices
+from ddco_pyro.fitting.restarts import OtherDevice
+from ddco_pyro.model.networks.conv import _field_means
+from ddco_pyro.spec import Spec, parse_spec
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*to a meta parameter:UserWarning")  # the double is called meta
+
+USERS = ("building", "material", "restarts", "training")
+"""Who asks for the device of a spec."""
+
+SPATIAL = {"network": "conv", "filters": 3, "kernel": 3, "pool": "spatial_softmax", "hidden": [5]}
+MEANS = {"network": "conv", "filters": 2, "kernel": 3, "pooled": 2, "hidden": [4]}
+MLP = {"network": "mlp", "hidden": [6], "inputs": ["pose"]}
+LINEAR = {"network": "linear", "inputs": ["pose"]}
+LSTM = {"network": "lstm", "over": {"network": "mlp", "hidden": [4], "inputs": ["pose"]}, "hidden": 3}
+TIMES = {"network": "per_timestep", "hidden": [4], "inputs": ["pose"]}
+BRANCHES = {"network": "branches", "of": {"camera": MEANS, "pose": {"network": "mlp", "hidden": [3]}}, "hidden": [4]}
+SAME = {
+    "mlp": {"policy": MLP, "termination": LINEAR},
+    "spatial softmax": {"policy": SPATIAL, "termination": LINEAR},
+}
+"""Those of which a double computes every number as the host does."""
+
+DROPPING = {"policy": {**MLP, "dropout": 0.2}, "termination": LINEAR}
+"""Dropout draws other numbers on every kind of device."""
+
+OTHER = {
+    "field means": {"policy": MEANS, "termination": MLP},
+    "per_timestep": {"policy": TIMES, "termination": MLP},
+    "lstm": {"policy": LSTM, "termination": LINEAR},
+    "a trunk of branches": {"trunk": BRANCHES, "policy": {"network": "linear"}, "termination": {"network": "linear"}},
+}
+"""Those that are computed by another algorithm, or in another order, where they are not on the host."""
+
+QUICK = ("mlp", "lstm", "a trunk of branches")
+ALL = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in (*SAME, *OTHER)]
+
+
+@pytest.fixture(scope="module")
+def demos() -> Demonstrations:
+    random = np.random.default_rng(0)
+
+    def one(number: int) -> Demonstration:
+        steps = 5 + number
+        seen = {
+            "pose": random.normal(size=(steps, 3)),
+            "camera": random.integers(0, 256, (steps, 9, 7, 3), dtype=np.uint8),
+        }
+        return Demonstration(f"demo_{number}", seen, random.normal(size=(steps, 2)))
+
+    return Demonstrations(tuple(one(number) for number in range(7)))
+
+
+def spec_of(level: dict[str, Any], **training: Any) -> Spec:
+    return parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.2},
+            "observations": ["pose", "camera"],
+            "control": {"std": {"learn": True}},
+            "hierarchy": {"levels": [{"count": 2, **level}], "meta_policy": LINEAR},
+            "training": {"epochs": 3, "batch_size": 3, "clip_gradient": 1.0, "layerwise": False, **training},
+        }
+    )
+
+
+def on(monkeypatch: pytest.MonkeyPatch, device: torch.device) -> None:
+    # it counts on the device that the double is named after
+    monkeypatch.setattr("ddco_pyro.fitting.building._refuse_giants", lambda *_: None)
+    for module in USERS:
+        monkeypatch.setattr(f"ddco_pyro.fitting.{module}.device_of", lambda training: device)
+
+
+def weights(fit: ddco_pyro.Fit) -> dict[str, np.ndarray]:
+    return {name: value.detach().cpu().numpy() for name, value in fit.hierarchy.state_dict().items()}
+
+
+# --- networks there, everything else here -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("network", ALL)
+def test_a_fit_with_networks_elsewhere(demos: Demonstrations, network: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each tensor that meets another is asked for its device; weights and numbers are those of a fit on the host."""
+    spec = spec_of((SAME | OTHER)[network], optimizer={"name": "momentum", "lr": 0.01})  # Adam's steps hide their sizes
+    here = ddco_pyro.fit(spec, demos)
+    monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", 6 * here.hierarchy.step_bytes)  # in chunks too
+    here = ddco_pyro.fit(spec, demos)
+    on(monkeypatch, THERE)
+    with Device():
+        there = ddco_pyro.fit(spec, demos)
+        placed = [parameter for module in there.hierarchy.networks().values() for parameter in module.parameters()]
+        assert placed
+        assert all(isinstance(parameter.data, Elsewhere) for parameter in placed)
+        others = {id(parameter) for parameter in there.hierarchy.parameters()} - set(map(id, placed))
+        assert others  # the spreads of controls
+        assert {p.device.type for p in there.hierarchy.parameters() if id(p) in others} == {"cpu"}
+        moved = weights(there)
+        acted = there.controller().act({key: values[0] for key, values in demos[0].observations.items()})
+    close = {"rtol": 0, "atol": 0} if network in SAME else {"rtol": 1e-4, "atol": 1e-5}
+    for name, values in weights(here).items():
+        np.testing.assert_allclose(moved[name], values, err_msg=name, **close)
+    expected = here.controller().act({key: values[0] for key, values in demos[0].observations.items()})
+    np.testing.assert_allclose(acted, expected, **close)
+    assert there.metrics["training"]["device"] == THERE.type
+    each = [fit.metrics["log_likelihood_per_step"]["valid"] for fit in (there, here)]
+    assert each[0] == pytest.approx(each[1], rel=0 if network in SAME else 1e-3)
+
+
+def test_the_double_refuses_what_was_left_on_the_host() -> None:
+    with Device():
+        there = torch.ones(3).to(THERE)
+        with pytest.raises(AssertionError, match="mixes devices"):
+            there + torch.ones(3)
+        assert float((there + 1).cpu().sum()) == 6
+
+
+@pytest.mark.slow
+def test_what_was_fitted_elsewhere_is_exported(demos: Demonstrations, tmp_path, monkeypatch) -> None:
+    on(monkeypatch, THERE)
+    with Device():
+        fit = ddco_pyro.fit(spec_of(SAME["mlp"], epochs=1), demos)
+        fit.hierarchy.place(torch.device("cpu"))
+    assert export(fit, tmp_path / "out").keys() == {"numpy", "torch"}
+
+
+@pytest.mark.parametrize("size", [(9, 7), (8, 16), (5, 30)])
+def test_means_of_fields_are_those_of_torch(size: tuple[int, int]) -> None:
+    """Value and gradient; uneven fields overlap."""
+    maps = torch.randn(2, 3, *size, dtype=torch.float64, requires_grad=True)
+    expected = torch.nn.functional.adaptive_avg_pool2d(maps, 5)
+    (slope,) = torch.autograd.grad(expected.square().sum(), maps)
+    with Device():
+        moved = maps.detach().to(THERE).requires_grad_()
+        means = _field_means(moved, 5)
+        (own,) = torch.autograd.grad(means.square().sum(), moved)
+        torch.testing.assert_close(means.detach().cpu(), expected.detach())
+        torch.testing.assert_close(own.cpu(), slope)
+
+
+# --- precision --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("network", ALL)
+def test_networks_in_bfloat16(demos: Demonstrations, network: str) -> None:
+    """In gradient steps alone: parameters stay float32, and what is fitted is near what float32 fits."""
+    level = (SAME | OTHER)[network]
+    exact, reduced = (ddco_pyro.fit(spec_of(level, precision=kind), demos) for kind in ("float32", "bfloat16"))
+    assert {values.dtype for values in weights(reduced).values()} == {
+        values.dtype for values in weights(exact).values()
+    }
+    first = [fit.hierarchy.eval()(fit.hierarchy.encoder.inputs([demos[0].observations])) for fit in (exact, reduced)]
+    assert {tensor.dtype for said in first for tensor in said.tensors()} == {torch.float32}
+    values = [fit.metrics["log_likelihood_per_step"]["train"] for fit in (exact, reduced)]
+    assert values[0] != values[1]
+    assert values[0] == pytest.approx(values[1], abs=0.02)
+
+
+# --- what is said -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_no_gpu_is_one_line(demos: Demonstrations, tmp_path) -> None:
+    demos.write(tmp_path / "demos.hdf5")
+    data = json.loads(spec_of(SAME["mlp"], device="cuda").model_dump_json(by_alias=True))
+    data["demonstrations"]["path"] = str(tmp_path / "demos.hdf5")
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(data))
+    for command in (["fit", tmp_path / "spec.yaml", "--out", tmp_path / "run"], ["check", tmp_path / "spec.yaml"]):
+        ended = call(*command)
+        assert (ended.status, ended.err.count("\n")) == (2, 1)
+        assert ended.err.startswith(f"ddco-pyro: training.device: cuda: torch {torch.__version__} has no GPU here")
+    assert not (tmp_path / "run").exists()
+    ended = call("check", tmp_path / "spec.yaml", "--set", "training.device=auto")
+    assert (ended.status, "networks: on cpu, float32 in gradient steps" in ended.out) == (0, True)
+
+
+def test_of_several_gpus_each_process_has_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    training = spec_of(SAME["mlp"], device="auto").training
+    seen = []
+    for rank in range(3):
+        monkeypatch.setenv("LOCAL_RANK", str(rank))
+        seen.append(devices.device_of(training))
+    assert seen == [torch.device("cuda", index) for index in (0, 1, 0)]
+    assert devices.device_of(spec_of(SAME["mlp"]).training) == torch.device("cpu")
+
+
+def test_a_run_goes_on_where_it_was_begun(demos: Demonstrations, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the same kind of device bit for bit; on another it is refused before a bit is trained."""
+    spec = spec_of(DROPPING, initialize="random")
+
+    def stop(event: Any) -> None:
+        if type(event).__name__ == "EpochEnded" and event.epoch == 2:
+            raise KeyboardInterrupt
+
+    on(monkeypatch, THERE)
+    with Device():
+        whole = ddco_pyro.fit(spec, demos, tmp_path / "whole")
+        with pytest.raises(KeyboardInterrupt):
+            ddco_pyro.fit(spec, demos, tmp_path / "killed", on_event=stop)
+    on(monkeypatch, torch.device("cpu"))
+    with pytest.raises(OtherDevice, match=r"restart-0.safetensors: was trained on meta, and networks are on cpu here"):
+        ddco_pyro.fit(spec, demos, tmp_path / "killed")
+    on(monkeypatch, THERE)
+    with Device():
+        again = ddco_pyro.fit(spec, demos, tmp_path / "killed")
+        for name, values in weights(whole).items():
+            np.testing.assert_array_equal(weights(again)[name], values)
+    for name in ("model.safetensors", "history.csv"):
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+# --- a GPU ------------------------------------------------------------------------------------------------------------
+
+gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch has no GPU here")
+
+
+@gpu
+@pytest.mark.parametrize("network", [*SAME, *OTHER, "dropout"])
+def test_a_gpu_gives_the_same_bits_again(demos: Demonstrations, network: str) -> None:
+    """Dropout too, whose numbers are those of the GPU's generator, which is left as it was."""
+    spec = spec_of((SAME | OTHER | {"dropout": DROPPING})[network], device="cuda")
+    torch.cuda.manual_seed(7)
+    before = torch.cuda.get_rng_state()
+    first = weights(ddco_pyro.fit(spec, demos))
+    assert torch.equal(torch.cuda.get_rng_state(), before)
+    torch.cuda.manual_seed(8)
+    for name, values in weights(ddco_pyro.fit(spec, demos)).items():
+        np.testing.assert_array_equal(values, first[name], err_msg=name)
+
+
+@gpu
+def test_a_chunk_drops_the_same_in_both_passes_on_a_gpu(demos: Demonstrations, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The gradient of chunks that are computed twice is that of the same chunks, all kept."""
+    fit = ddco_pyro.fit(spec_of(DROPPING, epochs=1, device="cuda"), demos)
+    monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", 3 * fit.hierarchy.step_bytes)
+    model = fit.hierarchy.train()
+    inputs = model.encoder.inputs([demos[6].observations])
+
+    def gradient() -> torch.Tensor:
+        torch.manual_seed(3)
+        model.zero_grad()
+        sum(tensor.square().sum() for tensor in model(inputs).tensors()).backward()
+        return torch.cat([p.grad.flatten().cpu() for p in model.parameters() if p.grad is not None])
+
+    again = gradient()
+    monkeypatch.setattr("ddco_pyro.model.hierarchy.checkpoint", lambda call, *arguments, **_: call(*arguments))
+    torch.testing.assert_close(again, gradient())
