@@ -14,6 +14,7 @@ import yaml
 from command_line import call
 from oracle import paths
 from planted import CONTROL, make_spec, make_trainer, make_truth, plant
+from sklearn.cluster import KMeans
 from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
@@ -205,6 +206,20 @@ def test_the_clusters_of_labelled_options_start_from_their_steps(order):
         labels = np.where((np.arange(12) < 3) & (numbers[truth] <= known), numbers[truth], -1)
         choices = Clusters(trainer, 3, seed=0, labels=torch.tensor(labels[None])).choices(trainer)
         np.testing.assert_array_equal(choices[0], numbers[truth])
+
+
+def test_a_short_option_with_labels_is_not_given_half_of_a_long_one():
+    """As k-means to its end does, which knows of sums of squares alone."""
+    places = np.concatenate([[0.0, 0.2], np.linspace(1.5, 8, 40), np.full(40, 20.0)])
+    truth = np.repeat([1, 2, 3], [2, 40, 40])
+    states = np.column_stack([places, np.zeros(82)])
+    labels = np.full(82, -1)
+    labels[[0, 17, 42]] = 1, 2, 3
+    batch = make_batchable(Demonstrations((Demonstration("demo", {"state": states}, states),)))
+    to_its_end = KMeans(3, init=states[[0, 17, 42]], n_init=1).fit_predict(states) + 1
+    choices = Clusters(batch, 3, seed=0, labels=torch.tensor(labels[None])).choices(batch)[0].numpy()
+    assert (to_its_end[truth < 3] == truth[truth < 3]).mean() < 0.65
+    assert (choices[truth < 3] == truth[truth < 3]).mean() > 0.75
 
 
 def make_batchable(demos):

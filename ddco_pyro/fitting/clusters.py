@@ -20,6 +20,9 @@ from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import BYTES_AT_ONCE
 from ddco_pyro.model.networks.conv import POOLED
 
+ITERATIONS = 300
+"""Of k-means at most."""
+
 
 class Clusters:
     """k-means clusters of the observations of every step of a batch, named as the options 1 to k.
@@ -27,7 +30,8 @@ class Clusters:
     :param controls: cluster observations and controls together, with as much weight on the controls as on the
         observations: steps that look alike but are acted on differently are then told apart.
     :param labels: the options of the steps that have one, 1 to m, -1 for the others, [N, T]: the clusters of these
-        options start from the means of their steps, the others as k-means++ does from there.
+        options start from the means of their steps, the others as k-means++ does from there. Where all options have
+        labelled steps clusters move once: further iterations may let two of them change places.
 
     Fewer than ``options`` clusters are found where there are fewer distinct observations. Of more steps than
     :func:`most_rows` as many are drawn at random, and the clusters are theirs.
@@ -42,7 +46,9 @@ class Clusters:
         chosen[np.random.default_rng(seed).permutation(batch.steps)[self._most :]] = False
         rows = np.concatenate(list(_only(chosen, self._blocks(batch))))
         start = "k-means++" if labels is None else _Start(labels[_alive(batch)].numpy()[chosen])
-        self._kmeans = KMeans(distinct(rows, options), init=start, n_init=10, random_state=seed).fit(rows)
+        number = distinct(rows, options)
+        most = 1 if isinstance(start, _Start) and start.names(number) else ITERATIONS
+        self._kmeans = KMeans(number, init=start, n_init=10, max_iter=most, random_state=seed).fit(rows)
 
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
@@ -114,8 +120,15 @@ class _Start:
     def __init__(self, labels: np.ndarray) -> None:
         self.labels = labels
 
+    def _labelled(self, clusters: int) -> list[int]:
+        return [int(option) for option in np.unique(self.labels) if 0 < option <= clusters]
+
+    def names(self, clusters: int) -> bool:
+        """Whether every cluster has labelled rows."""
+        return len(self._labelled(clusters)) == clusters
+
     def __call__(self, rows: np.ndarray, clusters: int, random_state: np.random.RandomState) -> np.ndarray:
-        labelled = [option for option in np.unique(self.labels) if 0 < option <= clusters]
+        labelled = self._labelled(clusters)
         means = {option: rows[self.labels == option].mean(0) for option in labelled}
         for option in set(range(1, clusters + 1)) - set(labelled):
             far = euclidean_distances(rows, np.stack(list(means.values())), squared=True).min(1)
