@@ -47,7 +47,7 @@ def render(physics: mujoco.Physics, camera: str, height: int, width: int) -> np.
         if (camera, height, width) not in kept:
             proxy = weakref.proxy(physics)
             kept[camera, height, width] = mujoco.Camera(proxy, height, width, camera, max_geom=MAX_GEOMS)
-        picture: np.ndarray = kept[camera, height, width].render()
+        picture: np.ndarray = kept[camera, height, width].render().copy()  # it draws into the same array
         return picture
     except _ERRORS as error:
         raise _no_opengl(error) from error
