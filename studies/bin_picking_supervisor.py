@@ -4,7 +4,8 @@
 
 Collects the demonstrations of ``specs/bin_picking.yaml``, unless they have been. What is held at the moment of decision
 is also read from the observed left mask alone, where the load is shown, by a classifier that is tested on bins it was
-not trained on: it says how much of that a policy can know. Writes ``docs/results/bin_picking/supervisor.json`` and ``.md``.
+not trained on: it says how much of that a policy can know. Writes ``docs/results/bin_picking/supervisor.json`` and
+``supervisor.md``.
 """
 
 from __future__ import annotations
@@ -62,8 +63,8 @@ def grasps(demos: Demonstrations) -> dict[str, Any]:
 
 
 def from_pictures(demos: Demonstrations) -> dict[str, Any]:
-    """How often pixels of the left mask, and how often the shape seen in it, say what is held; every bin is predicted from
-    the others.
+    """How often pixels of the left mask, and how often the shape seen in it, say what is held; every bin is predicted
+    from the others.
     """
     shown, held, bins = [], [], []
     for number, demo in enumerate(demos):
@@ -94,8 +95,8 @@ def _where_shown(mask: np.ndarray) -> np.ndarray:
 
 
 def shape(seen: np.ndarray) -> np.ndarray:
-    """What is seen in a mask [H, W] of 0 and 1, in numbers: its pixels and those inside it, its parts, its spread along and
-    across, Hu's moments, and where it begins and ends.
+    """What is seen in a mask [H, W] of 0 and 1, in numbers: its pixels and those inside it, its parts, its spread along
+    and across, Hu's moments, and where it begins and ends.
     """
     rows, columns = np.nonzero(seen)
     if len(rows) < FEWEST:
