@@ -10,7 +10,7 @@ from ..rendering import mujoco, render
 from .geometry import BASELINE, CAMERA_HEIGHT, FOCAL_LENGTH, IMAGE_SIZE
 
 EYES = ("left_eye", "right_eye")
-OBSERVED_SIZE = 64  # pixels by side of the masks that are observed: 1 mm each
+OBSERVED_SIZE = 64  # pixels by side of the masks that are observed: 1.1 mm each
 COVERED = 0.3  # of a pixel of those, from which on it counts as covered
 DISPARITY = round(FOCAL_LENGTH * BASELINE / CAMERA_HEIGHT)  # pixels, at the bin's floor
 SEARCH, WINDOW = 4, 12  # pixels about that disparity that are tried, and half the side of what is matched

@@ -1,7 +1,7 @@
 """Where things are: bin, cups, the places of a trial's way points, and the pixels of the overhead stereo pair.
 
-Metres and radians; pixels are counted from the centre of the upper left one. The world's origin is the centre of the
-bin's floor, x points towards the reject cup, y away from the arm.
+Metres and radians; pixels are counted from the centre of the upper left one. The world's origin is on the
+bin's floor, between the cups; x points towards the reject cup, y away from the arm.
 """
 
 from __future__ import annotations
@@ -10,20 +10,24 @@ import numpy as np
 
 from ..psm import Pose, rotation
 
-BIN_OUTSIDE = 0.029  # half the side of the bin, with its walls
+BIN_OUTSIDE = 0.029  # half the width of the bin, with its walls, and from the pile's middle to its near end
 BIN_INSIDE = 0.025
+BIN_FAR = 0.020  # by which its far end is further away than the near one
 CUPS = {"accept": np.array([-0.061, 0.0]), "reject": np.array([0.061, 0.0])}
 CUP_INSIDE = 0.026  # half the side
 FOAM_DEPTH = 0.006  # the foam gives way so far under the jaws
 
-NEUTRAL_TURN = np.pi / 4  # of the gripper about the vertical, where it shows what it holds and lets it go
+NEUTRAL_TURN = np.pi / 4  # of the gripper about the vertical, over the cups
+SHOWN_TURN = np.pi / 2  # where it shows what it holds, which is then along the bin's far wall
 GRASP_HEIGHT = 0.003  # of the middle of the pads
-SHOWING = np.array([0.0, 0.014, 0.030])  # over a margin of the bin, clear of the pile
+SHOWING = np.array([0.0, 0.033, 0.030])  # over the bin's far end, where nothing is dropped
+RETURNING = np.array([0.0, 0.004, 0.024])  # over the pile again, where what is not to be carried is let go
 
 IMAGE_SIZE = 256  # pixels by side, as rendered
 CAMERA_HEIGHT = 0.650
 BASELINE = 0.005
-FIELD_OF_VIEW = np.deg2rad(5.6364)
+CAMERA_Y = 0.010  # over the middle of the bin
+FIELD_OF_VIEW = np.deg2rad(6.3401)
 FOCAL_LENGTH = IMAGE_SIZE / 2 / np.tan(FIELD_OF_VIEW / 2)  # pixels
 MIDDLE = (IMAGE_SIZE - 1) / 2
 OBJECT_HEIGHT = 0.001  # of what lies on the floor; its depth in the pictures is taken for this
@@ -41,7 +45,7 @@ def nearest_turn(turn: float) -> float:
 
 def project(points: np.ndarray, right: bool = False) -> np.ndarray:
     """Pixels [..., 2] (column, row) of points [..., 3] in the picture of the left or the right eye."""
-    eye = np.array([BASELINE / 2 if right else -BASELINE / 2, 0.0, CAMERA_HEIGHT])
+    eye = np.array([BASELINE / 2 if right else -BASELINE / 2, CAMERA_Y, CAMERA_HEIGHT])
     seen = np.asarray(points) - eye
     scale = FOCAL_LENGTH / -seen[..., 2]
     return np.stack([MIDDLE + scale * seen[..., 0], MIDDLE - scale * seen[..., 1]], axis=-1)
@@ -50,12 +54,12 @@ def project(points: np.ndarray, right: bool = False) -> np.ndarray:
 def lying_at(pixel: np.ndarray) -> np.ndarray:
     """The point [3] of a lying object that the left eye sees at ``pixel`` [2]."""
     scale = (CAMERA_HEIGHT - OBJECT_HEIGHT) / FOCAL_LENGTH
-    x, y = (pixel[0] - MIDDLE) * scale - BASELINE / 2, (MIDDLE - pixel[1]) * scale
+    x, y = (pixel[0] - MIDDLE) * scale - BASELINE / 2, CAMERA_Y + (MIDDLE - pixel[1]) * scale
     return np.array([x, y, OBJECT_HEIGHT])
 
 
 def place_of(position: np.ndarray) -> str:
     """Where a point [3] is: ``bin``, ``accept``, ``reject``, or ``outside`` of all of them."""
-    if np.all(np.abs(position[:2]) < BIN_OUTSIDE):
+    if np.all(np.abs(position[:2] - [0.0, BIN_FAR / 2]) < [BIN_OUTSIDE, BIN_OUTSIDE + BIN_FAR / 2]):
         return "bin"
     return next((name for name, cup in CUPS.items() if np.all(np.abs(position[:2] - cup) < CUP_INSIDE)), "outside")

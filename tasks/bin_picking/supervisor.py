@@ -16,7 +16,7 @@ from ddco_pyro.simulation.task import Observation
 
 from .. import psm
 from ..psm import Pose
-from .geometry import CUPS, GRASP_HEIGHT, NEUTRAL_TURN, SHOWING, lying_at, upright
+from .geometry import CUPS, GRASP_HEIGHT, NEUTRAL_TURN, RETURNING, SHOWING, SHOWN_TURN, lying_at, upright
 from .objects import ACCEPTED, KINDS
 from .physics import Physics
 
@@ -55,7 +55,7 @@ def grasp_plan(grasp: np.ndarray) -> list[WayPoint]:
         return WayPoint(upright(turn, np.array([at[0], at[1], GRASP_HEIGHT + height])), is_open, tolerance)
 
     approach = [over(height, True, FAR if height > 0.01 else NEAR) for height in APPROACH_HEIGHTS]
-    showing = WayPoint(upright(NEUTRAL_TURN, SHOWING), False, FAR)
+    showing = WayPoint(upright(SHOWN_TURN, SHOWING), False, FAR)
     return [*approach, over(0.0, False, NEAR), over(LIFT_HEIGHT, False, FAR), showing]
 
 
@@ -68,8 +68,8 @@ def cup_plan(cup: str) -> list[WayPoint]:
     return [WayPoint(pose, number == 3, FAR) for number, pose in enumerate(poses)]
 
 
-RECOVERY = [WayPoint(upright(NEUTRAL_TURN, SHOWING), True, FAR)]
-"""What ends a trial in which nothing or several objects are held: the jaws open in place."""
+RECOVERY = [WayPoint(upright(SHOWN_TURN, RETURNING), is_open, FAR) for is_open in (False, True)]
+"""What ends a trial in which nothing or several objects are held: back over the bin, where the jaws open."""
 
 
 class OpenLoop:
@@ -90,7 +90,7 @@ class OpenLoop:
         """The phase of the step just decided: 0 approach, 1 grasp, 2 show, 3 recover, 4 carry, 5 release."""
         if self._step < SHOWN:
             return {"phase": (0, 0, 0, 1, 2, 2)[self._step]}
-        if len(self._plan) == SHOWN + 1:
+        if len(self._plan) == SHOWN + len(RECOVERY):
             return {"phase": PHASES.index("recover")}
         return {"phase": PHASES.index("release" if self._step == len(self._plan) - 1 else "carry")}
 
@@ -120,8 +120,8 @@ class Supervisor(OpenLoop):
 
     Before each step it predicts where the next way point would really bring the gripper. Where that is further from the
     way point than an operator would let pass, it changes the motors' set points by what removes the difference, from
-    here on. What it holds decides what follows: one object is carried to its cup; with none or several the jaws open in
-    place, and the next trial starts from there.
+    here on. What it holds decides what follows: one object is carried to its cup; with none or several the arm goes
+    back over the bin and the jaws open, and the next trial starts from there.
 
     As with a person, what it does is coarser than what it means to do. ``intended`` is the control it meant, which is
     recorded: demonstrations show how to come back from an inexact move without teaching the inexactness.

@@ -80,6 +80,8 @@ def test_turns_are_the_nearest_to_the_neutral_one_of_the_same_line() -> None:
 
 def test_places() -> None:
     assert geometry.place_of(np.array([0.02, -0.02, 0.0])) == "bin"
+    assert geometry.place_of(np.array([0.0, 0.045, 0.0])) == "bin"
+    assert geometry.place_of(np.array([0.0, -0.031, 0.0])) == "outside"
     assert geometry.place_of(np.array([-0.061, 0.02, 0.0])) == "accept"
     assert geometry.place_of(np.array([0.061, 0.0, 0.5])) == "reject"
     assert geometry.place_of(np.array([0.032, 0.0, 0.0])) == "outside"
@@ -192,7 +194,7 @@ def test_friction_holds_what_the_jaws_close_on_until_they_open(environment: Envi
 
 
 def test_an_object_outside_ends_the_bin(environment: Environment) -> None:
-    lay(environment, 1, (0.0, 0.045, 0.002))
+    lay(environment, 1, (0.0, 0.055, 0.002))
     assert go(environment, (0.0, 0.0, 0.03), 1).last()
     assert task.outcome(environment)["ended_lost"] == 1.0
 
