@@ -209,6 +209,7 @@ def check(case: Case, tmp_path: Path, kills: int, seed: int) -> Killed:
     return killed
 
 
+@pytest.mark.slow
 def test_killed_and_called_again(cases: dict[str, Case], tmp_path: Path) -> None:
     check(cases["import"], tmp_path, kills=2, seed=7)
 

@@ -72,6 +72,7 @@ class Interrupting:
 # --- processes --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_same_bits_also_where_one_had_begun(undisturbed, spec, demos, tmp_path, monkeypatch):
     """Interrupted in the middle of the second rung, continued in slices of a single epoch each by two processes."""
     monkeypatch.setattr(training, "SAVE_EVERY", 0.0)

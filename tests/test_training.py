@@ -275,7 +275,7 @@ def test_what_is_called_converged_is_at_the_optimum(tmp_path):
 # --- planted hierarchies ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("counts", [pytest.param((4,), marks=pytest.mark.slow), (4, 2)])
+@pytest.mark.parametrize("counts", [(4,), pytest.param((4, 2), marks=pytest.mark.slow)])
 def test_a_planted_hierarchy_is_recovered(tmp_path, counts):
     """Held-out log-likelihood within 2 % of the truth's own, and segments that agree with the true options."""
     spec = make_spec(counts, control=CONTROL, **TRAINING)
