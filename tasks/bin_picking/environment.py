@@ -36,7 +36,7 @@ REPEATABILITY = np.array([6e-4, 6e-4, 1e-4, 2e-3, 2e-3, 2e-3])  # rad, m: standa
 LIFTED_HEIGHT = 0.018  # m: a gripper above this has lifted what it holds
 MOST_ATTEMPTS = 4 * MOST  # every fourth attempt at least brings an object into a cup
 FRAME_SIZE = (360, 480)
-SHARED_SOURCES = ("psm.py", "rendering.py", "vision.py")
+SHARED_SOURCES = ("arm.py", "psm.py", "rendering.py", "vision.py")
 
 
 class BinPicking(base.Task):

@@ -9,11 +9,11 @@ import numpy as np
 from dm_control.rl.control import PhysicsError
 
 from .. import psm
+from ..arm import ArmPhysics
 from ..rendering import mujoco
 from .geometry import FOAM_DEPTH, place_of
 from .instrument import Instrument, slack_after
 
-SET_POINT_TIME = 0.02  # s, between interpolated set points
 MOVE_TIME = 0.26  # s, to reach the goal of a control step
 SETTLE_TIME = 0.10  # s, before observing
 DROP_TIME = 0.24  # s, from one dropped object to the next
@@ -29,16 +29,15 @@ HELD_REACH = 0.030  # m, from the gripper
 PAD_HALF_LENGTH = 0.0025  # m
 
 
-class Physics(mujoco.Physics):
+class Physics(ArmPhysics):
     """The scene, with what the task measures in it."""
 
+    move_time = MOVE_TIME
     instrument = Instrument.numbered(0)
     unstable = False
     slack = np.zeros(6)
     motors = np.zeros(6)
     """What the motors were last told, [6]."""
-    _from = np.zeros(8)
-    _to = np.zeros(8)
 
     def reset(self, keyframe_id: int | None = None) -> None:
         """Back to the model's own state."""
@@ -52,12 +51,9 @@ class Physics(mujoco.Physics):
 
     def place_arm(self, joints: np.ndarray, jaw: float) -> None:
         """Put the arm at true joints [6] and the jaws at an angle (rad), at rest."""
-        servo = np.concatenate([joints, [jaw / 2, jaw / 2]])
-        self.named.data.qpos[[*psm.JOINTS, "jaw_left", "jaw_right"]] = servo
-        self._from = self._to = servo
+        self.place_servos(joints, jaw)
         self.slack = np.zeros(6)
         self.motors = self.instrument.motors(joints, self.slack)
-        self.set_control(servo)
         self.forward()  # a step begins with the forces of what was there before
 
     def place_object(self, number: int, position: np.ndarray, quaternion: np.ndarray) -> None:
@@ -94,16 +90,7 @@ class Physics(mujoco.Physics):
         """
         goal = self.predicted(motors) + noise
         self.slack, self.motors = slack_after(self.slack, motors - self.motors), motors.copy()
-        self._from, self._to = self._to, np.concatenate([goal, [jaw / 2, jaw / 2]])
-
-    def step(self, nstep: int = 1) -> None:
-        """One control step of ``nstep`` time steps: to the goal along smoothly interpolated set points, then settle."""
-        block = round(SET_POINT_TIME / self.timestep())
-        for start in range(0, nstep, block):
-            fraction = min(1.0, (start + block) * self.timestep() / MOVE_TIME)
-            blend = fraction**3 * (10.0 - 15.0 * fraction + 6.0 * fraction**2)  # minimum jerk
-            self.set_control(self._from + blend * (self._to - self._from))
-            self.advance(block)
+        self.aim(goal, jaw)
 
     def advance(self, steps: int) -> None:
         """Simulate time steps; where the simulation breaks down it stays where it was, and is ``unstable``."""
@@ -111,7 +98,7 @@ class Physics(mujoco.Physics):
             return
         before = self.get_state(), self.time()
         try:
-            super().step(steps)
+            super().advance(steps)
         except PhysicsError:
             with self.suppress_physics_errors():
                 self.unstable = True
@@ -122,16 +109,7 @@ class Physics(mujoco.Physics):
 
     def encoders(self) -> np.ndarray:
         """Joints [6] as the motors' encoders read them (rad, m)."""
-        return self.instrument.motors(np.array(self.named.data.qpos[list(psm.JOINTS)]), self.slack)
-
-    def jaw(self) -> float:
-        """The angle between the jaws (rad)."""
-        return float(np.sum(self.named.data.qpos[["jaw_left", "jaw_right"]]))
-
-    def gripper(self) -> psm.Pose:
-        """The gripper's true pose."""
-        data = self.named.data
-        return psm.Pose(np.array(data.site_xmat["gripper"]).reshape(3, 3), np.array(data.site_xpos["gripper"]))
+        return self.instrument.motors(self.true_joints(), self.slack)
 
     def centres(self) -> np.ndarray:
         """The objects' centres of mass [N, 3] (m)."""
@@ -155,7 +133,3 @@ class Physics(mujoco.Physics):
     def gripper_place(self) -> str:
         """Where the gripper is, as for an object."""
         return place_of(self.gripper().position)
-
-    def true_joints(self) -> np.ndarray:
-        """Joints [6] as they are (rad, m)."""
-        return np.array(self.named.data.qpos[list(psm.JOINTS)])

@@ -40,7 +40,7 @@ DEFLECTION = np.deg2rad([7.0, 1.5])  # turn and tilt of the needle in the hand t
 INSERTED_DEPTH = 0.003  # m
 TARGET_RADIUS = 0.005  # m
 FRAME_SIZE = (360, 480)
-SHARED_SOURCES = ("planning.py", "psm.py", "rendering.py", "vision.py")
+SHARED_SOURCES = ("arm.py", "planning.py", "psm.py", "rendering.py", "vision.py")
 
 
 class NeedleInsertion(base.Task):

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .. import psm
+from ..arm import ArmPhysics
 from ..rendering import mujoco
 from . import geometry as geometry
 
-SET_POINT_TIME = 0.02  # s, between interpolated set points
 MOVE_TIME = 0.30  # s, to reach the goal of a control step
 SETTLE_TIME = 0.16  # s, before observing
 
@@ -45,13 +45,12 @@ class Events:
     catch: np.ndarray = field(default_factory=lambda: np.zeros(2))
 
 
-class Physics(mujoco.Physics):
+class Physics(ArmPhysics):
     """The scene, with what the task measures in it."""
 
+    move_time = MOVE_TIME
     events = Events()
     deflection = np.zeros(2)  # rad: the part of turn and tilt that nothing predicts
-    _from = np.zeros(8)
-    _to = np.zeros(8)
 
     def reset(self, keyframe_id: int | None = None) -> None:
         """Back to the model's own state: nothing held, nothing pierced."""
@@ -62,13 +61,9 @@ class Physics(mujoco.Physics):
 
     def place(self, joints: np.ndarray, jaw: float, needle: psm.Pose) -> None:
         """Put the arm at true joints [6] and the jaws at an angle (rad), at rest, and lay the needle at a pose."""
-        qpos = self.named.data.qpos
-        servo = np.concatenate([joints, [jaw / 2, jaw / 2]])
-        qpos[[*psm.JOINTS, "jaw_left", "jaw_right"]] = servo
         angle = np.arctan2(needle.rotation[1, 0], needle.rotation[0, 0])
-        qpos["needle"] = [*needle.position, np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)]
-        self._from = self._to = servo
-        self.set_control(servo)
+        self.named.data.qpos["needle"] = [*needle.position, np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)]
+        self.place_servos(joints, jaw)
 
     def move_to(self, joints: np.ndarray, jaw: float) -> None:
         """Set the goal of the next control step: true joints [6] and the angle between the jaws (rad)."""
@@ -78,38 +73,21 @@ class Physics(mujoco.Physics):
             self._release()
         if not self.held():
             self.events.catch = self._catch()
-        self._from, self._to = self._to, np.concatenate([joints, [jaw / 2, jaw / 2]])
+        self.aim(joints, jaw)
 
-    def step(self, nstep: int = 1) -> None:
-        """One control step of ``nstep`` time steps: to the goal along smoothly interpolated set points, then settle."""
-        block = round(SET_POINT_TIME / self.timestep())
-        for start in range(0, nstep, block):
-            fraction = min(1.0, (start + block) * self.timestep() / MOVE_TIME)
-            blend = fraction**3 * (10.0 - 15.0 * fraction + 6.0 * fraction**2)  # minimum jerk
-            self.set_control(self._from + blend * (self._to - self._from))
-            super().step(block)
-            self._try_grip()
-            self._try_pierce()
-
-    def true_joints(self) -> np.ndarray:
-        """Joints [6] as they are (rad, m)."""
-        return np.array(self.named.data.qpos[list(psm.JOINTS)])
+    def advance(self, steps: int) -> None:
+        """Simulate time steps, and see whether the jaws now hold the needle and whether the phantom lets it in."""
+        super().advance(steps)
+        self._try_grip()
+        self._try_pierce()
 
     def encoders(self) -> np.ndarray:
         """Joints [6] as the encoders read them (rad, m)."""
         return psm.encoder_readings(self.true_joints())
 
-    def jaw(self) -> float:
-        """The angle between the jaws (rad)."""
-        return float(np.sum(self.named.data.qpos[["jaw_left", "jaw_right"]]))
-
-    def gripper(self) -> psm.Pose:
-        """The gripper's true pose."""
-        return self._site("gripper")
-
     def tip(self) -> psm.Pose:
         """The needle's tip: x points where the needle does."""
-        return self._site("needle_tip")
+        return self.site("needle_tip")
 
     def needle(self) -> psm.Pose:
         """The needle's true pose: origin in the middle of the arc, x along the wire towards the tip."""
@@ -122,7 +100,7 @@ class Physics(mujoco.Physics):
 
     def target(self) -> np.ndarray:
         """The centre of the target region [3] (m); its face looks towards -x."""
-        return self._site("target").position
+        return self.site("target").position
 
     def held(self) -> bool:
         """Whether the jaws hold the needle."""
@@ -141,10 +119,6 @@ class Physics(mujoco.Physics):
                 if pad in (contact.geom1, contact.geom2):
                     forces[side] += self.data.contact_force(index)[0, 0]
         return forces
-
-    def _site(self, name: str) -> psm.Pose:
-        data = self.named.data
-        return psm.Pose(np.array(data.site_xmat[name]).reshape(3, 3), np.array(data.site_xpos[name]))
 
     def _catch(self) -> np.ndarray:
         """Where the gripper is on the needle: position along the wire (m), angle from the pads to the wire (rad)."""
