@@ -8,7 +8,7 @@
     python studies/pushing_studies.py augmentation
     python studies/pushing_studies.py variants [--variants "exact hand" "std 0.5"]
 
-``sweep`` chooses every method's learning rate and weight decay by held-out likelihood on demonstrations of development
+``sweep`` chooses every method's learning rate, its schedule and weight decay by held-out likelihood on demonstrations of development
 seeds, then its execution (mean or sampled controls; sampled, most likely or marginal options) by goals in development
 episodes, and writes ``pushing_settings.json`` beside this file; fits that are done are kept. ``variants`` changes one
 thing at a time for every method alike. A study writes NAME.csv, NAME.png and NAME.md from all cells that are done; it
@@ -59,8 +59,12 @@ from ddco_pyro.spec import Spec
 
 COUNTS = (5, 20, 40, 80)
 OPTIONS = (1, 2, 3, 4, 5, 6, 7, 8)
-OPTIMIZERS = tuple({"training.optimizer.lr": rate, "training.optimizer.weight_decay": decay}
-                   for rate, decay in itertools.product((5e-3, 1e-2), (0.0, 1e-3, 1e-2)))  # fmt: skip
+RATES, DECAYS, SCHEDULES = (5e-3, 1e-2), (0.0, 1e-3), ("constant", "cosine")
+"""A weight decay of 1e-2 was less likely than none for every method, with both rates."""
+OPTIMIZERS = tuple(
+    {"training.optimizer.lr": rate, "training.optimizer.weight_decay": decay, "training.optimizer.schedule": schedule}
+    for rate, decay, schedule in itertools.product(RATES, DECAYS, SCHEDULES)
+)
 EXECUTIONS = (*itertools.product(("mean",), ("sample", "most_likely", "marginal")), ("sample", "sample"))
 """Of the control, and of options; sampled controls ruin every policy, whatever the options."""
 SWEPT_DEMONSTRATIONS, SWEPT_SEEDS, SWEPT_EPISODES = 40, (0, 1), 12
