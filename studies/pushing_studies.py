@@ -11,10 +11,10 @@
 ``sweep`` chooses every method's learning rate, its schedule and weight decay by held-out likelihood on demonstrations
 of development seeds, then its execution (mean or sampled controls; sampled, most likely or marginal options) by goals
 in development episodes, and writes ``pushing_settings.json`` beside this file; fits that are done are kept.
-``variants`` changes one thing at a time for every method alike. A study writes NAME.csv, NAME.png and NAME.md from all cells that are done; it
-goes through the grid one seed after the other. ``--limited`` adds rollouts with at most 250 steps for each goal.
-``--demonstrations``, ``--options``, ``--methods`` and ``--variants`` run a part of the grid; what is written has every
-cell of the grid that is done, and says of how many seeds. ``--summarize`` runs nothing.
+``variants`` changes one thing at a time for every method alike. A study writes NAME.csv, NAME.png and NAME.md from all
+cells that are done; it goes through the grid one seed after the other. ``--limited`` adds rollouts with at most 250
+steps for each goal. ``--demonstrations``, ``--options``, ``--methods`` and ``--variants`` run a part of the grid; what
+is written has every cell of the grid that is done, and says of how many seeds. ``--summarize`` runs nothing.
 """
 
 from __future__ import annotations
