@@ -11,19 +11,16 @@ from ddco_pyro.spec.settings import (
     STEP,
     ControlSpec,
     DemonstrationsSpec,
-    DurationSpec,
     InferenceSpec,
-    LabelsSpec,
     LearnedStd,
     ObservationSpec,
-    OptimizerSpec,
     OptionExecution,
     PartSpec,
     ReportSpec,
     RolloutSpec,
     SelectionSpec,
-    TrainingSpec,
 )
+from ddco_pyro.spec.training import DurationSpec, LabelsSpec, OptimizerSpec, TrainingSpec
 from ddco_pyro.spec.user_code import user_code
 from ddco_pyro.spec.whole import Spec, parse_spec, with_overrides
 

@@ -8,7 +8,7 @@ from pydantic import Field, field_validator, model_validator
 
 from ddco_pyro.spec.messages import invalid
 from ddco_pyro.spec.networks import MetaPolicySpec, NetworkSpec, PolicySpec
-from ddco_pyro.spec.settings import OptimizerSpec
+from ddco_pyro.spec.training import OptimizerSpec
 from ddco_pyro.spec.types import Count, Emission, Items, Model, bare
 
 HEADS = ("linear", "mlp")

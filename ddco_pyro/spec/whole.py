@@ -19,8 +19,8 @@ from ddco_pyro.spec.settings import (
     ReportSpec,
     RolloutSpec,
     SelectionSpec,
-    TrainingSpec,
 )
+from ddco_pyro.spec.training import TrainingSpec
 from ddco_pyro.spec.types import Emission, Items, Model, Seed, TaskName
 
 
