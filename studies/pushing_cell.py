@@ -59,7 +59,7 @@ VARIANTS: dict[str, tuple[dict[str, Any], int]] = {
     "hand 0.2 rad/s": ({"demonstrations.supervisor": "scripted_noisy"}, UPDATES),
     "hand 0.4 rad/s": ({"demonstrations.supervisor": "scripted_noisy_0.4"}, UPDATES),
     "exact hand": ({"demonstrations.supervisor": "scripted"}, UPDATES),
-    "planning supervisor": ({"demonstrations.supervisor": "supervisor_noisy"}, UPDATES),
+    "planning supervisor": ({"demonstrations.supervisor": "supervisor_noisy_0.3"}, UPDATES),
     "absolute observations": ({"observations": ["joint_angles", "box_pose", "goal"]}, UPDATES),
     "std 0.5": ({"control.std": 0.5}, UPDATES),
     "10000 gradient steps": ({}, 10_000),

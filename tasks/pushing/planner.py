@@ -2,12 +2,15 @@
 
 After the paper's supervisor (§5.1, SM 1.1), whose one parameter is the longest branch of the tree, 0.1. A plan is made
 a function of the state, so that it can be imitated: the planner starts from the same random numbers for every plan,
-paths are cut short until little of their random growth is left, and the configurations they lead to follow a rule.
+paths are cut short until little of their random growth is left, the configurations they lead to follow a rule, and all
+pushes to a side go along one path, wherever they begin.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -21,15 +24,21 @@ RRT = Settings(range=0.1, resolution=0.004, shortcuts=60)
 MARGIN = 0.05  # m: what a planned path keeps from the box
 BAND = 0.04  # m: half height of the band in which the tip pushes
 LEAN = 0.25  # rad: how far the hand's pitch may be from the one to push with
+LEVEL, UPRIGHT = (
+    0.015,
+    0.1,
+)  # m, rad: the same for a path along which all pushes go: a low one kicks the box's foot away
+FARTHEST = 0.55  # m: where such a path begins and ends
 ROOM = np.array([0.3, 0.3, 0.4])  # rad: how far a push may leave the range of its ends, which keeps the tree small
 
 SPACING = 0.02  # rad, between the points of a path
 LOOK_AHEAD = 0.35  # rad along the path: where the arm aims
-APPROACHED = 0.05  # rad: an approach is over when this much of it is left
 ASTRAY = 0.3  # rad: an arm that is further from its path plans again
 BOX_MOVED = 0.02  # m: a box that has moved this far since an approach was planned makes it invalid
 
 Replanning = Literal["when_invalid", "every_step"]
+IsFree = Callable[[np.ndarray], bool]
+"""Whether an arm may be at joint angles [3]."""
 
 
 class Plan(NamedTuple):
@@ -44,8 +53,9 @@ class Plan(NamedTuple):
 class Planner:
     """Follows plans; makes another when the one it has is no longer valid, or at every step.
 
-    :param repeatable: whether equal scenes give equal plans. If not, the random numbers go on, paths are only cut short
-        by leaving out corners, and the configurations that they lead to are drawn: what the planner does by itself.
+    :param repeatable: whether equal scenes give equal plans, and equal goals equal pushes. If not, the random numbers
+        go on, paths are only cut short by leaving out corners, and the configurations that they lead to are drawn: what
+        the planner does by itself.
     """
 
     replanning: Replanning = "when_invalid"
@@ -96,15 +106,12 @@ class Planner:
 
     def _push(self, scene: Scene) -> np.ndarray:
         """A path that takes the box to its goal, and as far beyond as the tip follows through."""
-
-        def is_free(angles: np.ndarray) -> bool:
-            return in_band(angles, scene.side)
-
-        start = within_limits(scene.angles)
         goal = behind(scene.side, scene.goal, geometry.CONTACT - rules.FOLLOW_THROUGH)
-        ends = np.array([start, goal])
-        ranges = np.stack([within_limits(ends.min(axis=0) - ROOM), within_limits(ends.max(axis=0) + ROOM)], axis=1)
-        return dense(plan_path(start, goal, ranges, is_free, self._settings))
+        if self.repeatable:
+            path = push_path(scene.side)
+            return np.vstack([path[: np.linalg.norm(path - goal, axis=1).argmin()], goal])
+        start = within_limits(scene.angles)
+        return planned_push(start, goal, lambda angles: in_band(angles, scene.side), self._settings)
 
     def _behind(self, scene: Scene) -> np.ndarray:
         """Joint angles behind the box, ready to push."""
@@ -112,6 +119,20 @@ class Planner:
             return behind(scene.side, scene.box, rules.BEHIND)
         height, lean = self._random.uniform(-0.8, 0.8, 2) * (BAND, LEAN)
         return behind(scene.side, scene.box, rules.BEHIND + self._random.uniform(-0.02, 0.04), height, lean)
+
+
+@lru_cache
+def push_path(side: int) -> np.ndarray:
+    """Joint angles [N, 3] that push a box from one end of the plane to the other."""
+    start, goal = (within_limits(behind(side, end * side * FARTHEST, geometry.CONTACT)) for end in (-1, 1))
+    return planned_push(start, goal, lambda angles: in_band(angles, side, LEVEL, UPRIGHT), RRT)
+
+
+def planned_push(start: np.ndarray, goal: np.ndarray, is_free: IsFree, settings: Settings) -> np.ndarray:
+    """A path [N, 3] between joint angles that leaves the range of its ends by a little ``ROOM`` only."""
+    ends = np.array([start, goal])
+    ranges = np.stack([within_limits(ends.min(axis=0) - ROOM), within_limits(ends.max(axis=0) + ROOM)], axis=1)
+    return dense(plan_path(start, goal, ranges, is_free, settings))
 
 
 def within_limits(angles: np.ndarray) -> np.ndarray:
@@ -125,10 +146,10 @@ def behind(side: int, box: float, distance: float, height: float = 0.0, lean: fl
     return geometry.inverse(tip, side * rules.PUSH_PITCH + lean)
 
 
-def in_band(angles: np.ndarray, side: int) -> bool:
-    """Whether tip height and pitch are such that the arm may push."""
-    level = abs(geometry.tip_position(angles)[1] - rules.PUSH_HEIGHT) < BAND
-    return bool(level and abs(float(np.sum(angles)) - side * rules.PUSH_PITCH) < LEAN)
+def in_band(angles: np.ndarray, side: int, height: float = BAND, lean: float = LEAN) -> bool:
+    """Whether tip height and pitch are such that the arm may push: within half widths (m, rad) of the usual ones."""
+    level = abs(geometry.tip_position(angles)[1] - rules.PUSH_HEIGHT) < height
+    return bool(level and abs(float(np.sum(angles)) - side * rules.PUSH_PITCH) < lean)
 
 
 def may_push(angles: np.ndarray, scene: Scene) -> bool:
@@ -138,15 +159,16 @@ def may_push(angles: np.ndarray, scene: Scene) -> bool:
 
 
 def is_valid(plan: Plan, scene: Scene) -> bool:
-    """Whether a plan made for another scene still serves: same goal and side, box and arm where they were expected."""
+    """Whether a plan made for another scene still serves: same goal and side, box and arm where they were expected, and
+    the arm in place to push where the plan is to push, and nowhere else.
+    """
     if scene.goal != plan.scene.goal or scene.side != plan.scene.side:
         return False
     if float(np.linalg.norm(plan.path - scene.angles, axis=1).min()) > ASTRAY:
         return False
-    if plan.phase == 1:
-        return may_push(scene.angles, scene)
-    arrived = float(np.linalg.norm(plan.path[-1] - scene.angles)) < APPROACHED
-    return abs(scene.box - plan.scene.box) < BOX_MOVED and not arrived
+    if may_push(scene.angles, scene) or plan.phase == 1:
+        return may_push(scene.angles, scene) and plan.phase == 1
+    return abs(scene.box - plan.scene.box) < BOX_MOVED
 
 
 def ahead(path: np.ndarray, angles: np.ndarray) -> np.ndarray:

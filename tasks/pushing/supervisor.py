@@ -137,4 +137,5 @@ POLICIES = {
     "scripted": policy(WayPoints),
     "scripted_noisy": policy(WayPoints, HAND),
     **{f"scripted_noisy_{noise}": policy(WayPoints, noise) for noise in SHAKIER},
+    **{f"supervisor_noisy_{noise}": policy(Planner, noise) for noise in SHAKIER},
 }
