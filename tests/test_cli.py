@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from unittest import mock
 
@@ -150,6 +151,12 @@ def test_help_has_an_example_that_can_be_typed(command):
     assert (ended.status, ended.err) == (0, "")
     (example,) = re.findall(rf"Example: ddco-pyro {command} (.*)", " ".join(ended.out.split()))
     assert COMMANDS[command].make_context(command, shlex.split(example)).params
+
+
+def test_version_is_the_packages():
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    ended = call("--version")
+    assert (ended.status, ended.out, ended.err) == (0, f"ddco-pyro {declared}\n", "")
 
 
 def test_nothing_at_all_is_help():

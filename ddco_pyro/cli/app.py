@@ -10,7 +10,8 @@ import os
 import sys
 import traceback
 from collections.abc import Callable
-from typing import Any
+from importlib.metadata import version
+from typing import Annotated, Any
 
 import typer
 
@@ -40,6 +41,25 @@ EXAMPLES: dict[Callable[..., None], str] = {
     outputs.export: "export runs/mine --out controller --onnx",
 }
 """Every command, in the order of ``--help``."""
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(f"ddco-pyro {version('ddco-pyro')}")
+        raise typer.Exit
+
+
+@app.callback()
+def top(
+    _: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Say which version this is.", is_flag=True, is_eager=True, callback=_print_version
+        ),
+    ] = False,
+) -> None:
+    """Options that need no command."""
+
 
 for command, example in EXAMPLES.items():
     app.command(example.partition(" ")[0], epilog=f"Example: ddco-pyro {example}")(command)
