@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rates
 from cells import Cell, Settings, printed
 from joblib import Parallel, delayed
 from provenance import record, sentence, text
@@ -144,7 +145,7 @@ def page(summary: Mapping[str, Any], seconds: Sequence[Mapping[str, float]], mad
     criteria = list(next(iter(summary.values()))["criteria"])
     lines = [made_by, "", f"| | {' | '.join(summary)} | paper |", "|---" * (len(summary) + 2) + "|"]
     for name in criteria:
-        cells = [_share(one["criteria"][name]) for one in summary.values()]
+        cells = [rates.shown(one["criteria"][name]) for one in summary.values()]
         lines.append(f"| {name} | {' | '.join(cells)} | {PAPER.get(name, '-')} |")
     cells = [f"{one['delivered']:.0%}" for one in summary.values()]
     lines.append(f"| objects brought into cups | {' | '.join(cells)} | - |")
@@ -162,13 +163,6 @@ def page(summary: Mapping[str, Any], seconds: Sequence[Mapping[str, float]], mad
         f"A cell took {np.mean(fits):.0f} s to fit and {np.mean(rolled):.0f} s to roll out, on one thread.",
     ]
     return "\n".join(lines) + "\n"
-
-
-def _share(one: Mapping[str, Any]) -> str:
-    if not one["trials"]:
-        return "-"
-    low, high = one["interval"]
-    return f"{one['rate']:.0%} of {one['trials']} [{low:.0%}, {high:.0%}]"
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rates
 from ddco_tasks import psm
 from ddco_tasks.bin_picking import camera, candidates, supervisor
 from ddco_tasks.bin_picking.environment import load
@@ -99,16 +100,11 @@ def page(results: dict[str, Any], made_by: str) -> str:
     """The results as Markdown."""
     lines = [made_by, "", "| grasps on other images | takes something | takes exactly one |", "|---|---|---|"]
     for name in ("all drawn", "better half"):
-        cells = [results["testing"][name][key] for key in ("takes something", "takes exactly one")]
-        shares = [f"{one['rate']:.1%} of {one['trials']} ({_percent(one['interval'])})" for one in cells]
-        lines.append(f"| {name} | {' | '.join(shares)} |")
+        cells = [rates.shown(results["testing"][name][key]) for key in ("takes something", "takes exactly one")]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
     area = results["testing"]["area under the curve"]
     lines += ["", f"Area under the curve on other images {area:.2f}, on its own {results['training']:.2f}."]
     return "\n".join(lines) + "\n"
-
-
-def _percent(interval: list[float]) -> str:
-    return f"{interval[0]:.1%} to {interval[1]:.1%}"
 
 
 def main() -> None:

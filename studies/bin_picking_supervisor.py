@@ -17,6 +17,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import rates
 from ddco_tasks.bin_picking import camera
 from ddco_tasks.bin_picking.geometry import IMAGE_SIZE, SHOWING, project
 from ddco_tasks.bin_picking.objects import KINDS
@@ -118,25 +119,17 @@ def page(results: dict[str, Any], made_by: str) -> str:
     """The results as Markdown."""
     lines = [made_by, "", f"{results['demonstrations']} bins, {results['steps']} control steps.", ""]
     lines += ["| its grasps took | here | paper |", "|---|---|---|"]
-    lines += [f"| {name} | {said(one)} | {PAPER.get(name, '-')} |" for name, one in results["grasps"].items()]
+    lines += [f"| {name} | {rates.shown(one)} | {PAPER.get(name, '-')} |" for name, one in results["grasps"].items()]
     lines += ["", "*Of five*: with five in the bin, of the grasps that took something. Wilson 95 % intervals.", ""]
     lines += ["| its bins | here |", "|---|---|"]
-    lines += [f"| {name} | {said(one)} |" for name, one in results["bins"].items() if "rate" in one]
+    lines += [f"| {name} | {rates.shown(one)} |" for name, one in results["bins"].items() if "rate" in one]
     lines += [f"| {name}, mean | {one['mean']:.2f} |" for name, one in results["bins"].items() if "mean" in one]
     pictures = results["from pictures"]
     for name, one in pictures.items():
-        lines += ["", f"What is held, read by trees from the {name} of the left mask: {said(one['accuracy'])}."]
+        lines += ["", f"What is held, read by trees from the {name} of the left mask: {rates.shown(one['accuracy'])}."]
     lines += ["", "| held | said of the shape | times |", "|---|---|--:|"]
     lines += [f"| {held} | {name} | {count} |" for held, name, count in pictures["shape"]["held, said"]]
     return "\n".join(lines) + "\n"
-
-
-def said(one: dict[str, Any]) -> str:
-    """A rate with its counts and interval."""
-    if not one["trials"]:
-        return "-"
-    low, high = one["interval"]
-    return f"{one['rate']:.1%} ({one['successes']} of {one['trials']}; {low:.1%} to {high:.1%})"
 
 
 def main() -> None:
