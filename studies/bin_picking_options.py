@@ -1,0 +1,156 @@
+"""Which options of bin picking are active in the steps of a trial, and in a bin in which the policy acts.
+
+    python studies/bin_picking_options.py RUN [--bin 950000]
+
+RUN is the folder of a fit of ``specs/bin_picking.yaml``, such as ``studies/bin_picking.py`` makes. Options are those of
+the most likely path through the demonstrations, trials apart by how they end. Of the bin, the first frames are shown
+with the left mask, and the options of all steps.
+Writes ``docs/results/bin_picking/options.json``, ``options.md`` and ``options.png``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ddco_tasks.bin_picking.objects import ACCEPTED, KINDS
+from ddco_tasks.bin_picking.supervisor import PHASES
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from provenance import record, sentence, text
+
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.files import whole_file, write_text
+from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.fitting.fit import Fit, load
+from ddco_pyro.simulation.collect import collect
+from ddco_pyro.simulation.episodes import Episode, run_episode
+from ddco_pyro.simulation.task import find_task
+
+OUT = Path("docs/results/bin_picking")
+STEPS = 10  # of a trial of the supervisor
+ENDS = ("to the accept cup", "to the reject cup", "back over the bin")
+LABELS = ("phase", "kind")
+FRAMES = 11  # of the bin, as many as a trial has with its end
+PART = (slice(90, 270), slice(90, 390))  # of a frame, where something happens
+
+Shares = dict[str, list[dict[int, float]]]
+"""By how a trial ends, for each of its steps, the part of the trials in which each option is active."""
+
+
+def trials(controls: np.ndarray) -> list[slice]:
+    """The steps of each trial among controls [T, 7]: it ends with the step in which the jaws open."""
+    opened = controls[:, 6] > 0.5
+    ends = np.flatnonzero(opened & ~np.append(True, opened[:-1])) + 1
+    return [slice(start, end) for start, end in zip([0, *ends], ends, strict=False)]
+
+
+def end(demo: Demonstration, trial: slice) -> str:
+    """How a demonstrated trial ends."""
+    phase, kind = (demo.labels[name][trial] for name in LABELS)
+    if PHASES.index("recover") in phase:
+        return ENDS[2]
+    return ENDS[0] if KINDS[int(kind[-1])] == ACCEPTED else ENDS[1]
+
+
+def shares(demos: Demonstrations, options: np.ndarray) -> tuple[Shares, dict[str, int]]:
+    """Over all demonstrated trials, ``options`` [N, T] being the active ones; and how many trials end in each way."""
+    counts: dict[str, list[Counter[int]]] = {name: [Counter() for _ in range(STEPS)] for name in ENDS}
+    ended: Counter[str] = Counter()
+    for demo, active in zip(demos, options, strict=True):
+        for trial in trials(demo.actions):
+            name = end(demo, trial)
+            ended[name] += 1
+            for step, option in enumerate(active[trial][:STEPS]):
+                counts[name][step][int(option)] += 1
+    found = {
+        name: [{option: number / step.total() for option, number in sorted(step.items())} for step in each]
+        for name, each in counts.items()
+    }
+    return found, dict(ended)
+
+
+def acted(fit: Fit, seed: int) -> Episode:
+    """The bin of this seed, with frames."""
+    return run_episode(find_task("bin_picking"), fit.controller(), seed, film=True, observed=fit.spec.observed)
+
+
+def draw(found: Shares, ended: dict[str, int], episode: Episode, path: Path) -> None:
+    """Shares over the steps of a trial, a panel for each end; below, the beginning of the bin, and its options."""
+    figure = Figure(figsize=(11, 6.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    above, below, strip = np.ravel(figure.subfigures(3, 1, height_ratios=[3, 2.2, 0.7]))
+    for axes, name in zip(above.subplots(1, len(ENDS), sharey=True), ENDS, strict=True):
+        _stacked(axes, found[name])
+        axes.set_title(f"{name} ({ended.get(name, 0)} trials)", fontsize=9)
+    options = sorted({option for steps in found.values() for step in steps for option in step})
+    handles = [Patch(color=option_colour(option), label=f"option {option}") for option in options]
+    above.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8)
+    masks = episode.record.observations["image"]
+    for number, (scene, seen) in enumerate(below.subplots(2, FRAMES).T):
+        scene.axis("off")
+        seen.axis("off")
+        if number < len(masks):
+            scene.imshow(episode.frames[number][PART])
+            scene.set_title(str(number), fontsize=7)
+            seen.imshow(np.asarray(masks[number])[..., 0], cmap="gray")
+    _path(strip.subplots(), episode)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=110, format="png")
+
+
+def _stacked(axes: Axes, steps: list[dict[int, float]]) -> None:
+    top = np.zeros(STEPS)
+    for option in sorted({option for step in steps for option in step}):
+        heights = np.array([step.get(option, 0.0) for step in steps])
+        axes.bar(range(STEPS), heights, 1.0, bottom=top, color=option_colour(option))
+        top += heights
+    axes.set(xlabel="step of the trial", xticks=range(STEPS), ylim=(0, 1), ylabel="share of trials")
+
+
+def _path(axes: Axes, episode: Episode) -> None:
+    for step, option in enumerate(episode.choices[:, 0]):
+        axes.bar(step, 1, 1.0, color=option_colour(int(option)))
+    for trial in trials(episode.record.actions):
+        axes.axvline(trial.stop - 0.5, color="black", lw=1)
+    axes.set(xlabel="step of the bin; a line where the jaws opened", yticks=[], xlim=(-0.5, len(episode.choices) - 0.5))
+
+
+def page(results: dict[str, Any], made_by: str) -> str:
+    """The results as Markdown."""
+    lines = [made_by, "", "Active option in each step of a demonstrated trial, and in which part of the trials.", ""]
+    lines += [f"| trials | {' | '.join(map(str, range(STEPS)))} |", "|---" * (STEPS + 1) + "|"]
+    for name, steps in results["shares"].items():
+        cells = [", ".join(f"{option}: {share:.0%}" for option, share in step.items()) or "-" for step in steps]
+        lines.append(f"| {name} ({results['trials'].get(name, 0)}) | {' | '.join(cells)} |")
+    lines += ["", "![options over the steps of a trial, and over a bin](options.png)"]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Run the study."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--bin", type=int, default=950_000)
+    own = parser.parse_args()
+    command = f"python studies/bin_picking_options.py {own.run} --bin {own.bin}"
+    made_by = record(command)
+    fit = load(own.run)
+    demos = Demonstrations.read(collect("bin_picking", fit.spec.demonstrations), fit.spec.observed, labels=LABELS)
+    found, ended = shares(demos, fit.segment(demos)[0])
+    episode = acted(fit, own.bin)
+    results = {"shares": found, "trials": ended, "bin": {"seed": own.bin, "outcome": episode.outcome}}
+    draw(found, ended, episode, OUT / "options.png")
+    shown = page(results, sentence(command, [made_by]))
+    write_text(OUT / "options.json", text(results, [made_by]))
+    write_text(OUT / "options.md", shown)
+    print(shown)
+
+
+if __name__ == "__main__":
+    main()
