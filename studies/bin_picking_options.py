@@ -84,7 +84,7 @@ def draw(found: Shares, ended: dict[str, int], episode: Episode, path: Path) -> 
     """Shares over the steps of a trial, a panel for each end; below, the beginning of the bin, and its options."""
     figure = Figure(figsize=(11, 6.6), layout="constrained")
     FigureCanvasAgg(figure)
-    above, below, strip = np.ravel(figure.subfigures(3, 1, height_ratios=[3, 2.2, 0.7]))
+    above, below, strip = figure.subfigures(3, 1, height_ratios=[3, 2.2, 0.7])
     for axes, name in zip(above.subplots(1, len(ENDS), sharey=True), ENDS, strict=True):
         _stacked(axes, found[name])
         axes.set_title(f"{name} ({ended.get(name, 0)} trials)", fontsize=9)
