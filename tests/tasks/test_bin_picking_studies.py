@@ -1,0 +1,50 @@
+"""What the studies of bin picking make of demonstrations and rates, on ones with planted trials."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from bin_picking_options import ENDS, end, shares, trials
+from rates import shown
+
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.simulation.episodes import rate
+
+OPEN, CLOSED = 1.0, 0.0
+PIN, NEEDLE, NOTHING = 0, 1, -1
+# Two trials, and a third that does not come to its end. Phases: 0 approach, 1 grasp, 2 show, 3 recover, 4 carry,
+# 5 release.
+JAW = [OPEN, CLOSED, CLOSED, OPEN, OPEN, CLOSED, CLOSED, OPEN, OPEN, CLOSED]
+PHASE = [0, 1, 4, 5, 0, 1, 3, 3, 0, 1]
+OPTIONS = [1, 1, 2, 2, 1, 1, 1, 1, 1, 1]
+
+
+def demonstration(name: str, kind: int) -> Demonstration:
+    kinds = np.where(np.arange(len(JAW)) < 4, kind, NOTHING)
+    controls = np.column_stack([np.zeros((len(JAW), 6)), JAW])
+    labels = {"phase": np.array(PHASE), "kind": kinds}
+    return Demonstration(name, {"kin": np.zeros((len(JAW), 7))}, controls, labels)
+
+
+def test_trials_end_where_the_jaws_open() -> None:
+    assert trials(demonstration("demo_0", PIN).actions) == [slice(0, 4), slice(4, 8)]
+
+
+@pytest.mark.parametrize(("kind", "cup"), [(PIN, ENDS[0]), (NEEDLE, ENDS[1])])
+def test_trials_are_told_apart_by_where_the_load_goes(kind: int, cup: str) -> None:
+    demo = demonstration("demo_0", kind)
+    assert [end(demo, trial) for trial in trials(demo.actions)] == [cup, ENDS[2]]
+
+
+def test_options_are_shared_over_the_trials_that_end_alike() -> None:
+    demos = Demonstrations((demonstration("demo_0", PIN), demonstration("demo_1", PIN)))
+    found, ended = shares(demos, np.array([OPTIONS, [3, *OPTIONS[1:]]]))
+    assert ended == {ENDS[0]: 2, ENDS[2]: 2}
+    assert found[ENDS[0]][:5] == [{1: 0.5, 3: 0.5}, {1: 1.0}, {2: 1.0}, {2: 1.0}, {}]
+    assert found[ENDS[2]][:5] == [{1: 1.0}] * 4 + [{}]
+
+
+def test_rates_have_counts_and_wilson_interval() -> None:
+    # Wilson's interval for 8 of 10 by hand: centre (0.8 + 0.192073) / 1.384146 = 0.71674, half width 0.22658.
+    assert shown(rate(8, 10)) == "80.0% (8 of 10; 49.0% to 94.3%)"
+    assert shown(rate(0, 0)) == "-"
