@@ -40,6 +40,7 @@ STARTS = 950_000
 DEFAULTS = Settings({"bins": 20}, Path("runs/bin-picking"))
 PAPER = {"bins cleared": "70 % of 10", "grasp of exactly one": "66 % of 99", "recovery, recall": "97 % of 34",
          "categorisation": "98 %"}  # fmt: skip
+FAILURES = ("empty", "several", "slipped", "wrong cup", "not let go")
 
 Bin = Mapping[str, float]
 """The measures of a bin, by name."""
@@ -111,6 +112,7 @@ def measured(bins: Sequence[Bin]) -> dict[str, Any]:
             **one,
             "opened over the bin": one["recovered"] + one["due_cups"] - one["kept"],
             "wrong cup": one["delivered"] - one["sorted"],
+            "not let go": one["attempts"] - one["due_cups"] - one["due_recoveries"],
         }
         for one in bins
     ]
@@ -122,7 +124,7 @@ def measured(bins: Sequence[Bin]) -> dict[str, Any]:
         "recovery, precision": clustered(more, "recovered", "opened over the bin"),
         "categorisation": clustered(more, "sorted", "delivered"),
     }
-    failures = {name: int(sum(one[name] for one in more)) for name in ("empty", "several", "slipped", "wrong cup")}
+    failures = {name: int(sum(one[name] for one in more)) for name in FAILURES}
     ends = {name.removeprefix("ended_"): int(sum(one[name] for one in bins)) for name in bins[0] if "ended" in name}
     share = sum(one["delivered"] for one in bins) / sum(one["objects"] for one in bins)
     return {"criteria": criteria, "failures": failures, "ends": ends, "delivered": share}
@@ -159,7 +161,8 @@ def page(summary: Mapping[str, Any], seconds: Sequence[Mapping[str, float]], mad
         "",
         "Rates with 95 % Wilson intervals; where counts of a bin are pooled, for as many independent trials as the "
         "variance between bins gives. Below: how many attempts were empty, took several, lost some of what they had "
-        "lifted, or ended in the wrong cup; then how bins ended that were not cleared.",
+        "lifted, ended in the wrong cup, or were over before the jaws opened; then how bins ended that were not "
+        "cleared.",
         f"A cell took {np.mean(fits):.0f} s to fit and {np.mean(rolled):.0f} s to roll out, on one thread.",
     ]
     return "\n".join(lines) + "\n"
