@@ -1,7 +1,7 @@
 """Pushing from pictures (paper §5.1, SM 1.2, SM 1.5): goals against demonstrations, options, and augmentation.
 
     python studies/pushing_pictures.py demonstrations|options|augmentation [--seeds 3] [--methods ff ff_flat ...]
-        [--counts 80 40 20 10] [--options 1 2 3 4 5 6] [--updates 1000] [--episodes 5] [--set KEY=VALUE]...
+        [--counts 80 40 20 10] [--options 1 2 3 4 5 6] [--updates 4000] [--episodes 5] [--set KEY=VALUE]...
         [--summarize] [--minutes 60] [--jobs 1] [--out DIR] [--runs DIR]
 
 Does cells one seed after the other, and begins none after so many minutes; what this code has done with these settings

@@ -1,6 +1,6 @@
 """One cell of pushing from pictures: a method, its options, a number of demonstrations and a training seed.
 
-    python studies/pushing_pictures_cell.py METHOD OPTIONS COUNT SEED [--updates 1000] [--episodes 5] [--runs DIR]
+    python studies/pushing_pictures_cell.py METHOD OPTIONS COUNT SEED [--updates 4000] [--episodes 5] [--runs DIR]
 
 OPTIONS is 0 for a flat policy. Demonstrations and evaluation episodes are those of ``pushing_studies.py`` with the same
 seeds. Pictures are drawn three times as fine as they are seen, 48 x 64, and reduced by means. Keeps a JSON with
@@ -38,7 +38,7 @@ METHODS = ("ff", "ff_flat", "ff_hybrid", "ff_one", "ff_one_flat", "rnn", "rnn_fl
 """``_flat``: as many parameters as the hierarchy beside it has with the options of its spec; ``ff_one``: of one picture
 instead of two."""
 
-DEFAULTS = Settings({"updates": 1000, "episodes": 5}, Path("runs/pushing-pictures"))
+DEFAULTS = Settings({"updates": 4000, "episodes": 5}, Path("runs/pushing-pictures"))
 """Gradient steps of a fit, and what each one plays."""
 
 
