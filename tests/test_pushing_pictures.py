@@ -63,12 +63,12 @@ def test_cells_of_a_seed_come_before_those_of_the_next():
     [("ff", 3, 2, ("options",)), ("ff_one", 2, 1, ("options",)), ("rnn_hybrid", 4, 1, ("options", "control"))],
 )
 def test_specs_of_cells(method, options, frames, emits):
-    """72 demonstrations to train on, two in a step: 36 steps an epoch."""
+    """72 demonstrations to train on, two in a step: 36 steps an epoch, 4000 at least."""
     spec = spec_of(PictureCell(method, options, 80, 1), DEFAULTS)
     assert spec.observations[0].frames == frames
     assert spec.hierarchy.levels[0].count == options
     assert spec.hierarchy.meta_policy.emits == emits
-    assert spec.training.epochs == 28
+    assert spec.training.epochs == 112
 
 
 def test_what_is_not_done_is_said(tmp_path: Path):

@@ -53,9 +53,7 @@ def _print_version(asked: bool) -> None:
 def top(
     _: Annotated[
         bool,
-        typer.Option(
-            "--version", help="Say which version this is.", is_flag=True, is_eager=True, callback=_print_version
-        ),
+        typer.Option("--version", help="Say which version this is.", is_eager=True, callback=_print_version),
     ] = False,
 ) -> None:
     """Options that need no command."""
