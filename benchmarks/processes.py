@@ -22,6 +22,7 @@ from ddco_pyro.spec import Spec, parse_spec
 
 NUMBER, STEPS, EPOCHS = 8, 16, 4
 FF = {"network": "conv", "filters": 64, "kernel": 5, "hidden": [64]}
+"""The paper's: a convolution of 64 filters of 5 × 5 and a fully connected layer (SM 1.2)."""
 
 
 def problem() -> tuple[Spec, Demonstrations, Demonstrations]:

@@ -34,6 +34,7 @@ from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.spec import parse_spec
 
 sys.path.append(str(Path(__file__).parents[1] / "studies"))
+from processes import FF
 from processes import epoch as shared_epoch
 from provenance import record, sentence, text
 
@@ -47,9 +48,6 @@ FEW, SHORT = 4, 16
 
 WORKERS, BATCH = 2, 16
 """Of both ways to read: robomimic's settings for pictures."""
-
-FF = {"network": "conv", "filters": 64, "kernel": 5, "hidden": [64]}
-"""The paper's: a convolution of 64 filters of 5 × 5 and a fully connected layer (SM 1.2)."""
 
 ROUNDS = 5
 

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from ddco_tasks.planning import plan_path, points_along
+from ddco_tasks.planning import points_along
 from ddco_tasks.pushing import environment as pushing
 from ddco_tasks.pushing import geometry as pushing_geometry
-from ddco_tasks.pushing import planner as pushing_planner
-from ddco_tasks.pushing import rules
 from ddco_tasks.pushing.environment import Environment, limited, single, task
-from ddco_tasks.pushing.rules import PUSH_HEIGHT, Scene
+from ddco_tasks.pushing.rules import PUSH_HEIGHT
 from ddco_tasks.rendering import render
 
 from ddco_pyro.simulation.episodes import run_episode
@@ -247,122 +242,6 @@ def test_an_episode_about_one_goal_ends_where_it_is_reached() -> None:
         episode = run_episode(single, "scripted", seed)
         assert episode.outcome["goals"] == episode.outcome["success"] == 1.0
         assert len(episode.record) < single.steps
-
-
-# Supervisors.
-
-
-@pytest.mark.parametrize(("name", "least"), [("scripted", 25), ("supervisor", 25), ("scripted_noisy", 15)])
-def test_supervisors_reach_goals(name: str, least: int) -> None:
-    measures = run_episode(task, name, 3).outcome
-    assert measures["goals"] >= least
-    assert measures["topples"] <= 3
-
-
-def test_intentions_are_recorded_and_the_hand_is_inexact() -> None:
-    environment = task.load(0)
-    policy = task.policies["scripted_noisy"](environment)
-    exact = task.policies["scripted"](environment)
-    policy.reset(0)
-    step = environment.reset()
-    offsets = []
-    for _ in range(300):
-        executed = policy.act(step.observation)
-        np.testing.assert_array_equal(policy.intended, exact.act(step.observation))
-        offsets.append(executed - policy.intended)
-        step = environment.step(executed)
-    environment.close()
-    assert np.std(offsets) == pytest.approx(pushing.supervisor.HAND, rel=0.3)
-
-
-def test_the_scripted_supervisor_is_a_function_of_the_observation() -> None:
-    record = run_episode(single, "scripted_noisy", 1).record
-    environment = single.load(0)
-    policy = single.policies["scripted"](environment)
-    for row in np.random.default_rng(0).permutation(len(record)):
-        observation = {key: value[row] for key, value in record.observations.items()}
-        np.testing.assert_array_equal(policy.act(observation), record.actions[row])
-    environment.close()
-
-
-def scenes() -> Iterator[Scene]:
-    """Scenes with the arm beside, above and behind the box."""
-    for box, goal in ((0.0, 0.3), (0.3, -0.2), (-0.35, 0.1), (0.2, 0.45)):
-        for tip in ((-0.25, 0.12), (0.22, 0.15), (0.0, 0.45)):
-            yield Scene(pushing_geometry.inverse(np.array([tip[0] + box, tip[1]]), 0.0), box, goal)
-
-
-def test_planned_approaches_are_clear_and_lead_behind_the_box() -> None:
-    for scene in scenes():
-        if not pushing_geometry.is_clear(scene.angles, scene.box, pushing_planner.MARGIN):
-            continue
-        planner = pushing_planner.Planner()
-        path = planner._approach(scene)
-        np.testing.assert_allclose(path[0], scene.angles)
-        assert pushing_planner.may_push(path[-1], scene)
-        assert all(pushing_geometry.is_clear(angles, scene.box, 0.5 * pushing_planner.MARGIN) for angles in path)
-        again = pushing_planner.Planner()._approach(scene)
-        np.testing.assert_array_equal(path, again)
-
-
-def test_planned_pushes_stay_low_and_end_at_the_goal() -> None:
-    for side in (-1, 1):
-        scene = Scene(pushing_planner.behind(side, -0.3 * side, 0.16), -0.3 * side, 0.3 * side)
-        path = pushing_planner.Planner()._push(scene)
-        heights = np.array([pushing_geometry.tip_position(angles)[1] for angles in path])
-        assert np.abs(heights - PUSH_HEIGHT).max() < 1.2 * pushing_planner.LEVEL
-        assert pushing_geometry.tip_position(path[-1])[0] == pytest.approx(scene.goal - 0.09 * side, abs=1e-6)
-
-
-def test_a_planned_push_is_a_function_of_the_observation() -> None:
-    record = run_episode(single, "supervisor_noisy_0.3", 1).record
-    pushes = np.flatnonzero(record.labels["phase"] == 1)
-    assert len(pushes) > 10
-    for row in pushes:
-        observation = {key: value[row] for key, value in record.observations.items()}
-        fresh = pushing_planner.Planner().decide(rules.scene(observation))
-        np.testing.assert_array_equal(fresh, record.actions[row])
-
-
-def test_unrepeatable_plans_differ() -> None:
-    scene = next(scenes())
-    planner = pushing_planner.Planner(repeatable=False)
-    one, other = planner._approach(scene), planner._approach(scene)
-    assert one.shape != other.shape or not np.allclose(one, other)
-
-
-def test_shortcuts_make_paths_shorter() -> None:
-    def is_free(point: np.ndarray) -> bool:
-        return not (abs(point[0]) < 0.2 and point[1] < 0.5)
-
-    ranges = np.array([[-1.0, 1.0]] * 2)
-    ends = np.array([[-0.6, 0.0], [0.6, 0.0]])
-    lengths = []
-    for shortcuts in (0, 60):
-        settings = pushing_planner.Settings(range=0.1, shortcuts=shortcuts)
-        path = plan_path(*ends, ranges, is_free, settings)
-        lengths.append(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-    shortest = 2 * np.hypot(0.4, 0.5) + 0.4
-    assert shortest - 0.02 < lengths[1] < lengths[0]
-    assert lengths[1] < 1.15 * shortest
-
-
-DIGEST = """
-import hashlib, json
-from ddco_pyro.simulation.episodes import run_episode
-from ddco_tasks.pushing.environment import single
-names = ("supervisor", "supervisor_noisy", "scripted_noisy", "supervisor_every_step")
-print(json.dumps([hashlib.sha256(run_episode(single, name, 4).record.actions.tobytes()).hexdigest() for name in names]))
-"""
-
-
-def test_demonstrations_are_the_same_in_every_process() -> None:
-    found = [
-        json.loads(subprocess.run([sys.executable, "-c", DIGEST], capture_output=True, text=True, check=True).stdout)
-        for _ in range(2)
-    ]
-    assert found[0] == found[1]
-    assert len(set(found[0])) == 4
 
 
 # Pictures.
