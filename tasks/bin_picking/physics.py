@@ -84,10 +84,14 @@ class Physics(ArmPhysics):
         return self.instrument.command(joints, self.motors, self.slack)
 
     def move_to(self, motors: np.ndarray, jaw: float, noise: np.ndarray) -> None:
-        """Set the goal of the next control step: motors [6] and the angle between the jaws (rad).
+        """Set the goal of the next control step: motors [6] and the angle between the jaws (rad). Where the motors are
+        not finite the arm stays where it was, and the simulation is ``unstable``.
 
         :param noise: added to the joints [6], by which a move is not quite repeatable.
         """
+        if not np.isfinite(motors).all():
+            self.unstable = True
+            return
         goal = self.predicted(motors) + noise
         self.slack, self.motors = slack_after(self.slack, motors - self.motors), motors.copy()
         self.aim(goal, jaw)

@@ -20,7 +20,7 @@ class End(Enum):
     LOST = "lost"  # an object lies outside of bin and cups
     UNSEEN = "unseen"  # objects are left, and none is seen
     FOAM = "foam"  # the jaws were pressed further into the foam than it gives way
-    UNSTABLE = "unstable"  # the simulation broke down
+    UNSTABLE = "unstable"  # the simulation broke down, or a control was not finite
 
 
 @dataclass(frozen=True)
