@@ -33,8 +33,8 @@ class Form(NamedTuple):
 
 FORMS = {
     "joints": Form("bin_picking", 6, "joint angles"),
-    "pose": Form("ddco_tasks.bin_picking:pose", 6, "position and rotation vector"),
-    "matrix": Form("ddco_tasks.bin_picking:matrix", 12, "position and rotation matrix"),
+    "pose": Form("bin_picking_pose", 6, "position and rotation vector"),
+    "matrix": Form("bin_picking_matrix", 12, "position and rotation matrix"),
 }
 DEFAULTS = Settings({"bins": 20}, Path("runs/bin-picking-controls"))
 CRITERIA = ("bins cleared", "grasp of exactly one", "recovery, recall", "categorisation")
