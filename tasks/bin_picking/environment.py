@@ -28,7 +28,7 @@ from . import camera, candidates, supervisor
 from .controls import JOINTS, MATRIX, POSE, Controls, Scripted
 from .geometry import CUPS, IMAGE_SIZE, NEUTRAL_TURN, upright
 from .instrument import Instrument
-from .objects import KINDS, scene
+from .objects import KINDS, UNSEEN, scene
 from .physics import MOVE_TIME, SETTLE_TIME, Physics
 from .supervisor import JAW_OPEN, OVER_CUP
 from .trials import MOST_STEPS, Attempt, End, Trials
@@ -45,7 +45,8 @@ SHARED_SOURCES = ("arm.py", "psm.py", "rendering.py", "vision.py")
 class BinPicking(base.Task):
     """Starts, observes and rewards an episode; ``controls`` is the form of its controls.
 
-    ``trials`` has what became of the attempts, ``left`` how many objects were in the bin when the trial at hand began.
+    ``trials`` has what became of the attempts; of the trial at hand, ``left`` is how many objects were in the bin when
+    it began, and ``lifted`` those that the jaws first lifted, None before.
     """
 
     def __init__(self, kinds: Sequence[str], random: np.random.RandomState, controls: Controls = JOINTS) -> None:
@@ -53,6 +54,7 @@ class BinPicking(base.Task):
         self.controls = controls
         self.trials = Trials(kinds)
         self.left = len(kinds)
+        self.lifted: frozenset[int] | None = None
         self.jaw_open = True
         self._grasp = np.zeros(6)
         self._masks = np.zeros((IMAGE_SIZE, IMAGE_SIZE, len(camera.EYES)), np.uint8)
@@ -66,7 +68,7 @@ class BinPicking(base.Task):
         self.trials = Trials(self.trials.kinds)
         self.jaw_open = self._was_open = True
         self._held: frozenset[int] = frozenset()
-        self._lifted: frozenset[int] | None = None
+        self.lifted = None
         self.left = physics.objects
         self._masks = camera.masks(physics)
         self._next_candidate()
@@ -90,19 +92,19 @@ class BinPicking(base.Task):
     def after_step(self, physics: Physics) -> None:
         """See what became of the attempt, and whether the bin has ended."""
         self._masks = camera.masks(physics)
-        if not self.jaw_open and self._lifted is None and physics.gripper().position[2] > LIFTED_HEIGHT:
-            self._lifted = physics.held()
+        if not self.jaw_open and self.lifted is None and physics.gripper().position[2] > LIFTED_HEIGHT:
+            self.lifted = physics.held()
         released = self.jaw_open and not self._was_open
         if released or self.trials.steps >= MOST_STEPS:
             self._end_trial(physics, released)
         self.trials.end = self.trials.end or _gone_wrong(physics)
 
     def _end_trial(self, physics: Physics, released: bool) -> None:
-        places, lifted = physics.places(), self._lifted or frozenset()
+        places, lifted = physics.places(), self.lifted or frozenset()
         held = self._held if released else physics.held()
         where = [places[number] for number in sorted(held)] or [physics.gripper_place()]
-        self.trials.add(Attempt(self.left, lifted, held, tuple(where) if released else ()))
-        self._lifted = None
+        self.trials.add(Attempt(self.left, lifted, held, tuple(where) if released else (), self.trials.steps))
+        self.lifted = None
         self.left = sum(place not in CUPS for place in places)
         if not self.left:
             self.trials.end = End.CLEARED
@@ -217,3 +219,5 @@ task = make_task("bin_picking")
 other_instrument = make_task("bin_picking_other_instrument", instrument=2)
 pose = make_task("bin_picking_pose", controls=POSE)
 matrix = make_task("bin_picking_matrix", controls=MATRIX)
+alone = {kind: make_task(f"bin_picking_{kind}", kinds=(kind,)) for kind in (*KINDS, *UNSEEN)}
+"""The task with a single object in the bin, by its kind."""

@@ -117,7 +117,8 @@ class Physics(ArmPhysics):
 
     def centres(self) -> np.ndarray:
         """The objects' centres of mass [N, 3] (m)."""
-        return np.array([self.named.data.xipos[f"object_{number}"] for number in range(self.objects)]).reshape(-1, 3)
+        names = [f"object_{number}" for number in range(self.objects)]
+        return np.array([self.named.data.subtree_com[name] for name in names]).reshape(-1, 3)
 
     def held(self) -> frozenset[int]:
         """The objects that the jaws have lifted: those of which nothing but other held objects and the jaws hold up."""
