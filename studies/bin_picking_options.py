@@ -1,10 +1,13 @@
-"""Which options of bin picking are active in the steps of a trial, and in a bin in which the policy acts.
+"""Which options of bin picking are active in the steps of a trial, and in a bin in which the policy acts; and which
+inputs each of them attends to.
 
     python studies/bin_picking_options.py RUN [--bin 950000]
 
 RUN is the folder of a fit of ``specs/bin_picking.yaml``, such as ``studies/bin_picking.py`` makes. Options are those of
 the most likely path through the demonstrations, trials apart by how they end. Of the bin, the first frames are shown
-with the left mask, and the options of all steps.
+with the left mask, and the options of all steps. An option attends to an input by as much as its control would change
+with it: the standard deviation, to first order, of each number of the control where that input alone varied as it does
+over all demonstrated steps.
 Writes ``docs/results/bin_picking/options.json``, ``options.md`` and ``options.png``.
 """
 
@@ -12,10 +15,12 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from ddco_tasks.bin_picking.objects import ACCEPTED, KINDS
 from ddco_tasks.bin_picking.supervisor import PHASES
 from matplotlib.axes import Axes
@@ -23,11 +28,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from provenance import record, sentence, text
+from torch import Tensor
 
+from ddco_pyro.acting.saliency import Saliency
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import whole_file, write_text
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.fitting.fit import Fit, load
+from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.simulation.collect import collect
 from ddco_pyro.simulation.episodes import Episode, run_episode
 from ddco_pyro.simulation.task import find_task
@@ -39,6 +47,10 @@ LABELS = ("phase", "kind")
 FRAMES = 11  # of the bin, as many as a trial has with its end
 PART = (slice(90, 270), slice(90, 390))  # of a frame, where something happens
 
+SHADES = {"image": "#1f3b73", "grasp": "#c9a227", "kin": "#5b8c5a"}
+
+Attention = dict[int, dict[str, float]]
+"""By option, the part of each input in what its control would change with."""
 Shares = dict[str, list[dict[int, float]]]
 """By how a trial ends, for each of its steps, the part of the trials in which each option is active."""
 
@@ -75,21 +87,57 @@ def shares(demos: Demonstrations, options: np.ndarray) -> tuple[Shares, dict[str
     return found, dict(ended)
 
 
+def attention(hierarchy: Hierarchy, demos: Demonstrations, options: np.ndarray) -> Attention:
+    """What each option attends to, over the demonstrated steps in which it is the active one of ``options`` [N, T].
+
+    The slopes g [F] of a number of the control with an input, and the covariance Σ [F, F] of the input over all steps,
+    give √(gᵀΣg); this is divided by its sum over the inputs, and averaged over the numbers and the steps.
+    """
+    saliency, seen, slopes = Saliency(hierarchy), list[dict[str, Tensor]](), list[dict[str, Tensor]]()
+    active = []
+    for demo, path in zip(demos, options, strict=True):
+        saliency.reset()
+        for step in range(len(demo)):
+            observed = {key: values[step] for key, values in demo.observations.items()}
+            each = saliency.slopes(observed, (int(path[step]),))
+            seen.append({key: one.seen.flatten() for key, one in each.items()})
+            slopes.append({key: one.slopes.flatten(1) for key, one in each.items()})
+            active.append(int(path[step]))
+    spread = {key: _spreads(key, seen, slopes) for key in seen[0]}
+    total = sum(spread.values())
+    return {
+        option: {key: float((own / total)[np.array(active) == option].mean()) for key, own in spread.items()}
+        for option in sorted(set(active))
+    }
+
+
+def _spreads(key: str, seen: Sequence[dict[str, Tensor]], slopes: Sequence[dict[str, Tensor]]) -> np.ndarray:
+    """√(gᵀΣg) of an input for each step and number of the control, [T, A]."""
+    values = torch.stack([one[key] for one in seen]).float()
+    values -= values.mean(0)
+    return torch.stack([(one[key] @ values.T).square().mean(1).sqrt() for one in slopes]).numpy()
+
+
 def acted(fit: Fit, seed: int) -> Episode:
     """The bin of this seed, with frames."""
     return run_episode(find_task("bin_picking"), fit.controller(), seed, film=True, observed=fit.spec.observed)
 
 
-def draw(found: Shares, ended: dict[str, int], episode: Episode, path: Path) -> None:
-    """Shares over the steps of a trial, a panel for each end; below, the beginning of the bin, and its options."""
-    figure = Figure(figsize=(11, 6.6), layout="constrained")
+def draw(found: Shares, ended: dict[str, int], attended: Attention, episode: Episode, path: Path) -> None:
+    """Shares over the steps of a trial, a panel for each end, and what each option attends to; below, the beginning of
+    the bin, and its options.
+    """
+    figure = Figure(figsize=(13, 6.6), layout="constrained")
     FigureCanvasAgg(figure)
     above, below, strip = figure.subfigures(3, 1, height_ratios=[3, 2.2, 0.7])
-    for axes, name in zip(above.subplots(1, len(ENDS), sharey=True), ENDS, strict=True):
+    *panels, last = above.subplots(1, len(ENDS) + 1, sharey=True)
+    for axes, name in zip(panels, ENDS, strict=True):
         _stacked(axes, found[name])
         axes.set_title(f"{name} ({ended.get(name, 0)} trials)", fontsize=9)
+    _attended(last, attended)
     options = sorted({option for steps in found.values() for step in steps for option in step})
     handles = [Patch(color=option_colour(option), label=f"option {option}") for option in options]
+    handles += [Patch(color=shade, label=key) for key, shade in SHADES.items()]
     above.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8)
     masks = episode.record.observations["image"]
     for number, (scene, seen) in enumerate(below.subplots(2, FRAMES).T):
@@ -113,6 +161,16 @@ def _stacked(axes: Axes, steps: list[dict[int, float]]) -> None:
     axes.set(xlabel="step of the trial", xticks=range(STEPS), ylim=(0, 1), ylabel="share of trials")
 
 
+def _attended(axes: Axes, attended: Attention) -> None:
+    top = np.zeros(len(attended))
+    for key, shade in SHADES.items():
+        heights = np.array([one[key] for one in attended.values()])
+        axes.bar([str(option) for option in attended], heights, 0.8, bottom=top, color=shade)
+        top += heights
+    axes.set(xlabel="option", title="what moves its control")
+    axes.title.set_fontsize(9)
+
+
 def _path(axes: Axes, episode: Episode) -> None:
     for step, option in enumerate(episode.choices[:, 0]):
         axes.bar(step, 1, 1.0, color=option_colour(int(option)))
@@ -128,6 +186,11 @@ def page(results: dict[str, Any], made_by: str) -> str:
     for name, steps in results["shares"].items():
         cells = [", ".join(f"{option}: {share:.0%}" for option, share in step.items()) or "-" for step in steps]
         lines.append(f"| {name} ({results['trials'].get(name, 0)}) | {' | '.join(cells)} |")
+    inputs = list(SHADES)
+    lines += ["", "Of what moves the control of an option where it is active, the part of each input.", ""]
+    lines += [f"| option | {' | '.join(inputs)} |", "|---" * (len(inputs) + 1) + "|"]
+    for option, parts in results["inputs"].items():
+        lines.append(f"| {option} | {' | '.join(f'{parts[key]:.0%}' for key in inputs)} |")
     lines += ["", "![options over the steps of a trial, and over a bin](options.png)"]
     return "\n".join(lines) + "\n"
 
@@ -140,12 +203,15 @@ def main() -> None:
     own = parser.parse_args()
     command = f"python studies/bin_picking_options.py {own.run} --bin {own.bin}"
     made_by = record(command)
+    torch.set_num_threads(1)
     fit = load(own.run)
     demos = Demonstrations.read(collect("bin_picking", fit.spec.demonstrations), fit.spec.observed, labels=LABELS)
-    found, ended = shares(demos, fit.segment(demos)[0])
-    episode = acted(fit, own.bin)
-    results = {"shares": found, "trials": ended, "bin": {"seed": own.bin, "outcome": episode.outcome}}
-    draw(found, ended, episode, OUT / "options.png")
+    options = fit.segment(demos)[0]
+    found, ended = shares(demos, options)
+    attended, episode = attention(fit.hierarchy, demos, options), acted(fit, own.bin)
+    results = {"shares": found, "trials": ended, "inputs": attended}
+    results |= {"bin": {"seed": own.bin, "outcome": episode.outcome}}
+    draw(found, ended, attended, episode, OUT / "options.png")
     shown = page(results, sentence(command, [made_by]))
     write_text(OUT / "options.json", text(results, [made_by]))
     write_text(OUT / "options.md", shown)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from bin_picking_films import chosen, part
 from bin_picking_options import ENDS, end, shares, trials
 from bin_picking_trials import ENDINGS, Bin, Trial
 from bin_picking_unseen import place
@@ -104,3 +105,15 @@ def test_an_object_alone_is_where_it_was_dropped(
     lifted: frozenset[int], attempt: Attempt | None, expected: str
 ) -> None:
     assert place(Trial(STEPS, lifted, attempt)) == expected
+
+
+def test_the_first_trial_of_each_ending_is_filmed() -> None:
+    frames = [np.full((2, 2, 3), number, np.uint8) for number in range(8)]
+    whole = Episode(7, demonstration("demo_0", PIN), {}, np.arange(7).reshape(7, 1), frames)
+    names = ["slipped", "lost", "slipped", *ENDINGS, "slipped"]
+    found = ((name, part(whole, slice(number % 5, number % 5 + 2))) for number, name in enumerate(names))
+    films, counts = chosen(found)
+    assert list(films) == list(ENDINGS)
+    assert counts["slipped"] == 3  # nothing is looked at once all have been seen
+    assert films["lost"].choices.ravel().tolist() == [1, 2]
+    assert [int(frame[0, 0, 0]) for frame in films["lost"].frames] == [1, 2, 3]
