@@ -56,26 +56,33 @@ class Fitted(Cell):
 
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """The bins of every method, and how long fit and rollouts took."""
-        bins = int(settings.values["bins"])
-        changes = [f"seed={self.seed}", f"rollout.seed={STARTS + 1000 * self.seed}", *settings.overrides]
-        changes += ["rollout.policies=[]"]
-        changes += ["compare_with=[]"] if self.spec == "bin_picking_hybrid" else []
-        begun = time.perf_counter()
-        fitted = fit(load_spec(SPECS[self.spec], changes), out=folder)
-        trained = time.perf_counter()
-        roll_out(fitted, bins, jobs=1)
-        seconds = {"fit": trained - begun, "rollouts": time.perf_counter() - trained}
-        return {"methods": _methods(self.spec, fitted), "seconds": seconds}
+        alone = ["compare_with=[]"] if self.spec == "bin_picking_hybrid" else []
+        return of_fit(SPECS[self.spec], NAMES[self.spec], self.seed, alone, settings, folder)
 
 
-def _methods(spec: str, fitted: Fit) -> dict[str, Any]:
+def of_fit(
+    spec: str, name: str, seed: int, changes: Sequence[str], settings: Settings, folder: Path
+) -> dict[str, Any]:
+    """Fit a spec with changes, call it ``name``, and play as many bins as the settings say: the bins of every method,
+    with held-out likelihoods, and how long both took.
+    """
+    common = [f"seed={seed}", f"rollout.seed={STARTS + 1000 * seed}", "rollout.policies=[]", *settings.overrides]
+    begun = time.perf_counter()
+    fitted = fit(load_spec(spec, [*common, *changes]), out=folder)
+    trained = time.perf_counter()
+    roll_out(fitted, int(settings.values["bins"]), jobs=1)
+    seconds = {"fit": trained - begun, "rollouts": time.perf_counter() - trained}
+    return {"methods": methods(name, fitted), "seconds": seconds}
+
+
+def methods(called: str, fitted: Fit) -> dict[str, Any]:
     """The bins of each method by name, with its held-out likelihood where it was fitted."""
     models = {fitted.name: fitted.metrics} | fitted.metrics.get("comparison", {})
     found: dict[str, Any] = {}
     with (fitted.run_folder / "rollouts.csv").open(encoding="utf-8", newline="") as table:
         for row in csv.DictReader(table):
             name = row.pop("method")
-            named = NAMES[spec] if name == fitted.name else name
+            named = called if name == fitted.name else name
             own = found.setdefault(named, {"bins": []})
             own["bins"].append({key: float(value) for key, value in row.items()})
             if name in models:
