@@ -14,7 +14,7 @@ import argparse
 import csv
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,8 @@ FAILURES = ("empty", "several", "slipped", "wrong cup", "not let go")
 
 Bin = Mapping[str, float]
 """The measures of a bin, by name."""
+Page = Callable[[Mapping[str, Any], Sequence[Mapping[str, float]], str], str]
+"""Makes Markdown of every method's results, the seconds of the cells, and the sentence that says what made them."""
 
 
 @dataclass(frozen=True)
@@ -56,34 +58,34 @@ class Fitted(Cell):
 
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """The bins of every method, and how long fit and rollouts took."""
-        alone = ["compare_with=[]"] if self.spec == "bin_picking_hybrid" else []
-        return of_fit(SPECS[self.spec], NAMES[self.spec], self.seed, alone, settings, folder)
+        changes = ["compare_with=[]"] if self.spec == "bin_picking_hybrid" else []
+        return evaluated(SPECS[self.spec], self.seed, changes, NAMES[self.spec], settings, folder)
 
 
-def of_fit(
-    spec: str, name: str, seed: int, changes: Sequence[str], settings: Settings, folder: Path
+def evaluated(
+    spec: str, seed: int, changes: Sequence[str], called: str, settings: Settings, folder: Path
 ) -> dict[str, Any]:
-    """Fit a spec with changes, call it ``name``, and play as many bins as the settings say: the bins of every method,
-    with held-out likelihoods, and how long both took.
+    """The bins of every method of a spec with some changes, fitted under a training seed, and the seconds of it.
+
+    :param called: the name of the spec's own model.
     """
-    common = [f"seed={seed}", f"rollout.seed={STARTS + 1000 * seed}", "rollout.policies=[]", *settings.overrides]
+    own = [f"seed={seed}", f"rollout.seed={STARTS + 1000 * seed}", "rollout.policies=[]"]
     begun = time.perf_counter()
-    fitted = fit(load_spec(spec, [*common, *changes]), out=folder)
+    fitted = fit(load_spec(spec, [*own, *changes, *settings.overrides]), out=folder)
     trained = time.perf_counter()
     roll_out(fitted, int(settings.values["bins"]), jobs=1)
     seconds = {"fit": trained - begun, "rollouts": time.perf_counter() - trained}
-    return {"methods": methods(name, fitted), "seconds": seconds}
+    return {"methods": _methods(called, fitted), "seconds": seconds}
 
 
-def methods(called: str, fitted: Fit) -> dict[str, Any]:
+def _methods(called: str, fitted: Fit) -> dict[str, Any]:
     """The bins of each method by name, with its held-out likelihood where it was fitted."""
     models = {fitted.name: fitted.metrics} | fitted.metrics.get("comparison", {})
     found: dict[str, Any] = {}
     with (fitted.run_folder / "rollouts.csv").open(encoding="utf-8", newline="") as table:
         for row in csv.DictReader(table):
             name = row.pop("method")
-            named = called if name == fitted.name else name
-            own = found.setdefault(named, {"bins": []})
+            own = found.setdefault(called if name == fitted.name else name, {"bins": []})
             own["bins"].append({key: float(value) for key, value in row.items()})
             if name in models:
                 own["log_likelihood_per_step"] = models[name]["log_likelihood_per_step"]
@@ -192,17 +194,25 @@ def run(own: argparse.Namespace) -> str:
     """Do what is not done yet, and write what all cells that are done say together; the page."""
     settings = DEFAULTS.given(own)
     cells = [Fitted(spec, seed) for seed in range(own.seeds) for spec in own.specs]
+    command = f"python studies/bin_picking.py --seeds {own.seeds} --specs {' '.join(own.specs)} {settings.words()}"
+    return concluded(cells, settings, own, command, "summary", page)
+
+
+def concluded(
+    cells: Sequence[Cell], settings: Settings, own: argparse.Namespace, command: str, name: str, page: Page
+) -> str:
+    """Do the cells that are not done yet, unless they are only to be summarized, and write JSON and page of this name
+    of those that are done; the page.
+    """
     if not own.summarize:
         made_by = record(cells[0].command(settings))
         Parallel(n_jobs=own.jobs)(delayed(cell.run)(settings, made_by) for cell in cells)
     kept = [json.loads(path.read_text()) for cell in cells if (path := cell.path(settings)).exists()]
     summary = summarize([one["results"] for one in kept])
     records = [one["provenance"][0] for one in kept]
-    specs = " ".join(own.specs)
-    command = f"python studies/bin_picking.py --seeds {own.seeds} --specs {specs} {settings.words()}"
     shown = page(summary, [one["results"]["seconds"] for one in kept], sentence(command, records))
-    write_text(own.out / "summary.json", text(summary, records))
-    write_text(own.out / "summary.md", shown)
+    write_text(own.out / f"{name}.json", text(summary, records))
+    write_text(own.out / f"{name}.md", shown)
     return shown
 
 

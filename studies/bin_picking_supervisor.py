@@ -4,8 +4,8 @@
 
 Collects the demonstrations of ``specs/bin_picking.yaml``, unless they have been. What is held at the moment of decision
 is also read from the observed left mask, where the load is shown, and from how far the jaws are closed, by a classifier
-that is tested on bins it was not trained on: it says how much of that a policy can know. Writes ``docs/results/bin_picking/supervisor.json`` and
-``supervisor.md``.
+that is tested on bins it was not trained on: it says how much of that a policy can know.
+Writes ``docs/results/bin_picking/supervisor.json`` and ``supervisor.md``.
 """
 
 from __future__ import annotations
@@ -65,8 +65,9 @@ def grasps(demos: Demonstrations) -> dict[str, Any]:
 
 
 def from_observations(demos: Demonstrations) -> dict[str, Any]:
-    """How often pixels of the left mask, the shape seen in it, and that with the jaws' angle say what is held; every bin
-    is predicted from the others.
+    """How often pixels of the left mask, the shape seen in it, and that with the jaws' angle say what is held.
+
+    Every bin is predicted from the others.
     """
     shown, jaws, held, bins = [], [], [], []
     for number, demo in enumerate(demos):

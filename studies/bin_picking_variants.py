@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import rates
-from bin_picking import DEFAULTS, SPECS, Fitted, of_fit, summarize
+from bin_picking import DEFAULTS, SPECS, Fitted, evaluated, summarize
 from cells import Cell, Settings, described, printed
 from joblib import Parallel, delayed
 from provenance import record, sentence, text
@@ -55,7 +55,7 @@ class Variant(Cell):
 
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """As of a cell of ``bin_picking.py``."""
-        return of_fit(SPECS["bin_picking"], "DDCO", self.seed, VARIANTS[self.variant], settings, folder)
+        return evaluated(SPECS["bin_picking"], self.seed, VARIANTS[self.variant], "DDCO", settings, folder)
 
 
 def page(rows: Mapping[str, Mapping[str, Any]], seconds: Mapping[str, Sequence[float]], made_by: str) -> str:

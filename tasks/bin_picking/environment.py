@@ -1,14 +1,16 @@
 """Surgical bin picking: clear a foam bin of tangled pins, suturing needles and wires, each into its cup.
 
 After the paper's second physical experiment (Physical Experiment 2 and SM 1.4). A da Vinci-like arm with inexact
-encoders takes objects out of a bin, one grasp after another; in each control step it is given six joint angles and the
-jaw, moves there and settles. It is seen through its encoders and through a stereo pair 650 mm above the bin. An episode
-is a whole bin. Simulated lengths are metres; what is observed is in millimetres and pixels.
+encoders takes objects out of a bin, one grasp after another; in each control step it is given six joint angles, or a
+pose of the gripper, and the jaw, moves there and settles. It is seen through its encoders and through a stereo pair
+650 mm above the bin. An episode is a whole bin. Simulated lengths are metres; what is observed is in millimetres and
+pixels.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -23,9 +25,10 @@ from ddco_pyro.simulation.task import Task
 from .. import psm
 from ..rendering import render
 from . import camera, candidates, supervisor
+from .controls import JOINTS, MATRIX, POSE, Controls, Scripted
 from .geometry import CUPS, IMAGE_SIZE, NEUTRAL_TURN, upright
 from .instrument import Instrument
-from .objects import KINDS, scene
+from .objects import KINDS, UNSEEN, scene
 from .physics import MOVE_TIME, SETTLE_TIME, Physics
 from .supervisor import JAW_OPEN, OVER_CUP
 from .trials import MOST_STEPS, Attempt, End, Trials
@@ -41,15 +44,18 @@ SHARED_SOURCES = ("arm.py", "psm.py", "rendering.py", "vision.py")
 
 
 class BinPicking(base.Task):
-    """Starts, observes and rewards an episode.
+    """Starts, observes and rewards an episode; ``controls`` is the form of its controls.
 
-    ``trials`` has what became of the attempts, ``left`` how many objects were in the bin when the trial at hand began.
+    ``trials`` has what became of the attempts; of the trial at hand, ``left`` is how many objects were in the bin when
+    it began, and ``lifted`` those that the jaws first lifted, None before.
     """
 
-    def __init__(self, kinds: list[str], random: np.random.RandomState) -> None:
+    def __init__(self, kinds: Sequence[str], random: np.random.RandomState, controls: Controls = JOINTS) -> None:
         super().__init__(random=random)
+        self.controls = controls
         self.trials = Trials(kinds)
         self.left = len(kinds)
+        self.lifted: frozenset[int] | None = None
         self.jaw_open = True
         self._grasp = np.zeros(6)
         self._masks = np.zeros((IMAGE_SIZE, IMAGE_SIZE, len(camera.EYES)), np.uint8)
@@ -64,33 +70,32 @@ class BinPicking(base.Task):
         self.trials = Trials(self.trials.kinds)
         self.jaw_open = self._was_open = True
         self._held: frozenset[int] = frozenset()
-        self._lifted: frozenset[int] | None = None
+        self.lifted = None
         self.left = physics.objects
         self._see(physics)
         self._next_candidate()
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
-        """Set points [7]: what the encoders of six joints are to read (rad, insertion in m), and the jaw, which opens
+        """Set points [A]: what the encoders are to read, in the form of the task's controls, and the jaw, which opens
         above one half and closes otherwise.
         """
         del physics
-        limits = np.vstack([psm.JOINT_RANGES, [0.0, 1.0]])
-        return specs.BoundedArray((7,), float, limits[:, 0], limits[:, 1], name=",".join((*psm.JOINTS, "jaw")))
+        return self.controls.spec()
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
-        """Send the arm to where the encoders will read ``action`` [7], within the joints' limits."""
+        """Send the arm to where the encoders will read ``action`` [A], within the joints' limits."""
         spec = self.action_spec(physics)
         action = np.clip(np.asarray(action, float), spec.minimum, spec.maximum)
-        self._held, self._was_open, self.jaw_open = physics.held(), self.jaw_open, bool(action[6] > 0.5)
+        self._held, self._was_open, self.jaw_open = physics.held(), self.jaw_open, bool(action[-1] > 0.5)
         noise = REPEATABILITY * self.random.standard_normal(6)
-        physics.move_to(action[:6], JAW_OPEN * self.jaw_open, noise)
+        physics.move_to(self.controls.joints(action), JAW_OPEN * self.jaw_open, noise)
         self.trials.steps += 1
 
     def after_step(self, physics: Physics) -> None:
         """See what became of the attempt, and whether the bin has ended."""
         self._see(physics)
-        if not self.jaw_open and self._lifted is None and physics.gripper().position[2] > LIFTED_HEIGHT:
-            self._lifted = physics.held()
+        if not self.jaw_open and self.lifted is None and physics.gripper().position[2] > LIFTED_HEIGHT:
+            self.lifted = physics.held()
         released = self.jaw_open and not self._was_open
         if released or self.trials.steps >= MOST_STEPS:
             self._end_trial(physics, released)
@@ -101,11 +106,11 @@ class BinPicking(base.Task):
         self._jaw = physics.jaw() + JAW_ERROR * self.random.standard_normal()
 
     def _end_trial(self, physics: Physics, released: bool) -> None:
-        places, lifted = physics.places(), self._lifted or frozenset()
+        places, lifted = physics.places(), self.lifted or frozenset()
         held = self._held if released else physics.held()
         where = [places[number] for number in sorted(held)] or [physics.gripper_place()]
-        self.trials.add(Attempt(self.left, lifted, held, tuple(where) if released else ()))
-        self._lifted = None
+        self.trials.add(Attempt(self.left, lifted, held, tuple(where) if released else (), self.trials.steps))
+        self.lifted = None
         self.left = sum(place not in CUPS for place in places)
         if not self.left:
             self.trials.end = End.CLEARED
@@ -178,27 +183,36 @@ def frame(environment: dm_env.Environment) -> np.ndarray:
     return render(environment.physics, "overview", *FRAME_SIZE)
 
 
-def load(seed: int, instrument: int = 1) -> Environment:
-    """A fresh environment whose objects and episodes depend on the seed alone, with the instrument of that number."""
+def load(
+    seed: int, instrument: int = 1, controls: Controls = JOINTS, kinds: Sequence[str] | None = None
+) -> Environment:
+    """A fresh environment whose objects and episodes depend on the seed alone, with the instrument of that number.
+
+    :param kinds: of the objects; drawn where they are not given.
+    """
     random = np.random.RandomState(seed)
-    kinds = [KINDS[number] for number in random.randint(len(KINDS), size=random.randint(FEWEST, MOST + 1))]
+    if kinds is None:
+        kinds = [KINDS[number] for number in random.randint(len(KINDS), size=random.randint(FEWEST, MOST + 1))]
     physics = Physics.from_xml_string(scene(HERE / "bin_picking.xml", kinds))
     physics.instrument = Instrument.numbered(instrument)
     sub_steps = round((MOVE_TIME + SETTLE_TIME) / physics.timestep())
-    return Environment(physics, BinPicking(kinds, random), n_sub_steps=sub_steps)
+    return Environment(physics, BinPicking(kinds, random, controls), n_sub_steps=sub_steps)
 
 
 MEASURES = Trials(()).measures()
 RATES = {"success", "cleared"}
 
 
-def make_task(name: str, instrument: int = 1) -> Task:
-    """The task with the instrument of that number in the arm."""
+def make_task(
+    name: str, instrument: int = 1, controls: Controls = JOINTS, kinds: tuple[str, ...] | None = None
+) -> Task:
+    """The task with the instrument of that number in the arm, controls of that form, and objects of these kinds."""
     shared = (HERE.parent / name for name in SHARED_SOURCES)
+    scripted = {"open_loop": supervisor.OpenLoop, "supervisor": supervisor.Supervisor}
     return Task(
         name=name,
-        load=partial(load, instrument=instrument),
-        policies={"open_loop": supervisor.OpenLoop, "supervisor": supervisor.Supervisor},
+        load=partial(load, instrument=instrument, controls=controls, kinds=kinds),
+        policies={name: partial(Scripted, policy, controls) for name, policy in scripted.items()},
         outcome=outcome,
         frame=frame,
         steps=MOST_ATTEMPTS * MOST_STEPS,
@@ -209,3 +223,7 @@ def make_task(name: str, instrument: int = 1) -> Task:
 
 task = make_task("bin_picking")
 other_instrument = make_task("bin_picking_other_instrument", instrument=2)
+pose = make_task("bin_picking_pose", controls=POSE)
+matrix = make_task("bin_picking_matrix", controls=MATRIX)
+alone = {kind: make_task(f"bin_picking_{kind}", kinds=(kind,)) for kind in (*KINDS, *UNSEEN)}
+"""The task with a single object in the bin, by its kind."""

@@ -84,10 +84,14 @@ class Physics(ArmPhysics):
         return self.instrument.command(joints, self.motors, self.slack)
 
     def move_to(self, motors: np.ndarray, jaw: float, noise: np.ndarray) -> None:
-        """Set the goal of the next control step: motors [6] and the angle between the jaws (rad).
+        """Set the goal of the next control step: motors [6] and the angle between the jaws (rad). Where the motors are
+        not finite the arm stays where it was, and the simulation is ``unstable``.
 
         :param noise: added to the joints [6], by which a move is not quite repeatable.
         """
+        if not np.isfinite(motors).all():
+            self.unstable = True
+            return
         goal = self.predicted(motors) + noise
         self.slack, self.motors = slack_after(self.slack, motors - self.motors), motors.copy()
         self.aim(goal, jaw)
@@ -113,7 +117,8 @@ class Physics(ArmPhysics):
 
     def centres(self) -> np.ndarray:
         """The objects' centres of mass [N, 3] (m)."""
-        return np.array([self.named.data.xipos[f"object_{number}"] for number in range(self.objects)]).reshape(-1, 3)
+        names = [f"object_{number}" for number in range(self.objects)]
+        return np.array([self.named.data.subtree_com[name] for name in names]).reshape(-1, 3)
 
     def held(self) -> frozenset[int]:
         """The objects that the jaws have lifted: those of which nothing but other held objects and the jaws hold up."""

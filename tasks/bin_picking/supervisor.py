@@ -17,7 +17,7 @@ from ddco_pyro.simulation.task import Observation
 from .. import psm
 from ..psm import Pose
 from .geometry import CUPS, GRASP_HEIGHT, NEUTRAL_TURN, RETURNING, SHOWING, SHOWN_TURN, lying_at, upright
-from .objects import ACCEPTED, KINDS
+from .objects import ACCEPTED, KINDS, UNSEEN
 from .physics import Physics
 
 JAW_OPEN = 1.25  # rad, between the jaws: 12 mm between the pads
@@ -157,7 +157,7 @@ class Supervisor(OpenLoop):
         """Besides the phase, before the step just decided: how many objects were ``held``, the ``kind`` of a single one
         (-1 otherwise), and how many were ``left`` in the bin when the trial began.
         """
-        kind = KINDS.index(self._kinds[min(self._held)]) if len(self._held) == 1 else -1
+        kind = (KINDS + UNSEEN).index(self._kinds[min(self._held)]) if len(self._held) == 1 else -1
         return super().annotations | {"held": len(self._held), "kind": kind, "left": self._task.left}
 
     def _rest(self) -> list[WayPoint]:

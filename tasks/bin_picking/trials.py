@@ -20,7 +20,7 @@ class End(Enum):
     LOST = "lost"  # an object lies outside of bin and cups
     UNSEEN = "unseen"  # objects are left, and none is seen
     FOAM = "foam"  # the jaws were pressed further into the foam than it gives way
-    UNSTABLE = "unstable"  # the simulation broke down
+    UNSTABLE = "unstable"  # the simulation broke down, or a control was not finite
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,14 @@ class Attempt:
     :param carried: those that they held when they opened.
     :param places: where the latter then were, or where the gripper was that held none; empty where the jaws did not
         open before the trial's time was over.
+    :param steps: how many control steps it took.
     """
 
     before: int
     lifted: frozenset[int]
     carried: frozenset[int]
     places: tuple[str, ...]
+    steps: int
 
     @property
     def single(self) -> bool:
@@ -89,7 +91,7 @@ class Trials:
         loaded = [attempt for attempt in attempts if len(attempt.carried) == 1]
         others = [attempt for attempt in attempts if len(attempt.carried) != 1]
         delivered = [attempt for attempt in loaded if attempt.delivered]
-        in_own_cups = sum(self._own_cup(*attempt.carried) == attempt.places[0] for attempt in delivered)
+        in_own_cups = sum(self.own_cup(*attempt.carried) == attempt.places[0] for attempt in delivered)
         cleared = self.end is End.CLEARED
         counts = {
             "objects": len(self.kinds),
@@ -110,5 +112,6 @@ class Trials:
         rates = {"success": all_sorted, "cleared": cleared, **ends}
         return {name: float(value) for name, value in (rates | counts).items()}
 
-    def _own_cup(self, number: int) -> str:
+    def own_cup(self, number: int) -> str:
+        """The cup that an object belongs into."""
         return "accept" if self.kinds[number] == ACCEPTED else "reject"

@@ -90,12 +90,12 @@ def test_places() -> None:
 @pytest.mark.parametrize("kind", objects.KINDS)
 def test_objects_are_as_thick_and_long_as_the_paper_says(kind: str) -> None:
     parts = objects.parts(kind)
-    thickness = [2e3 * radius for _, _, radius in parts]
+    thickness = [2e3 * part.radius for part in parts]
     assert min(thickness) >= 1.0
     assert max(thickness) <= 3.0
-    for (_, end, _), (start, _, _) in itertools.pairwise(parts):
-        np.testing.assert_allclose(end, start, atol=1e-12)  # a chain
-    length = sum(np.linalg.norm(end - start) for start, end, _ in parts)
+    for one, after in itertools.pairwise(parts):
+        np.testing.assert_allclose(one.end, after.start, atol=1e-12)  # a chain
+    length = sum(np.linalg.norm(part.end - part.start) for part in parts)
     assert 0.02 < length < 0.03
 
 
@@ -263,13 +263,13 @@ def test_a_trial_that_goes_nowhere_is_a_miss(environment: Environment, monkeypat
 def test_measures_of_attempts() -> None:
     none, first, both = frozenset[int](), frozenset({0}), frozenset({0, 1})
     attempts = [
-        Attempt(3, none, none, ("bin",)),  # empty, recovered from
-        Attempt(3, none, none, ("reject",)),  # empty, and carried to a cup
-        Attempt(3, both, both, ("bin", "bin")),  # several, recovered from
-        Attempt(3, both, first, ("accept",)),  # one slipped, the other into its cup
-        Attempt(2, frozenset({1}), frozenset({1}), ("bin",)),  # one, dropped for no reason
-        Attempt(2, frozenset({1}), frozenset({1}), ("accept",)),  # into the wrong cup
-        Attempt(1, frozenset({2}), frozenset({2}), ()),  # never let go
+        Attempt(3, none, none, ("bin",), 10),  # empty, recovered from
+        Attempt(3, none, none, ("reject",), 10),  # empty, and carried to a cup
+        Attempt(3, both, both, ("bin", "bin"), 10),  # several, recovered from
+        Attempt(3, both, first, ("accept",), 10),  # one slipped, the other into its cup
+        Attempt(2, frozenset({1}), frozenset({1}), ("bin",), 10),  # one, dropped for no reason
+        Attempt(2, frozenset({1}), frozenset({1}), ("accept",), 10),  # into the wrong cup
+        Attempt(1, frozenset({2}), frozenset({2}), (), 10),  # never let go
     ]
     trials = Trials(["pin", "wire", "needle"], attempts, end=End.MISSED)
     expected = {"success": 0, "cleared": 0, "ended_missed": 1, "objects": 3, "attempts": 7, "single": 3, "empty": 2}
@@ -282,6 +282,6 @@ def test_measures_of_attempts() -> None:
 
 @pytest.mark.parametrize(("cups", "success"), [(("accept", "reject"), 1.0), (("accept", "accept"), 0.0)])
 def test_success_is_every_object_in_its_own_cup(cups: tuple[str, str], success: float) -> None:
-    attempts = [Attempt(2 - n, frozenset({n}), frozenset({n}), (cup,)) for n, cup in enumerate(cups)]
+    attempts = [Attempt(2 - n, frozenset({n}), frozenset({n}), (cup,), 10) for n, cup in enumerate(cups)]
     found = Trials(["pin", "wire"], attempts, end=End.CLEARED).measures()
     assert (found["cleared"], found["success"]) == (1.0, success)

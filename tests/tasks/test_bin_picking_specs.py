@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bin_picking_controls import FORMS, changes
 from ddco_tasks.bin_picking import task
 from ddco_tasks.bin_picking.supervisor import JAW_OPEN
 
@@ -45,6 +46,14 @@ def test_specs_are_checked_against_the_task(path: Path) -> None:
     spec = load_spec(path)
     known = dimensions(spec)
     assert known.shapes == {"image": (64, 64, 2), "grasp": (6,), "kin": (7,)}
+    assert check_networks(spec, known).depth == 1
+
+
+@pytest.mark.parametrize("controls", FORMS)
+def test_the_spec_is_checked_against_the_task_with_other_controls(controls: str) -> None:
+    spec = load_spec(SPECS[0], changes(controls))
+    known = dimensions(spec)
+    assert known.control_size == FORMS[controls].size + 1
     assert check_networks(spec, known).depth == 1
 
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from bin_picking_options import ENDS, end, shares, trials
+from bin_picking_trials import ENDINGS, Bin, Trial
+from bin_picking_unseen import place
+from ddco_tasks.bin_picking.trials import Attempt, End, Trials
 from rates import shown
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.simulation.episodes import rate
+from ddco_pyro.simulation.episodes import Episode, rate
 
 OPEN, CLOSED = 1.0, 0.0
 PIN, NEEDLE, NOTHING = 0, 1, -1
@@ -48,3 +51,56 @@ def test_rates_have_counts_and_wilson_interval() -> None:
     # Wilson's interval for 8 of 10 by hand: centre (0.8 + 0.192073) / 1.384146 = 0.71674, half width 0.22658.
     assert shown(rate(8, 10)) == "80.0% (8 of 10; 49.0% to 94.3%)"
     assert shown(rate(0, 0)) == "-"
+
+
+NONE, FIRST, BOTH = frozenset[int](), frozenset({0}), frozenset({0, 1})
+STEPS = slice(0, 10)
+ATTEMPTS = {
+    "into its cup": Attempt(2, FIRST, FIRST, ("accept",), 10),
+    "nothing taken": Attempt(2, NONE, NONE, ("bin",), 10),
+    "several taken": Attempt(2, BOTH, BOTH, ("bin", "bin"), 10),
+    "slipped": Attempt(2, BOTH, FIRST, ("accept",), 10),
+    "into the wrong cup": Attempt(2, FIRST, FIRST, ("reject",), 10),
+    "one let go over the bin": Attempt(2, FIRST, FIRST, ("bin",), 10),
+    "none or several to a cup": Attempt(2, BOTH, BOTH, ("accept", "accept"), 10),
+    "not let go": Attempt(2, FIRST, FIRST, (), 20),
+}
+
+
+def a_bin(trial: Trial, end: End) -> Bin:
+    """A bin with a pin and a wire, and one trial."""
+    empty = Episode(0, demonstration("demo_0", PIN), {}, np.zeros((10, 1), int))
+    return Bin(empty, Trials(["pin", "wire"], end=end), [trial])
+
+
+@pytest.mark.parametrize("name", ATTEMPTS)
+def test_trials_are_called_by_how_they_end(name: str) -> None:
+    trial = Trial(STEPS, ATTEMPTS[name].lifted, ATTEMPTS[name])
+    assert a_bin(trial, End.MISSED).ending(trial) == name
+
+
+def test_a_bin_that_ends_before_the_jaws_open_names_its_last_trial() -> None:
+    assert [*ATTEMPTS, "lost"] == list(ENDINGS)
+    for attempt in (None, ATTEMPTS["slipped"]):
+        trial = Trial(STEPS, FIRST, attempt)
+        assert a_bin(trial, End.LOST).ending(trial) == "lost"
+    unfinished = Trial(STEPS, NONE, None)
+    assert a_bin(unfinished, End.FOAM).ending(unfinished) == "foam"
+
+
+@pytest.mark.parametrize(
+    ("lifted", "attempt", "expected"),
+    [
+        (FIRST, Attempt(1, FIRST, FIRST, ("accept",), 10), "accept"),
+        (FIRST, Attempt(1, FIRST, FIRST, ("bin",), 10), "bin"),
+        (FIRST, Attempt(1, FIRST, FIRST, ("outside",), 10), "lost"),
+        (FIRST, Attempt(1, FIRST, NONE, ("reject",), 10), "lost"),  # the gripper was over the cup, the object not
+        (FIRST, Attempt(1, FIRST, FIRST, (), 20), "not let go"),
+        (FIRST, None, "lost"),
+        (NONE, Attempt(1, NONE, NONE, ("bin",), 10), "nothing"),
+    ],
+)
+def test_an_object_alone_is_where_it_was_dropped(
+    lifted: frozenset[int], attempt: Attempt | None, expected: str
+) -> None:
+    assert place(Trial(STEPS, lifted, attempt)) == expected
