@@ -36,6 +36,7 @@ from .trials import MOST_STEPS, Attempt, End, Trials
 HERE = Path(__file__).parent
 FEWEST, MOST = 3, 8  # objects in a bin
 REPEATABILITY = np.array([6e-4, 6e-4, 1e-4, 2e-3, 2e-3, 2e-3])  # rad, m: standard deviations, 0.2 mm at the gripper
+JAW_ERROR = 0.01  # rad: standard deviation of the angle that the jaws' encoder reads, as the backlash of the wrist
 LIFTED_HEIGHT = 0.018  # m: a gripper above this has lifted what it holds
 MOST_ATTEMPTS = 4 * MOST  # every fourth attempt at least brings an object into a cup
 FRAME_SIZE = (360, 480)
@@ -58,6 +59,7 @@ class BinPicking(base.Task):
         self.jaw_open = True
         self._grasp = np.zeros(6)
         self._masks = np.zeros((IMAGE_SIZE, IMAGE_SIZE, len(camera.EYES)), np.uint8)
+        self._jaw = JAW_OPEN
 
     def initialize_episode(self, physics: Physics) -> None:
         """The objects dropped into the bin, the gripper open over one of the cups."""
@@ -70,7 +72,7 @@ class BinPicking(base.Task):
         self._held: frozenset[int] = frozenset()
         self.lifted = None
         self.left = physics.objects
-        self._masks = camera.masks(physics)
+        self._see(physics)
         self._next_candidate()
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
@@ -91,13 +93,17 @@ class BinPicking(base.Task):
 
     def after_step(self, physics: Physics) -> None:
         """See what became of the attempt, and whether the bin has ended."""
-        self._masks = camera.masks(physics)
+        self._see(physics)
         if not self.jaw_open and self.lifted is None and physics.gripper().position[2] > LIFTED_HEIGHT:
             self.lifted = physics.held()
         released = self.jaw_open and not self._was_open
         if released or self.trials.steps >= MOST_STEPS:
             self._end_trial(physics, released)
         self.trials.end = self.trials.end or _gone_wrong(physics)
+
+    def _see(self, physics: Physics) -> None:
+        self._masks = camera.masks(physics)
+        self._jaw = physics.jaw() + JAW_ERROR * self.random.standard_normal()
 
     def _end_trial(self, physics: Physics, released: bool) -> None:
         places, lifted = physics.places(), self.lifted or frozenset()
@@ -129,14 +135,14 @@ class BinPicking(base.Task):
         ``image`` uint8 [64, 64, 2]: masks of the objects, 0 and 255, of the left and the right eye; ``grasp`` [6]: the
         trial's candidate, column and row (pixels of 256) in the left and the right picture, cosine and sine of the
         gripper's turn; ``kin`` [7]: position (mm) and rotation vector (rad) of the gripper as the encoders give them,
-        with kinematic error, and whether the jaws are open (0 or 1).
+        with kinematic error, and the angle between the jaws (rad), which objects between them keep from closing.
         """
         reported = psm.forward(physics.encoders())
         turn = psm.rotation_vector(reported.rotation)
         observation = OrderedDict()
         observation["image"] = camera.observed(self._masks)
         observation["grasp"] = self._grasp.copy()
-        observation["kin"] = np.concatenate([reported.position * 1e3, turn, [float(self.jaw_open)]])
+        observation["kin"] = np.concatenate([reported.position * 1e3, turn, [self._jaw]])
         return observation
 
     def get_reward(self, physics: Physics) -> float:

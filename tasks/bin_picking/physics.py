@@ -21,7 +21,7 @@ REST_TIME = 0.40  # s, after the last
 
 DROP_HEIGHT = 0.020  # m
 DROP_CENTRE = np.array([0.0, -0.006])  # m
-DROP_SPREAD = np.array([0.002, 0.002])  # m, standard deviations
+DROP_SPREAD = np.array([0.001, 0.001])  # m, standard deviations
 DROP_TILT = 0.4  # rad, standard deviation of the angle to the horizontal
 
 HELD_HEIGHT = 0.012  # m: an object whose centre of mass is above this does not rest on the bin or its walls

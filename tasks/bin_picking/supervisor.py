@@ -44,7 +44,7 @@ TURN_TOLERANCE = np.deg2rad(2.0)
 # A hand is inexact, the less so the nearer it is to what it aims at: standard deviations of a move.
 HAND_POSITION = {NEAR: 0.0004, FAR: 0.0010}  # m, in each direction
 HAND_HEIGHT_PART = 0.1  # more, in m per m that the gripper is above the grasp
-HAND_TURN = np.deg2rad(2.0)
+HAND_TURN = np.deg2rad(2.0)  # about each axis
 
 
 def grasp_plan(grasp: np.ndarray) -> list[WayPoint]:
@@ -169,9 +169,10 @@ class Supervisor(OpenLoop):
         """The gripper pose that a person achieves who wants another one."""
         height = max(0.0, way_point.pose.position[2] - GRASP_HEIGHT)
         spread = HAND_POSITION[way_point.tolerance] + HAND_HEIGHT_PART * height * (way_point.tolerance == NEAR)
-        turn = HAND_TURN * self._hand.standard_normal()
+        x, y, z = HAND_TURN * self._hand.standard_normal(3)
+        turn = psm.rotation(0, x) @ psm.rotation(1, y) @ psm.rotation(2, z)
         offset = spread * self._hand.standard_normal(3)
-        return Pose(psm.rotation(2, turn) @ way_point.pose.rotation, way_point.pose.position + offset)
+        return Pose(turn @ way_point.pose.rotation, way_point.pose.position + offset)
 
 
 def _differs(pose: Pose, way_point: WayPoint) -> bool:

@@ -173,6 +173,28 @@ def test_nothing_is_welded(environment: Environment) -> None:
     assert environment.physics.model.neq == 0
 
 
+JAWS = 4 * bin_picking.JAW_ERROR
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_jaws_close_as_far_as_what_they_hold_lets_them(environment: Environment, number: int) -> None:
+    radius = objects.parts(environment.task.trials.kinds[number])[0][2]
+    lay(environment, number, (0.0, 0.012, 0.002))
+    for height, jaw in ((0.020, 1), (0.003, 1), (0.003, 0)):
+        observation = go(environment, (0.0, 0.012, height), jaw, np.pi / 2).observation
+        if jaw:
+            np.testing.assert_allclose(observation["kin"][6], supervisor.JAW_OPEN, atol=JAWS)
+    nearest, furthest = 0.0077, 0.0127  # m, of the pads from the hinge
+    angle = observation["kin"][6]
+    assert 2 * radius / furthest - JAWS < angle < 2 * radius / nearest + JAWS
+
+
+def test_empty_jaws_close(environment: Environment) -> None:
+    angles = [go(environment, (0.0, 0.0, 0.03), 0).observation["kin"][6] for _ in range(5)]
+    np.testing.assert_allclose(angles, 0.0, atol=JAWS)
+    assert np.std(angles) > 0.0
+
+
 @pytest.mark.parametrize("number", range(3))
 def test_friction_holds_what_the_jaws_close_on_until_they_open(environment: Environment, number: int) -> None:
     physics, turn = environment.physics, np.pi / 2  # the object lies along x

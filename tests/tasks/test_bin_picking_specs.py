@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from bin_picking_controls import FORMS, changes
 from ddco_tasks.bin_picking import task
+from ddco_tasks.bin_picking.supervisor import JAW_OPEN
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.building import check_networks
@@ -60,11 +61,12 @@ def test_demonstrations_show_what_the_person_saw(demonstrations: Path) -> None:
     demos = Demonstrations.read(demonstrations, labels=("phase", "held", "kind", "left"))
     for demo in demos:
         assert set(np.unique(np.asarray(demo.observations["image"]))) == {0, 255}
-        opened = demo.observations["kin"][:, 6]
+        opened = demo.observations["kin"][:, 6] > JAW_OPEN / 2
         np.testing.assert_array_equal(opened[1:], demo.actions[:-1, 6])  # the jaws are as they were told to be
-        carried = demo.labels["phase"] == 4
+        carried = np.diff(demo.labels["phase"] == 4, prepend=False) & (demo.labels["phase"] == 4)  # begins to be
         assert (demo.labels["kind"][carried] >= 0).all()
-        assert (demo.labels["held"][demo.labels["phase"] == 3] != 1).all()
+        back = np.diff(demo.labels["phase"] == 3, prepend=False) & (demo.labels["phase"] == 3)
+        assert (demo.labels["held"][back] != 1).all()
         assert demo.labels["left"][0] == 3
 
 
