@@ -6,8 +6,8 @@ inputs each of them attends to.
 RUN is the folder of a fit of ``specs/bin_picking.yaml``, such as ``studies/bin_picking.py`` makes. Options are those of
 the most likely path through the demonstrations, trials apart by how they end. Of the bin, the first frames are shown
 with the left mask, and the options of all steps. An option attends to an input by as much as its control would change
-with it: the standard deviation, to first order, of each number of the control where that input alone varied as it does
-over all demonstrated steps.
+with it: the standard deviation, to first order, of each number of the control if that input alone varied as it does
+over all demonstrated steps. So do its termination and the meta-policy's choice.
 Writes ``docs/results/bin_picking/options.json``, ``options.md`` and ``options.png``.
 """
 
@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +31,13 @@ from matplotlib.patches import Patch
 from provenance import record, sentence, text
 from torch import Tensor
 
-from ddco_pyro.acting.saliency import Saliency
+from ddco_pyro.acting.saliency import Saliency, control
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import whole_file, write_text
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.fitting.fit import Fit, load
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.simulation.collect import collect
 from ddco_pyro.simulation.episodes import Episode, run_episode
 from ddco_pyro.simulation.task import find_task
@@ -49,8 +51,8 @@ PART = (slice(90, 270), slice(90, 390))  # of a frame, where something happens
 
 SHADES = {"image": "#1f3b73", "grasp": "#c9a227", "kin": "#5b8c5a"}
 
-Attention = dict[int, dict[str, float]]
-"""By option, the part of each input in what its control would change with."""
+Attention = dict[str, dict[str, float]]
+"""Of what options and meta-policy do, the part of each input in what it would change with."""
 Shares = dict[str, list[dict[int, float]]]
 """By how a trial ends, for each of its steps, the part of the trials in which each option is active."""
 
@@ -88,27 +90,45 @@ def shares(demos: Demonstrations, options: np.ndarray) -> tuple[Shares, dict[str
 
 
 def attention(hierarchy: Hierarchy, demos: Demonstrations, options: np.ndarray) -> Attention:
-    """What each option attends to, over the demonstrated steps in which it is the active one of ``options`` [N, T].
+    """What moves the control and the termination of each option, over the demonstrated steps in which it is the active
+    one of ``options`` [N, T]; and what moves the meta-policy's choice, over all steps.
 
-    The slopes g [F] of a number of the control with an input, and the covariance Σ [F, F] of the input over all steps,
-    give √(gᵀΣg); this is divided by its sum over the inputs, and averaged over the numbers and the steps.
+    The slopes g [F] of a number with an input, and the covariance Σ [F, F] of the input over all steps, give √(gᵀΣg);
+    this is divided by its sum over the inputs, and averaged over numbers and steps. The numbers are those of the
+    control, the termination's logit, and log-probabilities of the choice.
     """
     saliency, seen, slopes = Saliency(hierarchy), list[dict[str, Tensor]](), list[dict[str, Tensor]]()
-    active = []
     for demo, path in zip(demos, options, strict=True):
         saliency.reset()
         for step in range(len(demo)):
             observed = {key: values[step] for key, values in demo.observations.items()}
-            each = saliency.slopes(observed, (int(path[step]),))
+            each = saliency.slopes(observed, partial(_said, option=int(path[step])))
             seen.append({key: one.seen.flatten() for key, one in each.items()})
             slopes.append({key: one.slopes.flatten(1) for key, one in each.items()})
-            active.append(int(path[step]))
     spread = {key: _spreads(key, seen, slopes) for key in seen[0]}
-    total = sum(spread.values())
-    return {
-        option: {key: float((own / total)[np.array(active) == option].mean()) for key, own in spread.items()}
-        for option in sorted(set(active))
+    active = np.concatenate([path[: len(demo)] for demo, path in zip(demos, options, strict=True)])
+    size = hierarchy.scaling.numbers
+    parts = {"control": slice(size), "termination": slice(size, size + 1)}
+    found = {
+        f"{part}, option {option}": _shared(spread, active == option, numbers)
+        for option in np.unique(active)
+        for part, numbers in parts.items()
     }
+    return found | {"choice": _shared(spread, active > 0, slice(size + 1, None))}
+
+
+def _said(outputs: Outputs, option: int) -> Tensor:
+    """The control of an option, the logit of its termination, and log-probabilities of the meta-policy's choices."""
+    logits = outputs.callers[-1].logits
+    assert logits is not None  # there are several options
+    ends = outputs.termination_logits[0][0, 0, [option - 1]]
+    return torch.cat([control(outputs, (option,)), ends, logits[0, 0, 0].log_softmax(-1)])
+
+
+def _shared(spread: Mapping[str, np.ndarray], steps: np.ndarray, numbers: slice) -> dict[str, float]:
+    own = {key: values[steps, numbers] for key, values in spread.items()}
+    total = sum(own.values())
+    return {key: float((values / total).mean()) for key, values in own.items()}
 
 
 def _spreads(key: str, seen: Sequence[dict[str, Tensor]], slopes: Sequence[dict[str, Tensor]]) -> np.ndarray:
@@ -165,10 +185,10 @@ def _attended(axes: Axes, attended: Attention) -> None:
     top = np.zeros(len(attended))
     for key, shade in SHADES.items():
         heights = np.array([one[key] for one in attended.values()])
-        axes.bar([str(option) for option in attended], heights, 0.8, bottom=top, color=shade)
+        axes.bar([*attended], heights, 0.8, bottom=top, color=shade)
         top += heights
-    axes.set(xlabel="option", title="what moves its control")
-    axes.title.set_fontsize(9)
+    axes.set_title("what each input moves", fontsize=9)
+    axes.tick_params(axis="x", labelrotation=90, labelsize=7)
 
 
 def _path(axes: Axes, episode: Episode) -> None:
@@ -187,10 +207,16 @@ def page(results: dict[str, Any], made_by: str) -> str:
         cells = [", ".join(f"{option}: {share:.0%}" for option, share in step.items()) or "-" for step in steps]
         lines.append(f"| {name} ({results['trials'].get(name, 0)}) | {' | '.join(cells)} |")
     inputs = list(SHADES)
-    lines += ["", "Of what moves the control of an option where it is active, the part of each input.", ""]
-    lines += [f"| option | {' | '.join(inputs)} |", "|---" * (len(inputs) + 1) + "|"]
-    for option, parts in results["inputs"].items():
-        lines.append(f"| {option} | {' | '.join(f'{parts[key]:.0%}' for key in inputs)} |")
+    lines += [
+        "",
+        "What moves an option's control and its termination, in the steps in which it is active, and the meta-policy's "
+        "choice, in all steps: the part of each input.",
+        "",
+        f"| | {' | '.join(inputs)} |",
+        "|---" * (len(inputs) + 1) + "|",
+    ]
+    for name, parts in results["inputs"].items():
+        lines.append(f"| {name} | {' | '.join(f'{parts[key]:.0%}' for key in inputs)} |")
     lines += ["", "![options over the steps of a trial, and over a bin](options.png)"]
     return "\n".join(lines) + "\n"
 

@@ -8,6 +8,7 @@ import torch
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking, Saliency
+from ddco_pyro.acting.saliency import control as controlled
 from ddco_pyro.drawing.heat import HEIGHT, overlaid
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import parse_spec
@@ -89,7 +90,7 @@ def test_slopes_are_small_differences_of_vectors_too():
     hierarchy, seen = make(branches, ["options"]), episode()
     saliency = Saliency(hierarchy)
     for observation in seen:
-        slopes = saliency.slopes(observation, (2,))
+        slopes = saliency.slopes(observation, lambda outputs: controlled(outputs, (2,)))
     assert {key: one.slopes.shape for key, one in slopes.items()} == {"camera": (3, 10, 8, 6), "pose": (3, 2)}
     exact = hierarchy.double()
     for dimension in range(2):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ from ddco_pyro.drawing.heat import overlaid
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.state import States
+from ddco_pyro.model.outputs import Outputs
 
 
 class Look(NamedTuple):
@@ -25,7 +26,7 @@ class Look(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """An input as networks see it, of any shape, and ∂μ/∂x of each number μ of the control, [A, ...]."""
+    """An input as networks see it, of any shape, and ∂y/∂x of each number y of what they say of it, [A, ...]."""
 
     seen: Tensor
     slopes: Tensor
@@ -54,16 +55,16 @@ class Saliency:
         :raises ObservationError: an observation is missing or has an unseen shape.
         """
         looks = {}
-        for key, (seen, slopes) in self.slopes(observation, choices).items():
+        for key, (seen, slopes) in self.slopes(observation, lambda outputs: control(outputs, choices)).items():
             if key in self.hierarchy.encoder.images:
                 picture = self._last(key, seen.numpy())
                 looks[key] = Look(picture, slopes.square().sum((0, -1)).sqrt().numpy())
         return looks
 
-    def slopes(self, observation: Mapping[str, np.ndarray], choices: Sequence[int]) -> dict[str, Slopes]:
-        """How the control changes with what is observed, by the key of the observation; vectors are as encoded.
+    def slopes(self, observation: Mapping[str, np.ndarray], numbers: Callable[[Outputs], Tensor]) -> dict[str, Slopes]:
+        """How some numbers [A] of what the networks say change with what is observed, by the key of the observation.
 
-        :param choices: as those of :meth:`step`.
+        :param numbers: takes them from what the networks say of this step, [1, 1, ...].
         :raises ObservationError: as :meth:`step` does.
         """
         seen = self._window.inputs([observation])
@@ -73,15 +74,11 @@ class Saliency:
         with torch.enable_grad():
             outputs, states = self.hierarchy.advance(Inputs(vectors, images, seen.time), self._states)
             self._states = {name: tuple(part.detach() for part in state) for name, state in states.items()}
-            level = next((number for number, choice in enumerate(choices) if choice), len(choices))
-            emission = outputs.emissions[level]
-            assert emission is not None  # whoever is active emits the control
-            numbers = emission.numbers[0, 0, choices[level] - 1 if level < len(choices) else 0]
             each = [
                 torch.autograd.grad(
                     number, [*inputs.values()], retain_graph=True, allow_unused=True, materialize_grads=True
                 )
-                for number in numbers
+                for number in numbers(outputs)
             ]
         slopes = (torch.stack([one[0, 0] for one in of_input]) for of_input in zip(*each, strict=True))
         return {key: Slopes(arrays[key][0, 0], own) for key, own in zip(inputs, slopes, strict=True)}
@@ -89,6 +86,17 @@ class Saliency:
     def _last(self, key: str, pictures: np.ndarray) -> np.ndarray:
         """The newest of the pictures that are seen together."""
         return pictures[..., -(pictures.shape[-1] // self.hierarchy.encoder.transforms[key].frames) :]
+
+
+def control(outputs: Outputs, choices: Sequence[int]) -> Tensor:
+    """The numbers [A] of the active caller's control, in scaled units, in what networks say of a single step.
+
+    :param choices: the active choice of each level, lowest first; 0 for control by the caller.
+    """
+    level = next((number for number, choice in enumerate(choices) if choice), len(choices))
+    emission = outputs.emissions[level]
+    assert emission is not None  # whoever is active emits the control
+    return emission.numbers[0, 0, choices[level] - 1 if level < len(choices) else 0]
 
 
 class Looking:
