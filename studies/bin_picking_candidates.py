@@ -4,7 +4,8 @@
 
 An image is a pile of 3 to 8 objects; its labels are what came of simulated grasps at points drawn on what is seen, one
 after another from the same pile: a person would have marked them by hand. Writes the weights that the task reads
-(``tasks/bin_picking/grasp_classifier.json``), and ``docs/results/bin_picking/candidates.json`` and ``.md``.
+(``tasks/bin_picking/grasp_classifier.json``), and ``docs/results/bin_picking/candidates.json`` and ``.md``. With no
+images to label (``--images 0``) the weights that are there are measured.
 """
 
 from __future__ import annotations
@@ -70,6 +71,14 @@ def fitted(images: list[dict[str, Any]]) -> LogisticRegression:
     return LogisticRegression(max_iter=1000).fit(inputs, numbers > 0)
 
 
+def as_it_is() -> LogisticRegression:
+    """The task's classifier."""
+    kept, model = candidates.Classifier.load(), LogisticRegression()
+    model.coef_, model.intercept_ = kept.weights[None], np.array([kept.intercept])
+    model.classes_ = np.array([False, True])
+    return model
+
+
 def joined(images: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
     """Features and numbers of all grasps."""
     return np.vstack([one["features"] for one in images]), np.concatenate([one["lifted"] for one in images])
@@ -103,7 +112,8 @@ def page(results: dict[str, Any], made_by: str) -> str:
         cells = [rates.shown(results["testing"][name][key]) for key in ("takes something", "takes exactly one")]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     area = results["testing"]["area under the curve"]
-    lines += ["", f"Area under the curve on other images {area:.2f}, on its own {results['training']:.2f}."]
+    own = "" if results["training"] is None else f", on its own {results['training']:.2f}"
+    lines += ["", f"Area under the curve on other images {area:.2f}{own}."]
     return "\n".join(lines) + "\n"
 
 
@@ -120,11 +130,12 @@ def main() -> None:
     seeds = [*range(TRAINING, TRAINING + arguments.images), *range(TESTING, TESTING + arguments.others)]
     images = Parallel(n_jobs=arguments.jobs, verbose=5)(delayed(labelled)(seed, arguments.candidates) for seed in seeds)
     own, others = images[: arguments.images], images[arguments.images :]
-    model = fitted(own)
-    weights = {"weights": model.coef_[0].tolist(), "intercept": float(model.intercept_[0])}
-    write_text(candidates.WEIGHTS, json.dumps(weights, indent=1) + "\n")
-    made_by = record(command)  # with the weights that these images give, which are part of the task
-    training = measured(model, own)["area under the curve"]
+    model = fitted(own) if own else as_it_is()
+    if own:
+        weights = {"weights": model.coef_[0].tolist(), "intercept": float(model.intercept_[0])}
+        write_text(candidates.WEIGHTS, json.dumps(weights, indent=1) + "\n")
+    made_by = record(command)  # with the weights, which are part of the task
+    training = measured(model, own)["area under the curve"] if own else None
     results = {"training": training, "testing": measured(model, others)}
     shown = page(results, sentence(command, [made_by]))
     write_text(OUT / "candidates.json", text(results, [made_by]))

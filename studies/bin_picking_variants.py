@@ -1,13 +1,12 @@
-"""Bin picking with other numbers of options, with fewer demonstrations, and with pictures half as fine.
+"""Bin picking with other options, fewer demonstrations, coarser pictures, or controls that are poses (SM 1.4).
 
     python studies/bin_picking_variants.py [--seeds 1] [--variants options-1 demonstrations-20 ...] [--bins 20]
         [--jobs 1] [--summarize]
 
 Each variant is ``specs/bin_picking.yaml`` with one change, fitted with as many gradient steps, and plays the bins of
-the same training seed. ``options-K`` and ``pixels-32`` are the hierarchy alone, ``demonstrations-N`` has the flat
-policies beside it. What everything else is to be compared with, ``base``, is taken from the cells of
-``bin_picking.py``. ``--summarize`` runs nothing. Writes ``variants.json`` and ``variants.md`` of all cells that are
-done.
+the same training seed. ``demonstrations-N`` has the flat policies beside the hierarchy, the others do not. The spec
+itself, ``base``, is taken from the cells of ``bin_picking.py``. ``--summarize`` runs nothing. Writes ``variants.json``
+and ``variants.md`` of all cells that are done.
 """
 
 from __future__ import annotations
@@ -38,9 +37,17 @@ def _fewer(count: int) -> list[str]:
     return [f"demonstrations.count={count}", f"training.epochs={epochs}"]
 
 
+def _controls(task: str, numbers: int) -> list[str]:
+    """A task whose controls are so many numbers and the jaw."""
+    pose = f"{{name: pose, dims: {list(range(numbers))}, kind: gaussian}}"
+    return [ALONE, f"task={task}", f"control.parts=[{pose}, {{name: jaw, dims: [{numbers}], kind: binary}}]"]
+
+
 VARIANTS: dict[str, list[str]] = {
     **{f"options-{count}": [ALONE, f"hierarchy.levels.0.count={count}"] for count in (1, 2, 3, 5, 6, 8)},
     **{f"demonstrations-{count}": _fewer(count) for count in (10, 20, 40)},
+    "controls-pose": _controls("bin_picking_pose", 6),
+    "controls-matrix": _controls("bin_picking_matrix", 12),
     "pixels-32": [ALONE, "observations.0.resize=[13, 32]", "observations.0.augment.shift=2"],
 }
 
@@ -69,7 +76,11 @@ def page(rows: Mapping[str, Mapping[str, Any]], seconds: Mapping[str, Sequence[f
             cells = [rates.shown(one["criteria"][criterion]) for criterion in shown]
             held_out = ", ".join(f"{value:.2f}" for value in one["held_out"])
             lines.append(f"| {variant} | {name} | {' | '.join(cells)} | {held_out} | {took} |")
-    lines += ["", "Rates as in [summary.md](summary.md). Fits: of all methods of the row's variant, on one thread."]
+    lines += [
+        "",
+        "Rates as in [summary.md](summary.md). Likelihoods of other controls are in units of their own. Fits: of all "
+        "methods of the row's variant, on one thread.",
+    ]
     return "\n".join(lines) + "\n"
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bin_picking_controls import FORMS, changes
+from bin_picking_variants import VARIANTS
 from ddco_tasks.bin_picking import task
 from ddco_tasks.bin_picking.supervisor import JAW_OPEN
 
@@ -49,11 +49,11 @@ def test_specs_are_checked_against_the_task(path: Path) -> None:
     assert check_networks(spec, known).depth == 1
 
 
-@pytest.mark.parametrize("controls", FORMS)
-def test_the_spec_is_checked_against_the_task_with_other_controls(controls: str) -> None:
-    spec = load_spec(SPECS[0], changes(controls))
+@pytest.mark.parametrize(("variant", "numbers"), [(name, 7 + 6 * (name == "controls-matrix")) for name in VARIANTS])
+def test_variants_are_checked_against_their_tasks(variant: str, numbers: int) -> None:
+    spec = load_spec(SPECS[0], VARIANTS[variant])
     known = dimensions(spec)
-    assert known.control_size == FORMS[controls].size + 1
+    assert known.control_size == numbers
     assert check_networks(spec, known).depth == 1
 
 
