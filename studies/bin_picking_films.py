@@ -22,6 +22,7 @@ import torch
 from bin_picking_trials import ENDINGS, Bin, rolled
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 from provenance import record, sentence, text
 
 from ddco_pyro.data.files import whole_file, write_text
@@ -35,6 +36,7 @@ OUT = Path("docs/results/bin_picking")
 SHOWN = 8  # pictures of a film on the sheet
 PART = (slice(50, 280), slice(75, 420))  # of a frame, where something happens
 SMALLER = 2  # by how much they are reduced
+COLOURS = 128  # of the sheet: a third of the size
 
 
 def part(episode: Episode, steps: slice) -> Episode:
@@ -53,8 +55,8 @@ def endings(fit: Fit, seeds: range) -> Iterator[tuple[str, Episode]]:
 
 
 def chosen(found: Iterator[tuple[str, Episode]]) -> tuple[dict[str, Episode], Counter[str]]:
-    """The first trial of each ending, in the order of :data:`ENDINGS`, and how many trials ended in each way until all
-    had been seen.
+    """The first trial of each ending, those of :data:`ENDINGS` first, and how many trials ended in each way until all
+    of those had been seen.
     """
     first: dict[str, Episode] = {}
     counts: Counter[str] = Counter()
@@ -63,13 +65,13 @@ def chosen(found: Iterator[tuple[str, Episode]]) -> tuple[dict[str, Episode], Co
         first.setdefault(name, trial)
         if first.keys() >= set(ENDINGS):
             break
-    return {name: first[name] for name in ENDINGS if name in first}, counts
+    return {name: first[name] for name in dict.fromkeys([*ENDINGS, *first]) if name in first}, counts
 
 
 def sheet(trials: Mapping[str, Episode], path: Path) -> None:
     """A row of pictures for each trial, evenly over its frames, each framed in the colour of the active option."""
-    figure = Figure(figsize=(1.2 * SHOWN, 0.95 * len(trials)), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(1.2 * SHOWN, 0.95 * len(trials)), dpi=100, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
     for row, (name, trial) in zip(figure.subplots(len(trials), SHOWN, squeeze=False), trials.items(), strict=True):
         times = np.unique(np.linspace(0, len(trial.frames) - 1, SHOWN).round().astype(int))
         row[0].set_ylabel(name.replace(" to ", "\nto ").replace(" over ", "\nover "), fontsize=6)
@@ -82,8 +84,9 @@ def sheet(trials: Mapping[str, Episode], path: Path) -> None:
             axes.set(xticks=[], yticks=[])
         for axes in row[len(times) :]:
             axes.axis("off")
+    canvas.draw()
     with whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=100, format="png")
+        Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(COLOURS).save(temporary, "png")
 
 
 def page(results: Mapping[str, Any], made_by: str) -> str:
