@@ -15,8 +15,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +30,13 @@ from matplotlib.patches import Patch
 from provenance import record, sentence, text
 from torch import Tensor
 
-from ddco_pyro.acting.saliency import Saliency, control
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import whole_file, write_text
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.fitting.fit import Fit, load
+from ddco_pyro.fitting.inferred import infer
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.simulation.collect import collect
 from ddco_pyro.simulation.episodes import Episode, run_episode
@@ -97,45 +97,57 @@ def attention(hierarchy: Hierarchy, demos: Demonstrations, options: np.ndarray) 
     this is divided by its sum over the inputs, and averaged over numbers and steps. The numbers are those of the
     control, the termination's logit, and log-probabilities of the choice.
     """
-    saliency, seen, slopes = Saliency(hierarchy), list[dict[str, Tensor]](), list[dict[str, Tensor]]()
-    for demo, path in zip(demos, options, strict=True):
-        saliency.reset()
-        for step in range(len(demo)):
-            observed = {key: values[step] for key, values in demo.observations.items()}
-            each = saliency.slopes(observed, partial(_said, option=int(path[step])))
-            seen.append({key: one.seen.flatten() for key, one in each.items()})
-            slopes.append({key: one.slopes.flatten(1) for key, one in each.items()})
-    spread = {key: _spreads(key, seen, slopes) for key in seen[0]}
-    active = np.concatenate([path[: len(demo)] for demo, path in zip(demos, options, strict=True)])
-    size = hierarchy.scaling.numbers
+    each = [next(infer(hierarchy, [demo])).batch.inputs.loaded() for demo in demos]
+    arrays = [{**inputs.vectors, **inputs.images} for inputs in each]
+    seen = {key: torch.cat([one[key][0].float().flatten(1) for one in arrays]) for key in arrays[0]}
+    centred = {key: values - values.mean(0) for key, values in seen.items()}
+    active = [torch.as_tensor(path[: len(demo)]) for demo, path in zip(demos, options, strict=True)]
+    found = [_spreads(_slopes(hierarchy, *one), centred) for one in zip(each, active, strict=True)]
+    spread = {key: np.concatenate([one[key] for one in found]) for key in centred}
+    chosen, size = torch.cat(active).numpy(), hierarchy.scaling.numbers
     parts = {"control": slice(size), "termination": slice(size, size + 1)}
-    found = {
-        f"{part}, option {option}": _shared(spread, active == option, numbers)
-        for option in np.unique(active)
+    shared = {
+        f"{part}, option {option}": _shared(spread, chosen == option, numbers)
+        for option in np.unique(chosen[chosen > 0])
         for part, numbers in parts.items()
     }
-    return found | {"choice": _shared(spread, active > 0, slice(size + 1, None))}
+    return shared | {"choice": _shared(spread, chosen >= 0, slice(size + 1, None))}
 
 
-def _said(outputs: Outputs, option: int) -> Tensor:
-    """The control of an option, the logit of its termination, and log-probabilities of the meta-policy's choices."""
-    logits = outputs.callers[-1].logits
-    assert logits is not None  # there are several options
-    ends = outputs.termination_logits[0][0, 0, [option - 1]]
-    return torch.cat([control(outputs, (option,)), ends, logits[0, 0, 0].log_softmax(-1)])
+def _slopes(hierarchy: Hierarchy, inputs: Inputs, active: Tensor) -> dict[str, Tensor]:
+    """How what is said of each step changes with each input of that step [T, A, F]; these networks remember nothing."""
+    vectors, images = (
+        {key: array.detach().float().requires_grad_() for key, array in part.items()}
+        for part in (inputs.vectors, inputs.images)
+    )
+    arrays = vectors | images
+    said = _said(hierarchy(Inputs(vectors, images, inputs.time)), active)
+    how = {"retain_graph": True, "allow_unused": True, "materialize_grads": True}
+    slopes = [torch.autograd.grad(number.sum(), [*arrays.values()], **how) for number in said.T]
+    return {key: torch.stack(own, 2)[0].flatten(2) for key, own in zip(arrays, zip(*slopes, strict=True), strict=True)}
+
+
+def _said(outputs: Outputs, active: Tensor) -> Tensor:
+    """The active option's control and the logit of its termination, and log-probabilities of the meta-policy's choices,
+    of each step, [T, A].
+    """
+    emission, logits = outputs.emissions[0], outputs.callers[-1].logits
+    assert emission is not None  # options emit the control
+    assert logits is not None  # there are several of them
+    steps = torch.arange(len(active))
+    ends = outputs.termination_logits[0][0, steps, active - 1, None]
+    return torch.cat([emission.numbers[0, steps, active - 1], ends, logits[0, :, 0].log_softmax(-1)], dim=-1)
+
+
+def _spreads(slopes: Mapping[str, Tensor], centred: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
+    """√(gᵀΣg) of each input for each step and number, [T, A]."""
+    return {key: (slopes[key] @ values.T).square().mean(-1).sqrt().numpy() for key, values in centred.items()}
 
 
 def _shared(spread: Mapping[str, np.ndarray], steps: np.ndarray, numbers: slice) -> dict[str, float]:
     own = {key: values[steps, numbers] for key, values in spread.items()}
     total = sum(own.values())
     return {key: float((values / total).mean()) for key, values in own.items()}
-
-
-def _spreads(key: str, seen: Sequence[dict[str, Tensor]], slopes: Sequence[dict[str, Tensor]]) -> np.ndarray:
-    """√(gᵀΣg) of an input for each step and number of the control, [T, A]."""
-    values = torch.stack([one[key] for one in seen]).float()
-    values -= values.mean(0)
-    return torch.stack([(one[key] @ values.T).square().mean(1).sqrt() for one in slopes]).numpy()
 
 
 def acted(fit: Fit, seed: int) -> Episode:

@@ -8,7 +8,6 @@ import torch
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking, Saliency
-from ddco_pyro.acting.saliency import control as controlled
 from ddco_pyro.drawing.heat import HEIGHT, overlaid
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import parse_spec
@@ -49,15 +48,12 @@ def episode(seed=0):
     ]
 
 
-def control(hierarchy, observations, changed, choice, moved=0.0):
-    """The control's mean at the last step, where pixels seen there [H, W, 2 · C] have changed, and the encoded
-    pose has moved.
-    """
+def control(hierarchy, observations, changed, choice):
+    """The control's mean at the last step, where pixels of what is seen there [H, W, 2 · C] have changed."""
     inputs = hierarchy.encoder.inputs([{key: np.stack([one[key] for one in observations]) for key in SHAPES}]).loaded()
     images = {"camera": inputs.images["camera"].double()}
     images["camera"][0, -1] += torch.as_tensor(changed)
     vectors = {key: vector.double() for key, vector in inputs.vectors.items()}
-    vectors["pose"][0, -1] += torch.as_tensor(moved)
     outputs = hierarchy(type(inputs)(vectors, images, inputs.time))
     level = 0 if choice else 1
     return outputs.emissions[level].numbers[0, -1, choice - 1 if choice else 0].detach().numpy()
@@ -83,20 +79,6 @@ def test_saliency_is_the_size_of_small_differences(trunk, choice):
             squared += np.square((ends[0] - ends[1]) / 2e-4).sum()
         assert look.saliency[row, column] == pytest.approx(np.sqrt(squared), rel=1e-3, abs=1e-9)
     assert look.saliency.max() > 0
-
-
-def test_slopes_are_small_differences_of_vectors_too():
-    branches = {"network": "branches", "of": {"camera": CONV, "pose": {"network": "mlp"}}, "hidden": [5]}
-    hierarchy, seen = make(branches, ["options"]), episode()
-    saliency = Saliency(hierarchy)
-    for observation in seen:
-        slopes = saliency.slopes(observation, lambda outputs: controlled(outputs, (2,)))
-    assert {key: one.slopes.shape for key, one in slopes.items()} == {"camera": (3, 10, 8, 6), "pose": (3, 2)}
-    exact = hierarchy.double()
-    for dimension in range(2):
-        move = np.eye(2)[dimension] * 1e-5
-        ends = [control(exact, seen, np.zeros((10, 8, 6)), 2, sign * move) for sign in (1, -1)]
-        np.testing.assert_allclose(slopes["pose"].slopes[:, dimension], (ends[0] - ends[1]) / 2e-5, rtol=1e-3)
 
 
 def test_what_a_policy_does_not_read_has_none():

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.window import Window
@@ -15,7 +14,6 @@ from ddco_pyro.drawing.heat import overlaid
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.state import States
-from ddco_pyro.model.outputs import Outputs
 
 
 class Look(NamedTuple):
@@ -25,15 +23,8 @@ class Look(NamedTuple):
     saliency: np.ndarray
 
 
-class Slopes(NamedTuple):
-    """An input as networks see it, of any shape, and ∂y/∂x of each number y of what they say of it, [A, ...]."""
-
-    seen: Tensor
-    slopes: Tensor
-
-
 class Saliency:
-    """Follows an episode: :meth:`step` or :meth:`slopes` with each observation and the options that are active then.
+    """Follows an episode: :meth:`step` with each observation and the options that are active then.
 
     The saliency of a pixel is the norm of ∂μ/∂x over the numbers μ of the active caller's control, in scaled units, and
     the colours x of the pixel, of all pictures that are seen together; what is remembered of earlier steps is constant.
@@ -54,49 +45,28 @@ class Saliency:
         :param choices: the active choice of each level, lowest first; 0 for control by the caller.
         :raises ObservationError: an observation is missing or has an unseen shape.
         """
-        looks = {}
-        for key, (seen, slopes) in self.slopes(observation, lambda outputs: control(outputs, choices)).items():
-            if key in self.hierarchy.encoder.images:
-                picture = self._last(key, seen.numpy())
-                looks[key] = Look(picture, slopes.square().sum((0, -1)).sqrt().numpy())
-        return looks
-
-    def slopes(self, observation: Mapping[str, np.ndarray], numbers: Callable[[Outputs], Tensor]) -> dict[str, Slopes]:
-        """How some numbers [A] of what the networks say change with what is observed, by the key of the observation.
-
-        :param numbers: takes them from what the networks say of this step, [1, 1, ...].
-        :raises ObservationError: as :meth:`step` does.
-        """
         seen = self._window.inputs([observation])
-        arrays = {**seen.vectors, **seen.images}
-        inputs = {key: array.detach().float().requires_grad_() for key, array in arrays.items()}
-        vectors, images = ({key: inputs[key] for key in part} for part in (seen.vectors, seen.images))
+        images = {key: image.float().requires_grad_() for key, image in seen.images.items()}
         with torch.enable_grad():
-            outputs, states = self.hierarchy.advance(Inputs(vectors, images, seen.time), self._states)
+            outputs, states = self.hierarchy.advance(Inputs(seen.vectors, images, seen.time), self._states)
             self._states = {name: tuple(part.detach() for part in state) for name, state in states.items()}
-            each = [
-                torch.autograd.grad(
-                    number, [*inputs.values()], retain_graph=True, allow_unused=True, materialize_grads=True
-                )
-                for number in numbers(outputs)
-            ]
-        slopes = (torch.stack([one[0, 0] for one in of_input]) for of_input in zip(*each, strict=True))
-        return {key: Slopes(arrays[key][0, 0], own) for key, own in zip(inputs, slopes, strict=True)}
+            level = next((number for number, choice in enumerate(choices) if choice), len(choices))
+            emission = outputs.emissions[level]
+            assert emission is not None  # whoever is active emits the control
+            numbers = emission.numbers[0, 0, choices[level] - 1 if level < len(choices) else 0]
+            squared = {key: torch.zeros(image.shape[2:4]) for key, image in images.items()}
+            for number in numbers:
+                slopes = torch.autograd.grad(number, [*images.values()], retain_graph=True, allow_unused=True)
+                for key, slope in zip(images, slopes, strict=True):
+                    if slope is not None:  # the caller reads this picture
+                        squared[key] += slope[0, 0].square().sum(-1)
+        return {
+            key: Look(self._last(key, seen.images[key][0, 0].numpy()), squared[key].sqrt().numpy()) for key in images
+        }
 
     def _last(self, key: str, pictures: np.ndarray) -> np.ndarray:
         """The newest of the pictures that are seen together."""
         return pictures[..., -(pictures.shape[-1] // self.hierarchy.encoder.transforms[key].frames) :]
-
-
-def control(outputs: Outputs, choices: Sequence[int]) -> Tensor:
-    """The numbers [A] of the active caller's control, in scaled units, in what networks say of a single step.
-
-    :param choices: the active choice of each level, lowest first; 0 for control by the caller.
-    """
-    level = next((number for number, choice in enumerate(choices) if choice), len(choices))
-    emission = outputs.emissions[level]
-    assert emission is not None  # whoever is active emits the control
-    return emission.numbers[0, 0, choices[level] - 1 if level < len(choices) else 0]
 
 
 class Looking:
