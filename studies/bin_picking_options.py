@@ -197,7 +197,7 @@ def _attended(axes: Axes, attended: Attention) -> None:
     top = np.zeros(len(attended))
     for key, shade in SHADES.items():
         heights = np.array([one[key] for one in attended.values()])
-        axes.bar([*attended], heights, 0.8, bottom=top, color=shade)
+        axes.bar([name.replace("option ", "") for name in attended], heights, 0.8, bottom=top, color=shade)
         top += heights
     axes.set_title("what each input moves", fontsize=9)
     axes.tick_params(axis="x", labelrotation=90, labelsize=7)
