@@ -91,7 +91,7 @@ def shares(demos: Demonstrations, options: np.ndarray) -> tuple[Shares, dict[str
 
 def attention(hierarchy: Hierarchy, demos: Demonstrations, options: np.ndarray) -> Attention:
     """What moves the control and the termination of each option, over the demonstrated steps in which it is the active
-    one of ``options`` [N, T]; and what moves the meta-policy's choice, over all steps.
+    one of ``options`` [N, T]; and what moves the meta-policy's choice, over those in which another one begins.
 
     The slopes g [F] of a number with an input, and the covariance Σ [F, F] of the input over all steps, give √(gᵀΣg);
     this is divided by its sum over the inputs, and averaged over numbers and steps. The numbers are those of the
@@ -105,13 +105,14 @@ def attention(hierarchy: Hierarchy, demos: Demonstrations, options: np.ndarray) 
     found = [_spreads(_slopes(hierarchy, *one), centred) for one in zip(each, active, strict=True)]
     spread = {key: np.concatenate([one[key] for one in found]) for key in centred}
     chosen, size = torch.cat(active).numpy(), hierarchy.scaling.numbers
+    begins = np.concatenate([np.diff(path.numpy(), prepend=0) != 0 for path in active])
     parts = {"control": slice(size), "termination": slice(size, size + 1)}
     shared = {
         f"{part}, option {option}": _shared(spread, chosen == option, numbers)
         for option in np.unique(chosen[chosen > 0])
         for part, numbers in parts.items()
     }
-    return shared | {"choice": _shared(spread, chosen >= 0, slice(size + 1, None))}
+    return shared | {"choice": _shared(spread, begins, slice(size + 1, None))}
 
 
 def _slopes(hierarchy: Hierarchy, inputs: Inputs, active: Tensor) -> dict[str, Tensor]:
@@ -222,7 +223,7 @@ def page(results: dict[str, Any], made_by: str) -> str:
     lines += [
         "",
         "What moves an option's control and its termination, in the steps in which it is active, and the meta-policy's "
-        "choice, in all steps: the part of each input.",
+        "choice, in those in which another one begins: the part of each input.",
         "",
         f"| | {' | '.join(inputs)} |",
         "|---" * (len(inputs) + 1) + "|",
