@@ -30,11 +30,12 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit
-from ddco_pyro.simulation.episodes import rate
+from ddco_pyro.simulation.episodes import paired_difference, rate
 from ddco_pyro.spec import load_spec
 
 SPECS = {"bin_picking": "specs/bin_picking.yaml", "bin_picking_hybrid": "specs/bin_picking_hybrid.yaml"}
-NAMES = {"bin_picking": "DDCO", "bin_picking_hybrid": "hybrid"}
+OURS = "DDCO"
+NAMES = {"bin_picking": OURS, "bin_picking_hybrid": "hybrid"}
 STARTS = 950_000
 """Seed of the first training seed's first bin."""
 DEFAULTS = Settings({"bins": 20}, Path("runs/bin-picking"))
@@ -140,15 +141,31 @@ def measured(bins: Sequence[Bin]) -> dict[str, Any]:
 
 
 def summarize(cells: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Every method over all training seeds."""
+    """Every method over all training seeds, and what :func:`paired` says of it."""
     bins: dict[str, list[Bin]] = {}
+    by_seed: dict[str, list[int]] = {}
     likelihoods: dict[str, list[float]] = {}
     for cell in cells:
         for name, one in cell["methods"].items():
             bins.setdefault(name, []).extend(one["bins"])
+            by_seed.setdefault(name, []).append(int(sum(each["cleared"] for each in one["bins"])))
             if "log_likelihood_per_step" in one:
                 likelihoods.setdefault(name, []).append(one["log_likelihood_per_step"]["valid"])
-    return {name: measured(one) | {"held_out": likelihoods.get(name, [])} for name, one in bins.items()}
+    return {
+        name: measured(one)
+        | {"held_out": likelihoods.get(name, []), "cleared by seed": by_seed[name], "paired": paired(bins, name)}
+        for name, one in bins.items()
+    }
+
+
+def paired(bins: Mapping[str, Sequence[Bin]], name: str) -> dict[str, Any] | None:
+    """How many bins only DDCO cleared and how many only another method, of the same bins; None without the same."""
+    ours, theirs = ([one["cleared"] for one in bins.get(method, [])] for method in (OURS, name))
+    return None if name == OURS or len(ours) != len(theirs) else paired_difference(ours, theirs)
+
+
+def _shown(found: Mapping[str, Any] | None) -> str:
+    return "-" if found is None else f"{found['only_ours']}, {found['only_theirs']} (p = {found['p_value']:.2g})"
 
 
 def page(summary: Mapping[str, Any], seconds: Sequence[Mapping[str, float]], made_by: str) -> str:
@@ -158,6 +175,10 @@ def page(summary: Mapping[str, Any], seconds: Sequence[Mapping[str, float]], mad
     for name in criteria:
         cells = [rates.shown(one["criteria"][name]) for one in summary.values()]
         lines.append(f"| {name} | {' | '.join(cells)} | {PAPER.get(name, '-')} |")
+    cells = [", ".join(map(str, one["cleared by seed"])) for one in summary.values()]
+    lines.append(f"| bins cleared, by seed | {' | '.join(cells)} | - |")
+    cells = [_shown(one["paired"]) for one in summary.values()]
+    lines.append(f"| cleared by {OURS} alone, by this alone | {' | '.join(cells)} | - |")
     cells = [f"{one['delivered']:.0%}" for one in summary.values()]
     lines.append(f"| objects brought into cups | {' | '.join(cells)} | - |")
     cells = [", ".join(f"{value:.2f}" for value in one["held_out"]) or "-" for one in summary.values()]
@@ -169,7 +190,8 @@ def page(summary: Mapping[str, Any], seconds: Sequence[Mapping[str, float]], mad
     lines += [
         "",
         "Rates with 95 % Wilson intervals; where counts of a bin are pooled, for as many independent trials as the "
-        "variance between bins gives. Below: how many attempts were empty, took several, lost some of what they had "
+        "variance between bins gives; p of McNemar's exact test on the same bins. "
+        "Below: how many attempts were empty, took several, lost some of what they had "
         "lifted, ended in the wrong cup, or were over before the jaws opened; then how bins ended that were not "
         "cleared.",
         f"A cell took {np.mean(fits):.0f} s to fit and {np.mean(rolled):.0f} s to roll out, on one thread.",

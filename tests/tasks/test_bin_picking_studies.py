@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from bin_picking import OURS, summarize
 from bin_picking_films import chosen, part
 from bin_picking_options import ENDS, end, shares, trials
 from bin_picking_trials import ENDINGS, Bin, Trial
@@ -46,6 +47,18 @@ def test_options_are_shared_over_the_trials_that_end_alike() -> None:
     assert ended == {ENDS[0]: 2, ENDS[2]: 2}
     assert found[ENDS[0]][:5] == [{1: 0.5, 3: 0.5}, {1: 1.0}, {2: 1.0}, {2: 1.0}, {}]
     assert found[ENDS[2]][:5] == [{1: 1.0}] * 4 + [{}]
+
+
+def test_methods_are_paired_on_the_same_bins() -> None:
+    def bins(cleared: list[int]) -> dict[str, list[dict[str, float]]]:
+        return {"bins": [Trials(()).measures() | {"cleared": one, "objects": 3, "attempts": 1} for one in cleared]}
+
+    cells = [{"methods": {OURS: bins([1, 1, 1]), "flat": bins([0, 1, 0])}}] * 2
+    found = summarize([*cells, {"methods": {OURS: bins([0]), "flat": bins([1])}}])
+    assert found["flat"]["cleared by seed"] == [1, 1, 1]
+    # Of five bins that one method alone cleared, one or none was the other's: 2 (1 + 5) / 2⁵.
+    assert found["flat"]["paired"] == {"only_ours": 4, "only_theirs": 1, "trials": 7, "p_value": pytest.approx(0.375)}
+    assert found[OURS]["paired"] is None
 
 
 def test_rates_have_counts_and_wilson_interval() -> None:
