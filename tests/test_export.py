@@ -76,14 +76,20 @@ CONVOLUTIONS = {
     "network": "conv",
     "inputs": ["camera", "state"],
     "layers": [{"filters": 3, "kernel": 4, "stride": 2, "padding": 1}, {"filters": 2, "kernel": 3}],
+    "activation": "elu",
     "pool": "spatial_softmax",
 }
+LEAKY = {"network": "conv", "filters": 2, "pool": "flatten", "activation": "leaky_relu"}
 RECURRENT = {"network": "lstm", "over": {"hidden": [6]}, "hidden": [5, 4]}
 BRANCHES = {
     "network": "branches",
     "of": {
-        "camera": {"network": "lstm", "over": {"network": "conv", "filters": 2, "pool": "flatten"}, "hidden": 4},
-        "pair": {"network": "mlp", "inputs": ["goal", "state"], "hidden": [6]},
+        "camera": {
+            "network": "lstm",
+            "over": {"network": "conv", "filters": 2, "pool": "flatten", "activation": "leaky_relu"},
+            "hidden": 4,
+        },
+        "pair": {"network": "mlp", "inputs": ["goal", "state"], "hidden": [6], "activation": "tanh"},
         "step": {"network": "linear"},
     },
     "hidden": [7],

@@ -35,7 +35,7 @@ def test_every_built_in_network_takes_the_settings_that_a_spec_has_for_it():
 
 @pytest.mark.parametrize("name", CLASSES)
 def test_the_settings_of_a_spec_reach_the_network(name):
-    other = {"hidden": [7, 9], "dropout": 0.25, "filters": 2, "kernel": 3}
+    other = {"hidden": [7, 9], "dropout": 0.25, "activation": "elu", "filters": 2, "kernel": 3}
     given = {key: value for key, value in other.items() if key in SETTINGS[name].model_fields}
     shape = InputShape({"state": 3}, {"camera": (6, 6, 3)} if name == "conv" else {}, 5)
     if name == "branches":
@@ -49,6 +49,7 @@ def test_the_settings_of_a_spec_reach_the_network(name):
     assert {layer.p for layer in network.layers if isinstance(layer, nn.Dropout)} == (
         {0.25} if "dropout" in given else set()
     )
+    assert sum(isinstance(layer, nn.ELU) for layer in network.layers) == len(given.get("hidden", []))
     if name == "conv":
         assert network.convolutions["camera"].weight.shape == (2 * 4, 3, 3, 3)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import pytest
 import torch
 from stacked_networks import (
@@ -24,8 +26,9 @@ from user_networks import Stateful
 
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
 from ddco_pyro.model.networks.conv import POOLED
+from ddco_pyro.model.networks.stacked import StackedLinear
 from ddco_pyro.model.networks.state import answer
-from ddco_pyro.spec import NetworkSpec
+from ddco_pyro.spec import Activation, NetworkSpec
 
 
 @pytest.mark.parametrize("settings", [{"network": "linear"}, {"hidden": [8]}, {"hidden": [8, 6], "dropout": 0.5}])
@@ -47,6 +50,44 @@ def test_an_mlp_is_not_affine():
     twice = Inputs({"state": 2 * one.vector}, {}, one.time)
     nothing = Inputs({"state": 0 * one.vector}, {}, one.time)
     assert not torch.allclose(network(twice) + network(nothing), 2 * network(one), atol=1e-3)
+
+
+ACTIVATIONS = {
+    "relu": nn.functional.relu,
+    "leaky_relu": lambda x: nn.functional.leaky_relu(x, 0.01),
+    "elu": nn.functional.elu,
+    "tanh": torch.tanh,
+}
+
+
+def test_every_activation_is_measured():
+    assert list(ACTIVATIONS) == list(get_args(Activation))
+
+
+@pytest.mark.parametrize(("name", "activation"), ACTIVATIONS.items())
+def test_an_activation_follows_every_convolution_and_every_hidden_layer(name, activation):
+    layers = [{"filters": 2, "kernel": 3}, {"filters": 3, "kernel": 3}]
+    settings = {"layers": layers, "pool": "flatten", "hidden": [5, 4], "activation": name}
+    shape = InputShape({}, {"camera": PIXELS})
+    network, inputs = make(shape, network="conv", **settings), random_inputs(shape, 2, LONGEST, 0)
+    values = inputs.images["camera"].flatten(0, 1).permute(0, 3, 1, 2) / 255
+    for layer, filters in zip((network.convolutions["camera"], *network.deeper["camera"]), (2, 3), strict=True):
+        values = activation(nn.functional.conv2d(values, layer.weight[:filters], layer.bias[:filters]))
+    first, second, last = (layer for layer in network.layers if isinstance(layer, StackedLinear))
+    values = activation(values.flatten(1) @ first.weight[0] + first.bias[0])
+    expected = activation(values @ second.weight[0] + second.bias[0]) @ last.weight[0] + last.bias[0]
+    assert_close(network(inputs)[:, :, 0].flatten(0, 1), expected)
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_a_unit_below_0_for_all_that_is_observed_is_dead_only_where_it_is_rectified(name):
+    network = make(hidden=[8], activation=name)
+    first = network.layers[0]
+    with torch.no_grad():
+        first.weight[:, :, 0], first.bias[:, :, 0] = 0, -3
+    network(make_inputs()).sum().backward()
+    dead = first.bias.grad[:, 0, 0] == 0
+    assert dead.tolist() == [name == "relu"] * COPIES
 
 
 def test_dropout_drops_only_while_training():

@@ -78,14 +78,14 @@ class NumpyNetworks:
         return np.concatenate([self._evaluate(of, f"{name}.{number}") for number, of in enumerate(node["of"])], axis=1)
 
     def _perceptrons(self, node: Mapping[str, Any], name: str) -> np.ndarray:
-        """K perceptrons, those of this step; ReLU follows the hidden layers."""
+        """K perceptrons, those of this step; an activation follows the hidden layers."""
         values = self._evaluate(node["of"], f"{name}.of")[:, None]
         first = min(self._step, node["steps"] - 1) * node["copies"]
         own = slice(first, first + node["copies"])
         for layer in range(node["layers"]):
             values = values @ self._weights[f"{name}.{layer}.weight"][own] + self._weights[f"{name}.{layer}.bias"][own]
             if layer < node["hidden"]:
-                values = np.maximum(values, 0)
+                values = ACTIVATIONS[node["activation"]](values)
         return values[:, 0]
 
     def _lstm(self, node: Mapping[str, Any], name: str) -> np.ndarray:
@@ -103,11 +103,12 @@ class NumpyNetworks:
         return values[:, 0]
 
     def _convolutions(self, node: Mapping[str, Any], name: str) -> np.ndarray:
-        """Convolutions with ReLU of a picture, and what is read of their maps."""
+        """Convolutions of a picture, an activation after each, and what is read of their maps."""
         maps = self._images[node["key"]].astype(np.float32).transpose(2, 0, 1)[None] / 255
         for number, layer in enumerate(node["layers"]):
             weight, bias = self._weights[f"{name}.{number}.weight"], self._weights[f"{name}.{number}.bias"]
             maps = _convolved(np.broadcast_to(maps, (node["copies"], *maps.shape[1:])), weight, bias, layer)
+            maps = ACTIVATIONS[node["activation"]](maps)
         return POOLS[node["pool"]](maps, node["pooled"]).reshape(node["copies"], -1)
 
 
@@ -116,13 +117,21 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
 
 
 def _convolved(maps: np.ndarray, weight: np.ndarray, bias: np.ndarray, layer: Mapping[str, Any]) -> np.ndarray:
-    """[K, C, H, W] to [K, filters, H', W'], ReLU after it; filters [K · filters, C, size, size]."""
+    """[K, C, H, W] to [K, filters, H', W']; filters [K · filters, C, size, size]."""
     size, pad, stride = weight.shape[-1], (layer["padding"],) * 2, layer["stride"]
     padded = np.pad(maps, ((0, 0), (0, 0), pad, pad))
     windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(2, 3))[:, :, ::stride, ::stride]
     own = weight.reshape(len(maps), -1, *weight.shape[1:])
     convolved = np.einsum("kchwij,kfcij->kfhw", windows, own, optimize=True)
-    return np.maximum(convolved + bias.reshape(len(maps), -1, 1, 1), 0)
+    return np.asarray(convolved + bias.reshape(len(maps), -1, 1, 1))
+
+
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "relu": lambda x: np.maximum(x, 0),
+    "leaky_relu": lambda x: np.where(x > 0, x, np.float32(0.01) * x),
+    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
+    "tanh": np.tanh,
+}
 
 
 def _means(maps: np.ndarray, pooled: int) -> np.ndarray:

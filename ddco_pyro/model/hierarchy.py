@@ -269,7 +269,8 @@ def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
     assert spec.baseline is not None  # a spec has one or the other
     policy = spec.baseline.policy
     if spec.baseline.kind == "per_timestep":
-        policy = NetworkSpec(network="per_timestep", inputs=policy.inputs, hidden=policy.hidden, dropout=policy.dropout)
+        kept = {key: getattr(policy, key) for key in ("inputs", "hidden", "dropout", "activation")}
+        policy = NetworkSpec(network="per_timestep", **kept)
     return policy, ("control",)
 
 

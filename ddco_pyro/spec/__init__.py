@@ -5,7 +5,7 @@ An unknown key, a wrong type or a value out of range is a :class:`SpecError` wit
 
 from ddco_pyro.spec.hierarchy import BaselineSpec, HierarchySpec, LevelSpec
 from ddco_pyro.spec.messages import SpecError
-from ddco_pyro.spec.networks import ConvolutionLayer, MetaPolicySpec, NetworkSpec, PolicySpec, Pool
+from ddco_pyro.spec.networks import Activation, ConvolutionLayer, MetaPolicySpec, NetworkSpec, PolicySpec, Pool
 from ddco_pyro.spec.reading import dump_spec, load_spec, spec_schema
 from ddco_pyro.spec.settings import (
     STEP,
@@ -26,6 +26,7 @@ from ddco_pyro.spec.whole import Spec, parse_spec, with_overrides
 
 __all__ = [
     "STEP",
+    "Activation",
     "BaselineSpec",
     "ControlSpec",
     "ConvolutionLayer",

@@ -36,6 +36,7 @@ Sizes = Annotated[
 ]
 """Sizes of layers; a bare number is a single one."""
 Pool = Literal["mean", "flatten", "spatial_softmax"]
+Activation = Literal["relu", "leaky_relu", "elu", "tanh"]
 
 
 class Network(Model):
@@ -54,10 +55,13 @@ class Perceptron(Network):
     """Sizes of the hidden layers, first one first; a bare number is a single layer. Those of ``lstm`` remember."""
     dropout: Share = 0.0
     """Probability with which a unit is dropped while training."""
+    activation: Activation = "relu"
+    """What follows every hidden layer and every convolution. A unit of ``relu`` that is 0 for all that is observed has
+    no gradient any more and stays so; those of ``leaky_relu`` (slope 0.01 below 0), ``elu`` and ``tanh`` keep one."""
 
 
 class ConvolutionLayer(Model):
-    """One convolution, with ReLU after it."""
+    """One convolution, with the activation of its network after it."""
 
     filters: Count
     """Number of filters."""

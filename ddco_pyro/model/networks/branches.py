@@ -11,6 +11,7 @@ from ddco_pyro.model.networks.inputs import Inputs, InputShape
 from ddco_pyro.model.networks.numpy_form import NumpyForm, joined, numpy_form, perceptrons
 from ddco_pyro.model.networks.stacked import Perceptrons, options_first, options_last
 from ddco_pyro.model.networks.state import State, Trunk, answer, initial_state
+from ddco_pyro.spec import Activation
 
 
 class Branches(nn.Module):
@@ -23,13 +24,14 @@ class Branches(nn.Module):
         copies: int,
         hidden: tuple[int, ...],
         dropout: float,
+        activation: Activation,
         of: Mapping[str, Trunk],
     ) -> None:
         super().__init__()
         self.names = tuple(of)
         self.of = nn.ModuleList(trunk.network for trunk in of.values())
         features = sum(trunk.features for trunk in of.values())
-        self.layers = Perceptrons(copies, features, hidden, outputs, dropout)
+        self.layers = Perceptrons(copies, features, hidden, outputs, dropout, activation)
         self.features = self.layers.features
 
     def initial_state(self, trajectories: int) -> State:

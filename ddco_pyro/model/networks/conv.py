@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.numpy_form import NumpyForm, arrays_of, joined, perceptrons, vectors
-from ddco_pyro.model.networks.stacked import Perceptrons, options_last
-from ddco_pyro.spec import ConvolutionLayer, Pool
+from ddco_pyro.model.networks.stacked import ACTIVATIONS, Perceptrons, options_last
+from ddco_pyro.spec import Activation, ConvolutionLayer, Pool
 
 SHARPNESS = 10.0
 """Under a softmax maps begin so many times as strong as drawn: under one of weak maps all places are nearly the same,
@@ -21,7 +21,7 @@ POOLED = 8
 
 
 class Conv(nn.Module):
-    """K networks of convolutions (ReLU) over each picture, pooled, and a perceptron over that and the vectors.
+    """K networks of convolutions over each picture, pooled, and a perceptron over that and the vectors.
 
     :param layers: the convolutions; where there are none, a single one of ``filters`` and ``kernel``, stride 2.
     :param pool: ``mean`` of ``pooled`` × ``pooled`` fields of each map, ``flatten`` for all of it, or where in the map
@@ -35,6 +35,7 @@ class Conv(nn.Module):
         copies: int,
         hidden: tuple[int, ...],
         dropout: float,
+        activation: Activation,
         filters: int,
         kernel: int,
         layers: Sequence[ConvolutionLayer],
@@ -45,6 +46,7 @@ class Conv(nn.Module):
         if not shape.images:
             raise ShapeError("needs an image among the observations, and all of them are vectors: use network: mlp")
         self.reads, self.copies, self.pool, self.pooled = list(shape.vectors), copies, pool, pooled
+        self.activation = ACTIVATIONS[activation]()
         first, *rest = layers or [ConvolutionLayer(filters=filters, kernel=kernel, stride=2, padding=kernel // 2)]
         self.convolutions = nn.ModuleDict(
             {key: _convolution(first, size[-1], copies) for key, size in shape.images.items()}
@@ -62,7 +64,7 @@ class Conv(nn.Module):
         if pool == "spatial_softmax":
             self.strengthen(SHARPNESS)
         maps = sum(self._map_features(key, size) for key, size in shape.images.items())
-        self.layers = Perceptrons(copies, shape.vector + maps, hidden, outputs, dropout)
+        self.layers = Perceptrons(copies, shape.vector + maps, hidden, outputs, dropout, activation)
         self.features = self.layers.features
 
     def forward(self, inputs: Inputs) -> Tensor:
@@ -80,6 +82,7 @@ class Conv(nn.Module):
         layers = self._layers(key)
         strides = [{"stride": layer.stride[0], "padding": int(layer.padding[0])} for layer in layers]
         facts = {"kind": "convolutions", "key": key, "copies": self.copies, "layers": strides}
+        facts["activation"] = self.layers.activation
         arrays = arrays_of({str(number): layer for number, layer in enumerate(layers)})
         return facts | {"pool": self.pool, "pooled": self.pooled}, arrays
 
@@ -99,7 +102,7 @@ class Conv(nn.Module):
         layers = self._layers(key)
         maps = image.permute(0, 3, 1, 2).to(layers[0].weight.dtype) / 255
         for layer in layers:
-            maps = torch.relu(layer(maps))
+            maps = self.activation(layer(maps))
         return self._pool(maps).reshape(len(image), self.copies, -1).transpose(0, 1)
 
     def _pool(self, maps: Tensor) -> Tensor:

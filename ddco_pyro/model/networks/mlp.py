@@ -7,18 +7,25 @@ from torch import Tensor, nn
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.numpy_form import NumpyForm, perceptrons, vectors
 from ddco_pyro.model.networks.stacked import Perceptrons, options_last
+from ddco_pyro.spec import Activation
 
 
 class Mlp(nn.Module):
     """K perceptrons over all vectors side by side."""
 
     def __init__(
-        self, shape: InputShape, outputs: int | None, copies: int, hidden: tuple[int, ...], dropout: float
+        self,
+        shape: InputShape,
+        outputs: int | None,
+        copies: int,
+        hidden: tuple[int, ...],
+        dropout: float,
+        activation: Activation,
     ) -> None:
         super().__init__()
         refuse_images(shape)
         self.reads = list(shape.vectors)
-        self.layers = Perceptrons(copies, shape.vector, hidden, outputs, dropout)
+        self.layers = Perceptrons(copies, shape.vector, hidden, outputs, dropout, activation)
         self.features = self.layers.features
 
     def forward(self, inputs: Inputs) -> Tensor:
@@ -34,7 +41,7 @@ class Linear(Mlp):
     """K linear maps of all vectors; as a trunk the vectors themselves."""
 
     def __init__(self, shape: InputShape, outputs: int | None, copies: int) -> None:
-        super().__init__(shape, outputs, copies, hidden=(), dropout=0.0)
+        super().__init__(shape, outputs, copies, hidden=(), dropout=0.0, activation="relu")
 
 
 def refuse_images(shape: InputShape) -> None:

@@ -35,10 +35,10 @@ def vectors(keys: Sequence[str], copies: int) -> NumpyForm:
 
 
 def perceptrons(layers: Perceptrons, of: NumpyForm) -> NumpyForm:
-    """The form of K stacked perceptrons over something; ReLU follows the first ``hidden`` of its ``layers``."""
+    """The form of K stacked perceptrons over something; its activation follows the first ``hidden`` layers."""
     linear = [layer for layer in layers if isinstance(layer, StackedLinear)]
-    hidden = sum(isinstance(layer, nn.ReLU) for layer in layers)
-    facts = {"kind": "perceptrons", "layers": len(linear), "hidden": hidden, "copies": layers.copies, "steps": 1}
+    facts = {"kind": "perceptrons", "layers": len(linear), "hidden": layers.hidden, "activation": layers.activation}
+    facts |= {"copies": layers.copies, "steps": 1}
     return over_layers(of, facts, {str(number): layer for number, layer in enumerate(linear)})
 
 

@@ -9,19 +9,26 @@ from ddco_pyro.model.networks.inputs import Inputs, InputShape
 from ddco_pyro.model.networks.mlp import refuse_images
 from ddco_pyro.model.networks.numpy_form import NumpyForm, perceptrons, vectors
 from ddco_pyro.model.networks.stacked import Perceptrons, StackedLinear
+from ddco_pyro.spec import Activation
 
 
 class PerTimestep(nn.Module):
     """K × T perceptrons; step t is read by the t-th, steps past the longest demonstration by the last."""
 
     def __init__(
-        self, shape: InputShape, outputs: int | None, copies: int, hidden: tuple[int, ...], dropout: float
+        self,
+        shape: InputShape,
+        outputs: int | None,
+        copies: int,
+        hidden: tuple[int, ...],
+        dropout: float,
+        activation: Activation,
     ) -> None:
         super().__init__()
         refuse_images(shape)
         self.reads = list(shape.vectors)
         self.copies, self.steps = copies, shape.steps
-        self.layers = Perceptrons(shape.steps * copies, shape.vector, hidden, outputs, dropout)
+        self.layers = Perceptrons(shape.steps * copies, shape.vector, hidden, outputs, dropout, activation)
         self.features = self.layers.features
 
     def forward(self, inputs: Inputs) -> Tensor:

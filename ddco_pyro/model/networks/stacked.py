@@ -7,6 +7,15 @@ import math
 import torch
 from torch import Tensor, nn
 
+from ddco_pyro.spec import Activation
+
+ACTIVATIONS: dict[Activation, type[nn.Module]] = {
+    "relu": nn.ReLU,
+    "leaky_relu": nn.LeakyReLU,
+    "elu": nn.ELU,
+    "tanh": nn.Tanh,
+}
+
 
 class StackedLinear(nn.Module):
     """y_k = x_k W_k + b_k for k = 1..K; initialised as ``torch.nn.Linear`` would each of them."""
@@ -35,24 +44,31 @@ class StackedLinear(nn.Module):
 
 
 class Perceptrons(nn.Sequential):
-    """K multi-layer perceptrons with ReLU and dropout after every hidden layer; no hidden layer: K linear maps.
+    """K multi-layer perceptrons with activation and dropout after every hidden layer; no hidden layer: K linear maps.
 
     :param outputs: None leaves the last map out: they then give ``features`` numbers, those of the last hidden layer.
     """
 
     def __init__(
-        self, copies: int, inputs: int, hidden: tuple[int, ...], outputs: int | None, dropout: float = 0.0
+        self,
+        copies: int,
+        inputs: int,
+        hidden: tuple[int, ...],
+        outputs: int | None,
+        dropout: float = 0.0,
+        activation: Activation = "relu",
     ) -> None:
         layers: list[nn.Module] = []
         features = inputs
         for size in hidden:
-            layers += [StackedLinear(copies, features, size), nn.ReLU(), nn.Dropout(dropout)]
+            layers += [StackedLinear(copies, features, size), ACTIVATIONS[activation](), nn.Dropout(dropout)]
             features = size
         if outputs is not None:
             layers.append(StackedLinear(copies, features, outputs))
             features = outputs
         super().__init__(*layers)
         self.copies, self.features = copies, features
+        self.hidden, self.activation = len(hidden), activation
 
     def forward(self, values: Tensor) -> Tensor:
         """[K, M, inputs], or [1, M, inputs] shared by all K, to [K, M, features]."""
