@@ -271,7 +271,9 @@ def same(
     )
 
 
-@pytest.mark.parametrize("name", ["model.safetensors", "checkpoints/restart-0.safetensors"])
+@pytest.mark.parametrize("name", [
+    "model.safetensors", pytest.param("checkpoints/restart-0.safetensors", marks=pytest.mark.slow),
+])  # fmt: skip
 def test_a_flipped_bit_is_refused_or_makes_no_difference(toy_run: Fit, tmp_path: Path, name: str) -> None:
     """Of every 37th byte, in the header too."""
     path, content = tmp_path / "file", (toy_run.folder / name).read_bytes()

@@ -81,7 +81,7 @@ def test_two_hundred_joint_choices(counts):
     agree(tables, torch.tensor([12, 7]))
 
 
-@pytest.mark.parametrize("sharp", [1.0, 100.0])
+@pytest.mark.parametrize("sharp", [1.0, pytest.param(100.0, marks=pytest.mark.slow)])
 def test_ten_thousand_steps(sharp):
     tables = random_tables((5,), (True,), steps=10_000, seed=8)
     agree(replace(tables, control=tuple(sharp * c for c in tables.control)), torch.tensor([10_000]))

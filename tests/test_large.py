@@ -219,6 +219,7 @@ def flat_fit(path: Path, **observation: object) -> Path:
     return spec
 
 
+@pytest.mark.slow
 def test_a_fit_to_pictures_stays_within_what_is_allowed(tmp_path: Path) -> None:
     """290 MB of pictures; what they take on the way through networks is a multiple of that."""
     path = camera(tmp_path / "demos.hdf5", 3, 420, 240, 320)

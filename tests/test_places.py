@@ -43,7 +43,9 @@ def source(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("size", [0, 100, 5000, 60_000, 300_000])
+@pytest.mark.parametrize(
+    "size", [0, 5000, 300_000, *(pytest.param(size, marks=pytest.mark.slow) for size in (100, 60_000))]
+)
 def test_a_full_disk_while_importing(source: Path, tmp_path: Path, size: int) -> None:
     out = tmp_path / "out.hdf5"
     with room(size):

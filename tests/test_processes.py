@@ -118,6 +118,7 @@ def contents(folder):
 MODELS = [{}, {"optimizer": {"name": "momentum"}, "clip_gradient": 0.1, "duration": {"mean": 4}}]
 
 
+@pytest.mark.slow
 def test_three_processes_give_the_same_bits(demos, tmp_path):
     """Two models in turn, trained by the same processes; then one with a demonstration that is spoilt in the shard of
     another process, which raises what is raised here.

@@ -52,6 +52,7 @@ def two_skills(path: Path, number: int = 12) -> None:
     Demonstrations(tuple(records)).write(path)
 
 
+@pytest.mark.slow
 def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Path) -> None:
     """Held out it is as likely, to 0.1 nats per step, as under the policy that the demonstrations were drawn from."""
     two_skills(path)

@@ -19,7 +19,9 @@ NAMES = sorted(point.name for point in entry_points(group=TASKS))
 
 
 @pytest.mark.filterwarnings("ignore:.*:UserWarning:gymnasium.*")
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=pytest.mark.slow if name.startswith("bin_picking_") else ()) for name in NAMES
+])  # fmt: skip
 def test_gymnasiums_own_check(name: str) -> None:
     environment = gymnasium.make(f"ddco_pyro.simulation.environments:ddco/{name}-v0", render_mode="rgb_array")
     check_env(environment.unwrapped, skip_render_check=True)

@@ -55,6 +55,7 @@ def test_without_opengl_libraries_one_line_names_the_packages(cause: str) -> Non
     assert f"apt-get install {PACKAGES}" in advice(cause)
 
 
+@pytest.mark.slow
 def test_without_a_driver_one_line_names_the_packages() -> None:
     for command in ((sys.executable, "tasks/opengl.py"), (COMMAND, "check", "specs/needle.yaml")):
         found = ended(*command, **NO_DRIVER)
