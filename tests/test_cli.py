@@ -330,6 +330,7 @@ def test_a_command_ends_with_its_status_and_finds_tasks_beside_it(spec):
     assert (process.returncode, out, err.count("\n")) == (2, "", 1)
 
 
+@pytest.mark.slow
 def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
     longer = with_set("compare_with=[]", "training.epochs=60", "training.patience=null")
     folder = tmp_path / "cut"

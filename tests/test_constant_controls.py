@@ -175,7 +175,7 @@ def test_many_at_once_emit_them(whole: Fit, reduced: Fit, control: str) -> None:
         check_control(found, expected)
 
 
-@pytest.mark.parametrize("control", ["mean", "sample"])
+@pytest.mark.parametrize("control", ["mean", pytest.param("sample", marks=pytest.mark.slow)])
 def test_exported_controllers_emit_them(whole: Fit, tmp_path: Path, control: str) -> None:
     changed = Fit(with_overrides(whole.spec, {"rollout.control": control}), whole.hierarchy)
     differences = export(changed, tmp_path, onnx=True)

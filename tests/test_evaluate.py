@@ -94,6 +94,7 @@ def test_the_first_episodes_of_each_method_are_filmed(rolled):
     assert films == {f"{method}-{seed}.mp4" for method in METHODS for seed in (FIRST, FIRST + 1)}
 
 
+@pytest.mark.slow
 def test_rolling_out_again_gives_the_same(rolled, toy_run, tmp_path):
     run, results, *_ = rolled
     again = ddco_pyro.load(shutil.copytree(toy_run.folder, tmp_path / "again"))

@@ -122,7 +122,13 @@ FITS = {
 }
 
 
-@pytest.mark.parametrize("name", FITS)
+LIKE_OTHERS = ("lstm", "conv", "three levels")
+"""Their parts are those of others, together."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in LIKE_OTHERS else ()) for name in FITS]
+)
 def test_every_form_acts_as_the_controller_does(name, tmp_path):
     """On other observations than those that it was compared on when it was written, past the longest demonstration."""
     fit, onnx = FITS[name], name in ("per_timestep", "conv", "lstm", "trunk")
@@ -188,7 +194,7 @@ def test_the_runner_is_one_file_in_which_nothing_is_missing(exported):
     assert subprocess.run(linter, capture_output=True, text=True).stdout == "All checks passed!\n"
 
 
-@pytest.mark.parametrize("form", ["numpy", "torch", "onnx"])
+@pytest.mark.parametrize("form", ["numpy", pytest.param("torch", marks=pytest.mark.slow), "onnx"])
 def test_each_form_runs_without_this_library(exported, form):
     folder, _ = exported
     ended = subprocess.run([sys.executable, "-c", ALONE, form], cwd=folder, capture_output=True, text=True)
@@ -348,7 +354,7 @@ def test_networks_that_numpy_cannot_evaluate_are_compared_as_a_program(tmp_path,
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-@pytest.mark.parametrize("place", ["network", "over"])
+@pytest.mark.parametrize("place", ["network", pytest.param("over", marks=pytest.mark.slow)])
 def test_a_users_state_is_carried_by_programs(place, tmp_path):
     fit = make(RECURRENT)
     meta_policy = fit.hierarchy.meta_policy

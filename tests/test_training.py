@@ -158,8 +158,8 @@ def test_without_a_budget_every_stage_trains_until_its_patience(tmp_path):
     ("optimizer", "training", "rows"),
     [
         ("adam", {"epochs": 18}, 2 * 6 * 3),
-        ("momentum", {"epochs": 18}, 2 * 6 * 3),
-        ("adam", {"epochs": 30, "patience": 1}, None),
+        pytest.param("momentum", {"epochs": 18}, 2 * 6 * 3, marks=pytest.mark.slow),
+        pytest.param("adam", {"epochs": 30, "patience": 1}, None, marks=pytest.mark.slow),
         ("adam", {"epochs": 20, "upper_levels": "segments"}, 2 * 5 * 4),
     ],
     ids=["adam", "momentum", "stages that stop early", "levels from segments"],

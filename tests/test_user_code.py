@@ -173,6 +173,7 @@ def test_in_python_code_is_allowed_by_name(spec: Path, imported: Path) -> None:
     assert parse_spec(yaml.safe_load(toy_task.SPEC.replace("task: toy", f"task: {TASK}"))).task == TASK
 
 
+@pytest.mark.slow
 def test_the_working_folder_is_searched_only_where_code_is_allowed(spec: Path, tmp_path: Path) -> None:
     """Else what lies there could register itself, or stand in for an optional package that is not installed."""
     folder = tmp_path / "hostile"
