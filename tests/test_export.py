@@ -84,11 +84,7 @@ RECURRENT = {"network": "lstm", "over": {"hidden": [6]}, "hidden": [5, 4]}
 BRANCHES = {
     "network": "branches",
     "of": {
-        "camera": {
-            "network": "lstm",
-            "over": {"network": "conv", "filters": 2, "pool": "flatten", "activation": "leaky_relu"},
-            "hidden": 4,
-        },
+        "camera": {"network": "lstm", "over": LEAKY, "hidden": 4},
         "pair": {"network": "mlp", "inputs": ["goal", "state"], "hidden": [6], "activation": "tanh"},
         "step": {"network": "linear"},
     },
