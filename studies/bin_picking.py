@@ -14,7 +14,7 @@ import argparse
 import csv
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,8 +45,6 @@ FAILURES = ("empty", "several", "slipped", "wrong cup", "not let go")
 
 Bin = Mapping[str, float]
 """The measures of a bin, by name."""
-Page = Callable[[Mapping[str, Any], Sequence[Mapping[str, float]], str], str]
-"""Makes Markdown of every method's results, the seconds of the cells, and the sentence that says what made them."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +119,8 @@ def measured(bins: Sequence[Bin]) -> dict[str, Any]:
         {
             **one,
             "opened over the bin": one["recovered"] + one["due_cups"] - one["kept"],
+            "several held": one["due_recoveries"] - one["nothing"],
+            "several recovered": one["recovered"] - one["nothing_recovered"],
             "wrong cup": one["delivered"] - one["sorted"],
             "not let go": one["attempts"] - one["due_cups"] - one["due_recoveries"],
         }
@@ -131,6 +131,8 @@ def measured(bins: Sequence[Bin]) -> dict[str, Any]:
         "bins cleared into the right cups": rate(int(sum(one["success"] for one in bins)), len(bins)),
         "grasp of exactly one": clustered(more, "single", "attempts"),
         "recovery, recall": clustered(more, "recovered", "due_recoveries"),
+        "recall where nothing is held": clustered(more, "nothing_recovered", "nothing"),
+        "recall where several are": clustered(more, "several recovered", "several held"),
         "recovery, precision": clustered(more, "recovered", "opened over the bin"),
         "categorisation": clustered(more, "sorted", "delivered"),
     }
@@ -217,15 +219,6 @@ def run(own: argparse.Namespace) -> str:
     settings = DEFAULTS.given(own)
     cells = [Fitted(spec, seed) for seed in range(own.seeds) for spec in own.specs]
     command = f"python studies/bin_picking.py --seeds {own.seeds} --specs {' '.join(own.specs)} {settings.words()}"
-    return concluded(cells, settings, own, command, "summary", page)
-
-
-def concluded(
-    cells: Sequence[Cell], settings: Settings, own: argparse.Namespace, command: str, name: str, page: Page
-) -> str:
-    """Do the cells that are not done yet, unless they are only to be summarized, and write JSON and page of this name
-    of those that are done; the page.
-    """
     if not own.summarize:
         made_by = record(cells[0].command(settings))
         Parallel(n_jobs=own.jobs)(delayed(cell.run)(settings, made_by) for cell in cells)
@@ -233,8 +226,8 @@ def concluded(
     summary = summarize([one["results"] for one in kept])
     records = [one["provenance"][0] for one in kept]
     shown = page(summary, [one["results"]["seconds"] for one in kept], sentence(command, records))
-    write_text(own.out / f"{name}.json", text(summary, records))
-    write_text(own.out / f"{name}.md", shown)
+    write_text(own.out / "summary.json", text(summary, records))
+    write_text(own.out / "summary.md", shown)
     return shown
 
 

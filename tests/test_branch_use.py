@@ -14,7 +14,7 @@ from ddco_pyro.spec import parse_spec
 
 BRANCHES = {
     "network": "branches",
-    "of": {"seen": {"network": "mlp", "hidden": [8]}, "noise": {"network": "mlp", "hidden": [8]}},
+    "of": {"seen": {"network": "mlp", "hidden": [8]}, "noise": {"network": "mlp", "hidden": [8], "activation": "tanh"}},
     "hidden": [16],
 }
 
@@ -58,8 +58,8 @@ def test_what_decides_the_control_is_told_from_what_does_not(fitted):
         assert abs(noise) < 0.3 * seen
 
 
-def test_activations_are_the_means_of_what_the_branches_give(fitted):
-    """By hand: each branch called alone, its units' mean, weighted by the posterior."""
+def test_activations_are_the_mean_sizes_of_what_the_branches_give(fitted):
+    """By hand: each branch called alone, its units' mean size, weighted by the posterior."""
     demos = demonstrations(4)
     (use,) = branch_use(fitted.hierarchy, fitted.infer(demos))
     (piece,) = fitted.infer(demos)
@@ -68,7 +68,7 @@ def test_activations_are_the_means_of_what_the_branches_give(fitted):
     u = piece.posterior.u[0][..., 1:]
     for column, branch in enumerate(network.of):
         with torch.no_grad():
-            units = branch(piece.batch.inputs).double().mean(-1)
+            units = branch(piece.batch.inputs).double().abs().mean(-1)
         expected = (u * units).sum((0, 1)) / u.sum((0, 1))
         np.testing.assert_allclose([row[column] for row in use["activation"]], expected, rtol=1e-6)
 

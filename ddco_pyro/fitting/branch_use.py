@@ -26,7 +26,7 @@ def branch_use(hierarchy: Hierarchy, pieces: Iterable[Inferred]) -> list[dict[st
     ``level`` is its number from 0, ``branches`` the branches' names, and both of these have a row for each option and
     a column for each branch, weighted by the posterior probability that the option is active:
 
-    - ``activation``: the mean of what the branch gives the joint layer;
+    - ``activation``: the mean size of what the branch gives the joint layer;
     - ``loss``: by how many nats per step the option's control, and the meta-policy's choices, are less likely where the
       branch reads what was observed at another step, drawn among all steps; None where the level emits no control.
     """
@@ -74,7 +74,7 @@ def _sums(hierarchy: Hierarchy, piece: Inferred, level: int, branch: nn.Module) 
     with torch.no_grad(), ExitStack() as hooks:
         seen = hooks.enter_context(_watched(branch))
         hierarchy(piece.batch.inputs)
-        activation = torch.cat(seen, dim=1).double().mean(-1)
+        activation = torch.cat(seen, dim=1).double().abs().mean(-1)
         hooks.enter_context(_replaced(branch, piece.batch.lengths))
         loss = _score(hierarchy, piece, level, weight) - _score(hierarchy, piece, level, weight, replaced=True)
     return torch.stack([(weight * activation).sum((0, 1)), loss, weight.sum((0, 1))], dim=-1)

@@ -183,8 +183,8 @@ def branches(fit: Fit, metrics: Mapping[str, Any]) -> Figures | None:
         for use in uses
     ]
     caption = (
-        "Left: the mean of what each branch gives the joint layer, while the option is active. Right: by how many nats "
-        "per step its control is less likely where the branch reads what was observed at another step."
+        "Left: the mean size of what each branch gives the joint layer, while the option is active. Right: by how many "
+        "nats per step its control is less likely where the branch reads what was observed at another step."
     )
     picture = keep(plot_branches.draw(uses, names), fit.run_folder / "figures" / "branches.png", "Branches", caption)
     return Figures([picture], tables.branches(uses, names))

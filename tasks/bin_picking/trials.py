@@ -85,11 +85,13 @@ class Trials:
         ``single``, ``empty`` and ``several`` by how many objects were first lifted, ``slipped`` where fewer were left
         when the jaws opened. One that holds one object when the jaws open is to be delivered (``due_cups``, of them
         ``kept`` not dropped into the bin, ``delivered`` into a cup and ``sorted`` into its own), another one is to be
-        recovered from (``due_recoveries``, of them ``recovered``): opened over the bin.
+        recovered from (``due_recoveries``, of them ``recovered``): opened over the bin. ``nothing`` and
+        ``nothing_recovered`` are those of the latter two that hold nothing.
         """
         attempts = [attempt for attempt in self.attempts if attempt.places]
         loaded = [attempt for attempt in attempts if len(attempt.carried) == 1]
         others = [attempt for attempt in attempts if len(attempt.carried) != 1]
+        nothing = [attempt for attempt in others if not attempt.carried]
         delivered = [attempt for attempt in loaded if attempt.delivered]
         in_own_cups = sum(self.own_cup(*attempt.carried) == attempt.places[0] for attempt in delivered)
         cleared = self.end is End.CLEARED
@@ -106,6 +108,8 @@ class Trials:
             "sorted": in_own_cups,
             "due_recoveries": len(others),
             "recovered": sum(attempt.returned for attempt in others),
+            "nothing": len(nothing),
+            "nothing_recovered": sum(attempt.returned for attempt in nothing),
         }
         all_sorted = cleared and in_own_cups == len(self.kinds)
         ends = {f"ended_{end.value}": self.end is end for end in End if end is not End.CLEARED}

@@ -274,7 +274,7 @@ def test_measures_of_attempts() -> None:
     trials = Trials(["pin", "wire", "needle"], attempts, end=End.MISSED)
     expected = {"success": 0, "cleared": 0, "ended_missed": 1, "objects": 3, "attempts": 7, "single": 3, "empty": 2}
     expected |= {"several": 2, "slipped": 1, "due_cups": 3, "kept": 2, "delivered": 2, "sorted": 1}
-    expected |= {"due_recoveries": 3, "recovered": 2}
+    expected |= {"due_recoveries": 3, "recovered": 2, "nothing": 2, "nothing_recovered": 1}
     found = trials.measures()
     assert {name: found[name] for name in expected} == expected
     assert not trials.missed()
