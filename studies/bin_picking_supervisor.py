@@ -1,16 +1,16 @@
 """The demonstrator of bin picking: how many objects its grasps take, how its bins end, and what a picture tells.
 
-    python studies/bin_picking_supervisor.py
+    python studies/bin_picking_supervisor.py [--demonstrations 60] [--out DIR]
 
-Collects the demonstrations of ``specs/bin_picking.yaml``, unless they have been. What is held at the moment of decision
+Collects as many demonstrations as ``specs/bin_picking.yaml`` has, or others, unless they have been. What is held at the moment of decision
 is also read from the observed left mask, where the load is shown, and from how far the jaws are closed, by a classifier
 that is tested on bins it was not trained on: it says how much of that a policy can know. What a first grasp takes from
-a pile of five, as the paper counts, is measured on fresh ones. Writes ``docs/results/bin_picking/supervisor.json`` and
-``supervisor.md``.
+a pile of five, as the paper counts, is measured on fresh ones. Writes ``supervisor.json`` and ``supervisor.md``.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 from collections import Counter
 from pathlib import Path
@@ -35,9 +35,7 @@ from ddco_pyro.simulation.collect import collect
 from ddco_pyro.simulation.episodes import rate
 from ddco_pyro.spec import load_spec
 
-COMMAND = "python studies/bin_picking_supervisor.py"
 SPEC = "specs/bin_picking.yaml"
-OUT = Path("docs/results/bin_picking")
 FOLDS = 5
 BEST = "the shape and the jaws' angle"
 FEWEST = 4  # pixels; fewer have no shape
@@ -173,8 +171,14 @@ def page(results: dict[str, Any], made_by: str) -> str:
 
 def main() -> None:
     """Run the study."""
-    made_by = record(COMMAND)
-    path = collect("bin_picking", load_spec(SPEC).demonstrations)
+    plan = load_spec(SPEC).demonstrations
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--demonstrations", type=int, default=plan.count)
+    parser.add_argument("--out", type=Path, default=Path("docs/results/bin_picking"))
+    own = parser.parse_args()
+    command = f"python studies/bin_picking_supervisor.py --demonstrations {own.demonstrations}"
+    made_by = record(command)
+    path = collect("bin_picking", plan.model_copy(update={"count": own.demonstrations}))
     demos = Demonstrations.read(path, ["image", "kin"], labels=("phase", "held", "kind", "left"))
     results = {
         "demonstrations": len(demos),
@@ -185,9 +189,9 @@ def main() -> None:
         "bins": json.loads(str(demos.attributes["supervisor"])),
         "from observations": from_observations(demos),
     }
-    shown = page(results, sentence(COMMAND, [made_by]))
-    write_text(OUT / "supervisor.json", text(results, [made_by]))
-    write_text(OUT / "supervisor.md", shown)
+    shown = page(results, sentence(command, [made_by]))
+    write_text(own.out / "supervisor.json", text(results, [made_by]))
+    write_text(own.out / "supervisor.md", shown)
     print(shown)
 
 
