@@ -2,10 +2,11 @@
 
     python studies/bin_picking_supervisor.py [--demonstrations 60] [--out DIR]
 
-Collects as many demonstrations as ``specs/bin_picking.yaml`` has, or others, unless they have been. What is held at the moment of decision
-is also read from the observed left mask, where the load is shown, and from how far the jaws are closed, by a classifier
-that is tested on bins it was not trained on: it says how much of that a policy can know. What a first grasp takes from
-a pile of five, as the paper counts, is measured on fresh ones. Writes ``supervisor.json`` and ``supervisor.md``.
+Collects as many demonstrations as ``specs/bin_picking.yaml`` has, or others, unless they have been. What is held at the
+moment of decision is also read from the observed left mask, where the load is shown, and from how far the jaws are
+closed, by a classifier that is tested on bins it was not trained on: it says how much of that a policy can know. What a
+first grasp takes from a pile of five, as the paper counts, is measured on fresh ones. Writes ``supervisor.json`` and
+``supervisor.md``.
 """
 
 from __future__ import annotations
