@@ -154,6 +154,19 @@ def test_without_a_budget_every_stage_trains_until_its_patience(tmp_path):
     assert trainer.summary["budget"] == {"epochs": None, "gradient_steps": None}
 
 
+@pytest.mark.parametrize(("name", "apart"), [("adamw", True), ("adam", False)])
+def test_weight_decay_of_adamw_is_apart_from_the_gradient(name, apart, tmp_path):
+    """In the first step it takes as much more of every weight as it is larger; a penalty is lost in Adam's scaling."""
+    settings = {"initialize": "random", "layerwise": False, "epochs": 1}
+    after = []
+    for decay in (0.0, 1.0, 2.0):
+        spec = make_spec((2,), optimizer={"name": name, "lr": 0.01, "weight_decay": decay}, **settings)
+        after.append(make_trainer(spec, random_demonstrations(), tmp_path / str(decay)).run().state_dict())
+    none, once, twice = (torch.cat([value.flatten() for value in one.values()]) for one in after)
+    assert (none != once).sum() > 10
+    assert torch.allclose(twice - none, 2 * (once - none), atol=1e-7) == apart
+
+
 @pytest.mark.parametrize(
     ("optimizer", "training", "rows"),
     [

@@ -13,8 +13,8 @@ from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Share,
 class OptimizerSpec(Model):
     """The optimiser of the expectation-gradient steps."""
 
-    name: Literal["adam", "momentum"] = "adam"
-    """``adam``, or ``momentum`` for gradient descent with momentum."""
+    name: Literal["adam", "adamw", "momentum"] = "adam"
+    """``adam``, ``adamw``, or ``momentum`` for gradient descent with momentum."""
     lr: Positive = 1e-3
     """Learning rate."""
     schedule: Literal["constant", "cosine"] = "constant"
@@ -25,7 +25,7 @@ class OptimizerSpec(Model):
     momentum: Share = 0.9
     """Momentum (``momentum`` only)."""
     weight_decay: float = Field(default=0.0, ge=0)
-    """L2 penalty."""
+    """L2 penalty; of ``adamw`` by which part, times the learning rate, every weight shrinks in a step."""
 
 
 class LabelsSpec(Model):
