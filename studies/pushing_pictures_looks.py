@@ -1,0 +1,92 @@
+"""What a policy that pushes from pictures looks at, in an episode in which it acts.
+
+    python studies/pushing_pictures_looks.py METHOD OPTIONS COUNT SEED CHECKPOINTS [--updates 4000] [--runs DIR]
+
+The cell of ``pushing_pictures_cell.py`` with these words; CHECKPOINTS is the folder of its fit, as that leaves it in
+``RUNS/fits``, from which the networks are taken. Plays the cell's first evaluation episode. Writes ``looks.md`` and
+``looks.png`` in ``docs/results/pushing_pictures``: what the camera sees, paler, under how much the control of the
+active option changes with each pixel, and the active option of every step.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from cells import described
+from matplotlib.figure import Figure
+from provenance import record, sentence
+from pushing_cell import EVALUATION
+from pushing_pictures_cell import DEFAULTS, METHODS, WATCHED, PictureCell, pool, spec_of
+
+from ddco_pyro.acting.controller import Controller
+from ddco_pyro.acting.saliency import Looking
+from ddco_pyro.data.files import write_text
+from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.drawing.pictures import WIDTH, blank, keep
+from ddco_pyro.fitting.building import Dimensions, baseline_spec
+from ddco_pyro.fitting.run import train
+from ddco_pyro.simulation.episodes import run_episode
+from ddco_pyro.spec import Spec
+
+OUT = Path("docs/results/pushing_pictures")
+COLUMNS, ROWS = 6, 2
+
+
+def controller(cell: PictureCell, own: argparse.Namespace, spec: Spec) -> Controller:
+    """The cell's policy; nothing is trained where its fit is done."""
+    demos = pool(own.runs, cell.seed)
+    demos = demos.select(demos.names[: cell.count])
+    size = Dimensions.of(demos)
+    spec = spec if cell.options else baseline_spec(spec, spec.compare_with[0], size)
+    return Controller.from_spec(train(spec, size, demos, checkpoints=own.checkpoints).hierarchy, spec.rollout)
+
+
+def draw(frames: list[np.ndarray], choices: np.ndarray) -> Figure:
+    """Pictures evenly over the steps, framed in the colour of the active option, and the options [T] below."""
+    height, width = frames[0].shape[:2]
+    shown = np.linspace(0, len(frames) - 1, COLUMNS * ROWS).round().astype(int)
+    figure = blank(ROWS * (WIDTH / COLUMNS * height / width + 0.25) + 0.9)
+    figure.set_layout_engine("constrained")
+    grid = figure.add_gridspec(ROWS + 1, COLUMNS, height_ratios=[*[1.0] * ROWS, 0.15])
+    for number, step in enumerate(shown):
+        axes = figure.add_subplot(grid[number // COLUMNS, number % COLUMNS])
+        axes.imshow(frames[step])
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(f"step {step}", fontsize=8)
+        axes.spines[:].set(visible=True, linewidth=2, color=option_colour(int(choices[step])))
+    strip = figure.add_subplot(grid[ROWS, :])
+    for option in np.unique(choices):
+        strip.bar(np.flatnonzero(choices == option), 1, 1, color=option_colour(int(option)), label=f"option {option}")
+    strip.set(xlim=(-0.5, len(choices) - 0.5), yticks=[], xlabel="step")
+    strip.legend(frameon=False, fontsize=7, ncols=4, loc="lower left", bbox_to_anchor=(0, 1))
+    return figure
+
+
+def main() -> None:
+    """Draw the picture."""
+    parser = described(__doc__)
+    parser.add_argument("method", choices=METHODS)
+    for name in ("options", "count", "seed"):
+        parser.add_argument(name, type=int)
+    parser.add_argument("checkpoints", type=Path)
+    DEFAULTS.add_to(parser)
+    own = parser.parse_args()
+    cell, settings = PictureCell(own.method, own.options, own.count, own.seed), DEFAULTS.given(own)
+    words = f"{cell.method} {cell.options} {cell.count} {cell.seed} {own.checkpoints}"
+    command = f"python studies/pushing_pictures_looks.py {words} {settings.words()}"
+    made_by = record(command)
+    torch.set_num_threads(1)
+    looking = Looking(controller(cell, own, spec_of(cell, settings)))
+    seed = EVALUATION + 1000 * cell.seed
+    episode = run_episode(WATCHED, looking, seed, observed=["camera"], keep=[])
+    choices = episode.choices[:, 0] if cell.options else np.zeros(len(looking.frames), int)
+    caption = f"What {cell.method} looks at, and the option that is active; episode {seed}"
+    keep(draw(looking.frames, choices), OUT / "looks.png", caption, "")
+    write_text(OUT / "looks.md", f"{sentence(command, [made_by])}\n\n![{caption}](looks.png)\n")
+
+
+if __name__ == "__main__":
+    main()
