@@ -177,6 +177,8 @@ def main() -> None:
     parser.add_argument("--demonstrations", type=int, default=plan.count)
     parser.add_argument("--out", type=Path, default=Path("docs/results/bin_picking"))
     own = parser.parse_args()
+    if own.demonstrations < FOLDS:
+        parser.error(f"--demonstrations: {FOLDS} at least, one bin for each fold; got {own.demonstrations}")
     command = f"python studies/bin_picking_supervisor.py --demonstrations {own.demonstrations}"
     made_by = record(command)
     path = collect("bin_picking", plan.model_copy(update={"count": own.demonstrations}))

@@ -74,6 +74,8 @@ def main() -> None:
     parser.add_argument("checkpoints", type=Path)
     DEFAULTS.add_to(parser)
     own = parser.parse_args()
+    if not list(own.checkpoints.glob("restart-*.safetensors")):
+        parser.error(f"{own.checkpoints}: no fit is there; run pushing_pictures_cell.py with these words first")
     cell, settings = PictureCell(own.method, own.options, own.count, own.seed), DEFAULTS.given(own)
     words = f"{cell.method} {cell.options} {cell.count} {cell.seed} {own.checkpoints}"
     command = f"python studies/pushing_pictures_looks.py {words} {settings.words()}"
