@@ -40,7 +40,7 @@ drawn = {path.stem: Image(str(path)) for path in Path(FOLDER).glob("*.png")}
 # when the box has reached it a demonstration ends. The demonstrator sees the state, and its hand trembles.
 
 # %%
-demonstration = run_episode(find_task("pushing_goal"), "scripted_noisy_0.3", seed=3, observed=["camera"])
+demonstration = run_episode(find_task("pushing_goal"), "scripted_noisy_0.3", seed=0, observed=["camera"])
 pictures = demonstration.record.observations["camera"]
 steps = range(0, len(pictures), max(1, len(pictures) // 6))
 figure, axes = plt.subplots(2, len(steps), figsize=(16, 4.4), layout="constrained")
