@@ -3,8 +3,8 @@
     python studies/pushing_pictures_looks.py METHOD OPTIONS COUNT SEED CHECKPOINTS [--updates 4000] [--runs DIR]
 
 The cell of ``pushing_pictures_cell.py`` with these words; CHECKPOINTS is the folder of its fit, as that leaves it in
-``RUNS/fits``, from which the networks are taken. Plays the cell's first evaluation episode. Writes ``looks.md`` and
-``looks.png`` in ``docs/results/pushing_pictures``: what the camera sees, paler, under how much the control of the
+``RUNS/fits``, from which the networks are taken. Plays the cell's first evaluation episode. Writes ``looks.json``,
+``looks.md`` and ``looks.png`` in ``docs/results/pushing_pictures``: what the camera sees, paler, under how much the control of the
 active option changes with each pixel, and the active option of every step.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from cells import described
 from matplotlib.figure import Figure
-from provenance import record, sentence
+from provenance import record, sentence, text
 from pushing_cell import EVALUATION
 from pushing_pictures_cell import DEFAULTS, METHODS, WATCHED, PictureCell, pool, spec_of
 
@@ -87,6 +87,8 @@ def main() -> None:
     choices = episode.choices[:, 0] if cell.options else np.zeros(len(looking.frames), int)
     caption = f"What {cell.method} looks at, and the option that is active; episode {seed}"
     keep(draw(looking.frames, choices), OUT / "looks.png", caption, "")
+    results = {"outcome": dict(episode.outcome), "options": choices.tolist()}
+    write_text(OUT / "looks.json", text(results, [made_by]))
     write_text(OUT / "looks.md", f"{sentence(command, [made_by])}\n\n![{caption}](looks.png)\n")
 
 
