@@ -4,8 +4,8 @@
 
 The cell of ``pushing_pictures_cell.py`` with these words; CHECKPOINTS is the folder of its fit, as that leaves it in
 ``RUNS/fits``, from which the networks are taken. Plays the cell's first evaluation episode. Writes ``looks.json``,
-``looks.md`` and ``looks.png`` in ``docs/results/pushing_pictures``: what the camera sees, paler, under how much the control of the
-active option changes with each pixel, and the active option of every step.
+``looks.md`` and ``looks.png`` in ``docs/results/pushing_pictures``: what the camera sees, paler, under how much the
+control of the active option changes with each pixel, and the active option of every step.
 """
 
 from __future__ import annotations
@@ -87,7 +87,8 @@ def main() -> None:
     choices = episode.choices[:, 0] if cell.options else np.zeros(len(looking.frames), int)
     caption = f"What {cell.method} looks at, and the option that is active; episode {seed}"
     keep(draw(looking.frames, choices), OUT / "looks.png", caption, "")
-    results = {"outcome": dict(episode.outcome), "options": choices.tolist()}
+    shares = {int(option): float(np.mean(choices == option)) for option in np.unique(choices)}
+    results = {"goals": episode.outcome["goals"], "topples": episode.outcome["topples"], "part of the steps": shares}
     write_text(OUT / "looks.json", text(results, [made_by]))
     write_text(OUT / "looks.md", f"{sentence(command, [made_by])}\n\n![{caption}](looks.png)\n")
 
