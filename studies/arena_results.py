@@ -108,6 +108,7 @@ def page(results: Result, made_by: str) -> str:
     ]
     lines += [f"| {task} | {_expert(one['expert'])} |" for task, one in tasks.items()]
     for count, table in results["segments"].items():
+        lines += ["", f"## Success with {count} demonstrations", "", *_successes(tasks, count)]
         lines += ["", f"## Segments with {count} demonstrations", "", *arena_segments.page(table)]
     different = [found["methods"][name]["bridge_difference"] for one in tasks.values()
                  for found in one["counts"].values() for name in methods]  # fmt: skip
@@ -125,6 +126,26 @@ def _likelihood(one: Result) -> str:
 
 def _success(one: Result) -> str:
     return f"{one['successes']} of {one['trials']}" + (f", {spread(one, '{:.0%}')}" if one["interval"] else "")
+
+
+def _successes(tasks: Result, count: str) -> list[str]:
+    """Lines of Markdown: how often each method succeeds in all, and ours minus each of the others, paired by task."""
+    found = [one["counts"][count]["methods"] for one in tasks.values() if count in one["counts"]]
+    lines = [
+        f"Episodes of {len(found)} tasks and all training seeds; {OURS} minus each of the others, paired by task (of "
+        "means over training seeds), with 95 % t intervals over tasks, on how many tasks it is better, and "
+        "Wilcoxon's p.",
+        "",
+        f"| method | succeeds | {OURS} minus it |",
+        "|---|---|---|",
+    ]
+    for name in found[0]:
+        own = [one[name]["success"] for one in found]
+        counts = f"{sum(one['successes'] for one in own)} of {sum(one['trials'] for one in own)}"
+        ours, theirs = ([one[method]["success"]["mean"] for one in found] for method in (OURS, name))
+        difference = "-" if name == OURS else arena_segments.shown(arena_segments.paired(ours, theirs), "{:+.1%}")
+        lines.append(f"| {name} | {counts} | {difference} |")
+    return lines
 
 
 def _expert(one: Result) -> str:

@@ -53,15 +53,21 @@ def compared(cells: list[dict[str, Any]]) -> dict[str, Any]:
         }  # fmt: skip
         table[measure] = {
             "methods": {name: over_seeds([float(value) for value in own]) for name, own in by_task.items()},
-            "difference": {name: _paired(by_task[OURS], by_task[name]) for name in methods if name != OURS},
+            "difference": {name: paired(by_task[OURS], by_task[name]) for name in methods if name != OURS},
         }
     return {"tasks": tasks, "measures": table}
 
 
-def _paired(ours: list[Any], theirs: list[Any]) -> dict[str, Any]:
+def paired(ours: list[Any], theirs: list[Any]) -> dict[str, Any]:
+    """Ours minus theirs over tasks, [tasks] each, on how many tasks ours is more, and Wilcoxon's p."""
     values = np.subtract(ours, theirs)
     p = float(stats.wilcoxon(values).pvalue) if np.any(values) else 1.0
     return over_seeds([float(value) for value in values]) | {"wins": int((values > 0).sum()), "wilcoxon_p": p}
+
+
+def shown(difference: dict[str, Any], form: str) -> str:
+    """What :func:`paired` says."""
+    return f"{spread(difference, form)}; {difference['wins']}; p = {difference['wilcoxon_p']:.2g}"
 
 
 def page(table: dict[str, Any]) -> list[str]:
@@ -82,7 +88,6 @@ def page(table: dict[str, Any]) -> list[str]:
     ]
     lines += ["", f"| {OURS} minus | {' | '.join(MEASURES)} |", "|---" * (len(MEASURES) + 1) + "|"]
     for name in methods[1:]:
-        own = [measures[one]["difference"][name] for one in MEASURES]
-        cells = [f"{spread(one, '{:+.2f}')}; {one['wins']}; p = {one['wilcoxon_p']:.2g}" for one in own]
+        cells = [shown(measures[one]["difference"][name], "{:+.2f}") for one in MEASURES]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return lines

@@ -325,3 +325,13 @@ def test_segments_are_compared_over_tasks_and_not_over_seeds():
     assert difference["interval"] == pytest.approx([0.2 - half, 0.2 + half], abs=1e-6)
     assert difference["wins"] == 3
     assert difference["wilcoxon_p"] == pytest.approx(0.25)  # the least that three pairs can have
+
+
+def test_success_is_compared_over_tasks():
+    """1, 2 and 3 of 4 episodes in both seeds, flat none: 0.5 ± t(2) · 0.25 / √3, better on three of three."""
+    tasks = ("hammer-v3", "assembly-v3", "shelf-place-v3")
+    cells = [cell(seed, 0.5, 1.0, 0.5, (often, 0), task) for often, task in enumerate(tasks, 1) for seed in (0, 1)]
+    half = 100 * 4.302653 * 0.25 / math.sqrt(3)
+    text = page(summarize(cells), "Made.")
+    assert f"| flat | 0 of 24 | +50.0% [{50 - half:+.1f}%, {50 + half:+.1f}%]; 3; p = 0.25 |" in text
+    assert "| ddco | 12 of 24 | - |" in text
