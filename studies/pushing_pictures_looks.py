@@ -1,11 +1,13 @@
 """What a policy that pushes from pictures looks at, in an episode in which it acts.
 
-    python studies/pushing_pictures_looks.py METHOD OPTIONS COUNT SEED CHECKPOINTS [--updates 4000] [--runs DIR]
+    python studies/pushing_pictures_looks.py METHOD OPTIONS COUNT SEED CHECKPOINTS [--updates 4000] [--episodes 5]
+        [--runs DIR]
 
 The cell of ``pushing_pictures_cell.py`` with these words; CHECKPOINTS is the folder of its fit, as that leaves it in
-``RUNS/fits``, from which the networks are taken. Plays the cell's first evaluation episode. Writes ``looks.json``,
-``looks.md`` and ``looks.png`` in ``docs/results/pushing_pictures``: what the camera sees, paler, under how much the
-control of the active option changes with each pixel, and the active option of every step.
+``RUNS/fits``, from which the networks are taken. Plays the cell's evaluation episodes. Writes ``looks.json``,
+``looks.md`` and ``looks.png`` in ``docs/results/pushing_pictures``: of the first episode what the camera sees, paler,
+under how much the control of the active option changes with each pixel, and the active option of every step; of each
+episode how it went, and in which part of the steps the arm's tip is above what the camera sees.
 """
 
 from __future__ import annotations
@@ -28,11 +30,14 @@ from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.pictures import WIDTH, blank, keep
 from ddco_pyro.fitting.building import Dimensions, baseline_spec
 from ddco_pyro.fitting.run import train
-from ddco_pyro.simulation.episodes import run_episode
+from ddco_pyro.simulation.episodes import Episode, run_episode
+from ddco_pyro.simulation.task import Policy
 from ddco_pyro.spec import Spec
 
 OUT = Path("docs/results/pushing_pictures")
 COLUMNS, ROWS = 6, 2
+TOP = 0.55 + 12 * np.tan(np.deg2rad(7 / 2))
+"""Of what is seen in the arm's plane (m): the camera ``side`` of ``pushing.xml``, its height, distance and angle."""
 
 
 def controller(cell: PictureCell, own: argparse.Namespace, spec: Spec) -> Controller:
@@ -65,6 +70,28 @@ def draw(frames: list[np.ndarray], choices: np.ndarray) -> Figure:
     return figure
 
 
+def played(policy: Policy, seed: int) -> Episode:
+    """An episode, of which the way of the arm's tip is kept."""
+    return run_episode(WATCHED, policy, seed, observed=["camera"], keep=["tip"])
+
+
+def row_of(episode: Episode) -> dict[str, float]:
+    """What became of an episode."""
+    height = np.asarray(episode.record.observations["tip"])[:, 1]
+    outcome = {name: episode.outcome[name] for name in ("goals", "topples")}
+    return outcome | {"above the picture": float(np.mean(height > TOP)), "highest": float(height.max())}
+
+
+def page(rows: list[dict[str, float]], seed: int, caption: str, made_by: str) -> str:
+    """The episodes as Markdown."""
+    lines = [made_by, "", "| episode | goals | topples | steps with the tip above the picture | highest, m |"]
+    lines.append("|---|--:|--:|--:|--:|")
+    for number, row in enumerate(rows, seed):
+        counts = f"{row['goals']:.0f} | {row['topples']:.0f}"
+        lines.append(f"| {number} | {counts} | {row['above the picture']:.0%} | {row['highest']:.2f} |")
+    return "\n".join([*lines, "", f"The camera sees up to {TOP:.2f} m.", "", f"![{caption}](looks.png)"]) + "\n"
+
+
 def main() -> None:
     """Draw the picture."""
     parser = described(__doc__)
@@ -81,16 +108,16 @@ def main() -> None:
     command = f"python studies/pushing_pictures_looks.py {words} {settings.words()}"
     made_by = record(command)
     torch.set_num_threads(1)
-    looking = Looking(controller(cell, own, spec_of(cell, settings)))
-    seed = EVALUATION + 1000 * cell.seed
-    episode = run_episode(WATCHED, looking, seed, observed=["camera"], keep=[])
-    choices = episode.choices[:, 0] if cell.options else np.zeros(len(looking.frames), int)
+    acting, seed = controller(cell, own, spec_of(cell, settings)), EVALUATION + 1000 * cell.seed
+    looking = Looking(acting)
+    first = played(looking, seed)
+    episodes = [first, *(played(acting, seed + number) for number in range(1, int(settings.values["episodes"])))]
+    choices = first.choices[:, 0] if cell.options else np.zeros(len(looking.frames), int)
     caption = f"What {cell.method} looks at, and the option that is active; episode {seed}"
     keep(draw(looking.frames, choices), OUT / "looks.png", caption, "")
-    shares = {int(option): float(np.mean(choices == option)) for option in np.unique(choices)}
-    results = {"goals": episode.outcome["goals"], "topples": episode.outcome["topples"], "part of the steps": shares}
-    write_text(OUT / "looks.json", text(results, [made_by]))
-    write_text(OUT / "looks.md", f"{sentence(command, [made_by])}\n\n![{caption}](looks.png)\n")
+    rows = [row_of(episode) for episode in episodes]
+    write_text(OUT / "looks.json", text({"episodes": rows}, [made_by]))
+    write_text(OUT / "looks.md", page(rows, seed, caption, sentence(command, [made_by])))
 
 
 if __name__ == "__main__":
