@@ -27,7 +27,7 @@ from pushing_pictures_cell import DEFAULTS, METHODS, PictureCell
 from ddco_pyro.data.files import write_text
 
 STUDIES = {
-    "demonstrations": ("ff_flat", "ff", "rnn_flat", "rnn", "ff_one_flat", "ff_one"),
+    "demonstrations": ("ff_flat", "ff", "rnn_flat", "rnn", "ff_two_flat", "ff_two"),
     "options": ("ff", "rnn"),
     "augmentation": ("ff", "ff_hybrid", "rnn", "rnn_hybrid"),
 }

@@ -4,7 +4,8 @@
 
 OPTIONS is 0 for a flat policy. Demonstrations and evaluation episodes are those of ``pushing_studies.py`` with the same
 seeds. Pictures are drawn three times as fine as they are seen, 48 x 64, and reduced by means. Keeps a JSON with
-held-out log-likelihoods, what came of each episode, and the seconds that everything took.
+held-out log-likelihoods, what came of each episode, without a limit and with 250 steps for each goal, and the seconds
+that everything took.
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ SPECS = Path(__file__).parents[1] / "specs"
 SIZE, FINER = (48, 64), 3
 SUPERVISOR = "scripted_noisy_0.3"
 
-METHODS = ("ff", "ff_flat", "ff_hybrid", "ff_one", "ff_one_flat", "rnn", "rnn_flat", "rnn_hybrid")
-"""``_flat``: as many parameters as the hierarchy beside it has with the options of its spec; ``ff_one``: of one picture
-instead of two."""
+METHODS = ("ff", "ff_flat", "ff_hybrid", "ff_two", "ff_two_flat", "rnn", "rnn_flat", "rnn_hybrid")
+"""``_flat``: as many parameters as the hierarchy beside it has with the options of its spec; ``ff_two``: of two pictures
+side by side instead of one."""
 
 DEFAULTS = Settings({"updates": 4000, "episodes": 5}, Path("runs/pushing-pictures"))
 """Gradient steps of a fit, and what each one plays."""
@@ -66,13 +67,15 @@ class PictureCell(Cell):
         found = Fit(spec, trained.hierarchy)
         likelihood = {name: per_step(found, each) for name, each in (("train", demos), ("held_out", test))}
         first = EVALUATION + 1000 * self.seed
-        episodes = play(WATCHED, trained.hierarchy, spec.rollout, range(first, first + int(own["episodes"])))
+        seeds = range(first, first + int(own["episodes"]))
+        episodes, limited = (play(task, trained.hierarchy, spec.rollout, seeds) for task in (WATCHED, LIMITED))
         ended = time.perf_counter()
         return {
             "log_likelihood_per_step": likelihood,
             "parameters": parameters(trained.hierarchy),
             "steps": trained.training,
             "episodes": summary(episodes),
+            "limited": summary(limited),
             "seconds": {"fit": fitted - begun, "fit_processor": cpu, "play": ended - fitted},
         }
 
@@ -81,8 +84,8 @@ def spec_of(cell: PictureCell, settings: Settings) -> Spec:
     """The spec of a cell, whose pictures are small already."""
     family = cell.method.partition("_")[0]
     kind = "_hybrid" if cell.method.endswith("_hybrid") else ""
-    camera = {"key": "camera", "frames": 1 if "_one" in cell.method or family == "rnn" else 2}
-    changed: dict[str, Any] = {"observations": [camera], "seed": cell.seed, "demonstrations.count": cell.count}
+    changed: dict[str, Any] = {"seed": cell.seed, "demonstrations.count": cell.count}
+    changed |= {"observations.0.resize": None, "observations.0.frames": 2 if "_two" in cell.method else 1}
     if cell.options:
         changed["hierarchy.levels.0.count"] = cell.options
     spec = with_overrides(load_spec(SPECS / f"pushing_image_{family}{kind}.yaml", settings.overrides), changed)
@@ -101,6 +104,7 @@ def _finely_drawn(environment: dm_env.Environment) -> np.ndarray:
 CAMERA = Camera(SIZE, _finely_drawn)
 WATCHED = replace(pushing.task, cameras={"camera": CAMERA})
 SINGLE = replace(pushing.single, cameras={"camera": CAMERA})
+LIMITED = replace(pushing.limited, cameras={"camera": CAMERA})
 
 
 def pool(folder: Path, seed: int) -> Demonstrations:

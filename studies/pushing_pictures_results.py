@@ -20,6 +20,7 @@ Row = dict[str, Any]
 STATE = "docs/results/pushing/sample_complexity.md"
 COLUMNS = {
     "goals": ("goals", "{:.1f}"),
+    "goals, 250 steps each at most": ("limited", "{:.1f}"),
     "topples": ("topples", "{:.1f}"),
     "lost": ("lost", "{:.1f}"),
     "held-out nats/step": ("held_out", "{:.3f}"),
@@ -41,6 +42,7 @@ def row_of(cell: Any, results: dict[str, Any]) -> Row:
         **asdict(cell),
         **results["log_likelihood_per_step"],
         **{name: float(np.mean(episodes[name])) for name in ("goals", "topples", "lost")},
+        "limited": float(np.mean(results["limited"]["goals"])),
         "episodes": len(episodes["goals"]),
         "dwell": episodes["dwell"],
         "own_control": episodes["own_control"],
@@ -74,7 +76,8 @@ def differences(rows: Sequence[Row], across: str) -> list[str]:
         flat = {row["seed"]: row for row in rows if row["method"] == f"{method}_flat" and row["count"] == count}
         pairs = [(row, flat[row["seed"]]) for row in own if row["seed"] in flat]
         if pairs and across == "count":
-            said = [f"{_difference(pairs, 'goals', '{:.1f}')} goals"]
+            limited = _difference(pairs, "limited", "{:.1f}")
+            said = [f"{_difference(pairs, 'goals', '{:.1f}')} goals ({limited} with the limit)"]
             said.append(f"{_difference(pairs, 'held_out', '{:.3f}')} held-out nats/step")
             lines.append(
                 f"- {method} minus flat of equal size, {count} demonstrations, paired by seed ({len(pairs)}): "

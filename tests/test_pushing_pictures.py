@@ -17,6 +17,7 @@ def results(goals, held_out):
     return {
         "log_likelihood_per_step": {"train": held_out + 0.1, "held_out": held_out},
         "episodes": {"goals": goals, "topples": [0.0, 1.0], "lost": [0.0, 0.0], "dwell": None, "own_control": None},
+        "limited": {"goals": [2.0 * one for one in goals]},
         "parameters": 7,
         "seconds": {"fit": 90.0, "fit_processor": 30.0, "play": 30.0},
     }
@@ -30,7 +31,8 @@ def arguments(name, *words):
 
 def test_a_row_has_means_over_episodes():
     row = row_of(PictureCell("ff", 2, 80, 1), results([4.0, 1.0], -3.0))
-    assert (row["goals"], row["topples"], row["minutes"], row["processor"]) == (2.5, 0.5, 2.0, 0.5)
+    assert (row["goals"], row["limited"], row["topples"]) == (2.5, 5.0, 0.5)
+    assert (row["minutes"], row["processor"]) == (2.0, 0.5)
 
 
 def test_differences_are_paired_by_seed_and_number():
@@ -46,7 +48,7 @@ def test_differences_are_paired_by_seed_and_number():
         ]
     ]
     (line,) = differences(rows, "count")
-    assert line.startswith("- ff minus flat of equal size, 40 demonstrations, paired by seed (2): 1.0 ± 6.4 goals")
+    assert line.startswith("- ff minus flat of equal size, 40 demonstrations, paired by seed (2): 1.0 ± 6.4 goals (2.0 ± 12.7 with")
     assert "0.500 ± 6.353 held-out" in line
 
 
@@ -60,12 +62,13 @@ def test_cells_of_a_seed_come_before_those_of_the_next():
 
 @pytest.mark.parametrize(
     ("method", "options", "frames", "emits"),
-    [("ff", 3, 2, ("options",)), ("ff_one", 2, 1, ("options",)), ("rnn_hybrid", 4, 1, ("options", "control"))],
+    [("ff", 3, 1, ("options",)), ("ff_two", 2, 2, ("options",)), ("rnn_hybrid", 4, 1, ("options", "control"))],
 )
 def test_specs_of_cells(method, options, frames, emits):
     """72 demonstrations to train on, two in a step: 36 steps an epoch, 4000 at least."""
     spec = spec_of(PictureCell(method, options, 80, 1), DEFAULTS)
-    assert spec.observations[0].frames == frames
+    seen = spec.observations[0]
+    assert (seen.frames, seen.resize, seen.augment.shift) == (frames, None, 3)
     assert spec.hierarchy.levels[0].count == options
     assert spec.hierarchy.meta_policy.emits == emits
     assert spec.training.epochs == 112
