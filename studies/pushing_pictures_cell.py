@@ -36,8 +36,8 @@ SIZE, FINER = (48, 64), 3
 SUPERVISOR = "scripted_noisy_0.3"
 
 METHODS = ("ff", "ff_flat", "ff_hybrid", "ff_two", "ff_two_flat", "rnn", "rnn_flat", "rnn_hybrid")
-"""``_flat``: as many parameters as the hierarchy beside it has with the options of its spec; ``ff_two``: of two pictures
-side by side instead of one."""
+"""``_flat``: as many parameters as the hierarchy beside it has with the options of its spec; ``ff_two``: of two
+pictures side by side instead of one."""
 
 DEFAULTS = Settings({"updates": 4000, "episodes": 5}, Path("runs/pushing-pictures"))
 """Gradient steps of a fit, and what each one plays."""
