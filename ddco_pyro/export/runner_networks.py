@@ -105,6 +105,8 @@ class NumpyNetworks:
     def _convolutions(self, node: Mapping[str, Any], name: str) -> np.ndarray:
         """Convolutions of a picture, an activation after each, and what is read of their maps."""
         maps = self._images[node["key"]].astype(np.float32).transpose(2, 0, 1)[None] / 255
+        if node["standardize"]:
+            maps = (maps - maps.mean()) / np.sqrt(np.maximum(maps.var(), 1 / maps.size))
         for number, layer in enumerate(node["layers"]):
             weight, bias = self._weights[f"{name}.{number}.weight"], self._weights[f"{name}.{number}.bias"]
             maps = _convolved(np.broadcast_to(maps, (node["copies"], *maps.shape[1:])), weight, bias, layer)

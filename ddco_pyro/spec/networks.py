@@ -87,6 +87,8 @@ class Convolution(Perceptron):
     where it is active, ``spatial_softmax``."""
     pooled: Count = 8
     """Fields by side."""
+    standardize: bool = False
+    """Whether each picture is shifted and scaled to mean 0 and standard deviation 1 over its own pixels and colours."""
 
 
 class Recurrent(Network):

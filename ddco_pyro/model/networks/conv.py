@@ -26,6 +26,7 @@ class Conv(nn.Module):
     :param layers: the convolutions; where there are none, a single one of ``filters`` and ``kernel``, stride 2.
     :param pool: ``mean`` of ``pooled`` × ``pooled`` fields of each map, ``flatten`` for all of it, or where in the map
         it is active, ``spatial_softmax``.
+    :param standardize: whether each picture is shifted and scaled to mean 0 and standard deviation 1.
     """
 
     def __init__(
@@ -41,12 +42,13 @@ class Conv(nn.Module):
         layers: Sequence[ConvolutionLayer],
         pool: Pool,
         pooled: int,
+        standardize: bool = False,
     ) -> None:
         super().__init__()
         if not shape.images:
             raise ShapeError("needs an image among the observations, and all of them are vectors: use network: mlp")
         self.reads, self.copies, self.pool, self.pooled = list(shape.vectors), copies, pool, pooled
-        self.activation = ACTIVATIONS[activation]()
+        self.activation, self.standardize = ACTIVATIONS[activation](), standardize
         first, *rest = layers or [ConvolutionLayer(filters=filters, kernel=kernel, stride=2, padding=kernel // 2)]
         self.convolutions = nn.ModuleDict(
             {key: _convolution(first, size[-1], copies) for key, size in shape.images.items()}
@@ -82,7 +84,7 @@ class Conv(nn.Module):
         layers = self._layers(key)
         strides = [{"stride": layer.stride[0], "padding": int(layer.padding[0])} for layer in layers]
         facts = {"kind": "convolutions", "key": key, "copies": self.copies, "layers": strides}
-        facts["activation"] = self.layers.activation
+        facts |= {"activation": self.layers.activation, "standardize": self.standardize}
         arrays = arrays_of({str(number): layer for number, layer in enumerate(layers)})
         return facts | {"pool": self.pool, "pooled": self.pooled}, arrays
 
@@ -101,6 +103,7 @@ class Conv(nn.Module):
         """uint8 [M, H, W, C] to [K, M, features of the picture]."""
         layers = self._layers(key)
         maps = image.permute(0, 3, 1, 2).to(layers[0].weight.dtype) / 255
+        maps = _standardized(maps) if self.standardize else maps
         for layer in layers:
             maps = self.activation(layer(maps))
         return self._pool(maps).reshape(len(image), self.copies, -1).transpose(0, 1)
@@ -128,6 +131,12 @@ class Conv(nn.Module):
 def _convolution(layer: ConvolutionLayer, channels: int, copies: int, groups: int = 1) -> nn.Conv2d:
     size = copies * layer.filters
     return nn.Conv2d(channels, size, layer.kernel, layer.stride, layer.padding, groups=groups)
+
+
+def _standardized(pictures: Tensor) -> Tensor:
+    """Each picture [M, C, H, W] less its mean, over its standard deviation, that of a single bright number at least."""
+    variance, mean = torch.var_mean(pictures, (1, 2, 3), correction=0, keepdim=True)
+    return (pictures - mean) / variance.clamp(min=1 / pictures[0].numel()).sqrt()
 
 
 def _field_means(maps: Tensor, count: int) -> Tensor:
