@@ -79,7 +79,7 @@ CONVOLUTIONS = {
     "activation": "elu",
     "pool": "spatial_softmax",
 }
-LEAKY = {"network": "conv", "filters": 2, "pool": "flatten", "activation": "leaky_relu"}
+LEAKY = {"network": "conv", "filters": 2, "pool": "flatten", "activation": "leaky_relu", "standardize": True}
 RECURRENT = {"network": "lstm", "over": {"hidden": [6]}, "hidden": [5, 4]}
 BRANCHES = {
     "network": "branches",

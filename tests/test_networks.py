@@ -79,6 +79,30 @@ def test_an_activation_follows_every_convolution_and_every_hidden_layer(name, ac
     assert_close(network(inputs)[:, :, 0].flatten(0, 1), expected)
 
 
+def test_a_standardised_picture_is_seen_whatever_its_brightness_and_contrast():
+    """As numpy standardises it; half as strong and darker or brighter it gives the same."""
+    shape, settings = InputShape({}, {"camera": PIXELS}), {"network": "conv", "filters": 3, "pool": "flatten"}
+    plain, network = make(shape, **settings), make(shape, **settings, standardize=True)
+    network.load_state_dict(plain.state_dict())
+    picture = 2 * torch.randint(0, 64, (1, 1, *PIXELS), dtype=torch.uint8)
+    values = picture[0, 0].numpy() / 255.0
+    expected = torch.as_tensor((values - values.mean()) / values.std() * 255)
+    for seen in (picture, picture // 2, picture // 2 + 100):
+        inputs = Inputs({}, {"camera": seen}, torch.zeros(1))
+        of_floats = Inputs({}, {"camera": expected[None, None]}, torch.zeros(1))
+        torch.testing.assert_close(network(inputs), plain(of_floats), atol=1e-5, rtol=1e-4)
+
+
+def test_a_picture_of_one_colour_is_standardised_to_nothing():
+    shape = InputShape({}, {"camera": PIXELS})
+    network = make(shape, network="conv", filters=3, pool="flatten", standardize=True)
+    grey = torch.full((1, 1, *PIXELS), 100.0, requires_grad=True)
+    found = network(Inputs({}, {"camera": grey}, torch.zeros(1)))
+    assert_close(found, network(Inputs({}, {"camera": torch.zeros_like(grey)}, torch.zeros(1))))
+    (gradient,) = torch.autograd.grad(found.sum(), grey)
+    assert gradient.isfinite().all()
+
+
 @pytest.mark.parametrize("name", ACTIVATIONS)
 def test_a_unit_below_0_for_all_that_is_observed_is_dead_only_where_it_is_rectified(name):
     network = make(hidden=[8], activation=name)

@@ -38,7 +38,7 @@ class Convolutions(nn.Module):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             images = InputShape({}, {_KEY: tuple(shape)})
-            self.maps = Conv(images, None, 1, (), 0.0, "relu", 0, 0, layers, "spatial_softmax", 0)
+            self.maps = Conv(images, None, 1, (), 0.0, "relu", 0, 0, layers, "spatial_softmax", 0, False)
         if kind == "random_conv":  # nothing will train them, and strong maps that are random tell less
             self.maps.strengthen(1 / SHARPNESS)
         self.features = self.maps.features

@@ -42,7 +42,7 @@ class Conv(nn.Module):
         layers: Sequence[ConvolutionLayer],
         pool: Pool,
         pooled: int,
-        standardize: bool = False,
+        standardize: bool,
     ) -> None:
         super().__init__()
         if not shape.images:
