@@ -46,6 +46,9 @@ class Network(Model):
     """The kind of network; ``module:Class`` for a network of your own."""
     inputs: Items[Text] = ()
     """Names of the observations that it reads; all of them where none is named."""
+    shared: bool = False
+    """Whether all options have this network in common, with the same weights; for a trunk, and for networks in ``of``
+    and ``over``, of which every option makes its own."""
 
 
 class Perceptron(Network):

@@ -18,6 +18,7 @@ from ddco_pyro.model.networks.lstm import Lstm
 from ddco_pyro.model.networks.mlp import Linear, Mlp
 from ddco_pyro.model.networks.options import checked_options
 from ddco_pyro.model.networks.per_timestep import PerTimestep
+from ddco_pyro.model.networks.shared import Shared
 from ddco_pyro.model.networks.state import Trunk
 from ddco_pyro.model.networks.trial import try_network
 from ddco_pyro.spec import NetworkSpec, SpecError
@@ -41,22 +42,27 @@ def build(spec: NetworkSpec, shape: InputShape | Trunk, outputs: int, copies: in
     Each is made as ``Class(shape, outputs, copies, **settings)``, a user's too, which is also tried. One that
     remembers is a :class:`~ddco_pyro.model.networks.state.HasState`.
 
-    :raises ShapeError: where the network cannot read these observations, cannot be imported or made, or is refused by
-        :func:`ddco_pyro.model.networks.trial.try_network`.
+    :raises ShapeError: where the network cannot read these observations, cannot be imported or made, is to be shared,
+        or is refused by :func:`ddco_pyro.model.networks.trial.try_network`.
     :raises SpecError: where the options do not fit the signature of a user's class.
     """
+    if spec.shared:
+        raise ShapeError("shared: options would all do the same; share a trunk, or a network in of or over")
     if isinstance(shape, Trunk):
         return Head(shape.features, outputs, copies, **spec.settings)
     return _read(spec, shape, outputs, copies)
 
 
 def build_trunk(spec: NetworkSpec, shape: InputShape, copies: int) -> Trunk:
-    """``copies`` independent networks for others to read: a built-in one without its last layer, or a user's with
-    ``features`` outputs.
+    """``copies`` independent networks, or a ``shared`` one, for others to read: a built-in one without its last layer, or
+    a user's with ``features`` outputs.
 
     :raises ShapeError: as :func:`build`.
     :raises SpecError: as :func:`build`.
     """
+    if spec.shared:
+        alone = build_trunk(spec.model_copy(update={"shared": False}), shape, 1)
+        return Trunk(Shared(alone.network, copies), alone.features)
     if spec.network not in CLASSES:
         return Trunk(build(spec, shape, spec.features, copies), spec.features)
     network = _read(spec, shape, None, copies)
