@@ -85,7 +85,7 @@ def test_what_options_share_is_what_each_would_give_with_these_weights_and_learn
 
 
 def test_a_policy_that_options_would_share_is_refused():
-    with pytest.raises(ShapeError, match="^shared: options would all do the same"):
+    with pytest.raises(ShapeError, match=r"^shared: options would all do the same"):
         make(network="mlp", shared=True)
 
 
