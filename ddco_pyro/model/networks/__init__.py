@@ -54,8 +54,8 @@ def build(spec: NetworkSpec, shape: InputShape | Trunk, outputs: int, copies: in
 
 
 def build_trunk(spec: NetworkSpec, shape: InputShape, copies: int) -> Trunk:
-    """``copies`` independent networks for others to read, or a ``shared`` one: a built-in one without its last layer, or
-    a user's with ``features`` outputs.
+    """``copies`` independent networks for others to read, or a ``shared`` one: a built-in one without its last layer,
+    or a user's with ``features`` outputs.
 
     :raises ShapeError: as :func:`build`.
     :raises SpecError: as :func:`build`.
