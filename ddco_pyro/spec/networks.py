@@ -192,7 +192,7 @@ class NetworkSpec(UserDefined, Convolution, Recurrent, Branched):
     @model_serializer(mode="wrap")
     def _without_foreign_keys(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         fields: dict[str, Any] = serialize(self)
-        unused = (*foreign_keys(self.network), *(() if self.inputs else ("inputs",)))
+        unused = (*foreign_keys(self.network), *(key for key in ("inputs", "shared") if not getattr(self, key)))
         unused += ("filters", "kernel") if self.layers else ("layers",)
         return {key: value for key, value in fields.items() if key not in unused}
 
