@@ -34,6 +34,9 @@ COLUMNS = {
 ACROSS = {"demonstrations": "count", "options": "options", "augmentation": "options"}
 """What each study varies."""
 
+FEWEST = 3
+"""Training seeds of whose mean the figure has an interval; every seed is a dot."""
+
 
 def row_of(cell: Any, results: dict[str, Any]) -> Row:
     """A cell in a line: means over its episodes."""
@@ -104,7 +107,11 @@ def draw(study: str, rows: Sequence[Row], path: Path) -> None:
             groups = grouped(sorted(own, key=lambda row: row[across]), across)
             found = [over_seeds(group, measure) for group in groups.values()]
             places, means = [place for (place,) in groups], [mean for mean, _, _ in found]
-            axes.errorbar(places, means, [half for _, half, _ in found], marker="o", ms=4, capsize=2, label=method)
+            enough = [len(group) >= FEWEST for group in groups.values()]
+            bars = [half if many else np.nan for (_, half, _), many in zip(found, enough, strict=True)]
+            line = axes.errorbar(places, means, bars, marker="o", ms=4, capsize=2, label=method)
+            each = [(row[across], row[measure]) for row in own if row[measure] is not None]
+            axes.scatter(*zip(*each, strict=True), s=9, color=line[0].get_color(), alpha=0.5)
         axes.set(xlabel={"count": "demonstrations", "options": "options k"}[across], ylabel=label)
     figure.axes[0].legend(fontsize=8)
     with whole_file(path) as temporary:
