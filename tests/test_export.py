@@ -34,6 +34,7 @@ def make(
     built_in=(),
     trunk=None,
     meta_policy=None,
+    vectors=True,
     **rollout,
 ):
     """A run that was never fitted: random weights, observations with a mean and a spread.
@@ -45,6 +46,7 @@ def make(
         {"name": f"level-{d}", "count": k, "policy": policy | ({"emits": list(emits)} if d else {})}
         for d, k in enumerate(counts)
     ]
+    seen = [{"key": "state", "differences": True}, "goal", *built_in] if vectors else []
     pictures = [{"key": "camera", **(camera if isinstance(camera, dict) else {})}] if camera else []
     endings = endings or {"network": network if network in ("conv", "per_timestep") else "linear"}
     model = {
@@ -56,7 +58,7 @@ def make(
     spec = parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5"},
-            "observations": [{"key": "state", "differences": True}, "goal", *built_in, *pictures],
+            "observations": [*seen, *pictures],
             "control": {"std": {"learn": True}},
             "rollout": rollout,
             **(model if counts else {"baseline": {"kind": "flat", "policy": policy}}),
@@ -113,6 +115,7 @@ FITS = {
         meta_policy=BRANCHES,
         built_in=("step",),
     ),
+    "pictures alone": make(LEAKY, camera=True, endings=LEAKY, vectors=False, options="sample"),
     "several convolutions": make(
         CONVOLUTIONS, camera=True, endings={"network": "linear", "inputs": ["step", "goal"]}, built_in=("step",)
     ),

@@ -171,7 +171,8 @@ class ObservationEncoder(nn.Module):
     def standardized(self, features: Tensor) -> dict[str, Tensor]:
         """Features [..., F] as networks see them, [..., F_key] by name."""
         vector = ((features - self.mean) / self.std).float()
-        return dict(zip(self.keys, vector.split(self.sizes, -1), strict=True))
+        # A split into nothing cannot be read again from an exported program.
+        return dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)) if self.sizes else {}
 
     def inputs(self, observations: Iterable[Mapping[str, Observed]], times: np.ndarray | None = None) -> Inputs:
         """Sequences of observations, each [T_n, ...] by name, to padded network inputs, whose pictures are read when
