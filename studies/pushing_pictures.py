@@ -84,6 +84,13 @@ def run(own: argparse.Namespace) -> str:
     return write(own, settings, asked)
 
 
+def _part(own: argparse.Namespace) -> str:
+    """The words that say which part of a study is asked for."""
+    across = "counts" if own.study == "demonstrations" else "options"
+    methods = [name for name in STUDIES[own.study] if name in own.methods]
+    return f"--{across} {' '.join(map(str, getattr(own, across)))} --methods {' '.join(methods)}"
+
+
 def _begun(cell: PictureCell, settings: Settings, made_by: dict[str, str], until: float) -> None:
     if time.monotonic() < until:
         cell.run(settings, made_by)
@@ -96,7 +103,7 @@ def write(own: argparse.Namespace, settings: Settings, asked: Sequence[PictureCe
     missing = [cell.name for cell in asked if cell not in done]
     rows = [shown.row_of(cell, content["results"]) for cell, content in done.items()]
     records = [content["provenance"][0] for content in done.values()]
-    command = f"python studies/pushing_pictures.py {own.study} --seeds {own.seeds} {settings.words()}"
+    command = f"python studies/pushing_pictures.py {own.study} --seeds {own.seeds} {_part(own)} {settings.words()}"
     page = shown.page(own.study, rows, missing, sentence(command, records))
     write_text(own.out / f"{own.study}.json", text({"cells": rows, "missing": missing}, records))
     write_text(own.out / f"{own.study}.md", page)

@@ -19,7 +19,7 @@ import dm_env
 import numpy as np
 from cells import Cell, Settings
 from ddco_tasks.pushing import environment as pushing
-from pushing_cell import EVALUATION, HELD_OUT, HELD_OUT_SEED, POOL, TRAINING, per_step, summary
+from pushing_cell import EVALUATION, HELD_OUT, HELD_OUT_SEED, LABELS, POOL, TRAINING, per_step, summary
 
 from ddco_pyro.acting.lockstep import play
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
@@ -118,13 +118,13 @@ def held_out(folder: Path) -> Demonstrations:
 
 
 def recorded(folder: Path, first: int, count: int) -> Demonstrations:
-    """Demonstrations of one goal each from seeds ``first`` on, with pictures in memory; kept in a file."""
+    """Demonstrations of one goal each from seeds ``first`` on, with pictures and labels in memory; kept in a file."""
     path = folder / "demonstrations" / f"{first}.hdf5"
     if not path.exists():
         seeds = range(first, first + count)
         episodes = [run_episode(SINGLE, SUPERVISOR, seed, observed=["camera"], keep=["camera"]) for seed in seeds]
         Demonstrations(tuple(one.record for one in episodes)).write(path)
-    kept = Demonstrations.read(path)
+    kept = Demonstrations.read(path, labels=LABELS)
     return replace(kept, demonstrations=tuple(map(_in_memory, kept)))
 
 

@@ -7,13 +7,16 @@ The cell of ``pushing_pictures_cell.py`` with these words; CHECKPOINTS is the fo
 ``RUNS/fits``, from which the networks are taken. Plays the cell's evaluation episodes. Writes ``looks.json``,
 ``looks.md`` and ``looks.png`` in ``docs/results/pushing_pictures``: of the first episode what the camera sees, paler,
 under how much the control of the active option changes with each pixel, and the active option of every step; of each
-episode how it went, and in which part of the steps the arm's tip is above what the camera sees.
+episode how it went, and in which part of the steps the arm's tip is above what the camera sees; of options, in which
+steps of the held-out demonstrations each is the most likely one, by what the supervisor does there.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,14 +24,17 @@ from cells import described
 from matplotlib.figure import Figure
 from provenance import record, sentence, text
 from pushing_cell import EVALUATION
-from pushing_pictures_cell import DEFAULTS, METHODS, WATCHED, PictureCell, pool, spec_of
+from pushing_pictures_cell import DEFAULTS, METHODS, WATCHED, PictureCell, held_out, pool, spec_of
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.pictures import WIDTH, blank, keep
+from ddco_pyro.fitting.agreement import agreement
 from ddco_pyro.fitting.building import Dimensions, baseline_spec
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import train
 from ddco_pyro.simulation.episodes import Episode, run_episode
 from ddco_pyro.simulation.task import Policy
@@ -40,13 +46,32 @@ TOP = 0.55 + 12 * np.tan(np.deg2rad(7 / 2))
 """Of what is seen in the arm's plane (m): the camera ``side`` of ``pushing.xml``, its height, distance and angle."""
 
 
-def controller(cell: PictureCell, own: argparse.Namespace, spec: Spec) -> Controller:
+PHASES = ("approach", "push")
+"""Of the supervisor, by their label."""
+
+
+def fitted(cell: PictureCell, own: argparse.Namespace, spec: Spec) -> Fit:
     """The cell's policy; nothing is trained where its fit is done."""
     demos = pool(own.runs, cell.seed)
     demos = demos.select(demos.names[: cell.count])
     size = Dimensions.of(demos)
     spec = spec if cell.options else baseline_spec(spec, spec.compare_with[0], size)
-    return Controller.from_spec(train(spec, size, demos, checkpoints=own.checkpoints).hierarchy, spec.rollout)
+    return Fit(spec, train(spec, size, demos, checkpoints=own.checkpoints).hierarchy)
+
+
+def phases(fit: Fit, demos: Demonstrations) -> dict[str, Any]:
+    """NMI of the most likely options with the supervisor's phases, and the steps of each phase in each option."""
+    (options,) = fit.segment(demos)
+    segments = [row[: len(demo)] for row, demo in zip(options, demos, strict=True)]
+    labels = [np.asarray(demo.labels["phase"]) for demo in demos]
+    found = agreement(segments, labels)
+    assert found is not None
+    steps = {name: np.bincount(_of(segments, labels, number))[1:].tolist() for number, name in enumerate(PHASES)}
+    return {"nmi": found["nmi"], "steps": steps}
+
+
+def _of(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray], label: int) -> np.ndarray:
+    return np.concatenate(segments)[np.concatenate(labels) == label]
 
 
 def draw(frames: list[np.ndarray], choices: np.ndarray) -> Figure:
@@ -82,14 +107,19 @@ def row_of(episode: Episode) -> dict[str, float]:
     return outcome | {"above the picture": float(np.mean(height > TOP)), "highest": float(height.max())}
 
 
-def page(rows: list[dict[str, float]], seed: int, caption: str, made_by: str) -> str:
+def page(rows: list[dict[str, float]], found: dict[str, Any] | None, seed: int, caption: str, made_by: str) -> str:
     """The episodes as Markdown."""
     lines = [made_by, "", "| episode | goals | topples | steps with the tip above the picture | highest, m |"]
     lines.append("|---|--:|--:|--:|--:|")
     for number, row in enumerate(rows, seed):
         counts = f"{row['goals']:.0f} | {row['topples']:.0f}"
         lines.append(f"| {number} | {counts} | {row['above the picture']:.0%} | {row['highest']:.2f} |")
-    return "\n".join([*lines, "", f"The camera sees up to {TOP:.2f} m.", "", f"![{caption}](looks.png)"]) + "\n"
+    lines += ["", f"The camera sees up to {TOP:.2f} m."]
+    if found:
+        each = "; ".join(f"{name} {', '.join(map(str, counts))}" for name, counts in found["steps"].items())
+        lines += ["", f"Options and the supervisor's phases, held-out demonstrations: NMI {found['nmi']:.2f}."]
+        lines += [f"Steps of each phase in each option: {each}."]
+    return "\n".join([*lines, "", f"![{caption}](looks.png)"]) + "\n"
 
 
 def main() -> None:
@@ -108,7 +138,8 @@ def main() -> None:
     command = f"python studies/pushing_pictures_looks.py {words} {settings.words()}"
     made_by = record(command)
     torch.set_num_threads(1)
-    acting, seed = controller(cell, own, spec_of(cell, settings)), EVALUATION + 1000 * cell.seed
+    fit, seed = fitted(cell, own, spec_of(cell, settings)), EVALUATION + 1000 * cell.seed
+    acting = Controller.from_spec(fit.hierarchy, fit.spec.rollout)
     looking = Looking(acting)
     first = played(looking, seed)
     episodes = [first, *(played(acting, seed + number) for number in range(1, int(settings.values["episodes"])))]
@@ -116,8 +147,9 @@ def main() -> None:
     caption = f"What {cell.method} looks at, and the option that is active; episode {seed}"
     keep(draw(looking.frames, choices), OUT / "looks.png", caption, "")
     rows = [row_of(episode) for episode in episodes]
-    write_text(OUT / "looks.json", text({"episodes": rows}, [made_by]))
-    write_text(OUT / "looks.md", page(rows, seed, caption, sentence(command, [made_by])))
+    found = phases(fit, held_out(own.runs)) if cell.options else None
+    write_text(OUT / "looks.json", text({"episodes": rows, "phases": found}, [made_by]))
+    write_text(OUT / "looks.md", page(rows, found, seed, caption, sentence(command, [made_by])))
 
 
 if __name__ == "__main__":
