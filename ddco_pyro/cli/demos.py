@@ -135,7 +135,7 @@ def encode(
     observation: Annotated[str, typer.Option(metavar="KEY", help="The pictures to encode.", show_default=False)],
     out: Annotated[Path, typer.Option(help="The HDF5 file to write.", show_default=False)],
     encoder: Annotated[
-        str, typer.Option(metavar="NAME", help="random_conv, autoencoder, or module:Class of your own.")
+        str, typer.Option(metavar="NAME", help="random_conv, autoencoder, the folder of a fit, or module:Class.")
     ] = "random_conv",
     size: Annotated[
         int | None,

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from ddco_pyro.data.files import Damaged, whole_folder
 from ddco_pyro.data.tensors import read_tensors, write_tensors
+from ddco_pyro.encoding.fitted import FittedReader, Reader
 from ddco_pyro.encoding.networks import BUILT_IN, Convolutions
 from ddco_pyro.encoding.projection import Projection
 from ddco_pyro.encoding.user import Features, imported, see_name
@@ -27,7 +28,9 @@ class About(Model):
 
     version: Literal[1] = 1
     encoder: str
-    """``random_conv``, ``autoencoder`` or ``module:Class``."""
+    """``random_conv``, ``autoencoder``, ``module:Class``, or the folder of a fit."""
+    reader: Reader | None = None
+    """The network that was taken out of a fit."""
     observation: str
     """The key of the pictures it was made for."""
     picture: Items[Count]
@@ -48,7 +51,7 @@ class Encoder:
     about: About
     features: Features
     projection: Projection | None
-    network: Convolutions | None = None
+    network: Convolutions | FittedReader | None = None
 
     def __call__(self, picture: np.ndarray) -> np.ndarray:
         """The features that a policy, fitted to them, reads in place of the picture.
@@ -99,14 +102,19 @@ def load(folder: str | Path, allow_code: bool = False) -> Encoder:
     """
     folder = Path(folder)
     about = about_of(folder)
-    see_name(about.encoder, allow_code)
+    if about.reader is None:
+        see_name(about.encoder, allow_code)
     tensors, _ = read_tensors(folder / TENSORS, AGAIN)
     projection = None
     if "components" in tensors:
         projection = Projection(tensors["mean"].numpy(), tensors["components"].numpy(), about.explained)
-    if about.encoder not in BUILT_IN:
+    network: Convolutions | FittedReader
+    if about.reader is not None:
+        network = FittedReader(about.reader, about.picture)
+    elif about.encoder in BUILT_IN:
+        network = Convolutions(about.encoder, about.picture, about.seed)
+    else:
         return Encoder(about, imported(about.encoder), projection)
-    network = Convolutions(about.encoder, about.picture, about.seed)
     weights = {key.removeprefix("network/"): value for key, value in tensors.items() if key.startswith("network/")}
     try:
         network.load_state_dict(weights)

@@ -26,8 +26,8 @@ def see_name(name: str, allow_code: bool) -> None:
     if name in BUILT_IN:
         return
     if ":" not in name:
-        known = ", ".join(BUILT_IN)
-        raise BadInput(f"there is no encoder {name!r}{nearest(name, BUILT_IN)}; take {known}, or your own module:Class")
+        known = f"{', '.join(BUILT_IN)}, the folder of a fit, or your own module:Class"
+        raise BadInput(f"there is no encoder {name!r}{nearest(name, BUILT_IN)}; take {known}")
     if not allow_code:
         raise BadInput(
             f"encoder {name!r} would import user code; pass --allow-code if you trust it (in Python: allow_code=True)"

@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from torch import nn
 
 from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.data.hdf5 import DemonstrationsError, opened
@@ -25,6 +26,7 @@ from ddco_pyro.data.resumable import parts_of
 from ddco_pyro.data.sources import Column, Recording, format_of
 from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
 from ddco_pyro.encoding.encoder import About, Encoder, about_of
+from ddco_pyro.encoding.fitted import FittedReader, from_fit
 from ddco_pyro.encoding.networks import BUILT_IN, Convolutions
 from ddco_pyro.encoding.pictures import Pictures, batches
 from ddco_pyro.encoding.projection import Projection, principal_components
@@ -51,9 +53,9 @@ class Encoding:
     """How pictures become a vector.
 
     :param observation: the key of the pictures, uint8 [T, H, W, C].
-    :param encoder: ``random_conv``, ``autoencoder``, or a user's ``module:Class``.
+    :param encoder: ``random_conv``, ``autoencoder``, a user's ``module:Class``, or the folder of a fit.
     :param size: principal components that are kept; by default :data:`SIZE`, or all features as they are where they
-        are no more than that.
+        are no more than that, or those of a fit.
     :param name: the new observation's key; ``<observation>_features`` by default.
     :param updates: gradient steps of the autoencoder.
     """
@@ -64,6 +66,11 @@ class Encoding:
     seed: int = 0
     name: str | None = None
     updates: int = UPDATES
+
+    @property
+    def of_a_fit(self) -> bool:
+        """Whether the encoder is taken out of a fit."""
+        return Path(self.encoder).is_dir()
 
     @property
     def key(self) -> str:
@@ -95,26 +102,30 @@ def encode(
         features than ``size``.
     """
     path, out = Path(path), Path(out)
-    see_name(encoding.encoder, allow_code)
+    if not encoding.of_a_fit:
+        see_name(encoding.encoder, allow_code)
     if out.exists() and not out.is_file():
         raise BadInput(f"{out}: is there already and is no file; choose another --out")
     if (form := format_of(path)) != "robomimic":
         raise BadInput(f"{path}: is a {form} dataset; first: ddco-pyro import {path} --out demos.hdf5")
-    with open_robomimic(path) as source, one_thread() if encoding.encoder in BUILT_IN else nullcontext():
-        job = _Job(source, path, out, encoding, on_event)
+    ours = encoding.of_a_fit or encoding.encoder in BUILT_IN
+    with open_robomimic(path) as source, one_thread() if ours else nullcontext():
+        job = _Job(source, path, out, encoding, on_event, allow_code)
         return job.already() or job.run()
 
 
 class _Job:
     """The encoding of one file: ``folder`` is where it stands, ``beside`` where the encoder goes."""
 
-    def __init__(self, source: Robomimic, path: Path, out: Path, encoding: Encoding, on_event: OnEvent) -> None:
+    def __init__(
+        self, source: Robomimic, path: Path, out: Path, encoding: Encoding, on_event: OnEvent, allow_code: bool
+    ) -> None:
         self.source, self.out, self.encoding, self.on_event = source, out, encoding, on_event
         self.pictures = Pictures(source, encoding.observation)
         if encoding.key in source.recording(source.names[0]).observations:
             raise DemonstrationsError(f"obs/{encoding.key} is there already; choose another name with --as")
-        self.network, self.features = _encoder(encoding, self.pictures)
-        self.about = _about(encoding, self.pictures, self.features)
+        self.network, self.features = _encoder(encoding, self.pictures, allow_code)
+        self.about = _about(encoding, self.pictures, self.features, self.network)
         self.identity = _identity(path, encoding)
         self.beside, self.folder = out.with_name(f"{out.name}.encoder"), out.with_name(f".{out.name}.encoding")
 
@@ -157,7 +168,7 @@ class _Job:
 
     def _fitted(self) -> Encoder:
         """The encoder with its projection, once every demonstration has been encoded."""
-        if self.network is not None and self.encoding.encoder == "autoencoder":
+        if isinstance(self.network, Convolutions) and self.encoding.encoder == "autoencoder":
             checkpoint = self.folder / _CHECKPOINT
             train(self.network, self.pictures, self.encoding.seed, self.encoding.updates, checkpoint, self.on_event)
         self._encode_all()
@@ -212,8 +223,13 @@ class _Job:
                 write_recording(data, replace(recording, observations=observations))
 
 
-def _encoder(encoding: Encoding, pictures: Pictures) -> tuple[Convolutions | None, Features]:
-    """The encoder, which has been tried on the first training pictures; the network where it is built in."""
+def _encoder(
+    encoding: Encoding, pictures: Pictures, allow_code: bool
+) -> tuple[Convolutions | FittedReader | None, Features]:
+    """The encoder, which has been tried on the first training pictures where it is a user's; the network where not."""
+    if encoding.of_a_fit:
+        reader = from_fit(encoding.encoder, encoding.observation, pictures.shape, allow_code)
+        return reader, reader.encode
     if encoding.encoder in BUILT_IN:
         network = Convolutions(encoding.encoder, pictures.shape, encoding.seed)
         return network, network.encode
@@ -222,19 +238,21 @@ def _encoder(encoding: Encoding, pictures: Pictures) -> tuple[Convolutions | Non
     return None, features
 
 
-def _about(encoding: Encoding, pictures: Pictures, features: Features) -> About:
+def _about(encoding: Encoding, pictures: Pictures, features: Features, network: nn.Module | None) -> About:
     """What the encoder is.
 
     :raises BadInput: there are fewer features, or training pictures, than the size that is asked for.
     """
     number = features(next(pictures.of(pictures.training[0]))).shape[1]
-    size = encoding.size or min(SIZE, number, pictures.number)
+    reader = network.about if isinstance(network, FittedReader) else None
+    size = encoding.size or (number if reader else min(SIZE, number, pictures.number))
     if size > number:
         raise BadInput(f"--size {size}: encoder {encoding.encoder!r} gives {number} features; take at most as many")
     if size > pictures.number:
         raise BadInput(f"--size {size}: there are {pictures.number} training pictures; take at most as many")
     return About(
         encoder=encoding.encoder,
+        reader=reader,
         observation=encoding.observation,
         picture=pictures.shape,
         features=number,
@@ -244,10 +262,11 @@ def _about(encoding: Encoding, pictures: Pictures, features: Features) -> About:
 
 
 def _identity(path: Path, encoding: Encoding) -> str:
-    """What decides the contents of the file: a user's module too, by its own source."""
+    """What decides the contents of the file: a user's module too, by its own source, and a fit's weights."""
     stat = path.stat()
     module = sys.modules.get(encoding.encoder.partition(":")[0])
     code = Path(module.__file__).read_bytes() if module is not None and module.__file__ else b""
+    code = (Path(encoding.encoder) / "model.safetensors").read_bytes() if encoding.of_a_fit else code
     facts = {"file": [str(path.resolve()), stat.st_size, stat.st_mtime_ns], "code": hashlib.sha256(code).hexdigest()}
     return json.dumps(facts | asdict(encoding))
 

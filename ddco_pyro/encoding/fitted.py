@@ -1,0 +1,131 @@
+"""The network of a fit that reads pictures, taken out of it: an encoder that has learnt from controls."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ddco_pyro.data.pictures import Transform
+from ddco_pyro.errors import BadInput
+from ddco_pyro.fitting.fit import Fit, load
+from ddco_pyro.model.networks import Inputs, InputShape, build_trunk
+from ddco_pyro.model.networks.branches import Branches
+from ddco_pyro.model.networks.conv import Conv
+from ddco_pyro.model.networks.lstm import Lstm
+from ddco_pyro.model.networks.shared import Shared
+from ddco_pyro.spec import NetworkSpec
+from ddco_pyro.spec.types import Count, Items, Model
+
+Part = tuple[NetworkSpec, nn.Module, Sequence[str]]
+"""A network of a fit: its spec, itself, and the observations that it reads."""
+
+
+class Reader(Model):
+    """A network that reads one observation's pictures, beside its weights."""
+
+    network: NetworkSpec
+    crop: Items[int] | None = None
+    resize: Items[Count] | None = None
+    grey: bool = False
+
+
+class FittedReader(nn.Module):
+    """uint8 pictures [N, H, W, C], as they are stored, to what the last hidden layer of a fit's network gives, [N, F].
+
+    :param about: the network, and what it sees of a picture.
+    :param picture: [H, W, C].
+    """
+
+    def __init__(self, about: Reader, picture: Sequence[int]) -> None:
+        super().__init__()
+        self.about = about
+        self.transform = Transform(about.crop, about.resize, about.grey)
+        (self.key,) = about.network.inputs or ("picture",)
+        shape = InputShape({}, {self.key: self.transform.shape(picture)})
+        self.network = build_trunk(about.network, shape, 1).network
+        self.eval()
+
+    def encode(self, pictures: np.ndarray) -> np.ndarray:
+        """Features of each picture by itself, float32 [N, F]."""
+        seen = torch.from_numpy(np.ascontiguousarray(self.transform(pictures)))
+        with torch.no_grad():
+            features: Tensor = self.network(Inputs({}, {self.key: seen[:, None]}, torch.zeros(1)))
+        return features[:, 0, 0].numpy()
+
+
+def from_fit(folder: str, key: str, picture: Sequence[int], allow_code: bool = False) -> FittedReader:
+    """What reads the pictures under ``key`` in a fit: the branch, or the network under an LSTM, that sees nothing else,
+    of a flat policy or, where its options share it, of the lowest options.
+
+    :param folder: a run folder.
+    :param picture: [H, W, C] of the pictures that are to be encoded.
+    :raises BadInput: there is no finished fit, it saw other pictures, or several together, or has no such network.
+    """
+    fit = load(Path(folder), allow_code)
+    transform = _transform(folder, fit, key, picture)
+    found = next(_readers(_lowest(fit), key), None)
+    if found is None:
+        raise BadInput(f"{folder}: its lowest policy has no convolutions that read {key} alone; make them a branch")
+    spec, network, _ = found
+    if network.copies != 1:
+        raise BadInput(
+            f"{folder}: each option has a network of its own for {key}; take a flat policy, or one with shared: true"
+        )
+    about = Reader(
+        network=spec.model_copy(update={"inputs": (key,), "shared": False}),
+        crop=transform.crop,
+        resize=transform.resize,
+        grey=transform.grey,
+    )
+    reader, weights = FittedReader(about, picture), network.state_dict()
+    reader.network.load_state_dict({name: weights[name] for name in reader.network.state_dict()})
+    return reader
+
+
+def _transform(folder: str, fit: Fit, key: str, picture: Sequence[int]) -> Transform:
+    """What a fit sees of such pictures."""
+    encoder = fit.hierarchy.encoder
+    if key not in encoder.transforms:
+        there = ", ".join(encoder.transforms) or "none"
+        raise BadInput(f"{folder}: this fit observes no pictures {key!r}; the pictures it observes: {there}")
+    if encoder.shapes[key] != tuple(picture):
+        raise BadInput(f"{folder}: this fit observed {key} of {encoder.shapes[key]}, and these are {tuple(picture)}")
+    transform = encoder.transforms[key]
+    if transform.frames > 1:
+        raise BadInput(f"{folder}: this fit sees {transform.frames} pictures at once; take one with frames: 1")
+    return transform
+
+
+def _lowest(fit: Fit) -> Part:
+    """The network of a flat policy, or of the lowest options: their trunk, and their policy where there is none."""
+    networks, encoder = fit.hierarchy.networks(), fit.hierarchy.encoder
+    baseline, hierarchy = fit.spec.baseline, fit.spec.hierarchy
+    spec: NetworkSpec
+    if baseline is not None:
+        spec, place = baseline.policy, "meta_policy"
+    else:
+        assert hierarchy is not None  # one of both is there
+        lowest = hierarchy.levels[0]
+        spec, place = (lowest.trunk, "levels.0.trunk") if lowest.trunk else (lowest.policy, "levels.0.policy")
+    return spec, networks[place], spec.inputs or [*encoder.keys, *encoder.images]
+
+
+def _readers(part: Part, key: str) -> Iterator[Part]:
+    """The networks of convolutions within one that read these pictures and nothing else."""
+    spec, network, reads = part
+    if isinstance(network, Shared):
+        network = network.network
+    if isinstance(network, Conv) and [*reads] == [key]:
+        yield spec, network, reads
+    within: list[Part] = []
+    if isinstance(network, Branches):
+        named = zip(spec.of.items(), network.of, strict=True)
+        within = [(branch, own, branch.inputs or (name,)) for (name, branch), own in named]
+    elif isinstance(network, Lstm) and spec.over is not None:
+        within = [(spec.over, network.over, spec.over.inputs or reads)]
+    for inner in within:
+        yield from _readers(inner, key)

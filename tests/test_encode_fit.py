@@ -1,0 +1,144 @@
+"""Pictures encoded by the network of a fit, against what that network gives within the fit."""
+
+from __future__ import annotations
+
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from command_line import call
+from dots import followed, together
+
+import ddco_pyro
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.encoding import Encoding, encode, load
+from ddco_pyro.spec import parse_spec
+
+SEES = {"network": "conv", "filters": 3, "pool": "flatten", "hidden": [5], "activation": "tanh", "standardize": True}
+BRANCHES = {"network": "branches", "of": {"camera": SEES, "place": {"network": "mlp", "hidden": [4]}}, "hidden": [6]}
+SHARED = BRANCHES | {"of": BRANCHES["of"] | {"camera": SEES | {"shared": True}}}
+LSTM = {"network": "lstm", "over": SEES | {"inputs": ["camera"]}, "hidden": [4]}
+CUT = {"crop": [2, 1, 16, 18], "resize": [8, 9]}
+
+
+def flat(policy):
+    return {"baseline": {"kind": "flat", "policy": policy}}
+
+
+def options(trunk, **policy):
+    level = {"name": "option", "count": 2, "termination": {"network": "linear"}, "policy": {"network": "linear"}}
+    level |= {"trunk": trunk} if trunk else {}
+    return {"hierarchy": {"levels": [level | policy], "meta_policy": {"network": "linear", "inputs": ["place"]}}}
+
+
+MODELS = {
+    "a flat policy": (flat(BRANCHES), {}, lambda networks: networks["meta_policy"].of[0]),
+    "cut pictures": (flat(BRANCHES), CUT, lambda networks: networks["meta_policy"].of[0]),
+    "options that share it": (options(SHARED), {}, lambda networks: networks["levels.0.trunk"].of[0].network),
+    "under an LSTM": (flat(LSTM), {}, lambda networks: networks["meta_policy"].over),
+    "by itself": (flat(SEES | {"inputs": ["camera"]}), {}, lambda networks: networks["meta_policy"].layers[1]),
+}
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    path = tmp_path_factory.mktemp("small") / "small.hdf5"
+    followed(6).write(path)
+    return path
+
+
+def fitted(small, folder, model, camera=None):
+    """A run of one epoch."""
+    observations = [{"key": "camera", **(camera or {})}, {"key": "place"}]
+    spec = {"demonstrations": {"path": str(small)}, "observations": observations, "training": {"epochs": 1}}
+    return ddco_pyro.fit(parse_spec(spec | model), out=folder)
+
+
+def within(fit, network, demo):
+    """What the last hidden layer of a network of the fit gives at each step of a demonstration."""
+    given = []
+    handle = network.register_forward_hook(lambda _, __, output: given.append(output))
+    with torch.no_grad():
+        fit.hierarchy(fit.hierarchy.encoder.inputs([demo.observations]).loaded())
+    handle.remove()
+    return torch.cat([part.reshape(-1, part.shape[-1]) for part in given]).numpy()
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_features_are_those_of_the_fit(small, tmp_path, name):
+    model, camera, network = MODELS[name]
+    run, out = tmp_path / "run", tmp_path / "out.hdf5"
+    fit = fitted(small, run, model, camera)
+    folder = encode(small, out, Encoding("camera", str(run))).folder
+    shutil.rmtree(run)  # the encoder holds what it needs
+    demos, encoder = Demonstrations.read(small), load(folder)
+    for before, after in zip(demos, Demonstrations.read(out), strict=True):
+        expected = within(fit, network(fit.hierarchy.networks()), before)
+        features = after.observations["camera_features"]
+        np.testing.assert_allclose(features, expected, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose([encoder(one) for one in before.observations["camera"]], features, atol=1e-5)
+    assert np.ptp(together(Demonstrations.read(out), "camera_features"), axis=0).max() > 0.01
+
+
+def test_another_fit_is_another_encoding(small, tmp_path):
+    out, run = tmp_path / "out.hdf5", tmp_path / "run"
+    fitted(small, run, flat(BRANCHES))
+    arguments = ("encode", small, "--observation", "camera", "--encoder", run, "--out", out)
+    ended = call(*arguments)
+    assert (ended.status, ended.out.startswith(f"{out}: 6 demonstrations, obs/camera_features: 5 of 5 fea")) == (
+        0,
+        True,
+    )
+    assert call(*arguments).status == 0
+    shutil.rmtree(run)
+    fitted(small, run, flat(BRANCHES | {"hidden": [7]}))
+    again = call(*arguments)
+    assert (again.status, "is not this encoding" in again.err) == (2, True)
+
+
+ALONE = {"network": "mlp", "hidden": [4], "inputs": ["place"]}
+
+
+@pytest.mark.parametrize(
+    ("model", "camera", "message"),
+    [
+        (flat(ALONE), {}, "its lowest policy has no convolutions that read camera alone; make them a branch"),
+        (flat(SEES), {}, "its lowest policy has no convolutions that read camera alone"),
+        (
+            options(BRANCHES),
+            {},
+            "each option has a network of its own for camera; take a flat policy, or one with shared",
+        ),
+        (flat(BRANCHES), {"frames": 2}, "this fit sees 2 pictures at once; take one with frames: 1"),
+    ],
+)
+def test_fits_that_have_no_encoder(small, tmp_path, model, camera, message):
+    out, run = tmp_path / "out.hdf5", tmp_path / "run"
+    fitted(small, run, model, camera)
+    refused(call("encode", small, "--observation", "camera", "--encoder", run, "--out", out), out, f"{run}: {message}")
+
+
+def test_pictures_that_the_fit_does_not_know(small, tmp_path):
+    out, run = tmp_path / "out.hdf5", tmp_path / "run"
+    fitted(small, run, flat(BRANCHES))
+    other = call("encode", small, "--observation", "other", "--encoder", run, "--out", out)
+    refused(other, out, f"{run}: this fit observes no pictures 'other'; the pictures it observes: camera")
+    with h5py.File(small) as source, h5py.File(tmp_path / "cut.hdf5", "w") as file:
+        source.copy("data", file)
+        for demo in file["data"].values():
+            pictures = demo["obs/camera"][:, 1:]
+            del demo["obs/camera"]
+            demo["obs/camera"] = pictures
+    cut = call("encode", tmp_path / "cut.hdf5", "--observation", "camera", "--encoder", run, "--out", out)
+    refused(cut, out, f"{run}: this fit observed camera of (20, 20, 2), and these are (19, 20, 2)")
+    (run / "model.safetensors").unlink()
+    unfinished = call("encode", small, "--observation", "camera", "--encoder", run, "--out", out)
+    refused(unfinished, out, "an unfinished run")
+
+
+def refused(ended, out, message):
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert message in ended.err
+    assert not [path for path in out.parent.iterdir() if "out" in path.name]
