@@ -1,7 +1,8 @@
-"""Pushing from pictures (paper §5.1, SM 1.2, SM 1.5): goals against demonstrations, options, and augmentation.
+"""Pushing from pictures (paper §5.1, SM 1.2, SM 1.5): goals against demonstrations, the same over the features of a
+flat policy (``encoded``), goals against options, and augmentation.
 
-    python studies/pushing_pictures.py demonstrations|options|augmentation [--seeds 3] [--methods ff ff_flat ...]
-        [--counts 80 40 20 10] [--options 1 2 3 4 5 6] [--updates 4000] [--episodes 5] [--set KEY=VALUE]...
+    python studies/pushing_pictures.py demonstrations|encoded|options|augmentation [--seeds 3]
+        [--methods ff ff_flat ...] [--counts 80 40 20 10] [--options 1 2 3 4 5 6] [--updates 4000] [--episodes 5] [--set KEY=VALUE]...
         [--summarize] [--minutes 60] [--jobs 1] [--out DIR] [--runs DIR]
 
 Does cells one seed after the other, and begins none after so many minutes; what this code has done with these settings
@@ -28,12 +29,13 @@ from ddco_pyro.data.files import write_text
 
 STUDIES = {
     "demonstrations": ("ff_flat", "ff", "rnn_flat", "rnn", "ff_two_flat", "ff_two"),
+    "encoded": ("ff_flat", "encoded_flat", "encoded"),
     "options": ("ff", "rnn"),
     "augmentation": ("ff", "ff_hybrid", "rnn", "rnn_hybrid"),
 }
 """The methods of each."""
 
-OWN_OPTIONS = {"ff": 2, "rnn": 4}
+OWN_OPTIONS = {"ff": 2, "rnn": 4, "encoded": 2}
 """What the supplement says; the text has them the other way round."""
 
 COUNT = 40
@@ -43,7 +45,7 @@ COUNT = 40
 def cells(own: argparse.Namespace) -> list[PictureCell]:
     """All of a study, one seed after the other."""
     methods = [name for name in STUDIES[own.study] if name in own.methods]
-    if own.study == "demonstrations":
+    if shown.ACROSS[own.study] == "count":
         product = itertools.product(range(own.seeds), own.counts, methods)
         return [PictureCell(name, _own_options(name), count, seed) for seed, count, name in product]
     grid = itertools.product(range(own.seeds), own.options, methods)
@@ -86,7 +88,7 @@ def run(own: argparse.Namespace) -> str:
 
 def _part(own: argparse.Namespace) -> str:
     """The words that say which part of a study is asked for."""
-    across = "counts" if own.study == "demonstrations" else "options"
+    across = {"count": "counts", "options": "options"}[shown.ACROSS[own.study]]
     methods = [name for name in STUDIES[own.study] if name in own.methods]
     return f"--{across} {' '.join(map(str, getattr(own, across)))} --methods {' '.join(methods)}"
 

@@ -17,27 +17,40 @@ from typing import Any
 
 import dm_env
 import numpy as np
-from cells import Cell, Settings
+from cells import Cell, Settings, digest
 from ddco_tasks.pushing import environment as pushing
 from pushing_cell import EVALUATION, HELD_OUT, HELD_OUT_SEED, LABELS, POOL, TRAINING, per_step, summary
 
 from ddco_pyro.acting.lockstep import play
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import Transform
+from ddco_pyro.encoding.fitted import FittedReader, from_fit
 from ddco_pyro.fitting.building import Dimensions, baseline_spec, parameters
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import train
-from ddco_pyro.simulation.cameras import Camera
+from ddco_pyro.fitting.run import Trained, train
+from ddco_pyro.simulation.cameras import Camera, Encoded
 from ddco_pyro.simulation.episodes import run_episode
+from ddco_pyro.simulation.task import Task
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 
 SPECS = Path(__file__).parents[1] / "specs"
 SIZE, FINER = (48, 64), 3
 SUPERVISOR = "scripted_noisy_0.3"
 
-METHODS = ("ff", "ff_flat", "ff_hybrid", "ff_two", "ff_two_flat", "rnn", "rnn_flat", "rnn_hybrid")
+METHODS = (
+    *("ff", "ff_flat", "ff_hybrid", "ff_two", "ff_two_flat"),
+    *("rnn", "rnn_flat", "rnn_hybrid", "encoded", "encoded_flat"),
+)
 """``_flat``: as many parameters as the hierarchy beside it has with the options of its spec; ``ff_two``: of two
-pictures side by side instead of one."""
+pictures side by side instead of one; ``encoded``: perceptrons over what the convolutions of ``ff_flat``, fitted to the
+same demonstrations, give of a picture."""
+
+ENCODED = (
+    "observations=[camera_features]",
+    "control.std=0.35",
+    "training.optimizer={name: adam, lr: 1.0e-3, schedule: cosine}",
+)
+"""What is changed in ``pushing_mlp.yaml`` to read features; σ and rate are the likeliest on a development seed."""
 
 DEFAULTS = Settings({"updates": 4000, "episodes": 5}, Path("runs/pushing-pictures"))
 """Gradient steps of a fit, and what each one plays."""
@@ -56,19 +69,20 @@ class PictureCell(Cell):
 
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """Fit and play."""
-        spec, own = spec_of(self, settings), settings.values
-        demos = pool(settings.runs, self.seed)
-        demos = demos.select(demos.names[: self.count])
-        test, begun = held_out(settings.runs), time.perf_counter()
-        size, before = Dimensions.of(demos), time.process_time()
-        spec = spec if self.options else baseline_spec(spec, spec.compare_with[0], size)
-        trained = train(spec, size, demos, checkpoints=folder)
+        own, test, tasks = settings.values, held_out(settings.runs), (WATCHED, LIMITED)
+        demos = self.demonstrations(settings)
+        if self.method.startswith("encoded"):
+            reader = self._reader(settings, folder)
+            demos, test = (_encoded(reader, each) for each in (demos, test))
+            tasks = tuple(_seen_through(reader, task) for task in tasks)
+        begun, before = time.perf_counter(), time.process_time()
+        spec, trained = self.fitted(settings, demos, folder)
         fitted, cpu = time.perf_counter(), time.process_time() - before
         found = Fit(spec, trained.hierarchy)
         likelihood = {name: per_step(found, each) for name, each in (("train", demos), ("held_out", test))}
         first = EVALUATION + 1000 * self.seed
         seeds = range(first, first + int(own["episodes"]))
-        episodes, limited = (play(task, trained.hierarchy, spec.rollout, seeds) for task in (WATCHED, LIMITED))
+        episodes, limited = (play(task, trained.hierarchy, spec.rollout, seeds) for task in tasks)
         ended = time.perf_counter()
         return {
             "log_likelihood_per_step": likelihood,
@@ -79,16 +93,38 @@ class PictureCell(Cell):
             "seconds": {"fit": fitted - begun, "fit_processor": cpu, "play": ended - fitted},
         }
 
+    def demonstrations(self, settings: Settings) -> Demonstrations:
+        """What is trained with."""
+        demos = pool(settings.runs, self.seed)
+        return demos.select(demos.names[: self.count])
+
+    def fitted(self, settings: Settings, demos: Demonstrations, folder: Path) -> tuple[Spec, Trained]:
+        """The fit, which is done only once."""
+        spec, size = spec_of(self, settings), Dimensions.of(demos)
+        spec = spec if self.options else baseline_spec(spec, spec.compare_with[-1], size)
+        return spec, train(spec, size, demos, checkpoints=folder)
+
+    def _reader(self, settings: Settings, folder: Path) -> FittedReader:
+        """The convolutions of the flat policy of the same demonstrations, which is fitted as its own cell has it."""
+        flat, plain = PictureCell("ff_flat", 0, self.count, self.seed), replace(settings, overrides=())
+        its = folder.parents[1] / digest(plain.kept()) / flat.name
+        spec, trained = flat.fitted(plain, flat.demonstrations(plain), its)
+        return from_fit(Fit(spec, trained.hierarchy), "camera", (*SIZE, 3))
+
 
 def spec_of(cell: PictureCell, settings: Settings) -> Spec:
     """The spec of a cell, whose pictures are small already."""
     family = cell.method.partition("_")[0]
     kind = "_hybrid" if cell.method.endswith("_hybrid") else ""
     changed: dict[str, Any] = {"seed": cell.seed, "demonstrations.count": cell.count}
-    changed |= {"observations.0.resize": None, "observations.0.frames": 2 if "_two" in cell.method else 1}
     if cell.options:
         changed["hierarchy.levels.0.count"] = cell.options
-    spec = with_overrides(load_spec(SPECS / f"pushing_image_{family}{kind}.yaml", settings.overrides), changed)
+    if family == "encoded":
+        base = load_spec(SPECS / "pushing_mlp.yaml", [*ENCODED, *settings.overrides])
+    else:
+        changed |= {"observations.0.resize": None, "observations.0.frames": 2 if "_two" in cell.method else 1}
+        base = load_spec(SPECS / f"pushing_image_{family}{kind}.yaml", settings.overrides)
+    spec = with_overrides(base, changed)
     trained = cell.count - max(1, round(cell.count * spec.training.tune_fraction))
     epochs = int(np.ceil(settings.values["updates"] / np.ceil(trained / spec.training.batch_size)))
     return with_overrides(spec, {"training.epochs": epochs})
@@ -126,6 +162,19 @@ def recorded(folder: Path, first: int, count: int) -> Demonstrations:
         Demonstrations(tuple(one.record for one in episodes)).write(path)
     kept = Demonstrations.read(path, labels=LABELS)
     return replace(kept, demonstrations=tuple(map(_in_memory, kept)))
+
+
+def _encoded(reader: FittedReader, demos: Demonstrations) -> Demonstrations:
+    """Features in the place of the pictures."""
+    rows = ({"camera_features": reader.encode(np.asarray(demo.observations["camera"]))} for demo in demos)
+    both = zip(demos, rows, strict=True)
+    return replace(demos, demonstrations=tuple(replace(demo, observations=row) for demo, row in both))
+
+
+def _seen_through(reader: FittedReader, task: Task) -> Task:
+    """The same task, whose pictures are encoded."""
+    seen = Encoded(CAMERA, lambda picture: reader.encode(picture[None])[0], reader.features)
+    return replace(task, cameras={"camera_features": seen})
 
 
 def _in_memory(demo: Demonstration) -> Demonstration:

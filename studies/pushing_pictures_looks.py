@@ -13,7 +13,6 @@ steps of the held-out demonstrations each is the most likely one, by what the su
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from cells import described
 from matplotlib.figure import Figure
 from provenance import record, sentence, text
 from pushing_cell import EVALUATION
-from pushing_pictures_cell import DEFAULTS, METHODS, WATCHED, PictureCell, held_out, pool, spec_of
+from pushing_pictures_cell import DEFAULTS, METHODS, WATCHED, PictureCell, held_out
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking
@@ -33,12 +32,9 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.pictures import WIDTH, blank, keep
 from ddco_pyro.fitting.agreement import agreement
-from ddco_pyro.fitting.building import Dimensions, baseline_spec
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import train
 from ddco_pyro.simulation.episodes import Episode, run_episode
 from ddco_pyro.simulation.task import Policy
-from ddco_pyro.spec import Spec
 
 OUT = Path("docs/results/pushing_pictures")
 COLUMNS, ROWS = 6, 2
@@ -48,15 +44,6 @@ TOP = 0.55 + 12 * np.tan(np.deg2rad(7 / 2))
 
 PHASES = ("approach", "push")
 """Of the supervisor, by their label."""
-
-
-def fitted(cell: PictureCell, own: argparse.Namespace, spec: Spec) -> Fit:
-    """The cell's policy; nothing is trained where its fit is done."""
-    demos = pool(own.runs, cell.seed)
-    demos = demos.select(demos.names[: cell.count])
-    size = Dimensions.of(demos)
-    spec = spec if cell.options else baseline_spec(spec, spec.compare_with[0], size)
-    return Fit(spec, train(spec, size, demos, checkpoints=own.checkpoints).hierarchy)
 
 
 def phases(fit: Fit, demos: Demonstrations) -> dict[str, Any]:
@@ -138,8 +125,8 @@ def main() -> None:
     command = f"python studies/pushing_pictures_looks.py {words} {settings.words()}"
     made_by = record(command)
     torch.set_num_threads(1)
-    fit, seed = fitted(cell, own, spec_of(cell, settings)), EVALUATION + 1000 * cell.seed
-    acting = Controller.from_spec(fit.hierarchy, fit.spec.rollout)
+    spec, trained = cell.fitted(settings, cell.demonstrations(settings), own.checkpoints)
+    acting, seed = Controller.from_spec(trained.hierarchy, spec.rollout), EVALUATION + 1000 * cell.seed
     looking = Looking(acting)
     first = played(looking, seed)
     episodes = [first, *(played(acting, seed + number) for number in range(1, int(settings.values["episodes"])))]
@@ -147,7 +134,7 @@ def main() -> None:
     caption = f"What {cell.method} looks at, and the option that is active; episode {seed}"
     keep(draw(looking.frames, choices), OUT / "looks.png", caption, "")
     rows = [row_of(episode) for episode in episodes]
-    found = phases(fit, held_out(own.runs)) if cell.options else None
+    found = phases(Fit(spec, trained.hierarchy), held_out(own.runs)) if cell.options else None
     write_text(OUT / "looks.json", text({"episodes": rows, "phases": found}, [made_by]))
     write_text(OUT / "looks.md", page(rows, found, seed, caption, sentence(command, [made_by])))
 

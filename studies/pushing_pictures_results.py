@@ -31,7 +31,7 @@ COLUMNS = {
     "minutes": ("minutes", "{:.1f}"),
     "of them processor, fit": ("processor", "{:.1f}"),
 }
-ACROSS = {"demonstrations": "count", "options": "options", "augmentation": "options"}
+ACROSS = {"demonstrations": "count", "encoded": "count", "options": "options", "augmentation": "options"}
 """What each study varies."""
 
 FEWEST = 3

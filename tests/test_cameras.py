@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
@@ -14,10 +16,12 @@ from ddco_pyro.acting.lockstep import play
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import Pictures
 from ddco_pyro.data.sources.video import frames
+from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.prepare import dimensions
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.report import write_report
 from ddco_pyro.simulation import collect as collecting
+from ddco_pyro.simulation.cameras import Encoded
 from ddco_pyro.simulation.environments import TaskEnvironment
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import DemonstrationsSpec, RolloutSpec, parse_spec
@@ -60,6 +64,25 @@ def test_an_episode_is_drawn_where_its_pictures_are_observed():
     for control, picture in zip(seen.actions, seen.observations["camera"], strict=True):
         np.testing.assert_array_equal(picture, toy_task.frame(environment))
         environment.step(control)
+
+
+def test_an_encoder_stands_in_for_the_pictures():
+    """A policy acts on features of the pictures of the very same states."""
+
+    def brightness(picture):
+        return picture.mean((0, 1), dtype=np.float32)
+
+    coded = replace(watched, cameras={"colour": Encoded(watched.cameras["camera"], brightness, 3)})
+    assert coded.watched(0, ["colour"]).observation_spec()["colour"].shape == (3,)
+    seen, told = (
+        run_episode(one, "supervisor", 3, observed=[name]).record
+        for one, name in ((watched, "camera"), (coded, "colour"))
+    )
+    np.testing.assert_array_equal(told.observations["colour"], [*map(brightness, seen.observations["camera"])])
+    policy = spec_of("colour")
+    size = Dimensions({"colour": (3,)}, seen.actions.shape[1], len(seen))
+    (played,) = play(coded, build_hierarchy(policy, size), policy.rollout, [3], keep=["colour"])
+    np.testing.assert_array_equal(played.observations["colour"][0], brightness(seen.observations["camera"][0]))
 
 
 def test_what_is_not_kept_is_not_recorded():

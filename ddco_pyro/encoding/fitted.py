@@ -24,6 +24,10 @@ Part = tuple[NetworkSpec, nn.Module, Sequence[str]]
 """A network of a fit: its spec, itself, and the observations that it reads."""
 
 
+class ReaderError(BadInput):
+    """A fit has no network that could encode these pictures."""
+
+
 class Reader(Model):
     """A network that reads one observation's pictures, beside its weights."""
 
@@ -46,7 +50,8 @@ class FittedReader(nn.Module):
         self.transform = Transform(about.crop, about.resize, about.grey)
         (self.key,) = about.network.inputs or ("picture",)
         shape = InputShape({}, {self.key: self.transform.shape(picture)})
-        self.network = build_trunk(about.network, shape, 1).network
+        trunk = build_trunk(about.network, shape, 1)
+        self.network, self.features = trunk.network, trunk.features
         self.eval()
 
     def encode(self, pictures: np.ndarray) -> np.ndarray:
@@ -57,23 +62,32 @@ class FittedReader(nn.Module):
         return features[:, 0, 0].numpy()
 
 
-def from_fit(folder: str, key: str, picture: Sequence[int], allow_code: bool = False) -> FittedReader:
+def from_folder(folder: str, key: str, picture: Sequence[int], allow_code: bool = False) -> FittedReader:
+    """:func:`from_fit` of the fit in a run folder.
+
+    :raises BadInput: there is no finished fit, or as :func:`from_fit`.
+    """
+    try:
+        return from_fit(load(Path(folder), allow_code), key, picture)
+    except ReaderError as error:
+        raise BadInput(f"{folder}: {error}") from error
+
+
+def from_fit(fit: Fit, key: str, picture: Sequence[int]) -> FittedReader:
     """What reads the pictures under ``key`` in a fit: the branch, or the network under an LSTM, that sees nothing else,
     of a flat policy or, where its options share it, of the lowest options.
 
-    :param folder: a run folder.
     :param picture: [H, W, C] of the pictures that are to be encoded.
-    :raises BadInput: there is no finished fit, it saw other pictures, or several together, or has no such network.
+    :raises ReaderError: it saw other pictures, or several together, or has no such network.
     """
-    fit = load(Path(folder), allow_code)
-    transform = _transform(folder, fit, key, picture)
+    transform = _transform(fit, key, picture)
     found = next(_readers(_lowest(fit), key), None)
     if found is None:
-        raise BadInput(f"{folder}: its lowest policy has no convolutions that read {key} alone; make them a branch")
+        raise ReaderError(f"its lowest policy has no convolutions that read {key} alone; make them a branch")
     spec, network, _ = found
     if network.copies != 1:
-        raise BadInput(
-            f"{folder}: each option has a network of its own for {key}; take a flat policy, or one with shared: true"
+        raise ReaderError(
+            f"each option has a network of its own for {key}; take a flat policy, or one with shared: true"
         )
     about = Reader(
         network=spec.model_copy(update={"inputs": (key,), "shared": False}),
@@ -86,17 +100,17 @@ def from_fit(folder: str, key: str, picture: Sequence[int], allow_code: bool = F
     return reader
 
 
-def _transform(folder: str, fit: Fit, key: str, picture: Sequence[int]) -> Transform:
+def _transform(fit: Fit, key: str, picture: Sequence[int]) -> Transform:
     """What a fit sees of such pictures."""
     encoder = fit.hierarchy.encoder
     if key not in encoder.transforms:
         there = ", ".join(encoder.transforms) or "none"
-        raise BadInput(f"{folder}: this fit observes no pictures {key!r}; the pictures it observes: {there}")
+        raise ReaderError(f"this fit observes no pictures {key!r}; the pictures it observes: {there}")
     if encoder.shapes[key] != tuple(picture):
-        raise BadInput(f"{folder}: this fit observed {key} of {encoder.shapes[key]}, and these are {tuple(picture)}")
+        raise ReaderError(f"this fit observed {key} of {encoder.shapes[key]}, and these are {tuple(picture)}")
     transform = encoder.transforms[key]
     if transform.frames > 1:
-        raise BadInput(f"{folder}: this fit sees {transform.frames} pictures at once; take one with frames: 1")
+        raise ReaderError(f"this fit sees {transform.frames} pictures at once; take one with frames: 1")
     return transform
 
 

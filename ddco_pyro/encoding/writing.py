@@ -26,7 +26,7 @@ from ddco_pyro.data.resumable import parts_of
 from ddco_pyro.data.sources import Column, Recording, format_of
 from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
 from ddco_pyro.encoding.encoder import About, Encoder, about_of
-from ddco_pyro.encoding.fitted import FittedReader, from_fit
+from ddco_pyro.encoding.fitted import FittedReader, from_folder
 from ddco_pyro.encoding.networks import BUILT_IN, Convolutions
 from ddco_pyro.encoding.pictures import Pictures, batches
 from ddco_pyro.encoding.projection import Projection, principal_components
@@ -228,7 +228,7 @@ def _encoder(
 ) -> tuple[Convolutions | FittedReader | None, Features]:
     """The encoder, which has been tried on the first training pictures where it is a user's; the network where not."""
     if encoding.of_a_fit:
-        reader = from_fit(encoding.encoder, encoding.observation, pictures.shape, allow_code)
+        reader = from_folder(encoding.encoder, encoding.observation, pictures.shape, allow_code)
         return reader, reader.encode
     if encoding.encoder in BUILT_IN:
         network = Convolutions(encoding.encoder, pictures.shape, encoding.seed)

@@ -22,11 +22,35 @@ class Camera:
     size: tuple[int, int]
     draw: Callable[[dm_env.Environment], np.ndarray]
 
+    def spec(self, name: str) -> specs.Array:
+        """What the observation is."""
+        return specs.BoundedArray((*self.size, 3), np.uint8, 0, 255, name)
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """An observation that is what an encoder gives of a camera's picture.
+
+    :param encoder: uint8 [height, width, 3] to float32 [features], such as :func:`ddco_pyro.encoding.load` gives.
+    """
+
+    camera: Camera
+    encoder: Callable[[np.ndarray], np.ndarray]
+    features: int
+
+    def draw(self, environment: dm_env.Environment) -> np.ndarray:
+        """The features of what the camera sees of an environment as it is now, float32 [features]."""
+        return self.encoder(self.camera.draw(environment))
+
+    def spec(self, name: str) -> specs.Array:
+        """What the observation is."""
+        return specs.Array((self.features,), np.float32, name)
+
 
 class Watched(dm_env.Environment):
-    """An environment whose observations have the pictures of ``cameras`` too, by name; all else is as it was."""
+    """An environment whose observations have what ``cameras`` give too, by name; all else is as it was."""
 
-    def __init__(self, environment: dm_env.Environment, cameras: Mapping[str, Camera]) -> None:
+    def __init__(self, environment: dm_env.Environment, cameras: Mapping[str, Camera | Encoded]) -> None:
         self._environment, self._cameras = environment, dict(cameras)
 
     def __getattr__(self, name: str) -> Any:
@@ -46,10 +70,7 @@ class Watched(dm_env.Environment):
 
     def observation_spec(self) -> dict[str, specs.Array]:
         """What each observation is."""
-        pictures = {
-            name: specs.BoundedArray((*camera.size, 3), np.uint8, 0, 255, name)
-            for name, camera in self._cameras.items()
-        }
+        pictures = {name: camera.spec(name) for name, camera in self._cameras.items()}
         return {**self._environment.observation_spec(), **pictures}
 
     def action_spec(self) -> Any:

@@ -18,7 +18,7 @@ import dm_env
 import numpy as np
 
 from ddco_pyro.errors import BadInput
-from ddco_pyro.simulation.cameras import Camera, Watched
+from ddco_pyro.simulation.cameras import Camera, Encoded, Watched
 from ddco_pyro.spec.types import TASKS
 
 SUCCESS = "success"
@@ -56,8 +56,8 @@ class Task:
     :param steps: the most control steps that an episode can have, where that is known; 1 otherwise.
     :param measures: the kind of each measure in ``outcome``: a ``"rate"`` is 0 or 1 in every episode, a ``"mean"`` any
         number. Without it every measure is a mean but ``success``, which is always a rate.
-    :param cameras: observations that are pictures, by name. One is drawn where a spec observes it (:meth:`watched`),
-        and nowhere else: a picture takes longer than a step of simulation.
+    :param cameras: observations that are pictures, or what an encoder gives of them, by name. One is drawn where a spec
+        observes it (:meth:`watched`), and nowhere else: a picture takes longer than a step of simulation.
     :raises OutcomeError: ``measures`` has another kind, or calls ``success`` a mean.
     """
 
@@ -69,7 +69,7 @@ class Task:
     sources: tuple[Path, ...] = field(default=())
     steps: int = 1
     measures: Mapping[str, Kind] = field(default_factory=dict)
-    cameras: Mapping[str, Camera] = field(default_factory=dict)
+    cameras: Mapping[str, Camera | Encoded] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse a wrong declaration."""
