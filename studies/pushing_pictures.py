@@ -2,8 +2,8 @@
 flat policy (``encoded``), goals against options, and augmentation.
 
     python studies/pushing_pictures.py demonstrations|encoded|options|augmentation [--seeds 3]
-        [--methods ff ff_flat ...] [--counts 80 40 20 10] [--options 1 2 3 4 5 6] [--updates 4000] [--episodes 5] [--set KEY=VALUE]...
-        [--summarize] [--minutes 60] [--jobs 1] [--out DIR] [--runs DIR]
+        [--methods ff ff_flat ...] [--counts 80 40 20 10] [--options 1 2 3 4 5 6] [--updates 4000] [--episodes 5]
+        [--set KEY=VALUE]... [--summarize] [--minutes 60] [--jobs 1] [--out DIR] [--runs DIR]
 
 Does cells one seed after the other, and begins none after so many minutes; what this code has done with these settings
 is not done again. Writes ``NAME.json``, ``NAME.md`` and ``NAME.png`` of all cells that are done, and says which are
