@@ -134,7 +134,7 @@ def main() -> None:
     caption = f"What {cell.method} looks at, and the option that is active; episode {seed}"
     keep(draw(looking.frames, choices), OUT / "looks.png", caption, "")
     rows = [row_of(episode) for episode in episodes]
-    found = phases(Fit(spec, trained.hierarchy), held_out(own.runs)) if cell.options else None
+    found = phases(Fit(spec, trained.hierarchy), held_out(own.runs, cell.seed)) if cell.options else None
     write_text(OUT / "looks.json", text({"episodes": rows, "phases": found}, [made_by]))
     write_text(OUT / "looks.md", page(rows, found, seed, caption, sentence(command, [made_by])))
 
