@@ -9,9 +9,8 @@
     python studies/pushing_studies.py variants [--variants "exact hand" "std 0.5"]
 
 ``sweep`` chooses every method's learning rate, its schedule and weight decay by held-out likelihood on demonstrations
-of development seeds, then its σ in the same way, then its execution (mean or sampled controls; sampled, most likely or
-marginal options) by goals in development episodes, and writes ``pushing_settings.json`` beside this file; fits that are
-done are kept.
+of development seeds, then its execution (mean or sampled controls; sampled, most likely or marginal options) by goals
+in development episodes, and writes ``pushing_settings.json`` beside this file; fits that are done are kept.
 ``variants`` changes one thing at a time for every method alike. A study writes NAME.csv, NAME.png and NAME.md from all
 cells that are done; it goes through the grid one seed after the other. ``--limited`` adds rollouts with at most 250
 steps for each goal. ``--demonstrations``, ``--options``, ``--methods`` and ``--variants`` run a part of the grid; what
@@ -25,7 +24,7 @@ import itertools
 import json
 import os
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,8 +65,6 @@ OPTIMIZERS = tuple(
     {"training.optimizer.lr": rate, "training.optimizer.weight_decay": decay, "training.optimizer.schedule": schedule}
     for rate, decay, schedule in itertools.product(RATES, DECAYS, SCHEDULES)
 )
-STDS = tuple({"control.std": std} for std in (1.0, 0.7, 0.5, 0.35, 0.25))
-"""σ that is learnt is less likely than the best of these: it comes to fit what is trained on."""
 EXECUTIONS = (*itertools.product(("mean",), ("sample", "most_likely", "marginal")), ("sample", "sample"))
 """Of the control, and of options; sampled controls ruin every policy, whatever the options."""
 SWEPT_DEMONSTRATIONS, SWEPT_SEEDS, SWEPT_EPISODES = 40, (0, 1), 12
@@ -106,15 +103,14 @@ STUDIES: dict[str, Callable[[int], list[Cell]]] = {
 }
 
 
-def candidate(name: str, settings: Mapping[str, Any], seed: int, folder: Path) -> tuple[Cell, Spec, Hierarchy]:
-    """A method fitted with some settings to the demonstrations of a development seed."""
+def candidate(name: str, number: int, seed: int, folder: Path) -> tuple[Cell, Spec, Hierarchy]:
+    """A method fitted with an optimiser of the grid to the demonstrations of a development seed."""
     torch.set_num_threads(1)
     cell = Cell(name, OWN_OPTIONS.get(name), SWEPT_DEMONSTRATIONS, seed)
-    spec = spec_of(cell, settings)
+    spec = spec_of(cell, OPTIMIZERS[number])
     demos = pool(folder, spec, development=True)
     demos = demos.select(demos.names[:SWEPT_DEMONSTRATIONS])
-    words = "-".join(f"{key.rpartition('.')[2]}={value}" for key, value in settings.items())
-    path = folder / "sweep" / f"{cell.name}-{words}.safetensors"
+    path = folder / "sweep" / f"{cell.name}-{number}.safetensors"
     if path.exists():
         hierarchy = build_hierarchy(spec, Dimensions.of(demos))
         hierarchy.load_state_dict(read_tensors(path)[0])
@@ -124,16 +120,16 @@ def candidate(name: str, settings: Mapping[str, Any], seed: int, folder: Path) -
     return cell, spec, hierarchy
 
 
-def try_settings(name: str, settings: Mapping[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """Held-out likelihood with some settings."""
-    _, spec, hierarchy = candidate(name, settings, seed, folder)
+def try_optimizer(name: str, number: int, seed: int, folder: Path) -> dict[str, Any]:
+    """Held-out likelihood with an optimiser of the grid."""
+    _, spec, hierarchy = candidate(name, number, seed, folder)
     value = per_step(Fit(spec, hierarchy), held_out(folder, spec, development=True))
-    return {"method": name, **settings, "seed": seed, "held_out": value}
+    return {"method": name, "number": number, **OPTIMIZERS[number], "seed": seed, "held_out": value}
 
 
-def try_executions(name: str, settings: Mapping[str, Any], seed: int, folder: Path) -> list[dict[str, Any]]:
+def try_executions(name: str, number: int, seed: int, folder: Path) -> list[dict[str, Any]]:
     """Goals in development episodes with every execution; a flat policy has no options to be sampled."""
-    cell, spec, hierarchy = candidate(name, settings, seed, folder)
+    cell, spec, hierarchy = candidate(name, number, seed, folder)
     first, found = DEVELOPMENT_EPISODES + 1000 * seed, []
     for control, options in EXECUTIONS if cell.options else EXECUTIONS[::3]:
         rollout = spec.rollout.model_copy(update={"control": control, "options": options})
@@ -144,30 +140,26 @@ def try_executions(name: str, settings: Mapping[str, Any], seed: int, folder: Pa
 
 
 def sweep(folder: Path, jobs: int, names: Sequence[str]) -> None:
-    """Choose every method's optimiser, σ and execution from the same grids; what was chosen for other methods stays."""
+    """Choose every method's optimiser and execution from the same grids; what was chosen for other methods stays."""
     for seed in SWEPT_SEEDS:
         spec = spec_of(Cell("flat MLP", None, SWEPT_DEMONSTRATIONS, seed), {})
         pool(folder, spec, development=True)
         held_out(folder, spec, development=True)
-    chosen: dict[str, dict[str, Any]] = {name: {} for name in names}
-    fits: list[dict[str, Any]] = []
-    for grid in (OPTIMIZERS, STDS):
-        each = [(name, chosen[name] | one, seed) for name, one, seed in itertools.product(names, grid, SWEPT_SEEDS)]
-        found = Parallel(n_jobs=jobs)(delayed(try_settings)(*one, folder) for one in each)
-        for name in names:
-            keys = (*chosen[name], *grid[0])
-            chosen[name] = dict(zip(keys, best(found, name, "held_out", *keys), strict=True))
-        fits += [row for row in found if row not in fits]
-    pairs = [(name, chosen[name], seed, folder) for name, seed in itertools.product(names, SWEPT_SEEDS)]
+    grid = list(itertools.product(names, range(len(OPTIMIZERS)), SWEPT_SEEDS))
+    fits = Parallel(n_jobs=jobs)(delayed(try_optimizer)(*one, folder) for one in grid)
+    numbers = {name: best(fits, name, "held_out", "number")[0] for name in names}
+    pairs = [(name, number, seed, folder) for name, number in numbers.items() for seed in SWEPT_SEEDS]
     executions = list(itertools.chain(*Parallel(n_jobs=jobs)(delayed(try_executions)(*one) for one in pairs)))
+    before = json.loads(SETTINGS.read_text())
+    chosen = before["chosen"] | {name: dict(OPTIMIZERS[number]) for name, number in numbers.items()}
     for name in names:
         control, options = best(executions, name, "goals", "control", "options")
         chosen[name] |= {"rollout.control": control, "rollout.options": options}
-    before, rows = json.loads(SETTINGS.read_text()), {"fits": fits, "executions": executions}
+    rows = {"fits": fits, "executions": executions}
     others = {key: [row for row in before.get(key, ()) if row["method"] not in names] for key in rows}
     command = shlex.join(["python", "studies/pushing_studies.py", "sweep", "--methods", *names])
-    swept = {"command": command, "chosen": before["chosen"] | chosen}
-    write_text(SETTINGS, json.dumps(swept | {key: others[key] + rows[key] for key in rows}, indent=1) + "\n")
+    found = {"command": command, "chosen": chosen, **{key: others[key] + rows[key] for key in rows}}
+    write_text(SETTINGS, json.dumps(found, indent=1) + "\n")
 
 
 def best(rows: Sequence[dict[str, Any]], name: str, measure: str, *keys: str) -> tuple[Any, ...]:
