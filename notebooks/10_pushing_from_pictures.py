@@ -62,6 +62,16 @@ plt.show()
 display(Markdown(pages["demonstrations"]), drawn["demonstrations"])
 
 # %% [markdown]
+# ## Options over what a flat policy sees
+#
+# A flat policy learns to see more easily than options do. Here its convolutions are kept (`ddco-pyro encode --encoder
+# RUN`), and perceptrons are fitted to what they give of each picture: two options, and a flat one with as many
+# parameters.
+
+# %%
+display(Markdown(pages["encoded"]), drawn["encoded"])
+
+# %% [markdown]
 # ## What a policy looks at
 #
 # How much the control of the active option changes with each pixel, in the first episode of the evaluation.
