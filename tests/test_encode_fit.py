@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 
 import h5py
@@ -13,6 +14,7 @@ from dots import followed, together
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.files import Damaged
 from ddco_pyro.encoding import Encoding, encode, load
 from ddco_pyro.spec import parse_spec
 
@@ -80,6 +82,17 @@ def test_features_are_those_of_the_fit(small, tmp_path, name):
         np.testing.assert_allclose(features, expected, rtol=1e-4, atol=1e-6)
         np.testing.assert_allclose([encoder(one) for one in before.observations["camera"]], features, atol=1e-5)
     assert np.ptp(together(Demonstrations.read(out), "camera_features"), axis=0).max() > 0.01
+
+
+def test_an_encoder_that_names_user_code_is_damaged(small, tmp_path):
+    run, out = tmp_path / "run", tmp_path / "out.hdf5"
+    fitted(small, run, flat(BRANCHES))
+    about = encode(small, out, Encoding("camera", str(run))).folder / "encoder.json"
+    said = json.loads(about.read_text())
+    said["reader"]["network"] = {"network": "user_networks:Stateful", "inputs": ["camera"]}
+    about.write_text(json.dumps(said))
+    with pytest.raises(Damaged, match="has to be convolutions over one observation"):
+        load(about.parent)
 
 
 def test_another_fit_is_another_encoding(small, tmp_path):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from pydantic import field_validator
 from torch import Tensor, nn
 
 from ddco_pyro.data.pictures import Transform
@@ -32,9 +33,17 @@ class Reader(Model):
     """A network that reads one observation's pictures, beside its weights."""
 
     network: NetworkSpec
+    """Convolutions, never a user's class: what is written beside a file has to be safe to read."""
     crop: Items[int] | None = None
     resize: Items[Count] | None = None
     grey: bool = False
+
+    @field_validator("network")
+    @classmethod
+    def _convolutions(cls, network: NetworkSpec) -> NetworkSpec:
+        if network.network != "conv" or len(network.inputs) != 1:
+            raise ValueError("has to be convolutions over one observation")
+        return network
 
 
 class FittedReader(nn.Module):
@@ -48,7 +57,7 @@ class FittedReader(nn.Module):
         super().__init__()
         self.about = about
         self.transform = Transform(about.crop, about.resize, about.grey)
-        (self.key,) = about.network.inputs or ("picture",)
+        (self.key,) = about.network.inputs
         shape = InputShape({}, {self.key: self.transform.shape(picture)})
         trunk = build_trunk(about.network, shape, 1)
         self.network, self.features = trunk.network, trunk.features
