@@ -23,7 +23,7 @@ import pushing_pictures_results as shown
 from cells import Settings, described, printed
 from joblib import Parallel, delayed
 from provenance import record, sentence, text
-from pushing_pictures_cell import DEFAULTS, METHODS, PictureCell
+from pushing_pictures_cell import DEFAULTS, METHODS, PictureCell, spec_of
 
 from ddco_pyro.data.files import write_text
 
@@ -103,7 +103,10 @@ def write(own: argparse.Namespace, settings: Settings, asked: Sequence[PictureCe
     paths = {cell: cell.path(settings) for cell in asked}
     done = {cell: json.loads(path.read_text()) for cell, path in paths.items() if path.exists()}
     missing = [cell.name for cell in asked if cell not in done]
-    rows = [shown.row_of(cell, content["results"]) for cell, content in done.items()]
+    stds = {cell: spec_of(cell, settings).control.std for cell in done}
+    rows = shown.at_one_std(
+        [shown.row_of(cell, content["results"]) | {"std": stds[cell]} for cell, content in done.items()]
+    )
     records = [content["provenance"][0] for content in done.values()]
     command = f"python studies/pushing_pictures.py {own.study} --seeds {own.seeds} {_part(own)} {settings.words()}"
     page = shown.page(own.study, rows, missing, sentence(command, records))

@@ -24,6 +24,7 @@ COLUMNS = {
     "topples": ("topples", "{:.1f}"),
     "lost": ("lost", "{:.1f}"),
     "held-out nats/step": ("held_out", "{:.3f}"),
+    "held out, at one σ": ("at_one_std", "{:.3f}"),
     "training nats/step": ("train", "{:.3f}"),
     "steps an option lasts": ("dwell", "{:.0f}"),
     "steps under own control": ("own_control", "{:.2f}"),
@@ -33,6 +34,12 @@ COLUMNS = {
 }
 ACROSS = {"demonstrations": "count", "encoded": "count", "options": "options", "augmentation": "options"}
 """What each study varies."""
+
+CONTROLS = 3
+"""Joints of the arm."""
+
+OTHERS = {"encoded": {"ff_flat": "the flat policy whose features it reads"}}
+"""Flat policies that a hierarchy is compared with besides the one of equal size."""
 
 FEWEST = 3
 """Training seeds of whose mean the figure has an interval; every seed is a dot."""
@@ -55,6 +62,27 @@ def row_of(cell: Any, results: dict[str, Any]) -> Row:
     }
 
 
+def at_one_std(rows: Sequence[Row]) -> list[Row]:
+    """The same rows with ``at_one_std``, their held-out likelihood at the smallest σ of all: methods with others can be
+    compared by it. That of a flat policy at another σ follows from its own; that of options does not, and is None.
+    """
+    smallest = min(row["std"] for row in rows)
+    return [row | {"at_one_std": _at_std(row, smallest)} for row in rows]
+
+
+def _at_std(row: Row, std: float) -> float | None:
+    if row["std"] == std:
+        return float(row["held_out"])
+    if row["options"]:
+        return None
+    errors = -2 * row["std"] ** 2 * (row["held_out"] + _normalizer(row["std"]))
+    return float(-_normalizer(std) - errors / (2 * std**2))
+
+
+def _normalizer(std: float) -> float:
+    return float(CONTROLS * (np.log(2 * np.pi) / 2 + np.log(std)))
+
+
 def page(study: str, rows: Sequence[Row], missing: Sequence[str], made_by: str) -> str:
     """The table, the differences, and what has not been measured.
 
@@ -73,20 +101,28 @@ def page(study: str, rows: Sequence[Row], missing: Sequence[str], made_by: str) 
 
 
 def differences(rows: Sequence[Row], across: str) -> list[str]:
-    """Each hierarchy minus the flat policy of equal size, paired by seed."""
-    lines = []
-    for (method, count), own in grouped(rows, "method", "count").items():
-        flat = {row["seed"]: row for row in rows if row["method"] == f"{method}_flat" and row["count"] == count}
-        pairs = [(row, flat[row["seed"]]) for row in own if row["seed"] in flat]
-        if pairs and across == "count":
-            limited = _difference(pairs, "limited", "{:.1f}")
-            said = [f"{_difference(pairs, 'goals', '{:.1f}')} goals ({limited} with the limit)"]
-            said.append(f"{_difference(pairs, 'held_out', '{:.3f}')} held-out nats/step")
-            lines.append(
-                f"- {method} minus flat of equal size, {count} demonstrations, paired by seed ({len(pairs)}): "
-                f"{', '.join(said)}."
-            )
-    return lines
+    """Each hierarchy minus the flat policy of equal size, and minus that whose features it reads; paired by seed."""
+    if across != "count":
+        return []
+    return [
+        line
+        for (method, count), own in grouped(rows, "method", "count").items()
+        for other, called in {f"{method}_flat": "flat of equal size", **OTHERS.get(method, {})}.items()
+        for line in _against(own, [row for row in rows if row["method"] == other and row["count"] == count], called)
+    ]
+
+
+def _against(ours: Sequence[Row], theirs: Sequence[Row], called: str) -> list[str]:
+    by_seed = {row["seed"]: row for row in theirs}
+    pairs = [(row, by_seed[row["seed"]]) for row in ours if row["seed"] in by_seed]
+    if not pairs:
+        return []
+    method, count = ours[0]["method"], ours[0]["count"]
+    goals, limited = (_difference(pairs, measure, "{:.1f}") for measure in ("goals", "limited"))
+    return [
+        f"- {method} minus {called}, {count} demonstrations, paired by seed ({len(pairs)}): {goals} goals ({limited} with "
+        f"the limit), {_difference(pairs, 'at_one_std', '{:.3f}')} held-out nats/step."
+    ]
 
 
 def _difference(pairs: Sequence[tuple[Row, Row]], measure: str, form: str) -> str:

@@ -6,11 +6,13 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pushing_pictures as study
 import pytest
 from cells import described
 from pushing_pictures_cell import DEFAULTS, PictureCell, spec_of
-from pushing_pictures_results import differences, row_of
+from pushing_pictures_results import at_one_std, differences, row_of
+from scipy import stats
 
 
 def results(goals, held_out):
@@ -39,6 +41,7 @@ def test_differences_are_paired_by_seed_and_number():
     """2.5 − 1 and 4 − 3.5 goals: 1 ± 12.706 · 0.5."""
     rows = [
         row_of(PictureCell(method, options, count, seed), results(goals, -3.0 - seed * (method == "ff_flat")))
+        | {"std": 1.0}
         for method, options, count, seed, goals in [
             ("ff", 2, 40, 0, [4.0, 1.0]),
             ("ff", 2, 40, 1, [4.0, 4.0]),
@@ -47,10 +50,26 @@ def test_differences_are_paired_by_seed_and_number():
             ("ff_flat", 0, 40, 1, [3.0, 4.0]),
         ]
     ]
-    (line,) = differences(rows, "count")
+    (line,) = differences(at_one_std(rows), "count")
     assert line.startswith("- ff minus flat of equal size, 40 demonstrations, paired by seed (2): 1.0 ± 6.4 goals")
     assert "(2.0 ± 12.7 with the limit)" in line
     assert "0.500 ± 6.353 held-out" in line
+
+
+def test_likelihoods_are_compared_at_one_std():
+    """A flat policy's at σ = 0.35 is that of a Gaussian with its errors; options with another σ have none."""
+    errors = np.random.default_rng(0).normal(0, 0.4, (50, 3))
+    wide, narrow = (stats.norm.logpdf(errors, scale=std).sum(1).mean() for std in (1.0, 0.35))
+    methods = {"ff_flat": (0, 1.0, wide), "encoded": (2, 0.35, -1.0), "ff": (2, 1.0, -2.9)}
+    rows = [
+        row_of(PictureCell(name, options, 80, 0), results([1.0], held_out)) | {"std": std}
+        for name, (options, std, held_out) in methods.items()
+    ]
+    flat, encoded, other = at_one_std(rows)
+    assert flat["at_one_std"] == pytest.approx(narrow)
+    assert (encoded["at_one_std"], other["at_one_std"]) == (-1.0, None)
+    (line,) = differences([flat, encoded], "count")
+    assert "minus the flat policy whose features it reads, 80 demonstrations, paired by seed (1): 0.0 goals" in line
 
 
 def test_cells_of_a_seed_come_before_those_of_the_next():
