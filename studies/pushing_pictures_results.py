@@ -119,10 +119,9 @@ def _against(ours: Sequence[Row], theirs: Sequence[Row], called: str) -> list[st
         return []
     method, count = ours[0]["method"], ours[0]["count"]
     goals, limited = (_difference(pairs, measure, "{:.1f}") for measure in ("goals", "limited"))
-    return [
-        f"- {method} minus {called}, {count} demonstrations, paired by seed ({len(pairs)}): {goals} goals ({limited} with "
-        f"the limit), {_difference(pairs, 'at_one_std', '{:.3f}')} held-out nats/step."
-    ]
+    nats = _difference(pairs, "at_one_std", "{:.3f}")
+    which = f"{method} minus {called}, {count} demonstrations, paired by seed ({len(pairs)})"
+    return [f"- {which}: {goals} goals ({limited} with the limit), {nats} held-out nats/step."]
 
 
 def _difference(pairs: Sequence[tuple[Row, Row]], measure: str, form: str) -> str:
