@@ -132,7 +132,7 @@ def _difference(pairs: Sequence[tuple[Row, Row]], measure: str, form: str) -> st
 def draw(study: str, rows: Sequence[Row], path: Path) -> None:
     """Goals, held-out likelihood and the meta-policy's own control against what is varied."""
     across = ACROSS[study]
-    measures = {"goals": "goals in 2000 steps", "held_out": "held-out nats/step"}
+    measures = {"goals": "goals in 2000 steps", "at_one_std": "held-out nats/step, at one σ"}
     if study == "augmentation":
         measures["own_control"] = "steps under own control"
     figure = Figure(figsize=(9, 3.2), layout="constrained")
