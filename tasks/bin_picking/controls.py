@@ -100,7 +100,7 @@ def _of_matrix(numbers: np.ndarray) -> np.ndarray:
 
 def _to_matrix(joints: np.ndarray) -> np.ndarray:
     pose = psm.forward(joints)
-    return np.concatenate([pose.position * 1e3, pose.rotation.ravel()])
+    return np.concatenate([pose.position * 1e3, pose.rotation.ravel().clip(-1, 1)])  # rounding may lead beyond
 
 
 _POSITION = np.stack([1e3 * psm.RCM - REACH, 1e3 * psm.RCM + REACH], axis=1)

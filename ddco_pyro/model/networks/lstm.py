@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from torch import Tensor, nn
@@ -77,10 +78,11 @@ class StackedLstm(nn.Module):
         if batch[1] == 1:
             return self._step(values, h.transpose(0, 1), c.transpose(0, 1))
         sequences = values.unflatten(1, batch).expand(self.size[0], -1, -1, -1)
-        each = [
-            torch.lstm(sequence, own, weights, True, 1, 0.0, self.training, False, True)
-            for sequence, own, weights in zip(sequences, self._states(h, c), self._weights(), strict=True)
-        ]
+        with _full_precision(values.device):
+            each = [
+                torch.lstm(sequence.to(self.recurrent.dtype), own, weights, True, 1, 0.0, self.training, False, True)
+                for sequence, own, weights in zip(sequences, self._states(h, c), self._weights(), strict=True)
+            ]
         outputs, h, c = (torch.stack(parts) for parts in zip(*each, strict=True))
         return outputs.flatten(1, 2), h[:, 0].transpose(0, 1), c[:, 0].transpose(0, 1)
 
@@ -105,3 +107,8 @@ class StackedLstm(nn.Module):
         """Weights and biases of each copy, as torch has them."""
         for weight, bias, recurrent in zip(self.inputs.weight, self.inputs.bias, self.recurrent, strict=True):
             yield [weight.mT, recurrent.mT, bias[0], torch.zeros_like(bias[0])]
+
+
+def _full_precision(device: torch.device) -> AbstractContextManager[None]:
+    """Not every processor has what torch's loop takes in bfloat16, so there it is float32 on all of them."""
+    return torch.autocast("cpu", enabled=False) if device.type == "cpu" else nullcontext()
