@@ -64,14 +64,15 @@ def row_of(cell: Any, results: dict[str, Any]) -> Row:
 
 def at_one_std(rows: Sequence[Row]) -> list[Row]:
     """The same rows with ``at_one_std``, their held-out likelihood at the smallest σ of all: methods with others can be
-    compared by it. That of a flat policy at another σ follows from its own; that of options does not, and is None.
+    compared by it. That of a flat policy at another σ follows from its own; that of options does not, and is None. A σ
+    that is learnt stays.
     """
-    smallest = min(row["std"] for row in rows)
+    smallest = min((row["std"] for row in rows if isinstance(row["std"], float)), default=None)
     return [row | {"at_one_std": _at_std(row, smallest)} for row in rows]
 
 
-def _at_std(row: Row, std: float) -> float | None:
-    if row["std"] == std:
+def _at_std(row: Row, std: float | None) -> float | None:
+    if std is None or row["std"] == std or not isinstance(row["std"], float):
         return float(row["held_out"])
     if row["options"]:
         return None

@@ -14,6 +14,8 @@ from pushing_pictures_cell import DEFAULTS, PictureCell, spec_of
 from pushing_pictures_results import at_one_std, differences, row_of
 from scipy import stats
 
+from ddco_pyro.spec import load_spec
+
 
 def results(goals, held_out):
     return {
@@ -105,3 +107,11 @@ def test_what_is_not_done_is_said(tmp_path: Path):
     assert "| ff_flat | 80 | 1.5 |" in page
     assert "Not measured yet: 71 cells, 12 of ff, 12 of rnn_flat," in page
     assert (tmp_path / "demonstrations.png").stat().st_size > 5000
+
+
+def test_likelihoods_without_a_number_for_std_stay_as_they_are():
+    """There may be no cell yet, and σ may be learnt."""
+    assert at_one_std([]) == []
+    learnt = load_spec(Path(__file__).parents[1] / "specs/pushing_mlp.yaml", ["control.std={learn: true}"]).control.std
+    rows = [row_of(PictureCell("ff", 2, 80, seed), results([1.0], -2.0)) | {"std": learnt} for seed in (0, 1)]
+    assert [row["at_one_std"] for row in at_one_std(rows)] == [-2.0, -2.0]
