@@ -73,6 +73,7 @@ class PictureCell(Cell):
 
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """Fit and play."""
+        spec_of(self, settings)  # what is wrong in it is said before anything is drawn
         own, test, tasks = settings.values, held_out(settings.runs, self.seed), (WATCHED, LIMITED)
         demos = self.demonstrations(settings)
         if self.method.startswith("encoded"):
