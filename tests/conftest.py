@@ -13,6 +13,7 @@ import pytest
 import torch
 import toy_task
 import yaml
+from dots import followed
 from hypothesis import settings
 
 from ddco_pyro.fitting.run import fit
@@ -66,3 +67,11 @@ def watched():
 def toy_run(cache, tmp_path_factory, toy_spec, watched):
     """A fit of the toy task with both baselines beside it; nobody changes its folder."""
     return fit(toy_spec, out=tmp_path_factory.mktemp("runs") / "toy", on_event=watched)
+
+
+@pytest.fixture(scope="session")
+def few_dots(tmp_path_factory):
+    """A file of six demonstrations whose pictures show a dot."""
+    path = tmp_path_factory.mktemp("dots") / "few.hdf5"
+    followed(6).write(path)
+    return path

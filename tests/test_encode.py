@@ -37,13 +37,6 @@ def source(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    path = tmp_path_factory.mktemp("small") / "small.hdf5"
-    followed(6).write(path)
-    return path
-
-
 @pytest.fixture
 def out(tmp_path):
     return tmp_path / "out.hdf5"
@@ -100,14 +93,14 @@ def test_options_are_recovered_from_features(tmp_path, out):
     assert normalized_mutual_info_score(choices.flatten(), segments.flatten()) > 0.85
 
 
-def test_all_but_the_pictures_stays(small, out):
-    before = Demonstrations.read(small)
-    assert encode(small, out, Encoding("camera", size=5)).demonstrations == 6
+def test_all_but_the_pictures_stays(few_dots, out):
+    before = Demonstrations.read(few_dots)
+    assert encode(few_dots, out, Encoding("camera", size=5)).demonstrations == 6
     after = Demonstrations.read(out)
     assert (after.masks, after.names) == (before.masks, before.names)
     assert before.attributes.items() <= after.attributes.items()
     assert after.observation_shapes == {"other": (4, 4, 2), "place": (2,), "camera_features": (5,)}
-    labelled = [Demonstrations.read(path, labels=["phase"]) for path in (small, out)]
+    labelled = [Demonstrations.read(path, labels=["phase"]) for path in (few_dots, out)]
     for demo, other in zip(*labelled, strict=True):
         np.testing.assert_array_equal(demo.actions, other.actions)
         np.testing.assert_array_equal(demo.labels["phase"], other.labels["phase"])
@@ -118,16 +111,16 @@ def test_all_but_the_pictures_stays(small, out):
         assert file["data/demo_0/obs/camera_features"].dtype == np.float32
 
 
-def test_two_cameras_one_after_the_other(small, out, tmp_path):
-    encode(small, out, Encoding("camera", size=5))
+def test_two_cameras_one_after_the_other(few_dots, out, tmp_path):
+    encode(few_dots, out, Encoding("camera", size=5))
     encode(out, tmp_path / "both.hdf5", Encoding("other", size=3, name="wrist"))
     shapes = Demonstrations.read(tmp_path / "both.hdf5").observation_shapes
     assert shapes == {"place": (2,), "camera_features": (5,), "wrist": (3,)}
 
 
-def test_random_convolutions_written_out(small, out):
-    folder = encode(small, out, Encoding("camera", seed=3)).folder
-    weights, picture = load_file(folder / "encoder.safetensors"), together(Demonstrations.read(small), "camera")[7]
+def test_random_convolutions_written_out(few_dots, out):
+    folder = encode(few_dots, out, Encoding("camera", seed=3)).folder
+    weights, picture = load_file(folder / "encoder.safetensors"), together(Demonstrations.read(few_dots), "camera")[7]
     maps = torch.from_numpy(picture).permute(2, 0, 1)[None] / 255
     for layer, stride, padding in (("convolutions.picture", 2, 2), ("deeper.picture.0", 1, 1)):
         weight, bias = (weights[f"network/maps.{layer}.{name}"] for name in ("weight", "bias"))
@@ -136,7 +129,7 @@ def test_random_convolutions_written_out(small, out):
     axis = torch.linspace(-1, 1, SIZE // 2)
     expected = torch.stack([(share.sum(2) * axis).sum(1), (share.sum(1) * axis).sum(1)], 1).flatten()
     assert expected.shape == (128,)
-    np.testing.assert_allclose(load(folder).features(picture[None])[0], expected, atol=1e-6)
+    np.testing.assert_allclose(load(folder).kind(picture[None])[0], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [1, 4, 9])
@@ -149,9 +142,9 @@ def test_principal_components_are_those_of_all_rows_at_once(size):
     np.testing.assert_allclose(ours.explained, theirs.explained_variance_ratio_.sum(), rtol=1e-6)
 
 
-def test_components_see_the_training_demonstrations_alone(small, out):
-    folder = encode(small, out, Encoding("camera", "user_encoders:Means", size=2), allow_code=True).folder
-    train, _ = Demonstrations.read(small).split(0.2, 0)
+def test_components_see_the_training_demonstrations_alone(few_dots, out):
+    folder = encode(few_dots, out, Encoding("camera", "user_encoders:Means", size=2), allow_code=True).folder
+    train, _ = Demonstrations.read(few_dots).split(0.2, 0)
     pictures = together(train, "camera").astype(float)
     rows = np.concatenate([pictures.mean((1, 2)), pictures[:, : SIZE // 2].mean((1, 2))], 1)
     everything = load_file(folder / "encoder.safetensors")
@@ -160,9 +153,9 @@ def test_components_see_the_training_demonstrations_alone(small, out):
 
 
 @pytest.mark.parametrize("encoder", ["random_conv", "autoencoder", "user_encoders:Means"])
-def test_a_picture_that_is_seen_while_acting(small, out, encoder):
-    folder = encode(small, out, Encoding("camera", encoder, size=3, updates=2), allow_code=True).folder
-    loaded, pictures = load(folder, allow_code=True), together(Demonstrations.read(small), "camera")
+def test_a_picture_that_is_seen_while_acting(few_dots, out, encoder):
+    folder = encode(few_dots, out, Encoding("camera", encoder, size=3, updates=2), allow_code=True).folder
+    loaded, pictures = load(folder, allow_code=True), together(Demonstrations.read(few_dots), "camera")
     one_by_one = np.stack([loaded(picture) for picture in pictures])
     assert one_by_one.dtype == np.float32
     np.testing.assert_allclose(one_by_one, together(Demonstrations.read(out), "camera_features"), rtol=1e-4, atol=1e-5)
@@ -174,11 +167,11 @@ def test_a_picture_that_is_seen_while_acting(small, out, encoder):
 
 
 @pytest.mark.parametrize("encoder", ["random_conv", "autoencoder"])
-def test_blocks_of_any_size(small, tmp_path, monkeypatch, encoder):
+def test_blocks_of_any_size(few_dots, tmp_path, monkeypatch, encoder):
     encoding, results = Encoding("camera", encoder, size=4, updates=3), []
     for size in (2**24, 1, 3 * SIZE * SIZE * 2):
         monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", size)
-        encode(small, tmp_path / f"{size}.hdf5", encoding)
+        encode(few_dots, tmp_path / f"{size}.hdf5", encoding)
         results.append(contents(tmp_path / f"{size}.hdf5"))
     assert results[0] == results[1] == results[2]
 
@@ -196,8 +189,14 @@ def test_memory_holds_a_block_of_pictures(tmp_path, out, monkeypatch):
         tracemalloc.stop()
 
 
-def test_another_seed_is_another_encoder(small, tmp_path):
-    made = [encode(small, tmp_path / f"{seed}.hdf5", Encoding("camera", seed=seed)).path for seed in (0, 1)]
+def test_a_folder_does_not_hide_an_encoder_of_its_name(few_dots, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "random_conv").mkdir()
+    assert encode(few_dots, tmp_path / "out.hdf5", Encoding("camera")).about.reader is None
+
+
+def test_another_seed_is_another_encoder(few_dots, tmp_path):
+    made = [encode(few_dots, tmp_path / f"{seed}.hdf5", Encoding("camera", seed=seed)).path for seed in (0, 1)]
     features = [together(Demonstrations.read(path), "camera_features") for path in made]
     assert not np.allclose(*features)
 
@@ -219,15 +218,15 @@ def killed(path, out, encoding, kind, after):
     assert not out.exists()
 
 
-def test_killed_again_and_again(small, tmp_path, monkeypatch):
+def test_killed_again_and_again(few_dots, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "KEPT_EVERY", 2)
     encoding = Encoding("camera", "autoencoder", size=4, updates=9)
-    encode(small, tmp_path / "whole.hdf5", encoding)
+    encode(few_dots, tmp_path / "whole.hdf5", encoding)
     out, seen = tmp_path / "killed.hdf5", []
-    killed(small, out, encoding, UpdatesDone, 3)
-    killed(small, out, encoding, DemonstrationsDone, 2)
-    killed(small, out, encoding, DemonstrationsDone, 2)
-    encode(small, out, encoding, seen.append)
+    killed(few_dots, out, encoding, UpdatesDone, 3)
+    killed(few_dots, out, encoding, DemonstrationsDone, 2)
+    killed(few_dots, out, encoding, DemonstrationsDone, 2)
+    encode(few_dots, out, encoding, seen.append)
     assert [event.done for event in seen if isinstance(event, DemonstrationsDone)] == [5, 6]
     assert not [event for event in seen if isinstance(event, UpdatesDone)]
     assert contents(out) == contents(tmp_path / "whole.hdf5")
@@ -237,8 +236,8 @@ def test_killed_again_and_again(small, tmp_path, monkeypatch):
     ]
 
 
-def test_the_command(small, out):
-    arguments = ("encode", small, "--observation", "camera", "--size", 6, "--out", out)
+def test_the_command(few_dots, out):
+    arguments = ("encode", few_dots, "--observation", "camera", "--size", 6, "--out", out)
     ended = call(*arguments)
     assert ended.status == 0
     assert ended.out.startswith(f"{out}: 6 demonstrations, obs/camera_features: 6 of 128 features, 9")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import call
-from dots import followed, together
+from dots import together
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
@@ -44,17 +44,10 @@ MODELS = {
 }
 
 
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    path = tmp_path_factory.mktemp("small") / "small.hdf5"
-    followed(6).write(path)
-    return path
-
-
-def fitted(small, folder, model, camera=None):
+def fitted(few_dots, folder, model, camera=None):
     """A run of one epoch."""
     observations = [{"key": "camera", **(camera or {})}, {"key": "place"}]
-    spec = {"demonstrations": {"path": str(small)}, "observations": observations, "training": {"epochs": 1}}
+    spec = {"demonstrations": {"path": str(few_dots)}, "observations": observations, "training": {"epochs": 1}}
     return ddco_pyro.fit(parse_spec(spec | model), out=folder)
 
 
@@ -69,13 +62,13 @@ def within(fit, network, demo):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_features_are_those_of_the_fit(small, tmp_path, name):
+def test_features_are_those_of_the_fit(few_dots, tmp_path, name):
     model, camera, network = MODELS[name]
     run, out = tmp_path / "run", tmp_path / "out.hdf5"
-    fit = fitted(small, run, model, camera)
-    folder = encode(small, out, Encoding("camera", str(run))).folder
+    fit = fitted(few_dots, run, model, camera)
+    folder = encode(few_dots, out, Encoding("camera", str(run))).folder
     shutil.rmtree(run)  # the encoder holds what it needs
-    demos, encoder = Demonstrations.read(small), load(folder)
+    demos, encoder = Demonstrations.read(few_dots), load(folder)
     for before, after in zip(demos, Demonstrations.read(out), strict=True):
         expected = within(fit, network(fit.hierarchy.networks()), before)
         features = after.observations["camera_features"]
@@ -84,10 +77,10 @@ def test_features_are_those_of_the_fit(small, tmp_path, name):
     assert np.ptp(together(Demonstrations.read(out), "camera_features"), axis=0).max() > 0.01
 
 
-def test_an_encoder_that_names_user_code_is_damaged(small, tmp_path):
+def test_an_encoder_that_names_user_code_is_damaged(few_dots, tmp_path):
     run, out = tmp_path / "run", tmp_path / "out.hdf5"
-    fitted(small, run, flat(BRANCHES))
-    about = encode(small, out, Encoding("camera", str(run))).folder / "encoder.json"
+    fitted(few_dots, run, flat(BRANCHES))
+    about = encode(few_dots, out, Encoding("camera", str(run))).folder / "encoder.json"
     said = json.loads(about.read_text())
     said["reader"]["network"] = {"network": "user_networks:Stateful", "inputs": ["camera"]}
     about.write_text(json.dumps(said))
@@ -95,10 +88,10 @@ def test_an_encoder_that_names_user_code_is_damaged(small, tmp_path):
         load(about.parent)
 
 
-def test_another_fit_is_another_encoding(small, tmp_path):
+def test_another_fit_is_another_encoding(few_dots, tmp_path):
     out, run = tmp_path / "out.hdf5", tmp_path / "run"
-    fitted(small, run, flat(BRANCHES))
-    arguments = ("encode", small, "--observation", "camera", "--encoder", run, "--out", out)
+    fitted(few_dots, run, flat(BRANCHES))
+    arguments = ("encode", few_dots, "--observation", "camera", "--encoder", run, "--out", out)
     ended = call(*arguments)
     assert (ended.status, ended.out.startswith(f"{out}: 6 demonstrations, obs/camera_features: 5 of 5 fea")) == (
         0,
@@ -106,7 +99,7 @@ def test_another_fit_is_another_encoding(small, tmp_path):
     )
     assert call(*arguments).status == 0
     shutil.rmtree(run)
-    fitted(small, run, flat(BRANCHES | {"hidden": [7]}))
+    fitted(few_dots, run, flat(BRANCHES | {"hidden": [7]}))
     again = call(*arguments)
     assert (again.status, "is not this encoding" in again.err) == (2, True)
 
@@ -127,18 +120,20 @@ ALONE = {"network": "mlp", "hidden": [4], "inputs": ["place"]}
         (flat(BRANCHES), {"frames": 2}, "this fit sees 2 pictures at once; take one with frames: 1"),
     ],
 )
-def test_fits_that_have_no_encoder(small, tmp_path, model, camera, message):
+def test_fits_that_have_no_encoder(few_dots, tmp_path, model, camera, message):
     out, run = tmp_path / "out.hdf5", tmp_path / "run"
-    fitted(small, run, model, camera)
-    refused(call("encode", small, "--observation", "camera", "--encoder", run, "--out", out), out, f"{run}: {message}")
+    fitted(few_dots, run, model, camera)
+    refused(
+        call("encode", few_dots, "--observation", "camera", "--encoder", run, "--out", out), out, f"{run}: {message}"
+    )
 
 
-def test_pictures_that_the_fit_does_not_know(small, tmp_path):
+def test_pictures_that_the_fit_does_not_know(few_dots, tmp_path):
     out, run = tmp_path / "out.hdf5", tmp_path / "run"
-    fitted(small, run, flat(BRANCHES))
-    other = call("encode", small, "--observation", "other", "--encoder", run, "--out", out)
+    fitted(few_dots, run, flat(BRANCHES))
+    other = call("encode", few_dots, "--observation", "other", "--encoder", run, "--out", out)
     refused(other, out, f"{run}: this fit observes no pictures 'other'; the pictures it observes: camera")
-    with h5py.File(small) as source, h5py.File(tmp_path / "cut.hdf5", "w") as file:
+    with h5py.File(few_dots) as source, h5py.File(tmp_path / "cut.hdf5", "w") as file:
         source.copy("data", file)
         for demo in file["data"].values():
             pictures = demo["obs/camera"][:, 1:]
@@ -147,7 +142,7 @@ def test_pictures_that_the_fit_does_not_know(small, tmp_path):
     cut = call("encode", tmp_path / "cut.hdf5", "--observation", "camera", "--encoder", run, "--out", out)
     refused(cut, out, f"{run}: this fit observed camera of (20, 20, 2), and these are (19, 20, 2)")
     (run / "model.safetensors").unlink()
-    unfinished = call("encode", small, "--observation", "camera", "--encoder", run, "--out", out)
+    unfinished = call("encode", few_dots, "--observation", "camera", "--encoder", run, "--out", out)
     refused(unfinished, out, "an unfinished run")
 
 

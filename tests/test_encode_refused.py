@@ -18,13 +18,6 @@ from ddco_pyro.errors import BadInput
 OWN = "user_encoders:"
 
 
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    path = tmp_path_factory.mktemp("small") / "small.hdf5"
-    followed(6).write(path)
-    return path
-
-
 @pytest.fixture
 def out(tmp_path):
     return tmp_path / "out.hdf5"
@@ -54,8 +47,8 @@ def out(tmp_path):
     ],
 )
 @pytest.mark.filterwarnings("ignore:divide by zero")
-def test_what_cannot_be_used(small, out, options, message):
-    ended = call("encode", small, "--observation", "camera", "--allow-code", *options, "--out", out)
+def test_what_cannot_be_used(few_dots, out, options, message):
+    ended = call("encode", few_dots, "--observation", "camera", "--allow-code", *options, "--out", out)
     assert (ended.status, ended.err.count("\n")) == (2, 1)
     assert message in ended.err
     assert not list(out.parent.iterdir())
@@ -93,8 +86,8 @@ def unknown_in_a_mask(path):
         (Path.unlink, "there is no such file"),
     ],
 )
-def test_demonstrations_that_cannot_be_used(small, tmp_path, out, change, message):
-    path = shutil.copy(small, tmp_path / "changed.hdf5")
+def test_demonstrations_that_cannot_be_used(few_dots, tmp_path, out, change, message):
+    path = shutil.copy(few_dots, tmp_path / "changed.hdf5")
     change(Path(path))
     ended = call("encode", path, "--observation", "camera", "--out", out)
     assert (ended.status, ended.err.count("\n")) == (2, 1)
@@ -102,20 +95,20 @@ def test_demonstrations_that_cannot_be_used(small, tmp_path, out, change, messag
     assert not [file for file in tmp_path.iterdir() if "out" in file.name]
 
 
-def test_what_was_not_written_here_stays(small, out):
+def test_what_was_not_written_here_stays(few_dots, out):
     out.write_bytes(b"mine")
-    assert call("encode", small, "--observation", "camera", "--out", out).status == 2
+    assert call("encode", few_dots, "--observation", "camera", "--out", out).status == 2
     assert out.read_bytes() == b"mine"
     out.unlink()
     out.mkdir()
-    ended = call("encode", small, "--observation", "camera", "--out", out)
+    ended = call("encode", few_dots, "--observation", "camera", "--out", out)
     assert (ended.status, ended.err) == (
         2,
         f"ddco-pyro: {out}: is there already and is no file; choose another --out\n",
     )
     out.rmdir()
     (out.parent / "out.hdf5.encoder").mkdir()
-    ended = call("encode", small, "--observation", "camera", "--out", out)
+    ended = call("encode", few_dots, "--observation", "camera", "--out", out)
     assert (ended.status, ended.err.count("\n")) == (2, 1)
     assert "out.hdf5.encoder: is there already" in ended.err
 
@@ -130,18 +123,18 @@ def test_features_that_only_later_pictures_spoil(tmp_path, out):
     assert not out.with_name("out.hdf5.encoder").exists()
 
 
-def test_user_code_needs_permission(small, out):
-    ended = call("encode", small, "--observation", "camera", "--encoder", f"{OWN}Means", "--out", out)
+def test_user_code_needs_permission(few_dots, out):
+    ended = call("encode", few_dots, "--observation", "camera", "--encoder", f"{OWN}Means", "--out", out)
     assert (ended.status, ended.err.count("\n")) == (2, 1)
     assert "would import user code; pass --allow-code" in ended.err
     assert not list(out.parent.iterdir())
-    folder = encode(small, out, Encoding("camera", f"{OWN}Means"), allow_code=True).folder
+    folder = encode(few_dots, out, Encoding("camera", f"{OWN}Means"), allow_code=True).folder
     with pytest.raises(BadInput, match="would import user code"):
         load(folder)
 
 
-def test_a_damaged_encoder(small, out):
-    folder = encode(small, out, Encoding("camera", size=2)).folder
+def test_a_damaged_encoder(few_dots, out):
+    folder = encode(few_dots, out, Encoding("camera", size=2)).folder
     weights = bytearray((folder / "encoder.safetensors").read_bytes())
     weights[-1] ^= 1
     (folder / "encoder.safetensors").write_bytes(weights)

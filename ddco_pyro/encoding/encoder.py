@@ -12,10 +12,9 @@ from pydantic import ValidationError
 
 from ddco_pyro.data.files import Damaged, whole_folder
 from ddco_pyro.data.tensors import read_tensors, write_tensors
-from ddco_pyro.encoding.fitted import FittedReader, Reader
-from ddco_pyro.encoding.networks import BUILT_IN, Convolutions
+from ddco_pyro.encoding.fitted import Reader
+from ddco_pyro.encoding.kinds import Kind, again
 from ddco_pyro.encoding.projection import Projection
-from ddco_pyro.encoding.user import Features, imported, see_name
 from ddco_pyro.errors import BadInput
 from ddco_pyro.spec.types import Count, Items, Model, Seed
 
@@ -49,9 +48,8 @@ class Encoder:
     """A picture to a vector: call it with uint8 [H, W, C], it gives float32 [size]."""
 
     about: About
-    features: Features
+    kind: Kind
     projection: Projection | None
-    network: Convolutions | FittedReader | None = None
 
     def __call__(self, picture: np.ndarray) -> np.ndarray:
         """The features that a policy, fitted to them, reads in place of the picture.
@@ -64,7 +62,7 @@ class Encoder:
                 f"{self.about.observation}: is {picture.dtype} {picture.shape}; this encoder reads uint8 "
                 f"{self.about.picture}"
             )
-        return self.reduced(self.features(picture[None]))[0]
+        return self.reduced(self.kind(picture[None]))[0]
 
     def reduced(self, features: np.ndarray) -> np.ndarray:
         """Features as the encoder gives them, [M, F], to float32 [M, size]."""
@@ -72,7 +70,7 @@ class Encoder:
 
     def write(self, folder: Path) -> None:
         """Write it as a folder, whole or not at all; a user's encoder is named there, not kept."""
-        tensors = {f"network/{key}": value for key, value in self.network.state_dict().items()} if self.network else {}
+        tensors = {f"network/{key}": value for key, value in self.kind.weights().items()}
         if self.projection is not None:
             tensors["mean"] = torch.from_numpy(self.projection.mean)
             tensors["components"] = torch.from_numpy(self.projection.components)
@@ -102,22 +100,14 @@ def load(folder: str | Path, allow_code: bool = False) -> Encoder:
     """
     folder = Path(folder)
     about = about_of(folder)
-    if about.reader is None:
-        see_name(about.encoder, allow_code)
+    kind = again(about.encoder, about.reader, about.picture, about.seed, allow_code)
     tensors, _ = read_tensors(folder / TENSORS, AGAIN)
     projection = None
     if "components" in tensors:
         projection = Projection(tensors["mean"].numpy(), tensors["components"].numpy(), about.explained)
-    network: Convolutions | FittedReader
-    if about.reader is not None:
-        network = FittedReader(about.reader, about.picture)
-    elif about.encoder in BUILT_IN:
-        network = Convolutions(about.encoder, about.picture, about.seed)
-    else:
-        return Encoder(about, imported(about.encoder), projection)
     weights = {key.removeprefix("network/"): value for key, value in tensors.items() if key.startswith("network/")}
     try:
-        network.load_state_dict(weights)
+        kind.restore(weights)
     except RuntimeError as error:
         raise Damaged(folder / TENSORS, " ".join(str(error).split()), AGAIN) from error
-    return Encoder(about, network.encode, projection, network)
+    return Encoder(about, kind, projection)

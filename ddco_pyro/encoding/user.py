@@ -1,4 +1,4 @@
-"""A user's encoder, ``module:Class``: imported where that is allowed, and tried before it is used."""
+"""A user's encoder, ``module:Class``: imported, checked at each call, and tried before it is used."""
 
 from __future__ import annotations
 
@@ -8,30 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.encoding.networks import BUILT_IN
-from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.errors import BadInput
 
 Features = Callable[[np.ndarray], np.ndarray]
 """uint8 pictures [N, H, W, C] to features [N, F]."""
 
 TOLERANCE = 1e-3
 """Of the largest feature: two calls on the same picture may differ by so much, alone or among others."""
-
-
-def see_name(name: str, allow_code: bool) -> None:
-    """See that an encoder of this name may be made.
-
-    :raises BadInput: there is none, or it is user code and that is not allowed.
-    """
-    if name in BUILT_IN:
-        return
-    if ":" not in name:
-        known = f"{', '.join(BUILT_IN)}, the folder of a fit, or your own module:Class"
-        raise BadInput(f"there is no encoder {name!r}{nearest(name, BUILT_IN)}; take {known}")
-    if not allow_code:
-        raise BadInput(
-            f"encoder {name!r} would import user code; pass --allow-code if you trust it (in Python: allow_code=True)"
-        )
 
 
 def imported(name: str) -> Features:

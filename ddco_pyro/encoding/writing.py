@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
@@ -18,7 +17,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from torch import nn
 
 from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.data.hdf5 import DemonstrationsError, opened
@@ -26,12 +24,10 @@ from ddco_pyro.data.resumable import parts_of
 from ddco_pyro.data.sources import Column, Recording, format_of
 from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
 from ddco_pyro.encoding.encoder import About, Encoder, about_of
-from ddco_pyro.encoding.fitted import FittedReader, from_folder
-from ddco_pyro.encoding.networks import BUILT_IN, Convolutions
+from ddco_pyro.encoding.kinds import Kind, kind_of
 from ddco_pyro.encoding.pictures import Pictures, batches
 from ddco_pyro.encoding.projection import Projection, principal_components
-from ddco_pyro.encoding.training import UPDATES, train
-from ddco_pyro.encoding.user import Features, imported, see_name, try_out
+from ddco_pyro.encoding.training import UPDATES
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.inference.threads import one_thread
@@ -68,11 +64,6 @@ class Encoding:
     updates: int = UPDATES
 
     @property
-    def of_a_fit(self) -> bool:
-        """Whether the encoder is taken out of a fit."""
-        return Path(self.encoder).is_dir()
-
-    @property
     def key(self) -> str:
         """The new observation's key."""
         return self.name or f"{self.observation}_features"
@@ -102,14 +93,12 @@ def encode(
         features than ``size``.
     """
     path, out = Path(path), Path(out)
-    if not encoding.of_a_fit:
-        see_name(encoding.encoder, allow_code)
+    kind = kind_of(encoding.encoder, allow_code)
     if out.exists() and not out.is_file():
         raise BadInput(f"{out}: is there already and is no file; choose another --out")
     if (form := format_of(path)) != "robomimic":
         raise BadInput(f"{path}: is a {form} dataset; first: ddco-pyro import {path} --out demos.hdf5")
-    ours = encoding.of_a_fit or encoding.encoder in BUILT_IN
-    with open_robomimic(path) as source, one_thread() if ours else nullcontext():
+    with open_robomimic(path) as source, one_thread() if kind.ours else nullcontext():
         job = _Job(source, path, out, encoding, on_event, allow_code)
         return job.already() or job.run()
 
@@ -124,9 +113,10 @@ class _Job:
         self.pictures = Pictures(source, encoding.observation)
         if encoding.key in source.recording(source.names[0]).observations:
             raise DemonstrationsError(f"obs/{encoding.key} is there already; choose another name with --as")
-        self.network, self.features = _encoder(encoding, self.pictures, allow_code)
-        self.about = _about(encoding, self.pictures, self.features, self.network)
-        self.identity = _identity(path, encoding)
+        kind = kind_of(encoding.encoder, allow_code)
+        self.kind = kind.made(encoding.encoder, self.pictures, encoding.seed, allow_code)
+        self.about = _about(encoding, self.pictures, self.kind)
+        self.identity = _identity(path, encoding, self.kind)
         self.beside, self.folder = out.with_name(f"{out.name}.encoder"), out.with_name(f".{out.name}.encoding")
 
     def already(self) -> Encoded | None:
@@ -168,14 +158,13 @@ class _Job:
 
     def _fitted(self) -> Encoder:
         """The encoder with its projection, once every demonstration has been encoded."""
-        if isinstance(self.network, Convolutions) and self.encoding.encoder == "autoencoder":
-            checkpoint = self.folder / _CHECKPOINT
-            train(self.network, self.pictures, self.encoding.seed, self.encoding.updates, checkpoint, self.on_event)
+        seed, updates = self.encoding.seed, self.encoding.updates
+        self.kind.learn(self.pictures, seed, updates, self.folder / _CHECKPOINT, self.on_event)
         self._encode_all()
         projection = self._projection()
         explained = projection.explained if projection else 1.0
         about = self.about.model_copy(update={"explained": explained})
-        return Encoder(about, self.features, projection, self.network)
+        return Encoder(about, self.kind, projection)
 
     def _encode_all(self) -> None:
         """The features of every demonstration, before they are reduced."""
@@ -192,7 +181,7 @@ class _Job:
 
     def _features_of(self, name: str) -> Iterator[np.ndarray]:
         for block in self.pictures.of(name):
-            values = self.features(block)
+            values = self.kind(block)
             if values.shape[1] != self.about.features:
                 raise BadInput(
                     f"encoder {self.about.encoder!r} gives {values.shape[1]} features in {name}, and "
@@ -223,36 +212,20 @@ class _Job:
                 write_recording(data, replace(recording, observations=observations))
 
 
-def _encoder(
-    encoding: Encoding, pictures: Pictures, allow_code: bool
-) -> tuple[Convolutions | FittedReader | None, Features]:
-    """The encoder, which has been tried on the first training pictures where it is a user's; the network where not."""
-    if encoding.of_a_fit:
-        reader = from_folder(encoding.encoder, encoding.observation, pictures.shape, allow_code)
-        return reader, reader.encode
-    if encoding.encoder in BUILT_IN:
-        network = Convolutions(encoding.encoder, pictures.shape, encoding.seed)
-        return network, network.encode
-    features = imported(encoding.encoder)
-    try_out(encoding.encoder, features, next(pictures.of(pictures.training[0])))
-    return None, features
-
-
-def _about(encoding: Encoding, pictures: Pictures, features: Features, network: nn.Module | None) -> About:
+def _about(encoding: Encoding, pictures: Pictures, kind: Kind) -> About:
     """What the encoder is.
 
     :raises BadInput: there are fewer features, or training pictures, than the size that is asked for.
     """
-    number = features(next(pictures.of(pictures.training[0]))).shape[1]
-    reader = network.about if isinstance(network, FittedReader) else None
-    size = encoding.size or (number if reader else min(SIZE, number, pictures.number))
+    number = kind(next(pictures.of(pictures.training[0]))).shape[1]
+    size = encoding.size or kind.size(number, min(SIZE, pictures.number))
     if size > number:
         raise BadInput(f"--size {size}: encoder {encoding.encoder!r} gives {number} features; take at most as many")
     if size > pictures.number:
         raise BadInput(f"--size {size}: there are {pictures.number} training pictures; take at most as many")
     return About(
         encoder=encoding.encoder,
-        reader=reader,
+        reader=kind.reader,
         observation=encoding.observation,
         picture=pictures.shape,
         features=number,
@@ -261,14 +234,10 @@ def _about(encoding: Encoding, pictures: Pictures, features: Features, network: 
     )
 
 
-def _identity(path: Path, encoding: Encoding) -> str:
-    """What decides the contents of the file: a user's module too, by its own source, and a fit's weights."""
-    stat = path.stat()
-    module = sys.modules.get(encoding.encoder.partition(":")[0])
-    code = Path(module.__file__).read_bytes() if module is not None and module.__file__ else b""
-    code = (Path(encoding.encoder) / "model.safetensors").read_bytes() if encoding.of_a_fit else code
-    facts = {"file": [str(path.resolve()), stat.st_size, stat.st_mtime_ns], "code": hashlib.sha256(code).hexdigest()}
-    return json.dumps(facts | asdict(encoding))
+def _identity(path: Path, encoding: Encoding, kind: Kind) -> str:
+    """What decides the contents of the file."""
+    stat, code = path.stat(), hashlib.sha256(kind.decides()).hexdigest()
+    return json.dumps({"file": [str(path.resolve()), stat.st_size, stat.st_mtime_ns], "code": code} | asdict(encoding))
 
 
 def _digest(identity: str) -> str:
