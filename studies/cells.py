@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields, replace
@@ -115,11 +116,12 @@ def described(text: str | None) -> argparse.ArgumentParser:
 
 
 def printed(work: Callable[[], str]) -> None:
-    """Print what work gives, or end with the line that says why it cannot be done."""
+    """Print what work gives, or end with the line that says why it cannot be done: with 2 where the input is bad."""
     try:
         print(work())
     except (BadInput, Failed) as error:
-        raise SystemExit(str(error)) from None
+        print(error, file=sys.stderr)
+        raise SystemExit(2 if isinstance(error, BadInput) else 1) from None
 
 
 def digest(settings: Mapping[str, Any]) -> str:

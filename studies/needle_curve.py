@@ -13,6 +13,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from cells import printed
 from joblib import Parallel, delayed
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -63,8 +64,8 @@ def draw(curve: Curve, path: Path) -> None:
         figure.savefig(temporary, dpi=120, format="png")
 
 
-def main() -> None:
-    """Run the study."""
+def run() -> str:
+    """Do what is not done yet, and write what comes of it; the page."""
     parser = described(__doc__, seeds=3, episodes=60)
     parser.add_argument("--counts", type=int, nargs="+", default=[10, 20, 40, 80])
     arguments = parser.parse_args()
@@ -85,7 +86,12 @@ def main() -> None:
     write_text(arguments.out / "curve.json", text(curve, records))
     write_text(arguments.out / "curve.md", summary)
     draw(curve, arguments.out / "curve.png")
-    print(summary)
+    return summary
+
+
+def main() -> None:
+    """Run the study."""
+    printed(run)
 
 
 if __name__ == "__main__":

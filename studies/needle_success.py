@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cells import printed
 from joblib import Parallel, delayed
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -239,8 +240,8 @@ def words(arguments: argparse.Namespace) -> str:
     return f"--seeds {arguments.seeds} --episodes {arguments.episodes}{changes}"
 
 
-def main() -> None:
-    """Run the study."""
+def run() -> str:
+    """Do what is not done yet, and write what comes of it; the page."""
     arguments = described(__doc__, seeds=5, episodes=200).parse_args()
     command = f"python studies/needle_success.py {words(arguments)}"
     made_by = record(command)
@@ -252,7 +253,12 @@ def main() -> None:
     write_text(arguments.out / "summary.json", text(results, records))
     write_text(arguments.out / "summary.md", summary)
     draw(results["methods"], arguments.out / "success.png")
-    print(summary)
+    return summary
+
+
+def main() -> None:
+    """Run the study."""
+    printed(run)
 
 
 if __name__ == "__main__":

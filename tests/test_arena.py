@@ -229,14 +229,14 @@ def test_an_environment_that_cannot_be_made_is_one_line(tmp_path):
         assert not (folder / arena_venv.MADE).exists()
 
 
-def test_a_study_without_its_environment_ends_with_that_line(tmp_path, monkeypatch):
+def test_a_study_without_its_environment_ends_with_that_line(tmp_path, monkeypatch, capsys):
     (tmp_path / "venv").write_text("")  # a file is in its place
     words = ["arena.py", "--runs", str(tmp_path), "--tasks", "pick-place-v3", "--out", str(tmp_path / "out")]
     monkeypatch.setattr(sys, "argv", words)
     with pytest.raises(SystemExit) as ended:
         arena.main()
-    assert "\n" not in str(ended.value.code)
-    assert "venv" in str(ended.value.code)
+    told = capsys.readouterr().err
+    assert (ended.value.code, told.count("\n"), "venv" in told) == (2, 1, True)
     assert not (tmp_path / "out").exists()
 
 

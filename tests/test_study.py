@@ -12,7 +12,7 @@ import pytest
 from cells import Cell, Settings, described
 from study import Study
 
-from ddco_pyro.errors import Failed
+from ddco_pyro.errors import BadInput, Failed
 
 DEFAULTS = Settings({"episodes": 3, "noise": 0.5}, Path("unused"))
 
@@ -29,6 +29,8 @@ class Toy(Cell):
     def results(self, settings, folder):
         if self.task == "impossible":
             raise Failed("it cannot be done")
+        if self.task == "bad":
+            raise BadInput("bad input")
         done = settings.runs / "done"
         done.parent.mkdir(parents=True, exist_ok=True)
         with done.open("a") as file:
@@ -72,9 +74,11 @@ def test_cells_are_done_once_and_by_the_words_on_the_page_again(tmp_path, monkey
     assert len(list((tmp_path / "runs" / "cells").iterdir())) == 2
 
 
-def test_what_cannot_be_done_is_one_line(tmp_path, monkeypatch):
-    with pytest.raises(SystemExit, match=r"^it cannot be done$"):
-        run(monkeypatch, tmp_path, ["--tasks", "impossible"])
+@pytest.mark.parametrize(("task", "line", "status"), [("impossible", "it cannot be done", 1), ("bad", "bad input", 2)])
+def test_what_cannot_be_done_is_one_line(tmp_path, monkeypatch, capsys, task, line, status):
+    with pytest.raises(SystemExit) as ended:
+        run(monkeypatch, tmp_path, ["--tasks", task])
+    assert (ended.value.code, capsys.readouterr().err.splitlines()[-1]) == (status, line)
     assert not (tmp_path / "out").exists()
 
 
