@@ -97,7 +97,7 @@ def page(study: str, rows: Sequence[Row], missing: Sequence[str], made_by: str) 
     if missing:
         kinds = Counter(name.partition("-")[0] for name in missing)
         left = ", ".join(f"{count} of {method}" for method, count in kinds.items())
-        lines += ["", f"Not measured yet: {len(missing)} cells, {left}."]
+        lines += ["", f"Cells that are not measured yet: {left}."]
     return "\n".join(lines) + "\n"
 
 

@@ -105,7 +105,7 @@ def test_what_is_not_done_is_said(tmp_path: Path):
     path.write_text(json.dumps(content | {"results": results([2.0, 1.0], -3.0)}))
     page = study.run(own)
     assert "| ff_flat | 80 | 1.5 |" in page
-    assert "Not measured yet: 71 cells, 12 of ff, 12 of rnn_flat," in page
+    assert "Cells that are not measured yet: 12 of ff, 12 of rnn_flat," in page
     assert (tmp_path / "demonstrations.png").stat().st_size > 5000
 
 
