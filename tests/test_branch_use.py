@@ -29,29 +29,30 @@ def demonstrations(number=12, steps=20):
     return Demonstrations(tuple(made))
 
 
-def spec_of(level, epochs=150):
+def spec_of(level, epochs=150, trunk=None):
     return parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.25},
             "observations": ["seen", "noise"],
             "control": {"std": {"learn": True}},
-            "hierarchy": {"levels": [{"count": 2, **level}], "meta_policy": {"network": "linear"}},
+            "hierarchy": {"trunk": trunk, "levels": [{"count": 2, **level}], "meta_policy": {"network": "linear"}},
             "training": {"epochs": epochs, "optimizer": {"lr": 0.01}},
         }
     )
 
 
-@pytest.fixture(scope="module", params=["policy", "trunk"])
+@pytest.fixture(scope="module", params=["policy", "trunk", "whole"])
 def fitted(request, tmp_path_factory):
-    level = {request.param: BRANCHES}
-    if request.param == "trunk":
+    level = {} if request.param == "whole" else {request.param: BRANCHES}
+    if request.param != "policy":
         level |= {"policy": {"network": "linear"}, "termination": {"network": "linear"}}
     out = tmp_path_factory.mktemp("runs") / request.param
-    return ddco_pyro.fit(spec_of(level), demonstrations(), out=out)
+    whole = BRANCHES if request.param == "whole" else None
+    return ddco_pyro.fit(spec_of(level, trunk=whole), demonstrations(), out=out)
 
 
 def test_what_decides_the_control_is_told_from_what_does_not(fitted):
-    (use,) = fitted.metrics["branches"]
+    use, *_ = fitted.metrics["branches"]
     assert (use["level"], use["branches"]) == (0, ["seen", "noise"])
     for seen, noise in use["loss"]:
         assert seen > 1.0
@@ -61,10 +62,10 @@ def test_what_decides_the_control_is_told_from_what_does_not(fitted):
 def test_activations_are_the_mean_sizes_of_what_the_branches_give(fitted):
     """By hand: each branch called alone, its units' mean size, weighted by the posterior."""
     demos = demonstrations(4)
-    (use,) = branch_use(fitted.hierarchy, fitted.infer(demos))
+    use, *_ = branch_use(fitted.hierarchy, fitted.infer(demos))
     (piece,) = fitted.infer(demos)
     level = fitted.hierarchy.levels[0]
-    network = level.policy.network if level.trunk is None else level.trunk
+    network = fitted.hierarchy.trunk or level.trunk or level.policy.network
     u = piece.posterior.u[0][..., 1:]
     for column, branch in enumerate(network.of):
         with torch.no_grad():

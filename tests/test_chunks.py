@@ -28,6 +28,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "lstm over branches, a trunk": {
         "trunk": {"network": "lstm", "over": {**BRANCHES, "hidden": [5]}, "hidden": [4, 5]}
     },
+    "lstm over branches, read by all": {"whole": {"network": "lstm", "over": {**BRANCHES, "hidden": [5]}, "hidden": 4}},
     "branches": {"policy": {**BRANCHES, "hidden": [7]}},
     "per_timestep": {"policy": {"network": "per_timestep", "hidden": [4], "inputs": ["state"]}},
 }
@@ -36,19 +37,21 @@ TRAJECTORIES, STEPS = 2, 13
 
 def hierarchy(network: str, dtype: torch.dtype = torch.float64) -> Hierarchy:
     """Two levels of options."""
-    own = NETWORKS[network]
+    own = dict(NETWORKS[network])
+    whole = own.pop("whole", None)
+    reads: dict[str, Any] = {"network": "mlp", "inputs": [] if whole else ["state"]}
     level = {"policy": {"network": "linear"}, "termination": {"network": "linear"}, **own}
     if "trunk" not in own:
-        level["termination"] = {"network": "mlp", "inputs": ["state"]}
-    upper = {"name": "upper", "count": 2, "policy": {"network": "mlp", "inputs": ["state"]}}
-    meta = {"network": "lstm", "over": {"network": "mlp", "inputs": ["state"]}, "hidden": 3}
-    levels = [{"name": "lower", "count": 3, **level}, {**upper, "termination": {"network": "mlp", "inputs": ["state"]}}]
+        level["termination"] = reads
+    upper = {"name": "upper", "count": 2, "policy": reads, "termination": reads}
+    meta = reads if whole else {"network": "lstm", "over": reads, "hidden": 3}
+    levels = [{"name": "lower", "count": 3, **level}, upper]
     spec = parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5"},
             "observations": list(SHAPES),
             "control": {"std": {"learn": True}},
-            "hierarchy": {"levels": levels, "meta_policy": meta},
+            "hierarchy": {"trunk": whole, "levels": levels, "meta_policy": meta},
         }
     )
     torch.manual_seed(0)

@@ -29,16 +29,18 @@ def flat(policy):
     return {"baseline": {"kind": "flat", "policy": policy}}
 
 
-def options(trunk, **policy):
+def options(trunk, whole=None, **policy):
     level = {"name": "option", "count": 2, "termination": {"network": "linear"}, "policy": {"network": "linear"}}
     level |= {"trunk": trunk} if trunk else {}
-    return {"hierarchy": {"levels": [level | policy], "meta_policy": {"network": "linear", "inputs": ["place"]}}}
+    meta_policy = {"network": "linear", "inputs": [] if whole else ["place"]}
+    return {"hierarchy": {"trunk": whole, "levels": [level | policy], "meta_policy": meta_policy}}
 
 
 MODELS = {
     "a flat policy": (flat(BRANCHES), {}, lambda networks: networks["meta_policy"].of[0]),
     "cut pictures": (flat(BRANCHES), CUT, lambda networks: networks["meta_policy"].of[0]),
     "options that share it": (options(SHARED), {}, lambda networks: networks["levels.0.trunk"].of[0].network),
+    "read by all": (options(None, BRANCHES), {}, lambda networks: networks["trunk"].of[0]),
     "under an LSTM": (flat(LSTM), {}, lambda networks: networks["meta_policy"].over),
     "by itself": (flat(SEES | {"inputs": ["camera"]}), {}, lambda networks: networks["meta_policy"].layers[1]),
 }

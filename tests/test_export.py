@@ -33,6 +33,7 @@ def make(
     endings=None,
     built_in=(),
     trunk=None,
+    whole=None,
     meta_policy=None,
     vectors=True,
     **rollout,
@@ -51,6 +52,7 @@ def make(
     endings = endings or {"network": network if network in ("conv", "per_timestep") else "linear"}
     model = {
         "hierarchy": {
+            "trunk": whole,
             "levels": [level | {"termination": endings, "trunk": trunk} for level in levels],
             "meta_policy": (meta_policy or policy) | {"emits": list(emits)},
         }
@@ -115,6 +117,16 @@ FITS = {
         meta_policy=BRANCHES,
         built_in=("step",),
     ),
+    "read by all": make(
+        "linear",
+        (2, 3),
+        ("options", "control"),
+        {"resize": [7, 6], "grey": True, "frames": 2},
+        trunk={"network": "mlp", "hidden": [5]},
+        whole=BRANCHES,
+        built_in=("step",),
+        options="sample",
+    ),
     "pictures alone": make(LEAKY, camera=True, endings=LEAKY, vectors=False, options="sample"),
     "several convolutions": make(
         CONVOLUTIONS, camera=True, endings={"network": "linear", "inputs": ["step", "goal"]}, built_in=("step",)
@@ -131,7 +143,7 @@ LIKE_OTHERS = ("lstm", "conv", "three levels")
 )
 def test_every_form_acts_as_the_controller_does(name, tmp_path):
     """On other observations than those that it was compared on when it was written, past the longest demonstration."""
-    fit, onnx = FITS[name], name in ("per_timestep", "conv", "lstm", "trunk")
+    fit, onnx = FITS[name], name in ("per_timestep", "conv", "lstm", "trunk", "read by all")
     found = export(fit, tmp_path, onnx)
     assert list(found) == ["numpy", "torch", *(["onnx"] if onnx else [])]
     assert all(difference < TOLERANCE for difference, _ in found.values())

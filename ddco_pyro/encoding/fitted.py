@@ -124,7 +124,9 @@ def _transform(fit: Fit, key: str, picture: Sequence[int]) -> Transform:
 
 
 def _lowest(fit: Fit) -> Part:
-    """The network of a flat policy, or of the lowest options: their trunk, and their policy where there is none."""
+    """The network of a flat policy, or what the lowest options read: the hierarchy's trunk, their own, or, where there
+    is none, their policy.
+    """
     networks, encoder = fit.hierarchy.networks(), fit.hierarchy.encoder
     baseline, hierarchy = fit.spec.baseline, fit.spec.hierarchy
     spec: NetworkSpec
@@ -133,7 +135,9 @@ def _lowest(fit: Fit) -> Part:
     else:
         assert hierarchy is not None  # one of both is there
         lowest = hierarchy.levels[0]
-        spec, place = (lowest.trunk, "levels.0.trunk") if lowest.trunk else (lowest.policy, "levels.0.policy")
+        trunks = ("trunk", hierarchy.trunk), ("levels.0.trunk", lowest.trunk)
+        own = ("levels.0.policy", lowest.policy)
+        place, spec = next(((place, trunk) for place, trunk in trunks if trunk is not None), own)
     return spec, networks[place], spec.inputs or [*encoder.keys, *encoder.images]
 
 

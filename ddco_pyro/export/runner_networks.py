@@ -47,7 +47,9 @@ class NumpyNetworks:
         self._images, self._step = images, step
         self._before, self._after = iter(state), []
         outputs: Outputs = {}
+        whole = self._evaluate(self._about["trunk"], "trunk") if self._about["trunk"] else None
         for level, caller in enumerate(self._about["callers"]):
+            self._features = whole
             if level < depth and self._about["trunks"][level]:
                 self._features = self._evaluate(self._about["trunks"][level], f"trunk_{level}")
             out = self._evaluate(caller["network"], f"caller_{level}")
@@ -72,6 +74,7 @@ class NumpyNetworks:
         return np.broadcast_to(vector, (node["copies"], len(vector)))
 
     def _trunk(self, _: Mapping[str, Any], __: str) -> np.ndarray:
+        assert self._features is not None  # what reads a trunk comes after it
         return self._features
 
     def _joined(self, node: Mapping[str, Any], name: str) -> np.ndarray:

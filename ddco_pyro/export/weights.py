@@ -13,13 +13,16 @@ Arrays = dict[str, np.ndarray]
 
 
 def weights_and_networks(hierarchy: Hierarchy) -> tuple[Arrays, dict[str, Any]]:
-    """Every array by name; ``callers``, ``terminations``, ``trunks`` and whether ``numpy`` can evaluate all of them."""
+    """Every array by name; ``callers``, ``terminations``, ``trunks``, the hierarchy's ``trunk``, and whether ``numpy``
+    can evaluate all of them.
+    """
     encoder = hierarchy.encoder
     arrays: Arrays = {"mean": encoder.mean.numpy(), "deviation": encoder.std.numpy()}
     levels = hierarchy.option_levels()
     networks = {f"caller_{number}": caller.network for number, caller in enumerate(hierarchy.callers())}
     networks |= {f"end_{number}": level.termination for number, level in enumerate(levels)}
     networks |= {f"trunk_{number}": level.trunk for number, level in enumerate(levels) if level.trunk is not None}
+    networks |= {} if hierarchy.trunk is None else {"trunk": hierarchy.trunk}
     forms = {name: form for name, network in networks.items() if (form := numpy_form(network)) is not None}
     facts = {name: about for name, (about, _) in forms.items()}
     arrays |= {f"{name}.{key}": array for name, (_, each) in forms.items() for key, array in each.items()}
@@ -38,5 +41,6 @@ def weights_and_networks(hierarchy: Hierarchy) -> tuple[Arrays, dict[str, Any]]:
         "callers": callers,
         "terminations": terminations,
         "trunks": trunks,
+        "trunk": facts.get("trunk"),
         "numpy": len(forms) == len(networks),
     }

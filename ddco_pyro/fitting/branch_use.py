@@ -54,11 +54,18 @@ def _branched(hierarchy: Hierarchy) -> dict[int, Branches]:
     """The branches that each level's policies read, by level; the meta-policy's is the last."""
     by_level: dict[int, Branches] = {}
     for place, network in hierarchy.networks().items():
-        level = hierarchy.depth if place == "meta_policy" else int(place.split(".")[1])
         inside = [module for module in network.modules() if isinstance(module, Branches)]
         if inside and not place.endswith("termination"):
-            by_level.setdefault(level, inside[0])
+            for level in _levels(place, hierarchy.depth):
+                by_level.setdefault(level, inside[0])
     return dict(sorted(by_level.items()))
+
+
+def _levels(place: str, depth: int) -> Iterable[int]:
+    """The levels that a network of the hierarchy belongs to; its trunk to all of them."""
+    if place == "trunk":
+        return range(depth + 1)
+    return (depth,) if place == "meta_policy" else (int(place.split(".")[1]),)
 
 
 def _rows(sums: dict[tuple[int, int], Tensor], level: int, branches: int, what: int) -> list[list[float | None]]:

@@ -27,13 +27,13 @@ class Stage:
 def plan(spec: Spec, depth: int) -> list[Stage]:
     """The stages of training for D levels: from the lowest level up, the meta-policy last."""
     training = spec.training
-    everything = ("levels.", "meta_policy.")
+    everything = ("trunk.", "levels.", "meta_policy.")
     if depth == 0:
         return [Stage("policy", None, None, everything)]
     stages: list[Stage] = []
     together = training.upper_levels == "segments" and depth > 1
     for level in range(1, 2 if together else depth + 1):
-        own = (f"levels.{level - 1}.",)
+        own = (f"levels.{level - 1}.",) if level > 1 else ("trunk.", "levels.0.")
         if training.initialize != "random":
             kind = "parts" if training.initialize == "equal_parts" else "vq"
             stages.append(Stage(f"{kind}-{level}", level, level, own))

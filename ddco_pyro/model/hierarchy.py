@@ -74,6 +74,8 @@ class Caller(nn.Module):
 class Level(nn.Module):
     """The k options of one level: their policies π (or, above the lowest level, η) and terminations ψ, which read the
     observations, or the features of a trunk that they share.
+
+    :param shape: of the observations, or the hierarchy's trunk.
     """
 
     def __init__(
@@ -81,17 +83,17 @@ class Level(nn.Module):
         place: str,
         spec: LevelSpec,
         options_below: int,
-        shape: InputShape,
+        shape: InputShape | Trunk,
         control: ControlSpec,
         scaling: ControlScaling,
     ) -> None:
         super().__init__()
         self.count = spec.count
-        seen: InputShape | Trunk = shape
+        seen = shape
         if spec.trunk is not None:
             with named(f"{place}.trunk"):
                 seen = build_trunk(spec.trunk, shape, spec.count)
-        self.trunk = seen.network if isinstance(seen, Trunk) else None
+        self.trunk = seen.network if isinstance(seen, Trunk) and seen is not shape else None
         with named(f"{place}.policy"):
             self.policy = Caller(spec.policy, spec.policy.emits, options_below, seen, control, scaling, spec.count)
         with named(f"{place}.termination"):
@@ -126,7 +128,12 @@ class Hierarchy(nn.Module):
         varying = [dimension for dimension in range(control_size) if dimension not in constant]
         parts = all_gaussian(varying) if parts is None else parts
         self.scaling = scaling = ControlScaling(spec.control, control_size, dict(constant), parts)
-        self.input_shape = shape = self.encoder.shape(steps)
+        self.input_shape = seen = self.encoder.shape(steps)
+        shape: InputShape | Trunk = seen
+        if spec.hierarchy is not None and spec.hierarchy.trunk is not None:
+            with named("hierarchy.trunk"):
+                shape = build_trunk(spec.hierarchy.trunk, seen, 1)
+        self.trunk = shape.network if isinstance(shape, Trunk) else None
         levels, below = [], 0
         for number, level in enumerate(spec.hierarchy.levels if spec.hierarchy else ()):
             levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, spec.control, scaling))
@@ -160,7 +167,7 @@ class Hierarchy(nn.Module):
 
     def networks(self) -> dict[str, nn.Module]:
         """Every network by its place here."""
-        each: dict[str, nn.Module] = {}
+        each: dict[str, nn.Module] = {} if self.trunk is None else {"trunk": self.trunk}
         for number, level in enumerate(self.option_levels()):
             if level.trunk is not None:
                 each[f"levels.{number}.trunk"] = level.trunk
@@ -170,6 +177,8 @@ class Hierarchy(nn.Module):
 
     def named_networks(self) -> Iterator[tuple[str, nn.Module]]:
         """Every network by its place in the spec."""
+        if self.trunk is not None:
+            yield "hierarchy.trunk", self.trunk
         for number, level in enumerate(self.option_levels()):
             if level.trunk is not None:
                 yield f"hierarchy.levels.{number}.trunk", level.trunk
@@ -232,13 +241,14 @@ class Hierarchy(nn.Module):
         inputs, carried, answers = inputs.loaded().to(self.device), Carried(states), []
         reduced = self._reduced and self.training
         with torch.autocast(self.device.type, torch.bfloat16) if reduced else nullcontext():
+            given = inputs if self.trunk is None else carried.answer("trunk", self.trunk, inputs)
             for number, level in enumerate(self.option_levels()[:discovering]):
                 place, trunk = f"levels.{number}", level.trunk
-                seen = inputs if trunk is None else carried.answer(f"{place}.trunk", trunk, inputs)
+                seen = given if trunk is None else carried.answer(f"{place}.trunk", trunk, given)
                 answers.append(carried.answer(f"{place}.policy", level.policy.network, seen))
                 answers.append(carried.answer(f"{place}.termination", level.termination, seen))
             if not discovering:
-                answers.append(carried.answer("meta_policy", self.meta_policy.network, inputs))
+                answers.append(carried.answer("meta_policy", self.meta_policy.network, given))
         if reduced or self.device != HOST:
             answers = [said.float().to(HOST) if reduced else said.to(HOST) for said in answers]
         return answers, carried.after

@@ -14,6 +14,9 @@ from ddco_pyro.spec.types import Count, Emission, Items, Model, bare
 HEADS = ("linear", "mlp")
 """The networks that can read a trunk."""
 
+Reader = tuple[str, NetworkSpec]
+"""Where a network stands, and its spec."""
+
 
 class LevelSpec(Model):
     """One level of options."""
@@ -32,18 +35,34 @@ class LevelSpec(Model):
 
     @model_validator(mode="after")
     def _heads(self) -> LevelSpec:
-        for place, head in (("policy", self.policy), ("termination", self.termination)):
-            if self.trunk is not None and head.network not in HEADS:
-                text = f"reads the trunk: use one of {', '.join(HEADS)}, got {head.network!r}"
-                raise invalid((f"{place}.network", text))
-            if self.trunk is not None and head.inputs:
-                raise invalid((f"{place}.inputs", "the trunk reads the observations; say it there"))
+        if self.trunk is not None:
+            _check_readers(("policy", self.policy), ("termination", self.termination))
         return self
+
+    @property
+    def readers(self) -> tuple[Reader, ...]:
+        """The networks that read the observations, or the hierarchy's trunk."""
+        own = ("policy", self.policy), ("termination", self.termination)
+        return own if self.trunk is None else (("trunk", self.trunk),)
+
+
+def _check_readers(*heads: Reader) -> None:
+    """See that networks can read a trunk."""
+    for place, head in heads:
+        if head.network not in HEADS:
+            text = f"reads the trunk: use one of {', '.join(HEADS)}, got {head.network!r}"
+            raise invalid((f"{place}.network", text))
+        if head.inputs:
+            raise invalid((f"{place}.inputs", "the trunk reads the observations; say it there"))
 
 
 class HierarchySpec(Model):
     """Levels of options below a meta-policy."""
 
+    trunk: NetworkSpec | None = None
+    """A single network whose last hidden layer all others of the hierarchy read in place of the observations: trunks of
+    the levels, policies and terminations without one, and the meta-policy, which then are ``linear`` or ``mlp``; null:
+    each of them reads the observations."""
     levels: Items[LevelSpec] = Field(min_length=1)
     """The levels, lowest first."""
     meta_policy: MetaPolicySpec = MetaPolicySpec()
@@ -64,6 +83,18 @@ class HierarchySpec(Model):
         if problems:
             raise invalid(*problems)
         return tuple(_with_emission(level, "options" if index else "control") for index, level in enumerate(levels))
+
+    @model_validator(mode="after")
+    def _heads(self) -> HierarchySpec:
+        if self.trunk is not None:
+            levels = (level.readers for level in self.levels)
+            named = ((f"levels.{index}.{at}", head) for index, own in enumerate(levels) for at, head in own)
+            _check_readers(*named, ("meta_policy", self.meta_policy))
+            for index, level in enumerate(self.levels):
+                if level.trunk is not None and level.trunk.shared:
+                    text = "the hierarchy's trunk is what all options share; put these layers there"
+                    raise invalid((f"levels.{index}.trunk.shared", text))
+        return self
 
 
 def _with_emission(level: LevelSpec, default: Emission) -> LevelSpec:

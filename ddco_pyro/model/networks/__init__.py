@@ -49,24 +49,29 @@ def build(spec: NetworkSpec, shape: InputShape | Trunk, outputs: int, copies: in
     if spec.shared:
         raise ShapeError("shared: options would all do the same; share a trunk, or a network in of or over")
     if isinstance(shape, Trunk):
-        return Head(shape.features, outputs, copies, **spec.settings)
+        return Head(shape, outputs, copies, **spec.settings)
     return _read(spec, shape, outputs, copies)
 
 
-def build_trunk(spec: NetworkSpec, shape: InputShape, copies: int) -> Trunk:
+def build_trunk(spec: NetworkSpec, shape: InputShape | Trunk, copies: int) -> Trunk:
     """``copies`` independent networks for others to read, or a ``shared`` one: a built-in one without its last layer,
     or a user's with ``features`` outputs.
+
+    :param shape: of the observations, or another trunk, which it reads in their place.
 
     :raises ShapeError: as :func:`build`.
     :raises SpecError: as :func:`build`.
     """
+    if isinstance(shape, Trunk):
+        head = Head(shape, None, copies, **spec.settings)
+        return Trunk(head, head.features, copies)
     if spec.shared:
         alone = build_trunk(spec.model_copy(update={"shared": False}), shape, 1)
-        return Trunk(Shared(alone.network, copies), alone.features)
+        return Trunk(Shared(alone.network, copies), alone.features, copies)
     if spec.network not in CLASSES:
-        return Trunk(build(spec, shape, spec.features, copies), spec.features)
+        return Trunk(build(spec, shape, spec.features, copies), spec.features, copies)
     network = _read(spec, shape, None, copies)
-    return Trunk(network, network.features)  # type: ignore[arg-type]
+    return Trunk(network, network.features, copies)  # type: ignore[arg-type]
 
 
 def _read(spec: NetworkSpec, shape: InputShape, outputs: int | None, copies: int) -> nn.Module:

@@ -27,8 +27,9 @@ class Lstm(nn.Module):
         self, shape: InputShape, outputs: int | None, copies: int, over: Trunk | None, hidden: tuple[int, ...]
     ) -> None:
         super().__init__()
-        self.over, size = over or Trunk(Linear(shape, None, copies), shape.vector)
-        sizes = zip([size, *hidden], hidden, strict=False)
+        below = over or Trunk(Linear(shape, None, copies), shape.vector, copies)
+        self.over = below.network
+        sizes = zip([below.features, *hidden], hidden, strict=False)
         self.memory = nn.ModuleList(StackedLstm(copies, *pair) for pair in sizes)
         self.layers = Perceptrons(copies, hidden[-1], (), outputs)
         self.features = self.layers.features

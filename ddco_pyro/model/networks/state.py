@@ -32,10 +32,11 @@ class HasState(Protocol):
 
 
 class Trunk(NamedTuple):
-    """A network whose outputs [N, T, K, features] are read by another."""
+    """A network whose outputs [N, T, K, features] are read by another; K is 1 where all options read the same."""
 
     network: nn.Module
     features: int
+    copies: int
 
 
 def remembers(network: Any) -> TypeGuard[HasState]:

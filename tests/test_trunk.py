@@ -1,0 +1,98 @@
+"""A network that the whole hierarchy reads, against networks of their own with the same weights."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hierarchies import SHAPES, make_batch
+
+from ddco_pyro.fitting.stages import plan
+from ddco_pyro.inference import total_log_likelihood
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.spec import SpecError, parse_spec
+
+SEES = {"network": "mlp", "hidden": [5], "activation": "tanh"}
+JOINED = {"network": "mlp", "hidden": [4], "activation": "tanh"}
+LINEAR = {"network": "linear"}
+
+
+def spec_of(network, trunk=None, own=None, meta=None, **training):
+    """Two levels; ``own`` is the trunk of each."""
+    level = {"policy": network, "termination": network, "trunk": own}
+    levels = [level | {"name": "lower", "count": 3}, level | {"name": "upper", "count": 2}]
+    return parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": list(SHAPES),
+            "hierarchy": {"trunk": trunk, "levels": levels, "meta_policy": meta or network},
+            "training": training,
+        }
+    )
+
+
+def made(spec):
+    torch.manual_seed(0)
+    return Hierarchy(spec, SHAPES, 2, steps=4)
+
+
+def value_of(hierarchy):
+    batch = make_batch(trajectories=3)
+    return total_log_likelihood(hierarchy.tabulate(batch), batch.lengths)
+
+
+def first_layers(hierarchy):
+    """What each network begins with: of a level its trunk where it has one."""
+    networks = {name: network for name, network in hierarchy.networks().items() if name != "trunk"}
+    trunks = [name for name in networks if name.endswith("trunk")]
+    heads = [f"levels.{number}.{part}" for number in range(2) for part in ("policy", "termination")]
+    return [networks[name].layers[0] for name in ("meta_policy", *(trunks or heads))]
+
+
+@pytest.mark.parametrize("own", [None, JOINED], ids=["read by heads", "read by trunks of the levels"])
+def test_it_is_what_each_would_give_with_these_weights_and_learns_from_all(own):
+    """Networks that begin with a copy of it have the same likelihood; its gradient is the sum of all of theirs."""
+    alone = {**SEES, "hidden": [5, 4]}
+    spec = spec_of(LINEAR, SEES, own, meta=JOINED if own else LINEAR)
+    one = made(spec)
+    many = made(spec_of(LINEAR, None, alone, meta=alone) if own else spec_of(SEES))
+    shared = one.trunk.layers[0]
+    with torch.no_grad():
+        for layer in first_layers(many):
+            layer.weight.copy_(shared.weight.expand_as(layer.weight))
+            layer.bias.copy_(shared.bias.expand_as(layer.bias))
+        for name, network in one.networks().items():
+            if name != "trunk":
+                own_layers = [layer for layer in network.layers if hasattr(layer, "weight")]
+                its = [layer for layer in many.networks()[name].layers if hasattr(layer, "weight")]
+                for mine, theirs in zip(own_layers, its[len(its) - len(own_layers) :], strict=True):
+                    theirs.load_state_dict(mine.state_dict())
+    found, expected = value_of(one), value_of(many)
+    torch.testing.assert_close(found, expected)
+    found.backward()
+    expected.backward()
+    of_all = sum(layer.weight.grad.sum(0) for layer in first_layers(many))
+    torch.testing.assert_close(shared.weight.grad[0], of_all, rtol=1e-4, atol=1e-5)
+    assert sum(map(torch.numel, one.parameters())) < sum(map(torch.numel, many.parameters()))
+
+
+def test_it_is_trained_with_the_lowest_level_and_with_all():
+    spec = spec_of(LINEAR, SEES, layerwise=True, lower_levels="fine_tuned")
+    names = [name for name, _ in made(spec).named_parameters()]
+    trained = {stage.name: [name for name in names if name.startswith(stage.trained)] for stage in plan(spec, 2)}
+    assert [name for name, own in trained.items() if "trunk.layers.0.weight" in own] == ["vq-1", "level-1", "joint"]
+    assert trained["joint"] == [name for name in names if not name.startswith(("encoder.", "scaling."))]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"network": SEES, "meta": {"network": "lstm"}}, "hierarchy.meta_policy.network: reads the trunk: use one of"),
+        ({"network": {"network": "conv"}}, "hierarchy.levels.0.policy.network: reads the trunk"),
+        ({"own": {"network": "lstm"}}, "hierarchy.levels.0.trunk.network: reads the trunk"),
+        ({"network": LINEAR | {"inputs": ["state"]}}, "hierarchy.levels.0.policy.inputs: the trunk reads the obs"),
+        ({"own": SEES | {"shared": True}}, "hierarchy.levels.0.trunk.shared: the hierarchy's trunk is what all opt"),
+    ],
+)
+def test_what_cannot_read_it_is_refused(changes, message):
+    with pytest.raises(SpecError, match=rf"^{message}"):
+        spec_of(**{"network": LINEAR, "trunk": SEES} | changes)
