@@ -23,7 +23,7 @@ from pushing_cell import EVALUATION, HELD_OUT, HELD_OUT_SEED, LABELS, POOL, TRAI
 
 from ddco_pyro.acting.lockstep import play
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.pictures import Transform
+from ddco_pyro.data.pictures import Transform, shifted
 from ddco_pyro.encoding.fitted import FittedReader, from_fit
 from ddco_pyro.fitting.building import Dimensions, baseline_spec, parameters
 from ddco_pyro.fitting.fit import Fit
@@ -43,15 +43,19 @@ METHODS = (
 )
 """``_flat``: as many parameters as the hierarchy beside it has with the options of its spec; ``ff_two``: of two
 pictures side by side instead of one; ``encoded``: perceptrons over what the convolutions of ``ff_flat``, fitted to the
-same demonstrations, give of a picture."""
+same demonstrations, give of a picture and of :data:`COPIES` less one that are moved."""
 
 ENCODED = (
     "observations=[camera_features]",
     "control.std=0.35",
     "training.optimizer={name: adam, lr: 1.0e-3, schedule: cosine}",
+    "training.batch_size=16",
 )
 """What is changed in ``pushing_mlp.yaml`` to read features. Of σ of 1, 0.5, 0.35 and 0.25 this one is the likeliest
 on the held-out demonstrations of a development seed, for options and flat policy alike."""
+
+COPIES = 8
+"""How often the features of each demonstration are trained with: as it is, and moved as ``ff_flat`` sees it."""
 
 DEVELOPMENT = 7
 """The first training seed by which nothing but settings is chosen."""
@@ -75,13 +79,15 @@ class PictureCell(Cell):
         """Fit and play."""
         spec_of(self, settings)  # what is wrong in it is said before anything is drawn
         own, test, tasks = settings.values, held_out(settings.runs, self.seed), (WATCHED, LIMITED)
-        demos = self.demonstrations(settings)
+        demos = seen = self.demonstrations(settings)
         if self.method.startswith("encoded"):
             reader = self._reader(settings, folder)
-            demos, test = (_encoded(reader, each) for each in (demos, test))
+            seen, demos, test = (
+                _encoded(reader, each) for each in (moved(demos, spec_of(self, settings)), demos, test)
+            )
             tasks = tuple(_seen_through(reader, task) for task in tasks)
         begun, before = time.perf_counter(), time.process_time()
-        spec, trained = self.fitted(settings, demos, folder)
+        spec, trained = self.fitted(settings, seen, folder)
         fitted, cpu = time.perf_counter(), time.process_time() - before
         found = Fit(spec, trained.hierarchy)
         likelihood = {name: per_step(found, each) for name, each in (("train", demos), ("held_out", test))}
@@ -131,6 +137,7 @@ def spec_of(cell: PictureCell, settings: Settings) -> Spec:
         base = load_spec(SPECS / f"pushing_image_{family}{kind}.yaml", settings.overrides)
     spec = with_overrides(base, changed)
     trained = cell.count - max(1, round(cell.count * spec.training.tune_fraction))
+    trained *= COPIES if family == "encoded" else 1
     epochs = int(np.ceil(settings.values["updates"] / np.ceil(trained / spec.training.batch_size)))
     return with_overrides(spec, {"training.epochs": epochs})
 
@@ -167,6 +174,20 @@ def recorded(folder: Path, first: int, count: int) -> Demonstrations:
         Demonstrations(tuple(one.record for one in episodes)).write(path)
     kept = Demonstrations.read(path, labels=LABELS)
     return replace(kept, demonstrations=tuple(map(_in_memory, kept)))
+
+
+def moved(demos: Demonstrations, spec: Spec) -> Demonstrations:
+    """Each demonstration :data:`COPIES` times, but those that the spec tunes with, which nothing is trained with."""
+    shift = load_spec(SPECS / "pushing_image_ff.yaml").observations[0].augment.shift
+    kept, tune = demos.split(spec.training.tune_fraction, spec.seed)
+    random, copies = np.random.default_rng(spec.seed), list(kept)
+    for number in range(1, COPIES):
+        for demo in kept:
+            by = random.integers(-shift, shift + 1, 2).tolist()
+            pictures = shifted(np.asarray(demo.observations["camera"]), *by)
+            copies.append(replace(demo, name=f"{demo.name}_{number}", observations={"camera": pictures}))
+    masks = {"train": tuple(copy.name for copy in copies), "valid": tune.names}
+    return replace(demos, demonstrations=(*copies, *tune), masks=masks)
 
 
 def _encoded(reader: FittedReader, demos: Demonstrations) -> Demonstrations:

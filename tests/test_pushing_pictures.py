@@ -10,10 +10,11 @@ import numpy as np
 import pushing_pictures as study
 import pytest
 from cells import described
-from pushing_pictures_cell import DEFAULTS, PictureCell, spec_of
+from pushing_pictures_cell import COPIES, DEFAULTS, SIZE, PictureCell, moved, spec_of
 from pushing_pictures_results import at_one_std, differences, row_of
 from scipy import stats
 
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.spec import load_spec
 
 
@@ -56,6 +57,30 @@ def test_differences_are_paired_by_seed_and_number():
     assert line.startswith("- ff minus flat of equal size, 40 demonstrations, paired by seed (2): 1.0 ± 6.4 goals")
     assert "(2.0 ± 12.7 with the limit)" in line
     assert "0.500 ± 6.353 held-out" in line
+
+
+def test_features_are_of_moved_pictures_too_but_not_of_those_to_tune_with():
+    pictures = np.random.default_rng(0).integers(0, 256, (10, 4, *SIZE, 3), dtype=np.uint8)
+    demos = Demonstrations(
+        tuple(Demonstration(f"demo_{at}", {"camera": own}, np.zeros((4, 2))) for at, own in enumerate(pictures))
+    )
+    spec = spec_of(PictureCell("encoded", 2, 10, 3), DEFAULTS)
+    train, tune = moved(demos, spec).split(spec.training.tune_fraction, spec.seed)
+    assert (len(train), len(tune), len(set(train.names))) == (9 * COPIES, 1, 9 * COPIES)
+    assert not {name.rsplit("_", 1)[0] if name.count("_") > 1 else name for name in train.names} & set(tune.names)
+    whole, by = {demo.name: demo.observations["camera"] for demo in demos}, set()
+    for demo in train:
+        inside, seen = whole[demo.name[: len("demo_0")]][:, 3:-3, 3:-3], demo.observations["camera"]
+        height, width = inside.shape[1:3]
+        places = [
+            (row, column)
+            for row in range(7)
+            for column in range(7)
+            if (seen[:, row : row + height, column : column + width] == inside).all()
+        ]
+        assert len(places) == 1
+        by.update(places)
+    assert len(by) > 20  # of 49
 
 
 def test_likelihoods_are_compared_at_one_std():
