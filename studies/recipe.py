@@ -1,13 +1,14 @@
 """How a task's models are best trained and executed, chosen on development seeds that no result is about.
 
-    python studies/recipe.py [--grid initialization | decay] [--counts 100] [--spec specs/needle.yaml]
+    python studies/recipe.py [--grid initialization | decay | trunk] [--counts 100] [--spec specs/needle.yaml]
         [--seeds 5000 6000] [--episodes 60] [--jobs 2] [--out DIR]
 
 Each development seed has demonstrations of its own. Every model, baselines too, has as many candidates; each is
 trained once for each seed, scored on held-out demonstrations, and rolled out from starts that no result is about.
 ``--grid initialization`` tries how options begin, ``decay`` how much weights decay and what policy and termination of
-an option share; ``--counts`` trains on the first demonstrations of a seed. A cell that is in ``--out`` is not made
-again by the same code. Writes ``docs/results/recipe.json`` and ``.md``, or ``recipe_decay`` for that grid.
+an option share, ``trunk`` a network that the whole hierarchy reads (fewer candidates than ``decay`` has for each model;
+the hierarchy alone has such a thing); ``--counts`` trains on the first demonstrations of a seed. A cell that is in
+``--out`` is not made again by the same code. Writes ``docs/results/recipe.json`` and ``.md``, or ``recipe_GRID``.
 """
 
 from __future__ import annotations
@@ -87,7 +88,30 @@ def decays() -> dict[str, list[Candidate]]:
     }
 
 
-GRIDS = {"initialization": (beginnings, "recipe"), "decay": (decays, "recipe_decay")}
+def trunks() -> dict[str, list[Candidate]]:
+    """Linear policies, terminations and meta-policy over a hidden layer that all of them read; four settings."""
+    linear = {"network": "linear"}
+    heads = {f"hierarchy.{place}": linear for place in ("levels.0.policy", "levels.0.termination", "meta_policy")}
+    begun = {"training.initialize": "equal_parts", "training.layerwise": False, "control.std": OWN_STD}
+    sizes_and_decays = product(([64], [128]), (1e-2, 3e-2))
+    return {
+        "ddco": [
+            {
+                **begun,
+                **heads,
+                "hierarchy.trunk": {"network": "mlp", "hidden": hidden},
+                "training.optimizer.weight_decay": decay,
+            }
+            for hidden, decay in sizes_and_decays
+        ]
+    }
+
+
+GRIDS = {
+    "initialization": (beginnings, "recipe"),
+    "decay": (decays, "recipe_decay"),
+    "trunk": (trunks, "recipe_trunk"),
+}
 """What is tried, and the name of its results."""
 
 
@@ -167,6 +191,8 @@ def words(values: Candidate) -> str:
         return "the recipe of before: clusters of observations and controls, layer by layer, one σ, perceptrons switch"
     if "baseline" in values:
         said = [f"hidden {values['baseline']['policy']['hidden']}", f"lr {values['training.optimizer.lr']}"]
+    elif "hierarchy.trunk" in values:
+        said = [f"all read one hidden layer {values['hierarchy.trunk']['hidden']}"]
     elif "hierarchy.meta_policy" in values:
         switching = values["hierarchy.meta_policy"]["network"]
         said = [values["training.initialize"], f"{'perceptrons' if switching == 'mlp' else switching} switch"]
