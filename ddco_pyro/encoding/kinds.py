@@ -127,7 +127,7 @@ class Taken(OfANetwork):
         return self._code
 
     def size(self, features: int, most: int) -> int:
-        """All of them: they are few, and what learns from controls has no others."""
+        """All of them: they are few, and the fit has learnt to need each."""
         return features
 
 
@@ -142,9 +142,9 @@ class Own(Kind):
     @classmethod
     def made(cls, name: str, pictures: Pictures, seed: int, allow_code: bool) -> Kind:
         """See :meth:`Kind.made`; it is tried on the first training pictures."""
-        own = cls(name)
-        try_out(name, own, next(pictures.of(pictures.training[0])))
-        return own
+        encoder = cls(name)
+        try_out(name, encoder, next(pictures.of(pictures.training[0])))
+        return encoder
 
     def __call__(self, pictures: np.ndarray) -> np.ndarray:
         """See :class:`Kind`."""
