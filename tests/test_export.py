@@ -10,129 +10,14 @@ import onnx
 import pytest
 import torch
 from command_line import call
+from exportable import FITS, RECURRENT, SHAPES, make
 from user_networks import Remembering
 
 import ddco_pyro
 import ddco_pyro.export as module
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.export import TOLERANCE, export, runner
-from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import InputShape
-from ddco_pyro.spec import parse_spec
-
-SHAPES = {"state": (3,), "goal": (2, 2), "camera": (9, 12, 3)}
-
-
-def make(
-    network="mlp",
-    counts=(3,),
-    emits=("options",),
-    camera=False,
-    steps=7,
-    endings=None,
-    built_in=(),
-    trunk=None,
-    whole=None,
-    meta_policy=None,
-    vectors=True,
-    **rollout,
-):
-    """A run that was never fitted: random weights, observations with a mean and a spread.
-
-    :param camera: whether there are pictures, or how they are cut.
-    """
-    policy = network if isinstance(network, dict) else {"network": network}
-    levels = [
-        {"name": f"level-{d}", "count": k, "policy": policy | ({"emits": list(emits)} if d else {})}
-        for d, k in enumerate(counts)
-    ]
-    seen = [{"key": "state", "differences": True}, "goal", *built_in] if vectors else []
-    pictures = [{"key": "camera", **(camera if isinstance(camera, dict) else {})}] if camera else []
-    endings = endings or {"network": network if network in ("conv", "per_timestep") else "linear"}
-    model = {
-        "hierarchy": {
-            "trunk": whole,
-            "levels": [level | {"termination": endings, "trunk": trunk} for level in levels],
-            "meta_policy": (meta_policy or policy) | {"emits": list(emits)},
-        }
-    }
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": [*seen, *pictures],
-            "control": {"std": {"learn": True}},
-            "rollout": rollout,
-            **(model if counts else {"baseline": {"kind": "flat", "policy": policy}}),
-        }
-    )
-    torch.manual_seed(1)
-    hierarchy = Hierarchy(spec, SHAPES, 2, steps)
-    hierarchy.encoder.mean.uniform_(-3, 3)
-    hierarchy.encoder.std.uniform_(0.5, 2)
-    hierarchy.encoder.mean[3:6] = 0  # of the differences: it goes to and fro
-    hierarchy.scaling.scale.copy_(torch.tensor([10.0, 0.3]))
-    hierarchy.scaling.shift.copy_(torch.tensor([-4.0, 1.0]))
-    return Fit(spec, hierarchy.eval())
-
-
-CONVOLUTIONS = {
-    "network": "conv",
-    "inputs": ["camera", "state"],
-    "layers": [{"filters": 3, "kernel": 4, "stride": 2, "padding": 1}, {"filters": 2, "kernel": 3}],
-    "activation": "elu",
-    "pool": "spatial_softmax",
-}
-LEAKY = {"network": "conv", "filters": 2, "pool": "flatten", "activation": "leaky_relu", "standardize": True}
-RECURRENT = {"network": "lstm", "over": {"hidden": [6]}, "hidden": [5, 4]}
-BRANCHES = {
-    "network": "branches",
-    "of": {
-        "camera": {"network": "lstm", "over": LEAKY | {"shared": True}, "hidden": 4},
-        "pair": {"network": "mlp", "inputs": ["goal", "state"], "hidden": [6], "activation": "tanh"},
-        "state": {"network": "lstm", "hidden": 3, "shared": True},
-        "step": {"network": "linear"},
-    },
-    "hidden": [7],
-}
-FITS = {
-    "linear": make("linear", options="most_likely"),
-    "mlp": make("mlp", control="sample", options="sample"),
-    "per_timestep": make("per_timestep", steps=30),
-    "conv": make("conv", camera={"crop": [1, 2, 7, 9], "resize": [6, 8], "frames": 3}, options="sample"),
-    "hybrid": make("mlp", (2, 3), ("options", "control"), control="sample"),
-    "three levels": make("mlp", (2, 3, 2), ("options", "control")),
-    "marginal": make("mlp", (2, 3, 2), ("options", "control"), options="marginal"),
-    "flat": make("mlp", (), built_in=("step",)),
-    "lstm": make(RECURRENT, (2, 2), ("options", "control"), endings=RECURRENT, control="sample"),
-    "lstm over pictures": make(
-        {"network": "lstm", "over": CONVOLUTIONS}, camera=True, endings=CONVOLUTIONS, steps=30, options="sample"
-    ),
-    "trunk": make(
-        "linear",
-        (2, 3),
-        ("options", "control"),
-        {"resize": [7, 6], "grey": True, "frames": 2},
-        trunk=BRANCHES,
-        meta_policy=BRANCHES,
-        built_in=("step",),
-    ),
-    "read by all": make(
-        "linear",
-        (2, 3),
-        ("options", "control"),
-        {"resize": [7, 6], "grey": True, "frames": 2},
-        trunk={"network": "mlp", "hidden": [5]},
-        whole=BRANCHES,
-        built_in=("step",),
-        options="sample",
-    ),
-    "pictures alone": make(LEAKY, camera=True, endings=LEAKY, vectors=False, options="sample"),
-    "several convolutions": make(
-        CONVOLUTIONS, camera=True, endings={"network": "linear", "inputs": ["step", "goal"]}, built_in=("step",)
-    ),
-}
-
 
 LIKE_OTHERS = ("lstm", "conv", "three levels")
 """Their parts are those of others, together."""
