@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cells import printed
 from joblib import Parallel, delayed
 from provenance import Record, is_kept, record, sentence, text
 from scipy import stats
@@ -243,7 +244,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=60)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("runs/recipe"))
-    print(run(parser.parse_args()))
+    printed(lambda: run(parser.parse_args()))
 
 
 if __name__ == "__main__":
