@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import stats
+from sklearn.preprocessing import QuantileTransformer
 
 from ddco_pyro.data.control_parts import all_gaussian
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
@@ -85,6 +86,46 @@ def test_differences_are_standardised_apart_from_their_observation():
     raw = np.concatenate([np.vstack([np.zeros(4), one]) for one in differences])
     np.testing.assert_allclose(encoder.mean[4:], raw.mean(0))
     np.testing.assert_allclose(encoder.std[4:], raw.std(0))
+
+
+@pytest.mark.parametrize("key", ["pose", "grid"])
+def test_bins_add_up_to_quantiles(key):
+    """How far each number has come through all of its parts together is scikit-learn's quantile transform."""
+    bins, raw = 4, rows(key)
+    encoder = fitted(ObservationSpec(key=key, bins=bins))
+    seen = alive(encoder.inputs(demo.observations for demo in DEMOS).vector).astype(float)
+    width, own = raw.shape[1], slice(raw.shape[1], None)
+    plain = fitted(ObservationSpec(key=key)).inputs(demo.observations for demo in DEMOS)
+    np.testing.assert_allclose(seen[:, :width], alive(plain.vector))
+    cut = seen * encoder.std.numpy() + encoder.mean.numpy()
+    low, high = encoder.low.numpy()[own], encoder.high.numpy()[own]
+    through = (cut[:, own] - low) / np.where(high > low, high - low, 1)
+    expected = QuantileTransformer(n_quantiles=bins + 1, subsample=None).fit_transform(raw)
+    expected[:, np.ptp(raw, axis=0) == 0] = 0  # it never changes
+    np.testing.assert_allclose(through.reshape(len(raw), bins, width).mean(1), expected, atol=1e-5)
+    np.testing.assert_allclose(seen.mean(0), 0, atol=1e-5)
+    np.testing.assert_allclose(seen.std(0), np.where(np.tile(np.ptp(raw, axis=0) > 0, 1 + bins), 1, 0), atol=1e-5)
+
+
+def test_differences_are_seen_in_bins_too():
+    encoder = fitted(ObservationSpec(key="grid", differences=True, bins=2), ObservationSpec(key="pose"))
+    raw = np.concatenate([encoder.features(demo.observations) for demo in DEMOS])
+    assert (encoder.given, encoder.sizes) == ([8, 3], [24, 3])
+    middle = np.median(raw[:, :8], axis=0)
+    np.testing.assert_allclose(encoder.high[8:16], middle)
+    np.testing.assert_allclose(encoder.low[16:24], middle)
+    assert torch.isinf(encoder.low[24:]).all()
+
+
+def test_a_part_that_holds_one_value_alone_is_only_centred():
+    """Half of the steps have one value, and so do the parts between quantiles there."""
+    random = np.random.default_rng(0)
+    jaw = np.where(random.random((40, 1)) < 0.5, 1.25, random.random((40, 1)) / 5)
+    encoder = ObservationEncoder([ObservationSpec(key="jaw", bins=8)], {"jaw": (1,)})
+    encoder.fit(Demonstrations((Demonstration("demo_0", {"jaw": jaw}, np.zeros((40, 1))),)))
+    seen = encoder.inputs([{"jaw": jaw}]).vector[0].numpy()
+    assert np.isin(seen.std(0).round(4), [0, 1]).all()
+    assert (seen.std(0) < 1e-6).sum() >= 2
 
 
 def test_what_is_not_to_be_standardised_stays_as_it_is():

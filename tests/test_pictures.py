@@ -195,6 +195,7 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
         ),
         ({"key": "camera", "resize": [3]}, r"observations.1.resize: "),
         ({"key": "camera", "zoom": 2}, r"observations.1.zoom: "),
+        ({"key": "camera", "bins": 4}, r"'camera' has pictures: bins are for vectors"),
     ],
 )
 def test_what_cannot_be_cut_is_refused(kept: Path, observation: dict[str, Any], message: str) -> None:

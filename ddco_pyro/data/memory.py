@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -108,25 +108,25 @@ class Extent:
                     pictures |= {place} if plain and len(array.shape) == 4 else set()
         return cls(tuple(lengths), size, shapes, frozenset(pictures))
 
-    def features(self, differences: Collection[str] = ()) -> int:
+    def features(self, seen: Mapping[str, int]) -> int:
         """Numbers of a step that are no pictures.
 
-        :param differences: places of observations whose differences are appended.
+        :param seen: by place, how many numbers networks see for each that is observed; one where it is not named.
         """
         numbers = {place: math.prod(shape) for place, shape in self.shapes.items() if place not in self.pictures}
-        return sum(count * (2 if place in differences else 1) for place, count in numbers.items())
+        return sum(count * seen.get(place, 1) for place, count in numbers.items())
 
-    def step(self, differences: Collection[str] = ()) -> float:
+    def step(self, seen: Mapping[str, int]) -> float:
         """Bytes of a step's vectors as networks are given them, and of what is made on the way there."""
-        return (KEPT + MAKING) * self.features(differences)
+        return (KEPT + MAKING) * self.features(seen)
 
-    def fit(self, works: Iterable[Work], differences: Collection[str] = ()) -> float:
+    def fit(self, works: Iterable[Work], seen: Mapping[str, int]) -> float:
         """Bytes that a fit takes, about: the most that one of its models does, which are trained one after the other.
 
         The vectors are there as they were read, and padded. What else there is comes one after the other: what is made
         of them, clusters, and gradient steps.
         """
-        longest, features = max(1, *self.lengths), self.features(differences)
+        longest, features = max(1, *self.lengths), self.features(seen)
         padded, given = len(self.lengths) * longest, KEPT * features
         passing = [MAKING * features * padded]
         for work in works:

@@ -56,7 +56,7 @@ class StepProgram(nn.Module):
         """Inputs of the right shapes."""
         encoder = self.hierarchy.encoder
         images = [torch.zeros(shape, dtype=torch.uint8) for shape in encoder.images.values()]
-        features = torch.zeros(len(encoder.mean), dtype=torch.float64)
+        features = torch.zeros(sum(encoder.given), dtype=torch.float64)
         return (features, torch.zeros(1, dtype=torch.int64), *images, *self.initial_state())
 
     def onnx_names(self) -> tuple[list[str], list[str]]:

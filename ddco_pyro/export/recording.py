@@ -100,7 +100,8 @@ def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generato
         length = int(np.prod(shape))
         values = mean[:length] + std[:length] * random.normal(size=(steps, length))
         if spec.differences:
-            differences = mean[length:] + std[length:] * random.normal(size=values.shape)
+            own = slice(length, 2 * length)
+            differences = mean[own] + std[own] * random.normal(size=values.shape)
             values = _walk(values[0], differences, mean[:length], std[:length])
         observations[spec.key] = values.reshape(steps, *shape)
         at += size

@@ -40,6 +40,8 @@ class NumpyNetworks:
     ) -> tuple[Outputs, State]:
         """The outputs of every network for one observation, and the next state."""
         weights, depth = self._weights, len(self._about["levels"])
+        if "places" in weights:
+            features = np.clip(features[weights["places"]], weights["low"], weights["high"])
         vector = ((features - weights["mean"]) / weights["deviation"]).astype(np.float32)
         sizes = self._about["features"]
         ends = np.cumsum([0, *sizes.values()])

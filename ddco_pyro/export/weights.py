@@ -18,6 +18,9 @@ def weights_and_networks(hierarchy: Hierarchy) -> tuple[Arrays, dict[str, Any]]:
     """
     encoder = hierarchy.encoder
     arrays: Arrays = {"mean": encoder.mean.numpy(), "deviation": encoder.std.numpy()}
+    if encoder.has_bins:
+        ends = {"low": encoder.low, "high": encoder.high, "places": encoder.places}
+        arrays |= {name: array.numpy() for name, array in ends.items()}
     levels = hierarchy.option_levels()
     networks = {f"caller_{number}": caller.network for number, caller in enumerate(hierarchy.callers())}
     networks |= {f"end_{number}": level.termination for number, level in enumerate(levels)}

@@ -145,8 +145,8 @@ def _refuse_too_long(recording: Recording, fit: Fit, before: int) -> None:
     seen = {f"obs/{key}": known[key] for key in fit.hierarchy.encoder.shapes if key in known}
     extent = Extent.of([{"actions": recording.actions, **seen}])
     (steps,) = extent.lengths
-    differences = {f"obs/{observation.key}" for observation in fit.spec.observations if observation.differences}
-    each, networks = extent.step(differences) + INFERENCE, min(steps, fit.hierarchy.steps_in_memory)
+    seen_of_each = {f"obs/{observation.key}": observation.seen for observation in fit.spec.observations}
+    each, networks = extent.step(seen_of_each) + INFERENCE, min(steps, fit.hierarchy.steps_in_memory)
     needed = PROGRAM + extent.size + steps * each + networks * fit.hierarchy.step_bytes
     needed += FOUND * fit.hierarchy.depth * (before + steps)
     refuse_too_much(needed, f"{recording.name}: segmenting its {steps} steps", "divide it, or the file")

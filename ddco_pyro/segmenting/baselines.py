@@ -67,13 +67,12 @@ def _rows_of(
     shapes = train.observation_shapes
     encoder = ObservationEncoder(observations or [ObservationSpec(key=key) for key in shapes], shapes)
     encoder.fit(train)
-    mean, std = encoder.mean.numpy(), encoder.std.numpy()
     controls = np.concatenate([demo.actions for demo in train])
     middle, spread = controls.mean(0), controls.std(0)
     varying = spread > 1e-9 * np.maximum(np.abs(controls).max(0), 1e-9)
 
     def rows(demo: Demonstration) -> np.ndarray:
-        vector = (encoder.features(demo.observations) - mean) / std
+        vector = encoder.scaled(encoder.features(demo.observations))
         images = [
             torch.cat(
                 [

@@ -80,6 +80,11 @@ class ObservationSpec(Model):
     """Shift and scale to mean 0 and standard deviation 1 over the training demonstrations; dimensions that vary by
     rounding alone, or not at all, are only shifted."""
 
+    bins: Annotated[int, Field(ge=0, le=64)] = 0
+    """Vectors alone: behind its numbers and their differences, each of them again as often as this, cut off at the
+    ends of one of as many parts of its range, which hold as many training steps each (a piecewise-linear encoding).
+    So networks see what small differences say in a part of a wide range, as of jaws that are nearly closed."""
+
     crop: Part | None = None
     """Pictures alone: top, left, height and width of the part that is seen, in the file's pixels; null: all of it."""
     resize: Size | None = None
@@ -103,6 +108,16 @@ class ObservationSpec(Model):
         if self.key == STEP and self.differences:
             raise invalid(("differences", f"{STEP} grows by the same at each step; leave it out"))
         return self
+
+    @property
+    def given(self) -> int:
+        """Of a vector: how many numbers there are for each that is observed."""
+        return 2 if self.differences else 1
+
+    @property
+    def seen(self) -> int:
+        """Of a vector: how many numbers networks see for each that is observed."""
+        return self.given * (1 + self.bins)
 
 
 Observation = Annotated[ObservationSpec, bare("key", str | ObservationSpec)]

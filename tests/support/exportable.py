@@ -23,6 +23,7 @@ def make(
     whole=None,
     meta_policy=None,
     vectors=True,
+    bins=0,
     **rollout,
 ):
     """A run that was never fitted: random weights, observations with a mean and a spread.
@@ -34,7 +35,7 @@ def make(
         {"name": f"level-{d}", "count": k, "policy": policy | ({"emits": list(emits)} if d else {})}
         for d, k in enumerate(counts)
     ]
-    seen = [{"key": "state", "differences": True}, "goal", *built_in] if vectors else []
+    seen = [{"key": "state", "differences": True, "bins": bins}, "goal", *built_in] if vectors else []
     pictures = [{"key": "camera", **(camera if isinstance(camera, dict) else {})}] if camera else []
     endings = endings or {"network": network if network in ("conv", "per_timestep") else "linear"}
     model = {
@@ -58,6 +59,10 @@ def make(
     hierarchy.encoder.mean.uniform_(-3, 3)
     hierarchy.encoder.std.uniform_(0.5, 2)
     hierarchy.encoder.mean[3:6] = 0  # of the differences: it goes to and fro
+    if bins:
+        own = slice(6, 6 * (1 + bins))
+        hierarchy.encoder.low[own].uniform_(-3, 1)
+        hierarchy.encoder.high[own] = hierarchy.encoder.low[own] + 2
     hierarchy.scaling.scale.copy_(torch.tensor([10.0, 0.3]))
     hierarchy.scaling.shift.copy_(torch.tensor([-4.0, 1.0]))
     return Fit(spec, hierarchy.eval())
@@ -86,6 +91,7 @@ FITS = {
     "linear": make("linear", options="most_likely"),
     "mlp": make("mlp", control="sample", options="sample"),
     "per_timestep": make("per_timestep", steps=30),
+    "bins": make("mlp", bins=4),
     "conv": make("conv", camera={"crop": [1, 2, 7, 9], "resize": [6, 8], "frames": 3}, options="sample"),
     "hybrid": make("mlp", (2, 3), ("options", "control"), control="sample"),
     "three levels": make("mlp", (2, 3, 2), ("options", "control")),
