@@ -136,6 +136,7 @@ def kept(
 
     :param settings: what names the cell and decides its results; part of them.
     :param made_by: what was known of the code when the study began.
+    :raises ValueError: a result is named like a setting, which it would replace: it could not be told what was done.
     """
     if path.exists():
         content: dict[str, Any] = json.loads(path.read_text())
@@ -144,5 +145,7 @@ def kept(
     torch.set_num_threads(1)
     with threadpool_limits(1):
         results = work()
+    if twice := sorted(settings.keys() & results.keys()):
+        raise ValueError(f"{path}: results are named like settings: {', '.join(twice)}")
     write_text(path, text({**settings, **results}, [made_by]))
     return dict(json.loads(path.read_text()))

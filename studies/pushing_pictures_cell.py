@@ -99,7 +99,7 @@ class PictureCell(Cell):
             "log_likelihood_per_step": likelihood,
             "parameters": parameters(trained.hierarchy),
             "steps": trained.training,
-            "episodes": summary(episodes),
+            "unlimited": summary(episodes),
             "limited": summary(limited),
             "seconds": {"fit": fitted - begun, "fit_processor": cpu, "play": ended - fitted},
         }

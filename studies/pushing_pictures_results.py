@@ -47,7 +47,7 @@ FEWEST = 3
 
 def row_of(cell: Any, results: dict[str, Any]) -> Row:
     """A cell in a line: means over its episodes."""
-    seconds, episodes = results["seconds"], results["episodes"]
+    seconds, episodes = results["seconds"], results["unlimited"]
     return {
         **asdict(cell),
         **results["log_likelihood_per_step"],

@@ -276,6 +276,8 @@ def test_a_cell_is_done_once_for_each_code_and_settings(tmp_path):
         content = cells.kept(tmp_path / "cell.json", settings, {"code": code}, work)
         assert content == {"provenance": [{"code": code}], "results": settings | {"value": value}}
     assert cells.kept(tmp_path / "cell.json", {"seed": 2}, {"code": "b"}, work)["results"] == {"seed": 2, "value": 2}
+    with pytest.raises(ValueError, match="results are named like settings: seed"):  # it would be done each time
+        cells.kept(tmp_path / "cell.json", {"seed": 3}, {"code": "b"}, lambda: {"seed": [1.0]})
 
 
 # --- the study --------------------------------------------------------------------------------------------------------

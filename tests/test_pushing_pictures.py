@@ -21,7 +21,7 @@ from ddco_pyro.spec import load_spec
 def results(goals, held_out):
     return {
         "log_likelihood_per_step": {"train": held_out + 0.1, "held_out": held_out},
-        "episodes": {"goals": goals, "topples": [0.0, 1.0], "lost": [0.0, 0.0], "dwell": None, "own_control": None},
+        "unlimited": {"goals": goals, "topples": [0.0, 1.0], "lost": [0.0, 0.0], "dwell": None, "own_control": None},
         "limited": {"goals": [2.0 * one for one in goals]},
         "parameters": 7,
         "seconds": {"fit": 90.0, "fit_processor": 30.0, "play": 30.0},
