@@ -200,7 +200,7 @@ def memory_needed(spec: Spec, path: Path) -> float:
             works = [_work(*model, size, sum(stored.lengths)) for model in models]
     except SpecError:  # it is said where networks are checked
         works = [Work(spec.training.batch_size, STEPS_AT_ONCE, STEPS_AT_ONCE, 0, 0)]
-    return stored.fit(works, {f"obs/{observation.key}": observation.seen for observation in spec.observations})
+    return stored.fit(works, spec.seen)
 
 
 def _work(spec: Spec, hierarchy: Hierarchy, dimensions: Dimensions, steps: int) -> Work:

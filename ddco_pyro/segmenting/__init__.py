@@ -145,8 +145,7 @@ def _refuse_too_long(recording: Recording, fit: Fit, before: int) -> None:
     seen = {f"obs/{key}": known[key] for key in fit.hierarchy.encoder.shapes if key in known}
     extent = Extent.of([{"actions": recording.actions, **seen}])
     (steps,) = extent.lengths
-    seen_of_each = {f"obs/{observation.key}": observation.seen for observation in fit.spec.observations}
-    each, networks = extent.step(seen_of_each) + INFERENCE, min(steps, fit.hierarchy.steps_in_memory)
+    each, networks = extent.step(fit.spec.seen) + INFERENCE, min(steps, fit.hierarchy.steps_in_memory)
     needed = PROGRAM + extent.size + steps * each + networks * fit.hierarchy.step_bytes
     needed += FOUND * fit.hierarchy.depth * (before + steps)
     refuse_too_much(needed, f"{recording.name}: segmenting its {steps} steps", "divide it, or the file")

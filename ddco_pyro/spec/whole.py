@@ -65,6 +65,11 @@ class Spec(Model):
         """Names of the observations that demonstrations have to hold: all but the built-in ``step``."""
         return [observation.key for observation in self.observations if observation.key != STEP]
 
+    @property
+    def seen(self) -> dict[str, int]:
+        """By place in a file, such as ``obs/pose``: how many numbers networks see for each that is observed."""
+        return {f"obs/{observation.key}": observation.seen for observation in self.observations}
+
     @model_validator(mode="after")
     def _consistent(self) -> Spec:
         problems = [
