@@ -48,13 +48,15 @@ FITS: dict[str, tuple[str, str, tuple[str, ...]]] = {
 """Each model as its own spec has it: file, what stands behind the names of its methods, and what is changed."""
 FEW = ("ddco", "flat", "per_timestep")
 """The fits to fewer than all demonstrations."""
+CLOCKED = ("ddco_clock", "flat_clock")
+"""Those to fewer demonstrations of policies that are told the time step, as a policy for each time step is."""
 Seed = dict[str, Any]
 """What is kept of one training seed: the ``results`` of ``seed-N.json``."""
 
 
-def run_seed(seed: int, count: int, arguments: argparse.Namespace, made_by: Record) -> None:
+def run_seed(seed: int, count: int, arguments: argparse.Namespace, made_by: Record, clocked: bool = False) -> None:
     """Fit, roll out, and keep the numbers of one training seed that is given so many of its demonstrations."""
-    path = kept_at(arguments.out, seed, count)
+    path = kept_at(arguments.out, seed, count, clocked)
     settings = {"seed": seed, "count": count, "episodes": arguments.episodes, "overrides": arguments.set}
     if path.exists() and is_kept(json.loads(path.read_text()), settings, made_by):
         return
@@ -64,7 +66,7 @@ def run_seed(seed: int, count: int, arguments: argparse.Namespace, made_by: Reco
     own.append(f"rollout.seed={STARTS}")
     folder = arguments.runs / made_by["code"][:12] / path.stem
     found: dict[str, Any] = {}
-    for name in FITS if count == ALL else FEW:
+    for name in FITS if count == ALL else CLOCKED if clocked else FEW:
         file, suffix, changes = FITS[name]
         scripted = () if (name, seed, count) == ("ddco", 0, ALL) else ("rollout.policies=[]",)
         spec = load_spec(file, [*own, *changes, *scripted, *(arguments.set if name.startswith(OURS) else ())])
@@ -76,9 +78,13 @@ def run_seed(seed: int, count: int, arguments: argparse.Namespace, made_by: Reco
     write_text(path, text(settings | found, [made_by]))
 
 
-def kept_at(out: Path, seed: int, count: int) -> Path:
-    """Where the numbers of a seed and a number of demonstrations are kept."""
-    return out / (f"seed-{seed}.json" if count == ALL else f"count-{count:03d}-seed-{seed}.json")
+def kept_at(out: Path, seed: int, count: int, clocked: bool = False) -> Path:
+    """Where the numbers of a seed and a number of demonstrations are kept; with all of them those told the time step
+    stand with the others.
+    """
+    if count == ALL:
+        return out / f"seed-{seed}.json"
+    return out / f"{'clock' if clocked else 'count'}-{count:03d}-seed-{seed}.json"
 
 
 def _numbers(fitted: Fit, rolled: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -139,13 +145,13 @@ def over_seeds(values: list[float], bounds: tuple[float, float] = (-np.inf, np.i
     return found | {"range": [min(values), max(values)]} | {key: span.tolist() for key, span in spans.items()}
 
 
-def differences(seeds: list[Seed]) -> dict[str, dict[str, Any]]:
+def differences(seeds: list[Seed], ours: str = OURS) -> dict[str, dict[str, Any]]:
     """Ours minus every other method that is trained, paired by seed: success, and held-out nats per step."""
-    others = [name for name in seeds[0]["log_likelihood_per_step"] if name != OURS]
+    others = [name for name in seeds[0]["log_likelihood_per_step"] if name != ours]
     return {
         name: {
-            "success": over_seeds([_success(one, OURS) - _success(one, name) for one in seeds]),
-            "log_likelihood_valid": over_seeds([_valid(one, OURS) - _valid(one, name) for one in seeds]),
+            "success": over_seeds([_success(one, ours) - _success(one, name) for one in seeds]),
+            "log_likelihood_valid": over_seeds([_valid(one, ours) - _valid(one, name) for one in seeds]),
         }
         for name in others
     }

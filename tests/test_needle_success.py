@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from needle_curve import joined
 from needle_success import differences, over_seeds, page, summarize
 from provenance import ROOT, is_kept
 
@@ -117,3 +118,14 @@ def test_the_page_is_made_of_its_numbers():
     kept = [json.loads(path.read_text())["results"] for path in sorted(folder.glob("seed-*.json"))]
     assert content["results"] == {"methods": summarize(kept), "differences": differences(kept)}
     assert page(content["results"], len(kept), made_by) == (folder / "summary.md").read_text()
+
+
+def test_what_several_files_keep_of_a_seed_is_joined_by_method(seeds):
+    """Policies that are told the time step are kept in a file of their own."""
+    whole = seeds[0] | {"seed": 0, "count": 20}
+    clocked = {"methods": {"ddco_clock": rates((9, 10), (9, 10), (9, 9), 0.4)}, "seed": 0, "count": 20}
+    both = joined([whole, clocked | {"log_likelihood_per_step": {"ddco_clock": {"train": 27.0, "valid": 26.0}}}])
+    assert list(both["methods"]) == [*whole["methods"], "ddco_clock"] and both["count"] == 20
+    paired = differences([both], "ddco_clock")
+    assert paired["ddco"]["success"]["by_seed"] == [pytest.approx(0.9 - 0.3)]
+    assert paired["flat"]["log_likelihood_valid"]["by_seed"] == [pytest.approx(26.0 - 20.0)]
