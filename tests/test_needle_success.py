@@ -125,7 +125,8 @@ def test_what_several_files_keep_of_a_seed_is_joined_by_method(seeds):
     whole = seeds[0] | {"seed": 0, "count": 20}
     clocked = {"methods": {"ddco_clock": rates((9, 10), (9, 10), (9, 9), 0.4)}, "seed": 0, "count": 20}
     both = joined([whole, clocked | {"log_likelihood_per_step": {"ddco_clock": {"train": 27.0, "valid": 26.0}}}])
-    assert list(both["methods"]) == [*whole["methods"], "ddco_clock"] and both["count"] == 20
+    assert list(both["methods"]) == [*whole["methods"], "ddco_clock"]
+    assert both["count"] == 20
     paired = differences([both], "ddco_clock")
     assert paired["ddco"]["success"]["by_seed"] == [pytest.approx(0.9 - 0.3)]
     assert paired["flat"]["log_likelihood_valid"]["by_seed"] == [pytest.approx(26.0 - 20.0)]
