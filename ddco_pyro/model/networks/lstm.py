@@ -135,16 +135,15 @@ def _in_windows(
         return layer(values, inputs.batch, h * goes_on, c * goes_on)  # type: ignore[no-any-return]
     rest = min(-int(inputs.time[0]) % horizon, steps)  # of the window in which the first step lies
     whole, last = divmod(steps - rest, horizon)
-    sequences, parts, at = values.unflatten(1, (trajectories, steps)), [], 0
-    for windows, size in ((1, rest), (whole, horizon), (1, last)):
-        if windows and size:
-            seen = sequences[:, :, at : at + windows * size].flatten(1, 2)
+    parts: list[Tensor] = []
+    sequences = values.unflatten(1, (trajectories, steps)).split([rest, whole * horizon, last], dim=2)
+    for seen, windows in zip(sequences, (1, whole, 1), strict=True):
+        if size := seen.shape[2]:
             if parts or not rest:
                 h = c = h.new_zeros(trajectories * windows, *h.shape[1:])
-            said, h, c = layer(seen, (trajectories * windows, size), h, c)
+            said, h, c = layer(seen.flatten(1, 2), (trajectories * windows, size // windows), h, c)
             h, c = (state.unflatten(0, (trajectories, windows))[:, -1] for state in (h, c))
-            parts.append(said.unflatten(1, (trajectories, windows * size)))
-            at += windows * size
+            parts.append(said.unflatten(1, (trajectories, size)))
     return torch.cat(parts, dim=2).flatten(1, 2), h, c
 
 
