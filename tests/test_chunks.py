@@ -25,6 +25,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "mlp": {"policy": {"network": "mlp", "hidden": [8], "dropout": 0.3, "inputs": ["state"]}},
     "conv": {"policy": {**CONV, "dropout": 0.3}},
     "lstm over conv": {"policy": {"network": "lstm", "over": CONV, "hidden": 5}},
+    "lstm over conv, a horizon": {"policy": {"network": "lstm", "over": CONV, "hidden": [5, 3], "horizon": 5}},
     "lstm over branches, a trunk": {
         "trunk": {"network": "lstm", "over": {**BRANCHES, "hidden": [5]}, "hidden": [4, 5]}
     },

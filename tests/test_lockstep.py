@@ -45,6 +45,10 @@ MODELS = {
     "options": two_levels(["options"]),
     "hybrid": two_levels(["options", "control"]),
     "lstm": {"observations": [*OBSERVATIONS, "step"], "baseline": {"kind": "flat", "policy": {"network": "lstm"}}},
+    "windows": {
+        "observations": OBSERVATIONS,
+        "baseline": {"kind": "flat", "policy": {"network": "lstm", "horizon": 2}},
+    },
 }
 
 
@@ -56,7 +60,11 @@ def ragged(task):
 @pytest.mark.parametrize("spec", [MEAN, MARGINAL, SAMPLED], ids=["most likely", "marginal", "sampled"])
 @pytest.mark.parametrize(
     ("name", "weights", "actors"),
-    [("flat", (0,), {0}), ("lstm", (0,), {0}), ("options", (4, 6, 8), {0}), ("hybrid", (0, 2, 10), {0, 1, 2})],
+    [
+        *((name, (0,), {0}) for name in ("flat", "lstm", "windows")),
+        ("options", (4, 6, 8), {0}),
+        ("hybrid", (0, 2, 10), {0, 1, 2}),
+    ],
 )
 def test_together_as_alone(name, weights, actors, spec):
     """With models in which options change within an episode and, in the hybrid, an option of each level and the
@@ -73,7 +81,7 @@ def test_together_as_alone(name, weights, actors, spec):
             acted |= {next((d for d, choice in enumerate(row) if choice), len(row)) for row in found.choices.tolist()}
             changes += (np.diff(found.choices, axis=0) != 0).any(1).sum()
     assert acted == actors
-    assert changes > 1 or name in ("flat", "lstm")
+    assert changes > 1 or name in ("flat", "lstm", "windows")
 
 
 def test_environments_are_closed_when_one_fails():

@@ -19,7 +19,13 @@ def demonstration(steps):
     return Demonstration("demo_0", {"state": rng.normal(size=(steps, 3))}, rng.normal(size=(steps, 2)))
 
 
-@pytest.mark.parametrize(("counts", "network"), [((3,), "mlp"), ((2, 2), "mlp"), ((2, 2), "lstm")])
+WINDOWS = {"network": "lstm", "horizon": 4}
+
+
+@pytest.mark.parametrize(
+    ("counts", "network"),
+    [((3,), "mlp"), ((2, 2), "mlp"), ((2, 2), "lstm"), pytest.param((2, 2), WINDOWS, id="windows")],
+)
 def test_what_it_says_at_the_end_is_what_the_demonstration_says(counts, network):
     """Before the last control is known, the belief is the posterior of the demonstration without that control."""
     hierarchy, demo = make_hierarchy(counts, ("options", "control"), network), demonstration(6)

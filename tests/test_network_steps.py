@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stacked_networks import COPIES, assert_close, make, make_inputs, random_inputs, refused, separate
+from stacked_networks import COPIES, SHAPE, assert_close, make, make_inputs, random_inputs, refused, separate
 from torch import nn
 
 from ddco_pyro.model.networks import CLASSES, InputShape
@@ -45,7 +45,8 @@ users = st.sampled_from(
 def lstm(over):
     """An LSTM over another network."""
     some = st.lists(st.integers(1, 5), min_size=1, max_size=2)
-    return st.fixed_dictionaries({"network": st.just("lstm"), "over": over, "hidden": some})
+    horizon = st.none() | st.integers(1, 10)
+    return st.fixed_dictionaries({"network": st.just("lstm"), "over": over, "hidden": some, "horizon": horizon})
 
 
 def branches():
@@ -99,6 +100,32 @@ def test_lstms_are_separate_networks(over):
             own, _ = alone(own)
         expected.append(separate(network.layers, k)(own))
     assert_close(answer(network, inputs)[0], torch.stack(expected, dim=2))
+
+
+@pytest.mark.parametrize("start", [0, 4, 9, 11])
+@pytest.mark.parametrize("horizon", [1, 3, 5, 20])
+def test_a_memory_with_a_horizon_is_made_afresh_for_each_window(horizon, start):
+    """Windows are counted from the first step of a trajectory, at whichever step a call begins."""
+    network, k = make(network="lstm", hidden=[6, 5], horizon=horizon), COPIES - 1
+    everything = random_inputs(SHAPE, 2, 23, 0)
+    alone = nn.LSTM(SHAPE.vector, 6, batch_first=True), nn.LSTM(6, 5, batch_first=True)
+    for layer, own in zip(network.memory, alone, strict=True):
+        with torch.no_grad():
+            own.weight_ih_l0.copy_(layer.inputs.weight[k].T)
+            own.weight_hh_l0.copy_(layer.recurrent[k].T)
+            own.bias_ih_l0.copy_(layer.inputs.bias[k, 0])
+            own.bias_hh_l0.zero_()
+    expected = []
+    for first in range(0, 23, horizon):
+        values = everything.vector[:, first : first + horizon]
+        for own in alone:
+            values, _ = own(values)
+        expected.append(separate(network.layers, k)(values))
+    said, state = [], None
+    for part in (slice(0, start), slice(start, None)) if start else (slice(None),):
+        outputs, state = answer(network, everything.part(slice(None), part), state)
+        said.append(outputs[:, :, k])
+    assert_close(torch.cat(said, dim=1), torch.cat(expected, dim=1))
 
 
 def test_no_option_is_trained_by_another_options_memory():

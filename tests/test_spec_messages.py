@@ -88,6 +88,18 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "hierarchy.meta_policy.hidden: lstm has one layer at least; give its size",
     ),
     (
+        {"hierarchy.meta_policy": {"network": "lstm", "horizon": 0}},
+        "hierarchy.meta_policy.horizon: must be at least 1, got 0",
+    ),
+    (
+        {"hierarchy.meta_policy": {"network": "lstm", "horizon": 2.5}},
+        "hierarchy.meta_policy.horizon: must be a whole number, got 2.5",
+    ),
+    (
+        {"hierarchy.meta_policy": {"network": "mlp", "horizon": 10}},
+        "hierarchy.meta_policy.horizon: does not apply to network 'mlp'; leave it out",
+    ),
+    (
         {"hierarchy.meta_policy": {"network": "branches"}},
         "hierarchy.meta_policy.of: missing; name an observation and its network, such as {state: {network: mlp}}",
     ),

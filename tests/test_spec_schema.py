@@ -40,7 +40,12 @@ networks = st.one_of(
     ),
     st.fixed_dictionaries(
         {"network": st.just("lstm")},
-        optional={"over": st.none() | perceptrons, "hidden": st.lists(counts, min_size=1), "inputs": st.lists(texts)},
+        optional={
+            "over": st.none() | perceptrons,
+            "hidden": st.lists(counts, min_size=1),
+            "horizon": st.none() | counts,
+            "inputs": st.lists(texts),
+        },
     ),
     st.fixed_dictionaries({"network": st.just("linear")}),
     st.fixed_dictionaries(
@@ -153,6 +158,7 @@ def test_the_schema_says_which_networks_have_a_setting() -> None:
             "enum": ["linear", "mlp", "per_timestep", "conv", "lstm", "branches"]
         }
         assert properties["filters"]["description"].endswith(" For ``conv``.")
+        assert properties["horizon"]["description"].endswith(" For ``lstm``.")
         assert properties["hidden"]["description"].endswith(
             " For ``mlp``, ``per_timestep``, ``conv``, ``lstm``, ``branches``."
         )

@@ -100,11 +100,12 @@ class NumpyNetworks:
     def _lstm(self, node: Mapping[str, Any], name: str) -> np.ndarray:
         """K LSTMs; networks are evaluated in the order in which the state has theirs."""
         values = self._evaluate(node["of"], f"{name}.of")[:, None]
+        goes_on = np.float32(not node["horizon"] or self._step % node["horizon"] != 0)
         for layer in range(node["layers"]):
             weight, bias, recurrent = (
                 self._weights[f"{name}.{layer}.{part}"] for part in ("inputs.weight", "inputs.bias", "recurrent")
             )
-            h, c = (next(self._before).transpose(1, 0, 2) for _ in "hc")
+            h, c = (goes_on * next(self._before).transpose(1, 0, 2) for _ in "hc")
             take, keep, new, give = np.split(values @ weight + bias + h @ recurrent, 4, axis=2)
             c = _sigmoid(keep) * c + _sigmoid(take) * np.tanh(new)
             values = _sigmoid(give) * np.tanh(c)

@@ -100,6 +100,8 @@ class Recurrent(Network):
     over: NetworkSpec | None = None
     """The network whose last hidden layer it reads; null: it reads the observed vectors."""
     hidden: Sizes = (64,)
+    horizon: Count | None = None
+    """The memory starts anew every so many steps of a trajectory, counted from its first; null: never."""
 
 
 class Branched(Perceptron):

@@ -80,7 +80,7 @@ RECURRENT = {"network": "lstm", "over": {"hidden": [6]}, "hidden": [5, 4]}
 BRANCHES = {
     "network": "branches",
     "of": {
-        "camera": {"network": "lstm", "over": LEAKY | {"shared": True}, "hidden": 4},
+        "camera": {"network": "lstm", "over": LEAKY | {"shared": True}, "hidden": [4, 3], "horizon": 3},
         "pair": {"network": "mlp", "inputs": ["goal", "state"], "hidden": [6], "activation": "tanh"},
         "state": {"network": "lstm", "hidden": 3, "shared": True},
         "step": {"network": "linear"},

@@ -14,7 +14,8 @@ SHAPES = {"state": (3,)}
 
 def make_hierarchy(counts=(3,), emits=("options",), network="mlp", seed=0, trunk=None, **control):
     """A random hierarchy over 3 features and 2 control dimensions; ``counts`` lowest level first."""
-    levels = [{"name": f"level-{d}", "count": k, "policy": {"network": network}} for d, k in enumerate(counts, 1)]
+    reads = network if isinstance(network, dict) else {"network": network}
+    levels = [{"name": f"level-{d}", "count": k, "policy": dict(reads)} for d, k in enumerate(counts, 1)]
     for level in levels if trunk else ():
         level["trunk"] = trunk
     for level in levels[1:]:
@@ -25,7 +26,7 @@ def make_hierarchy(counts=(3,), emits=("options",), network="mlp", seed=0, trunk
             "observations": ["state"],
             "control": {"std": 0.7, **control},
             **(
-                {"hierarchy": {"levels": levels, "meta_policy": {"network": network, "emits": list(emits)}}}
+                {"hierarchy": {"levels": levels, "meta_policy": {**reads, "emits": list(emits)}}}
                 if counts
                 else {"baseline": "flat"}
             ),

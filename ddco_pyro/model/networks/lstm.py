@@ -21,12 +21,21 @@ class Lstm(nn.Module):
 
     They read what ``over`` gives, or else the vectors. The state is that of ``over``, then h and c [N, K, size] of each
     layer.
+
+    :param horizon: h and c are zeros again before every step whose number in its trajectory is a multiple of it.
     """
 
     def __init__(
-        self, shape: InputShape, outputs: int | None, copies: int, over: Trunk | None, hidden: tuple[int, ...]
+        self,
+        shape: InputShape,
+        outputs: int | None,
+        copies: int,
+        over: Trunk | None,
+        hidden: tuple[int, ...],
+        horizon: int | None,
     ) -> None:
         super().__init__()
+        self.horizon = horizon
         below = over or Trunk(Linear(shape, None, copies), shape.vector, copies)
         self.over = below.network
         sizes = zip([below.features, *hidden], hidden, strict=False)
@@ -47,7 +56,10 @@ class Lstm(nn.Module):
         values = options_first(features)
         for number, layer in enumerate(self._memory()):
             h, c = state[within + 2 * number :][:2]
-            values, *own = layer(values, inputs.batch, h, c)
+            if self.horizon is None:
+                values, *own = layer(values, inputs.batch, h, c)
+            else:
+                values, *own = _in_windows(layer, values, inputs, h, c, self.horizon)
             after = (*after, *own)
         return options_last(self.layers(values), inputs.batch), after
 
@@ -57,7 +69,8 @@ class Lstm(nn.Module):
         if of is None:
             return None
         layers = {str(number): layer for number, layer in enumerate(self.memory)}
-        return perceptrons(self.layers, over_layers(of, {"kind": "lstm", "layers": len(layers)}, layers))
+        facts = {"kind": "lstm", "layers": len(layers), "horizon": self.horizon}
+        return perceptrons(self.layers, over_layers(of, facts, layers))
 
     def _memory(self) -> list[StackedLstm]:
         return [layer for layer in self.memory if isinstance(layer, StackedLstm)]
@@ -108,6 +121,30 @@ class StackedLstm(nn.Module):
         """Weights and biases of each copy, as torch has them."""
         for weight, bias, recurrent in zip(self.inputs.weight, self.inputs.bias, self.recurrent, strict=True):
             yield [weight.mT, recurrent.mT, bias[0], torch.zeros_like(bias[0])]
+
+
+def _in_windows(
+    layer: StackedLstm, values: Tensor, inputs: Inputs, h: Tensor, c: Tensor, horizon: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What a layer gives where each window of ``horizon`` steps of a trajectory begins with zeros. Windows that are
+    there from their first step to their last are sequences of their own, all together.
+    """
+    trajectories, steps = inputs.batch
+    if steps == 1:  # without a branch, which a program of one step cannot hold
+        goes_on = (inputs.time % horizon != 0).to(h.dtype)
+        return layer(values, inputs.batch, h * goes_on, c * goes_on)  # type: ignore[no-any-return]
+    rest = min(-int(inputs.time[0]) % horizon, steps)  # of the window in which the first step lies
+    whole, last = divmod(steps - rest, horizon)
+    parts: list[Tensor] = []
+    sequences = values.unflatten(1, (trajectories, steps)).split([rest, whole * horizon, last], dim=2)
+    for seen, windows in zip(sequences, (1, whole, 1), strict=True):
+        if size := seen.shape[2]:
+            if parts or not rest:
+                h = c = h.new_zeros(trajectories * windows, *h.shape[1:])
+            said, h, c = layer(seen.flatten(1, 2), (trajectories * windows, size // windows), h, c)
+            h, c = (state.unflatten(0, (trajectories, windows))[:, -1] for state in (h, c))
+            parts.append(said.unflatten(1, (trajectories, size)))
+    return torch.cat(parts, dim=2).flatten(1, 2), h, c
 
 
 def _full_precision(device: torch.device) -> AbstractContextManager[None]:
