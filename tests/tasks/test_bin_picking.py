@@ -249,7 +249,8 @@ def test_a_simulation_that_breaks_down_ends_the_bin_with_finite_observations(env
 
 
 def test_nothing_to_be_seen_ends_the_bin(environment: Environment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bin_picking.camera, "masks", lambda _: np.zeros((geometry.IMAGE_SIZE, geometry.IMAGE_SIZE, 2), np.uint8))
+    black = np.zeros((geometry.IMAGE_SIZE, geometry.IMAGE_SIZE, 2), np.uint8)
+    monkeypatch.setattr(bin_picking.camera, "masks", lambda _: black)
     go(environment, (0.0, 0.02, 0.03), 0)
     assert go(environment, (0.0, 0.02, 0.03), 1).last()
     assert task.outcome(environment)["ended_unseen"] == 1.0
