@@ -39,6 +39,8 @@ from ddco_pyro.spec import load_spec
 SPEC = "specs/bin_picking.yaml"
 FOLDS = 5
 BEST = "the shape and the jaws' angle"
+SENT_BACK = 0.03  # of single objects, at which it is counted how many loads of several and of nothing are told
+BACK = ("several", "nothing")  # what is not carried to a cup
 FEWEST = 4  # pixels; fewer have no shape
 SHOWN_WITHIN = 13  # rows of the observed mask about the place where the load is shown
 PILES, FIRST_PILE = 200, 330_000
@@ -115,14 +117,28 @@ def from_observations(demos: Demonstrations) -> dict[str, Any]:
 
 
 def _read(inputs: np.ndarray, held: list[str], bins: list[int]) -> dict[str, Any]:
-    trees = ExtraTreesClassifier(500, random_state=0)
-    said = cross_val_predict(trees, inputs, np.array(held), groups=bins, cv=GroupKFold(FOLDS))
+    trees, names = ExtraTreesClassifier(500, random_state=0), np.unique(held)
+    folds = GroupKFold(FOLDS)
+    likely = cross_val_predict(trees, inputs, np.array(held), groups=bins, cv=folds, method="predict_proba")
+    said = names[np.argmax(likely, axis=1)]
     confused = Counter(zip(held, said.tolist(), strict=True))
     right = sum(count for (truth, guess), count in confused.items() if truth == guess)
     return {
         "accuracy": rate(right, len(held)),
+        "told": told(likely[:, np.isin(names, BACK)].sum(axis=1), held),
         "held, said": [[*pair, count] for pair, count in sorted(confused.items())],
     }
+
+
+def told(back: np.ndarray, held: list[str]) -> dict[str, Any]:
+    """Of loads of several and of nothing, how many are told where at most 3 % of single objects are sent back.
+
+    :param back: how likely it is [N] that a load is not a single object.
+    """
+    loads = np.array(held)
+    single = np.sort(back[~np.isin(loads, BACK)])
+    bound = single[-1 - int(SENT_BACK * len(single))]
+    return {name: rate(int((back[loads == name] > bound).sum()), int((loads == name).sum())) for name in BACK}
 
 
 def _where_shown(mask: np.ndarray) -> np.ndarray:
@@ -164,7 +180,9 @@ def page(results: dict[str, Any], made_by: str) -> str:
     lines += [f"| {name}, mean | {one['mean']:.2f} |" for name, one in results["bins"].items() if "mean" in one]
     read = results["from observations"]
     for name, one in read.items():
+        several, nothing = (rates.shown(one["told"][kind]) for kind in BACK)
         lines += ["", f"What is held, read by trees from {name}: {rates.shown(one['accuracy'])}."]
+        lines += [f"With {SENT_BACK:.0%} of single objects sent back: several told in {several}, nothing in {nothing}."]
     lines += ["", f"| held | said of {BEST} | times |", "|---|---|--:|"]
     lines += [f"| {held} | {name} | {count} |" for held, name, count in read[BEST]["held, said"]]
     return "\n".join(lines) + "\n"

@@ -132,8 +132,8 @@ class BinPicking(base.Task):
     def get_observation(self, physics: Physics) -> OrderedDict[str, np.ndarray]:
         """What cameras and encoders tell.
 
-        ``image`` uint8 [64, 64, 2]: masks of the objects, 0 and 255, of the left and the right eye; ``grasp`` [6]: the
-        trial's candidate, column and row (pixels of 256) in the left and the right picture, cosine and sine of the
+        ``image`` uint8 [72, 72, 2]: masks of the objects, 0 and 255, of the left and the right eye; ``grasp`` [6]: the
+        trial's candidate, column and row (pixels of 288) in the left and the right picture, cosine and sine of the
         gripper's turn; ``kin`` [7]: position (mm) and rotation vector (rad) of the gripper as the encoders give them,
         with kinematic error, and the angle between the jaws (rad), which objects between them keep from closing.
         """

@@ -12,7 +12,7 @@ from ..psm import Pose, rotation
 
 BIN_OUTSIDE = 0.029  # half the width of the bin, with its walls, and from the pile's middle to its near end
 BIN_INSIDE = 0.025
-BIN_FAR = 0.020  # by which its far end is further away than the near one
+BIN_FAR = 0.045  # by which its far end is further away than the near one
 CUPS = {"accept": np.array([-0.061, 0.0]), "reject": np.array([0.061, 0.0])}
 CUP_INSIDE = 0.026  # half the side
 FOAM_DEPTH = 0.006  # the foam gives way so far under the jaws
@@ -20,14 +20,14 @@ FOAM_DEPTH = 0.006  # the foam gives way so far under the jaws
 NEUTRAL_TURN = np.pi / 4  # of the gripper about the vertical, over the cups
 SHOWN_TURN = np.pi / 2  # where it shows what it holds, which is then along the bin's far wall
 GRASP_HEIGHT = 0.003  # of the middle of the pads
-SHOWING = np.array([0.0, 0.033, 0.030])  # over the bin's far end, where nothing is dropped
+SHOWING = np.array([0.0, 0.039, 0.038])  # over the bin's far end, where nothing stays
 RETURNING = np.array([0.0, 0.004, 0.024])  # over the pile again, where what is not to be carried is let go
 
-IMAGE_SIZE = 256  # pixels by side, as rendered
+IMAGE_SIZE = 288  # pixels by side, as rendered
 CAMERA_HEIGHT = 0.650
 BASELINE = 0.005
-CAMERA_Y = 0.010  # over the middle of the bin
-FIELD_OF_VIEW = np.deg2rad(6.3401)
+CAMERA_Y = 0.0145
+FIELD_OF_VIEW = np.deg2rad(7.1307)
 FOCAL_LENGTH = IMAGE_SIZE / 2 / np.tan(FIELD_OF_VIEW / 2)  # pixels
 MIDDLE = (IMAGE_SIZE - 1) / 2
 OBJECT_HEIGHT = 0.001  # of what lies on the floor; its depth in the pictures is taken for this

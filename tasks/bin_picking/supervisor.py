@@ -22,7 +22,7 @@ from .physics import Physics
 
 JAW_OPEN = 1.25  # rad, between the jaws: 12 mm between the pads
 OVER_CUP = 0.026  # m, the gripper's height where it lets go
-CARRY_HEIGHT = 0.034  # m
+CARRY_HEIGHT = 0.038  # m
 APPROACH_HEIGHTS = (0.025, 0.009, 0.0)  # m above the grasp, way points 0 to 2; the jaws close in the next
 LIFT_HEIGHT = 0.028  # m
 HALFWAY = 0.5  # of the way from the showing place to the cup, way point 6

@@ -212,11 +212,24 @@ def test_friction_holds_what_the_jaws_close_on_until_they_open(environment: Envi
     assert (attempt.lifted, attempt.returned) == ({number}, True)
 
 
+@pytest.mark.parametrize("turn", [0.0, np.pi / 4, np.pi / 2])
+@pytest.mark.parametrize("number", range(3))
+def test_what_falls_where_loads_are_shown_slides_back(environment: Environment, number: int, turn: float) -> None:
+    physics = environment.physics
+    quaternion = np.array([np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)])
+    physics.place_object(number, geometry.SHOWING - [0.0, 0.0, 0.008], quaternion)
+    for _ in range(2):
+        observation = go(environment, (0.0, 0.0, 0.03), 1).observation
+    assert physics.places()[number] == "bin"
+    assert physics.centres()[number][1] < 0.022
+    assert not observation["image"][:24].any()
+
+
 # What can go wrong: the episode ends, with a name.
 
 
 def test_an_object_outside_ends_the_bin(environment: Environment) -> None:
-    lay(environment, 1, (0.0, 0.055, 0.002))
+    lay(environment, 1, (0.0, 0.09, 0.002))
     assert go(environment, (0.0, 0.0, 0.03), 1).last()
     assert task.outcome(environment)["ended_lost"] == 1.0
 
@@ -236,7 +249,8 @@ def test_a_simulation_that_breaks_down_ends_the_bin_with_finite_observations(env
 
 
 def test_nothing_to_be_seen_ends_the_bin(environment: Environment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bin_picking.camera, "masks", lambda _: np.zeros((256, 256, 2), np.uint8))
+    black = np.zeros((geometry.IMAGE_SIZE, geometry.IMAGE_SIZE, 2), np.uint8)
+    monkeypatch.setattr(bin_picking.camera, "masks", lambda _: black)
     go(environment, (0.0, 0.02, 0.03), 0)
     assert go(environment, (0.0, 0.02, 0.03), 1).last()
     assert task.outcome(environment)["ended_unseen"] == 1.0

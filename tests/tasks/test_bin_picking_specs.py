@@ -45,7 +45,7 @@ def test_both_specs_are_here() -> None:
 def test_specs_are_checked_against_the_task(path: Path) -> None:
     spec = load_spec(path)
     known = dimensions(spec)
-    assert known.shapes == {"image": (64, 64, 2), "grasp": (6,), "kin": (7,)}
+    assert known.shapes == {"image": (72, 72, 2), "grasp": (6,), "kin": (7,)}
     assert check_networks(spec, known).depth == 1
 
 
