@@ -37,11 +37,13 @@ SPECS = Path(__file__).parents[1] / "specs"
 SIZE, FINER = (48, 64), 3
 SUPERVISOR = "scripted_noisy_0.3"
 
-METHODS = (
-    *("ff", "ff_flat", "ff_hybrid", "ff_two", "ff_two_flat"),
-    *("rnn", "rnn_flat", "rnn_hybrid", "encoded", "encoded_flat"),
-)
-"""``_flat``: as many parameters as the hierarchy beside it has with the options of its spec; ``ff_two``: of two
+METHODS = {
+    **dict.fromkeys(("ff", "ff_flat", "ff_two", "ff_two_flat"), "pushing_image_ff"),
+    **dict.fromkeys(("rnn", "rnn_flat"), "pushing_image_rnn"),
+    **{"ff_hybrid": "pushing_image_ff_hybrid", "rnn_hybrid": "pushing_image_rnn_hybrid"},
+    **dict.fromkeys(("encoded", "encoded_flat"), "pushing_mlp"),
+}
+"""The spec of each. ``_flat``: as many parameters as the hierarchy beside it has with the options of its spec; ``ff_two``: of two
 pictures side by side instead of one; ``encoded``: perceptrons over what the convolutions of ``ff_flat``, fitted to the
 same demonstrations, give of a picture and of :data:`COPIES` less one that are moved."""
 
@@ -125,19 +127,16 @@ class PictureCell(Cell):
 
 def spec_of(cell: PictureCell, settings: Settings) -> Spec:
     """The spec of a cell, whose pictures are small already."""
-    family = cell.method.partition("_")[0]
-    kind = "_hybrid" if cell.method.endswith("_hybrid") else ""
+    encoded = cell.method.startswith("encoded")
     changed: dict[str, Any] = {"seed": cell.seed, "demonstrations.count": cell.count}
     if cell.options:
         changed["hierarchy.levels.0.count"] = cell.options
-    if family == "encoded":
-        base = load_spec(SPECS / "pushing_mlp.yaml", [*ENCODED, *settings.overrides])
-    else:
+    if not encoded:
         changed |= {"observations.0.resize": None, "observations.0.frames": 2 if "_two" in cell.method else 1}
-        base = load_spec(SPECS / f"pushing_image_{family}{kind}.yaml", settings.overrides)
+    base = load_spec(SPECS / f"{METHODS[cell.method]}.yaml", [*(ENCODED if encoded else ()), *settings.overrides])
     spec = with_overrides(base, changed)
     trained = cell.count - max(1, round(cell.count * spec.training.tune_fraction))
-    trained *= COPIES if family == "encoded" else 1
+    trained *= COPIES if encoded else 1
     epochs = int(np.ceil(settings.values["updates"] / np.ceil(trained / spec.training.batch_size)))
     return with_overrides(spec, {"training.epochs": epochs})
 

@@ -10,7 +10,8 @@ import numpy as np
 import pushing_pictures as study
 import pytest
 from cells import described
-from pushing_pictures_cell import COPIES, DEFAULTS, SIZE, PictureCell, moved, spec_of
+from provenance import ROOT, sources, tree
+from pushing_pictures_cell import COPIES, DEFAULTS, METHODS, SIZE, PictureCell, moved, spec_of
 from pushing_pictures_results import at_one_std, differences, row_of
 from scipy import stats
 
@@ -119,6 +120,11 @@ def test_specs_of_cells(method, options, frames, emits):
     assert spec.hierarchy.levels[0].count == options
     assert spec.hierarchy.meta_policy.emits == emits
     assert spec.training.epochs == 112
+
+
+def test_results_depend_on_the_specs_of_their_cells():
+    known = sources(tree(ROOT), "python studies/pushing_pictures.py demonstrations")
+    assert {f"specs/{name}.yaml" for name in METHODS.values()} <= known.keys()
 
 
 def test_what_is_not_done_is_said(tmp_path: Path):
