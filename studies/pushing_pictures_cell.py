@@ -43,9 +43,9 @@ METHODS = {
     **{"ff_hybrid": "pushing_image_ff_hybrid", "rnn_hybrid": "pushing_image_rnn_hybrid"},
     **dict.fromkeys(("encoded", "encoded_flat"), "pushing_mlp"),
 }
-"""The spec of each. ``_flat``: as many parameters as the hierarchy beside it has with the options of its spec; ``ff_two``: of two
-pictures side by side instead of one; ``encoded``: perceptrons over what the convolutions of ``ff_flat``, fitted to the
-same demonstrations, give of a picture and of :data:`COPIES` less one that are moved."""
+"""The spec of each method. ``_flat``: as many parameters as the hierarchy beside it has with the options of its spec;
+``ff_two``: of two pictures side by side instead of one; ``encoded``: perceptrons over what the convolutions of
+``ff_flat``, fitted to the same demonstrations, give of a picture and of :data:`COPIES` less one that are moved."""
 
 ENCODED = (
     "observations=[camera_features]",
