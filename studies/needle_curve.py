@@ -1,7 +1,7 @@
 """Success on the needle task against the number of demonstrations.
 
-    python studies/needle_curve.py [--counts 10 20 40 80] [--clock] [--seeds 3] [--episodes 60] [--jobs 2]
-        [--set KEY=VALUE]... [--summarize]
+    python studies/needle_curve.py [--counts 10 20 40 80] [--clock] [--seeds 3] [--episodes 60]
+        [--fits NAME ...] [--jobs 2] [--set KEY=VALUE]... [--summarize]
 
 Trains on the first demonstrations of each training seed of ``needle_success.py``, whose results stand beside as those
 with 100 where they are there, as does what was kept of other numbers. With ``--clock`` it is the policies that are told

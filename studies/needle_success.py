@@ -1,10 +1,12 @@
 """Success and held-out log-likelihood on the needle task over training seeds (the table of SM 1.3).
 
-    python studies/needle_success.py [--seeds 5] [--episodes 200] [--jobs 2] [--set KEY=VALUE]... [--out DIR]
+    python studies/needle_success.py [--seeds 5] [--episodes 200] [--fits NAME ...] [--jobs 2] [--set KEY=VALUE]...
+        [--out DIR]
 
 Every seed has demonstrations of its own. The specs of the hierarchy, of the flat and of the per-timestep policy are
 fitted to them, the first two also with the time step as an observation; all are rolled out from the same starts.
-``--set`` changes the hierarchy's spec. What this code has done already with the same settings (``seed-N.json``, and
+``--set`` changes the hierarchy's spec, ``--fits`` does some of them again beside what is kept of the others. What this
+code has done already with the same settings (``seed-N.json``, and
 fits under ``runs``) is not done again. Writes ``summary.json``, ``summary.md`` and ``success.png``.
 """
 
@@ -58,15 +60,18 @@ def run_seed(seed: int, count: int, arguments: argparse.Namespace, made_by: Reco
     """Fit, roll out, and keep the numbers of one training seed that is given so many of its demonstrations."""
     path = kept_at(arguments.out, seed, count, clocked)
     settings = {"seed": seed, "count": count, "episodes": arguments.episodes, "overrides": arguments.set}
-    if path.exists() and is_kept(json.loads(path.read_text()), settings, made_by):
+    kept = json.loads(path.read_text()) if path.exists() else {"provenance": [], "results": {}}
+    if is_kept(kept, settings, made_by):
         return
+    whole = tuple(FITS) if count == ALL else CLOCKED if clocked else FEW
+    names = [name for name in whole if name in arguments.fits]
+    records, found = _beside(kept, settings) if len(names) < len(whole) else ([], {})
     first = DEMONSTRATIONS + APART * seed
     left_out = ", ".join(f"demo_{first + number}" for number in range(count, ALL))
     own = [f"seed={seed}", f"demonstrations.seed={first}", f"demonstrations.exclude=[{left_out}]"]
     own.append(f"rollout.seed={STARTS}")
     folder = arguments.runs / made_by["code"][:12] / path.stem
-    found: dict[str, Any] = {}
-    for name in FITS if count == ALL else CLOCKED if clocked else FEW:
+    for name in names:
         file, suffix, changes = FITS[name]
         scripted = () if (name, seed, count) == ("ddco", 0, ALL) else ("rollout.policies=[]",)
         spec = load_spec(file, [*own, *changes, *scripted, *(arguments.set if name.startswith(OURS) else ())])
@@ -75,7 +80,13 @@ def run_seed(seed: int, count: int, arguments: argparse.Namespace, made_by: Reco
             rolled = roll_out(fitted, arguments.episodes, jobs=1)
         for part, values in _numbers(fitted, rolled).items():
             found[part] = found.get(part, {}) | {f"{method}{suffix}": value for method, value in values.items()}
-    write_text(path, text(settings | found, [made_by]))
+    write_text(path, text(settings | found, [*records, made_by]))
+
+
+def _beside(kept: dict[str, Any], settings: dict[str, Any]) -> tuple[list[Record], Seed]:
+    """The records and numbers of what was done with these settings before, by whatever code; none with others."""
+    same = all(kept["results"].get(key) == value for key, value in settings.items())
+    return (kept["provenance"], dict(kept["results"])) if same else ([], {})
 
 
 def kept_at(out: Path, seed: int, count: int, clocked: bool = False) -> Path:
@@ -234,6 +245,7 @@ def described(text: str | None, seeds: int, episodes: int) -> argparse.ArgumentP
     parser.add_argument("--seeds", type=int, default=seeds)
     parser.add_argument("--episodes", type=int, default=episodes)
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--fits", nargs="+", default=list(FITS), choices=FITS)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--out", type=Path, default=Path("docs/results/needle"))
     parser.add_argument("--runs", type=Path, default=Path("runs/needle-success"))
@@ -243,7 +255,8 @@ def described(text: str | None, seeds: int, episodes: int) -> argparse.ArgumentP
 def words(arguments: argparse.Namespace) -> str:
     """What decides a result, as words of a command."""
     changes = "".join(f" --set '{change}'" for change in arguments.set)
-    return f"--seeds {arguments.seeds} --episodes {arguments.episodes}{changes}"
+    fits = "" if set(arguments.fits) == set(FITS) else f" --fits {' '.join(arguments.fits)}"
+    return f"--seeds {arguments.seeds} --episodes {arguments.episodes}{fits}{changes}"
 
 
 def run() -> str:

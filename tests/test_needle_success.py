@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 
+import needle_success
 import numpy as np
 import pytest
 from needle_curve import joined
@@ -130,3 +131,22 @@ def test_what_several_files_keep_of_a_seed_is_joined_by_method(seeds):
     paired = differences([both], "ddco_clock")
     assert paired["ddco"]["success"]["by_seed"] == [pytest.approx(0.9 - 0.3)]
     assert paired["flat"]["log_likelihood_valid"]["by_seed"] == [pytest.approx(26.0 - 20.0)]
+
+
+def test_some_fits_are_done_again_beside_what_is_kept_of_the_others(tmp_path, monkeypatch):
+    """The file then has the records of both codes; with other settings nothing that was kept is taken over."""
+    monkeypatch.setattr(needle_success, "fit", lambda spec, out: out.name)
+    monkeypatch.setattr(needle_success, "roll_out", lambda fitted, episodes, jobs: episodes)
+    monkeypatch.setattr(needle_success, "_numbers", lambda fitted, rolled: {"methods": {fitted: rolled}})
+    parser = needle_success.described(None, seeds=1, episodes=60)
+
+    def kept(code, *words):
+        asked = parser.parse_args([*words, "--out", str(tmp_path)])
+        needle_success.run_seed(0, 20, asked, {"code": code * 20})
+        content = json.loads((tmp_path / "count-020-seed-0.json").read_text())
+        return content["results"]["methods"], [one["code"][0] for one in content["provenance"]]
+
+    assert kept("a") == ({"ddco": 60, "flat": 60, "per_timestep": 60}, ["a"])
+    monkeypatch.setattr(needle_success, "_numbers", lambda fitted, rolled: {"methods": {fitted: -rolled}})
+    assert kept("b", "--fits", "ddco") == ({"ddco": -60, "flat": 60, "per_timestep": 60}, ["a", "b"])
+    assert kept("c", "--fits", "ddco", "--episodes", "7") == ({"ddco": -7}, ["c"])
