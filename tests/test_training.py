@@ -10,12 +10,11 @@ import torch
 from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plant, recovered
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.fitting.checkpoint import Progress, Restart
+from ddco_pyro.fitting.checkpoint import Restart
 from ddco_pyro.fitting.convergence import RISING, StageEnd
 from ddco_pyro.fitting.objective import TrainingError
 from ddco_pyro.fitting.stages import plan
-from ddco_pyro.fitting.training import advance
-from ddco_pyro.spec import parse_spec, with_overrides
+from ddco_pyro.spec import parse_spec
 
 
 def random_demonstrations(number=10, steps=8, seed=0):
@@ -62,26 +61,6 @@ def flat(kind="flat", network="linear", lr=0.03, **training):
 )
 def test_stages_go_from_the_lowest_level_up(training, depth, names):
     assert [stage.name for stage in plan(make_spec(**training), depth)] == names
-
-
-def test_a_meta_policy_that_nothing_trains_before_all_are_begins_with_its_options():
-    """Parts say which option a demonstration begins with and which one follows: before the last stage the meta-policy
-    knows it. Of when it would act itself they say nothing.
-    """
-    line = np.linspace(-1, 1, 12)[:, None] * [1.0, 0.0] + np.random.default_rng(0).normal(0, 0.02, (10, 12, 2))
-    demos = Demonstrations(tuple(Demonstration(f"demo_{n}", {"state": one}, one) for n, one in enumerate(line)))
-    own = {"initialize": "equal_parts", "layerwise": False, "optimizer": {"lr": 0.1}, "epochs": 800, "patience": None}
-    material = make_trainer(make_spec((3,), **own), demos, None).material
-    restart = Restart(Progress(0))
-    advance(material, restart, until=0)
-    model = material.hierarchy(0)
-    model.load_state_dict(restart.states["model"])
-    with torch.no_grad():
-        selects = model.tabulate(material.train).selection[0].exp().mean(0)[:, 0, 1:]
-    for step, option in ((0, 0), (4, 1), (8, 2)):
-        assert selects[step, option] > 0.8
-    acts = with_overrides(material.spec, {"hierarchy.meta_policy.emits": ["options", "control"]})
-    assert [stage.discovering for stage in plan(acts, 1)] == [1, None]
 
 
 def test_learning_rates_warm_up_and_fall_along_half_a_cosine(tmp_path, monkeypatch):

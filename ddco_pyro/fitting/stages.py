@@ -36,10 +36,7 @@ def plan(spec: Spec, depth: int) -> list[Stage]:
         own = (f"levels.{level - 1}.",) if level > 1 else ("trunk.", "levels.0.")
         if training.initialize != "random":
             kind = "parts" if training.initialize == "equal_parts" else "vq"
-            if level == depth and _meta_policy_begins(spec):
-                stages.append(Stage(f"{kind}-{level}", None, level, (*own, "meta_policy.")))
-            else:
-                stages.append(Stage(f"{kind}-{level}", level, level, own))
+            stages.append(Stage(f"{kind}-{level}", level, level, own))
         if training.layerwise:
             stages.append(Stage(f"level-{level}", level, None, own))
     if together:
@@ -51,11 +48,3 @@ def plan(spec: Spec, depth: int) -> list[Stage]:
     if not training.layerwise or training.lower_levels == "fine_tuned":
         stages.append(Stage("joint", None, None, everything))
     return stages
-
-
-def _meta_policy_begins(spec: Spec) -> bool:
-    """Whether the meta-policy is trained from the start with the options that it selects: where no stage trains it
-    before all are trained together, and it does not act itself, of which clusters and parts say nothing.
-    """
-    assert spec.hierarchy is not None  # only levels are clamped
-    return not spec.training.layerwise and "control" not in spec.hierarchy.meta_policy.emits
