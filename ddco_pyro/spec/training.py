@@ -74,8 +74,7 @@ class TrainingSpec(Model):
     ``equal_parts``: each demonstration cut into as many parts of equal length as there are options, for skills that
     follow one another; ``random``: random weights."""
     layerwise: bool = True
-    """Discover level after level, lowest first, and then the meta-policy, rather than all at once: then a meta-policy
-    that emits options alone begins with the options of the highest level, from its clusters or parts."""
+    """Discover level after level, lowest first, rather than all at once."""
     upper_levels: Literal["clusters", "segments"] = "clusters"
     """How levels above the lowest are discovered, layer by layer: ``clusters``: each as the lowest is, after the one
     below it; ``segments``: all together, from which options of the lowest level follow each other."""
