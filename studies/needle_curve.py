@@ -69,7 +69,7 @@ def names(curve: Curve) -> list[str]:
 
 def draw(curve: Curve, path: Path) -> None:
     """A line for each method: the mean, training seeds as dots, the interval as a bar."""
-    figure = Figure(figsize=(6, 3.6), layout="constrained")
+    figure = Figure(figsize=(7.2, 3.6), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     methods = names(curve)
@@ -85,7 +85,7 @@ def draw(curve: Curve, path: Path) -> None:
     axes.set(xscale="log", xlabel="demonstrations", ylabel="success rate", ylim=(-0.02, 1.02))
     axes.set_xticks([int(count) for count in curve], list(curve))
     axes.minorticks_off()
-    axes.legend(fontsize=8)
+    figure.legend(fontsize=8, loc="outside right upper")
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=120, format="png")
 
