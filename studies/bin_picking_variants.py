@@ -48,7 +48,7 @@ VARIANTS: dict[str, list[str]] = {
     **{f"demonstrations-{count}": _fewer(count) for count in (10, 20, 40)},
     "controls-pose": _controls("bin_picking_pose", 6),
     "controls-matrix": _controls("bin_picking_matrix", 12),
-    "pixels-32": [ALONE, "observations.0.resize=[13, 32]", "observations.0.augment.shift=2"],
+    "pixels-28": [ALONE, "observations.0.resize=[13, 28]", "observations.0.augment.shift=1"],
 }
 
 
