@@ -94,7 +94,7 @@ def attention(hierarchy: Hierarchy, demos: Demonstrations, options: np.ndarray) 
     one of ``options`` [N, T]; and what moves the meta-policy's choice, over those in which another one begins.
 
     The slopes g [F] of a number with an input, and the covariance Σ [F, F] of the input over all steps, give √(gᵀΣg);
-    this is divided by its sum over the inputs, and averaged over numbers and steps. The numbers are those of the
+    this is divided by its sum over the inputs, and averaged over numbers and steps, where anything moves them. The numbers are those of the
     control, the termination's logit, and log-probabilities of the choice.
     """
     each = [next(infer(hierarchy, [demo])).batch.inputs.loaded() for demo in demos]
@@ -147,8 +147,9 @@ def _spreads(slopes: Mapping[str, Tensor], centred: Mapping[str, Tensor]) -> dic
 
 def _shared(spread: Mapping[str, np.ndarray], steps: np.ndarray, numbers: slice) -> dict[str, float]:
     own = {key: values[steps, numbers] for key, values in spread.items()}
-    total = sum(own.values())
-    return {key: float((values / total).mean()) for key, values in own.items()}
+    total = np.sum([*own.values()], axis=0)
+    moved = total > 0  # nothing moves the log-probability of a choice that is certain
+    return {key: float((values[moved] / total[moved]).mean()) for key, values in own.items()}
 
 
 def acted(fit: Fit, seed: int) -> Episode:

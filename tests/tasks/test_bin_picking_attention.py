@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from bin_picking_options import attention
+from bin_picking_options import _shared, attention
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -69,3 +69,10 @@ def test_an_option_attends_to_what_spreads_times_its_weight(
         share = found[f"{what}, option {option}"]
         assert share["grasp"] == pytest.approx(spread["grasp"] / (spread["grasp"] + spread["kin"]), rel=1e-4)
         assert share["grasp"] + share["kin"] == pytest.approx(1.0)
+
+
+def test_what_nothing_moves_does_not_count() -> None:
+    """A choice that is certain in float32 has no slope at all."""
+    spread = {"image": np.array([[1.0, 0.0], [0.0, 3.0]]), "grasp": np.array([[3.0, 0.0], [0.0, 1.0]])}
+    shared = _shared(spread, np.array([True, True]), slice(None))
+    assert shared == {"image": pytest.approx(0.5), "grasp": pytest.approx(0.5)}
