@@ -94,8 +94,8 @@ def attention(hierarchy: Hierarchy, demos: Demonstrations, options: np.ndarray) 
     one of ``options`` [N, T]; and what moves the meta-policy's choice, over those in which another one begins.
 
     The slopes g [F] of a number with an input, and the covariance Σ [F, F] of the input over all steps, give √(gᵀΣg);
-    this is divided by its sum over the inputs, and averaged over numbers and steps, where anything moves them. The numbers are those of the
-    control, the termination's logit, and log-probabilities of the choice.
+    this is divided by its sum over the inputs, and averaged over numbers and steps, where anything moves them. The
+    numbers are those of the control, the termination's logit, and log-probabilities of the choice.
     """
     each = [next(infer(hierarchy, [demo])).batch.inputs.loaded() for demo in demos]
     arrays = [{**inputs.vectors, **inputs.images} for inputs in each]
