@@ -61,10 +61,10 @@ def run_seed(seed: int, count: int, arguments: argparse.Namespace, made_by: Reco
     path = kept_at(arguments.out, seed, count, clocked)
     settings = {"seed": seed, "count": count, "episodes": arguments.episodes, "overrides": arguments.set}
     kept = json.loads(path.read_text()) if path.exists() else {"provenance": [], "results": {}}
-    if is_kept(kept, settings, made_by):
-        return
     whole = tuple(FITS) if count == ALL else CLOCKED if clocked else FEW
     names = [name for name in whole if name in arguments.fits]
+    if (is_kept(kept, settings, made_by) and set(names) <= kept["results"]["methods"].keys()) or not names:
+        return
     records, found = _beside(kept, settings) if len(names) < len(whole) else ([], {})
     first = DEMONSTRATIONS + APART * seed
     left_out = ", ".join(f"demo_{first + number}" for number in range(count, ALL))

@@ -150,3 +150,6 @@ def test_some_fits_are_done_again_beside_what_is_kept_of_the_others(tmp_path, mo
     monkeypatch.setattr(needle_success, "_numbers", lambda fitted, rolled: {"methods": {fitted: -rolled}})
     assert kept("b", "--fits", "ddco") == ({"ddco": -60, "flat": 60, "per_timestep": 60}, ["a", "b"])
     assert kept("c", "--fits", "ddco", "--episodes", "7") == ({"ddco": -7}, ["c"])
+    monkeypatch.setattr(needle_success, "_numbers", lambda fitted, rolled: {"methods": {fitted: rolled}})
+    assert kept("c", "--episodes", "7") == ({"ddco": 7, "flat": 7, "per_timestep": 7}, ["c"])
+    assert kept("d", "--episodes", "7", "--fits", "flat_clock") == ({"ddco": 7, "flat": 7, "per_timestep": 7}, ["c"])
