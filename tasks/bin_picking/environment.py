@@ -26,7 +26,7 @@ from .. import psm
 from ..rendering import render
 from . import camera, candidates, supervisor
 from .controls import JOINTS, MATRIX, POSE, Controls, Scripted
-from .geometry import CUPS, IMAGE_SIZE, NEUTRAL_TURN, upright
+from .geometry import CUPS, IMAGE_SIZE, NEUTRAL_TURN, in_bin, lying_at, upright
 from .instrument import Instrument
 from .objects import KINDS, UNSEEN, scene
 from .physics import MOVE_TIME, SETTLE_TIME, Physics
@@ -39,6 +39,7 @@ REPEATABILITY = np.array([6e-4, 6e-4, 1e-4, 2e-3, 2e-3, 2e-3])  # rad, m: standa
 JAW_ERROR = 0.01  # rad: standard deviation of the angle that the jaws' encoder reads, as the backlash of the wrist
 LIFTED_HEIGHT = 0.018  # m: a gripper above this has lifted what it holds
 MOST_ATTEMPTS = 4 * MOST  # every fourth attempt at least brings an object into a cup
+BIN_SEEN = in_bin(lying_at(np.stack(np.meshgrid(*2 * [np.arange(IMAGE_SIZE, dtype=float)]), axis=-1)))
 FRAME_SIZE = (360, 480)
 SHARED_SOURCES = ("arm.py", "psm.py", "rendering.py", "vision.py")
 
@@ -46,15 +47,15 @@ SHARED_SOURCES = ("arm.py", "psm.py", "rendering.py", "vision.py")
 class BinPicking(base.Task):
     """Starts, observes and rewards an episode; ``controls`` is the form of its controls.
 
-    ``trials`` has what became of the attempts; of the trial at hand, ``left`` is how many objects were in the bin when
-    it began, and ``lifted`` those that the jaws first lifted, None before.
+    ``trials`` has what became of the attempts; of the trial at hand, ``remaining`` are the objects that were in no cup
+    when it began, and ``lifted`` those that the jaws first lifted, None before.
     """
 
     def __init__(self, kinds: Sequence[str], random: np.random.RandomState, controls: Controls = JOINTS) -> None:
         super().__init__(random=random)
         self.controls = controls
         self.trials = Trials(kinds)
-        self.left = len(kinds)
+        self.remaining = frozenset(range(len(kinds)))
         self.lifted: frozenset[int] | None = None
         self.jaw_open = True
         self._grasp = np.zeros(6)
@@ -71,7 +72,7 @@ class BinPicking(base.Task):
         self.jaw_open = self._was_open = True
         self._held: frozenset[int] = frozenset()
         self.lifted = None
-        self.left = physics.objects
+        self.remaining = frozenset(range(physics.objects))
         self._see(physics)
         self._next_candidate()
 
@@ -107,12 +108,12 @@ class BinPicking(base.Task):
 
     def _end_trial(self, physics: Physics, released: bool) -> None:
         places, lifted = physics.places(), self.lifted or frozenset()
-        held = self._held if released else physics.held()
+        held = (self._held if released else physics.held()) & (self.remaining | lifted)  # not what lies in a cup
         where = [places[number] for number in sorted(held)] or [physics.gripper_place()]
-        self.trials.add(Attempt(self.left, lifted, held, tuple(where) if released else (), self.trials.steps))
+        self.trials.add(Attempt(len(self.remaining), lifted, held, tuple(where) if released else (), self.trials.steps))
         self.lifted = None
-        self.left = sum(place not in CUPS for place in places)
-        if not self.left:
+        self.remaining = frozenset(number for number, place in enumerate(places) if place not in CUPS)
+        if not self.remaining:
             self.trials.end = End.CLEARED
         elif self.trials.missed():
             self.trials.end = End.MISSED
@@ -120,8 +121,8 @@ class BinPicking(base.Task):
             self._next_candidate()
 
     def _next_candidate(self) -> None:
-        """Draw the grasp of the next trial from what is seen."""
-        left = self._masks[..., 0]
+        """Draw the grasp of the next trial from what is seen in the bin."""
+        left = np.where(BIN_SEEN, self._masks[..., 0], 0)
         candidate = candidates.sample(left, self.random)
         if candidate is None:
             self.trials.end = End.UNSEEN

@@ -52,14 +52,20 @@ def project(points: np.ndarray, right: bool = False) -> np.ndarray:
 
 
 def lying_at(pixel: np.ndarray) -> np.ndarray:
-    """The point [3] of a lying object that the left eye sees at ``pixel`` [2]."""
+    """The point [..., 3] of a lying object that the left eye sees at ``pixel`` [..., 2]."""
     scale = (CAMERA_HEIGHT - OBJECT_HEIGHT) / FOCAL_LENGTH
-    x, y = (pixel[0] - MIDDLE) * scale - BASELINE / 2, CAMERA_Y + (MIDDLE - pixel[1]) * scale
-    return np.array([x, y, OBJECT_HEIGHT])
+    x, y = (pixel[..., 0] - MIDDLE) * scale - BASELINE / 2, CAMERA_Y + (MIDDLE - pixel[..., 1]) * scale
+    return np.stack([x, y, np.full_like(x, OBJECT_HEIGHT)], axis=-1)
+
+
+def in_bin(positions: np.ndarray) -> np.ndarray:
+    """Whether points [..., 3] are in the bin, or above it."""
+    half = [BIN_OUTSIDE, BIN_OUTSIDE + BIN_FAR / 2]
+    return np.all(np.abs(positions[..., :2] - [0.0, BIN_FAR / 2]) < half, axis=-1)
 
 
 def place_of(position: np.ndarray) -> str:
     """Where a point [3] is: ``bin``, ``accept``, ``reject``, or ``outside`` of all of them."""
-    if np.all(np.abs(position[:2] - [0.0, BIN_FAR / 2]) < [BIN_OUTSIDE, BIN_OUTSIDE + BIN_FAR / 2]):
+    if in_bin(position):
         return "bin"
     return next((name for name, cup in CUPS.items() if np.all(np.abs(position[:2] - cup) < CUP_INSIDE)), "outside")

@@ -158,7 +158,7 @@ class Supervisor(OpenLoop):
         (-1 otherwise), and how many were ``left`` in the bin when the trial began.
         """
         kind = (KINDS + UNSEEN).index(self._kinds[min(self._held)]) if len(self._held) == 1 else -1
-        return super().annotations | {"held": len(self._held), "kind": kind, "left": self._task.left}
+        return super().annotations | {"held": len(self._held), "kind": kind, "left": len(self._task.remaining)}
 
     def _rest(self) -> list[WayPoint]:
         if len(self._held) != 1:

@@ -16,7 +16,7 @@ class End(Enum):
     """How a bin ended."""
 
     CLEARED = "cleared"  # all objects are in cups
-    MISSED = "missed"  # four attempts in a row brought not exactly one object into a cup
+    MISSED = "missed"  # four attempts in a row brought not exactly one object into a cup, or too many were made
     LOST = "lost"  # an object lies outside of bin and cups
     UNSEEN = "unseen"  # objects are left, and none is seen
     FOAM = "foam"  # the jaws were pressed further into the foam than it gives way
@@ -74,8 +74,12 @@ class Trials:
         self.steps = 0
 
     def missed(self) -> bool:
-        """Whether the last four attempts brought nothing into a cup."""
+        """Whether the last four attempts brought nothing into a cup, or there were four for each object: so a bin ends
+        even where objects come back.
+        """
         last = self.attempts[-MOST_MISSES:]
+        if len(self.attempts) >= MOST_MISSES * len(self.kinds):
+            return True
         return len(last) == MOST_MISSES and not any(attempt.delivered for attempt in last)
 
     def measures(self) -> dict[str, float]:

@@ -256,6 +256,37 @@ def test_nothing_to_be_seen_ends_the_bin(environment: Environment, monkeypatch: 
     assert task.outcome(environment)["ended_unseen"] == 1.0
 
 
+def test_a_grasp_is_of_what_is_seen_in_the_bin(environment: Environment, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both eyes see the inner edge of the accept cup, too."""
+    seen = np.zeros((geometry.IMAGE_SIZE, geometry.IMAGE_SIZE, 2), np.uint8)
+    pixels = geometry.project(np.array([[-0.04, y, 0.002] for y in np.linspace(-0.02, 0.02, 81)])).round().astype(int)
+    seen[pixels[:, 1], pixels[:, 0]] = 255
+    monkeypatch.setattr(bin_picking.camera, "masks", lambda _: seen)
+    go(environment, (0.0, 0.02, 0.03), 0)
+    assert go(environment, (0.0, 0.02, 0.03), 1).last()
+    assert task.outcome(environment)["ended_unseen"] == 1.0
+
+
+def test_what_lies_in_a_cup_by_the_jaws_is_not_carried(environment: Environment) -> None:
+    """On others it is as high as what hangs in the jaws."""
+    lay(environment, 0, (-0.06, 0.0, 0.002))
+    for jaw in (0, 1):
+        go(environment, (0.0, 0.02, 0.03), jaw)
+    go(environment, (-0.061, 0.0, 0.026), 0)
+    lay(environment, 0, (-0.06, 0.0, 0.02))
+    assert environment.physics.held() == {0}
+    go(environment, (-0.061, 0.0, 0.026), 1)
+    last = environment.task.trials.attempts[-1]
+    assert (last.before, last.carried, last.places) == (2, frozenset(), ("accept",))
+
+
+def test_a_bin_ends_whatever_comes_and_goes() -> None:
+    """Four attempts for each object are enough where every fourth brings one into a cup."""
+    again = Attempt(2, frozenset({0}), frozenset({0}), ("accept",), 10)
+    ended = [Trials(["pin", "wire"], [again] * number).missed() for number in range(1, 9)]
+    assert ended == [False] * 7 + [True]
+
+
 def test_four_misses_in_a_row_end_the_bin(environment: Environment) -> None:
     jaws = [step % 2 for step in range(8)]  # close and open over the bin
     ended = [go(environment, (0.0, 0.02, 0.03), jaw).last() for jaw in jaws]
