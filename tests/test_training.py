@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +11,13 @@ import torch
 from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plant, recovered
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.fitting.checkpoint import Restart
+from ddco_pyro.fitting.checkpoint import Progress, Restart
 from ddco_pyro.fitting.convergence import RISING, StageEnd
-from ddco_pyro.fitting.objective import TrainingError
+from ddco_pyro.fitting.objective import Objective, TrainingError
 from ddco_pyro.fitting.stages import plan
-from ddco_pyro.spec import parse_spec
+from ddco_pyro.fitting.training import advance
+from ddco_pyro.inference import total_log_likelihood
+from ddco_pyro.spec import parse_spec, with_overrides
 
 
 def random_demonstrations(number=10, steps=8, seed=0):
@@ -61,6 +64,60 @@ def flat(kind="flat", network="linear", lr=0.03, **training):
 )
 def test_stages_go_from_the_lowest_level_up(training, depth, names):
     assert [stage.name for stage in plan(make_spec(**training), depth)] == names
+
+
+def lines(**training):
+    """Ten demonstrations along a line, cut into three equal parts, and how they are fitted."""
+    line = np.linspace(-1, 1, 12)[:, None] * [1.0, 0.0] + np.random.default_rng(0).normal(0, 0.02, (10, 12, 2))
+    demos = Demonstrations(tuple(Demonstration(f"demo_{n}", {"state": one}, one) for n, one in enumerate(line)))
+    own = {"initialize": "equal_parts", "layerwise": False, "optimizer": {"lr": 0.1}, "epochs": 800, "patience": None}
+    return make_trainer(make_spec((3,), **own, **training), demos, None).material
+
+
+def test_a_meta_policy_that_nothing_trains_before_all_are_begins_with_its_options():
+    """Parts say which option a demonstration begins with and which one follows: before the last stage the meta-policy
+    knows it, and options last. Of when it would act itself parts say nothing.
+    """
+    material, restart = lines(), Restart(Progress(0))
+    advance(material, restart, until=0)
+    model = material.hierarchy(0)
+    model.load_state_dict(restart.states["model"])
+    with torch.no_grad():
+        tables = model.tabulate(material.train)
+    selects, ends = tables.selection[0].exp().mean(0)[:, 0, 1:], tables.termination[0].exp().mean(0)[..., 1]
+    for option, (first, last) in enumerate(((0, 3), (4, 7), (8, 11))):
+        assert selects[first, option] > 0.8
+        assert ends[first + 1 : last + 1, option].max() < 0.2
+    acts = with_overrides(material.spec, {"hierarchy.meta_policy.emits": ["options", "control"]})
+    assert [stage.discovering for stage in plan(acts, 1)] == [1, None]
+
+
+@pytest.mark.parametrize("duration", [None, {"mean": 4, "weight": 2}])
+def test_beside_the_levels_under_a_uniform_meta_policy_the_meta_policy_learns_of_the_same_choices(duration):
+    """Gradients against those of each by itself: the levels' do not change, and the meta-policy's are those of the
+    clamped likelihood of the whole hierarchy.
+    """
+    material = lines(duration=duration)
+    stage, rows = plan(material.spec, 1)[0], torch.arange(len(material.train))
+    alone = replace(stage, discovering=1, selecting=False)
+    model = material.hierarchy(0)
+    found = gradients(model, Objective(material, Progress(0), stage), rows)
+    levels = gradients(model, Objective(material, Progress(0), alone), rows)
+    objective = Objective(material, Progress(0), stage)
+    tables = model.tabulate(material.train).clamp(1, objective.known[0][1])
+    model.zero_grad()
+    (-total_log_likelihood(tables, material.train.lengths) / material.train.steps).backward()
+    whole = {name: each.grad for name, each in model.named_parameters()}
+    for name, gradient in found.items():
+        expected = whole[name] if name.startswith("meta_policy.") else levels[name]
+        torch.testing.assert_close(gradient, expected)
+        assert gradient.abs().max() > 0
+
+
+def gradients(model, objective, rows):
+    model.zero_grad()
+    objective.ascend(model, rows)
+    return {name: each.grad.clone() for name, each in model.named_parameters() if each.grad is not None}
 
 
 def test_learning_rates_warm_up_and_fall_along_half_a_cosine(tmp_path, monkeypatch):

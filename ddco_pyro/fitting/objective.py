@@ -126,10 +126,14 @@ class Objective:
         return tables
 
     def _total(self, tables: Tables, batch: Batch) -> Tensor:
-        if self.constants is None:
-            value = total_log_likelihood(tables, batch.lengths, self.material.spec.inference.engine)
-        else:
+        likelihood = partial(total_log_likelihood, lengths=batch.lengths, engine=self.material.spec.inference.engine)
+        if self.constants is not None:
             value = expected(tables, batch.lengths, self.constants)
+        elif self.stage.selecting:
+            levels, meta_policy = tables.apart()
+            value = likelihood(levels) + likelihood(meta_policy)
+        else:
+            value = likelihood(tables)
         prior = self.material.spec.training.duration
         if prior is None:
             return value

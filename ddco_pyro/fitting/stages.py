@@ -14,6 +14,7 @@ class Stage:
     :param discovering: train levels 1 to d under a uniform meta-policy; None for the whole hierarchy.
     :param clamped: the level whose choices are clamped to clusters or parts of the demonstrations; None for no level.
     :param trained: prefixes of the names of the parameters that are trained.
+    :param selecting: the meta-policy is trained on the same choices, and the levels still have a uniform one.
     :param from_constants: networks take over what :class:`ddco_pyro.fitting.upper.Constants` say.
     """
 
@@ -21,6 +22,7 @@ class Stage:
     discovering: int | None
     clamped: int | None
     trained: tuple[str, ...]
+    selecting: bool = False
     from_constants: bool = False
 
 
@@ -36,7 +38,10 @@ def plan(spec: Spec, depth: int) -> list[Stage]:
         own = (f"levels.{level - 1}.",) if level > 1 else ("trunk.", "levels.0.")
         if training.initialize != "random":
             kind = "parts" if training.initialize == "equal_parts" else "vq"
-            stages.append(Stage(f"{kind}-{level}", level, level, own))
+            if level == depth and _meta_policy_begins(spec):
+                stages.append(Stage(f"{kind}-{level}", None, level, (*own, "meta_policy."), selecting=True))
+            else:
+                stages.append(Stage(f"{kind}-{level}", level, level, own))
         if training.layerwise:
             stages.append(Stage(f"level-{level}", level, None, own))
     if together:
@@ -48,3 +53,11 @@ def plan(spec: Spec, depth: int) -> list[Stage]:
     if not training.layerwise or training.lower_levels == "fine_tuned":
         stages.append(Stage("joint", None, None, everything))
     return stages
+
+
+def _meta_policy_begins(spec: Spec) -> bool:
+    """Whether the meta-policy is trained on the choices that the highest level is clamped to: where no stage trains it
+    before all are trained together, and it does not act itself, of which clusters and parts say nothing.
+    """
+    assert spec.hierarchy is not None  # only levels are clamped
+    return not spec.training.layerwise and "control" not in spec.hierarchy.meta_policy.emits

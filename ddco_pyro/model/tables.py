@@ -9,6 +9,7 @@ control itself, for this step. Below a choice 0 there is nothing left to choose,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -80,6 +81,14 @@ class Tables:
         each, choices = torch.arange(self.selection[level - 1].shape[-1]), choices.unsqueeze(-1)
         evidence[level - 1] = torch.where((choices == each) | (choices < 0), 0.0, NEVER)
         return replace(self, evidence=tuple(evidence))
+
+    def apart(self) -> tuple[Tables, Tables]:
+        """These tables with a uniform meta-policy, and with the meta-policy alone to differentiate."""
+        *lower, top = self.selection
+        uniform = torch.full_like(top, -math.log(top.shape[-1] - 1))
+        uniform[..., 0] = NEVER
+        fixed = Tables.of(self.depth, [None if table is None else table.detach() for table in self.leaves()])
+        return replace(self, selection=(*lower, uniform)), replace(fixed, selection=(*fixed.selection[:-1], top))
 
     def trajectory(self, n: int, length: int) -> Tables:
         """The first ``length`` steps of trajectory ``n`` alone, as tables with N = 1."""
