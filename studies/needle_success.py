@@ -157,14 +157,17 @@ def over_seeds(values: list[float], bounds: tuple[float, float] = (-np.inf, np.i
 
 
 def differences(seeds: list[Seed], ours: str = OURS) -> dict[str, dict[str, Any]]:
-    """Ours minus every other method that is trained, paired by seed: success, and held-out nats per step."""
+    """Ours minus every other method that is trained, paired by seed where there are both: success, and held-out nats
+    per step.
+    """
     others = [name for name in seeds[0]["log_likelihood_per_step"] if name != ours]
+    both = {name: [one for one in seeds if {ours, name} <= one["methods"].keys()] for name in others}
     return {
         name: {
-            "success": over_seeds([_success(one, ours) - _success(one, name) for one in seeds]),
-            "log_likelihood_valid": over_seeds([_valid(one, ours) - _valid(one, name) for one in seeds]),
+            "success": over_seeds([_success(one, ours) - _success(one, name) for one in paired]),
+            "log_likelihood_valid": over_seeds([_valid(one, ours) - _valid(one, name) for one in paired]),
         }
-        for name in others
+        for name, paired in both.items()
     }
 
 

@@ -86,6 +86,11 @@ def test_differences_are_paired_by_seed(seeds):
     assert found["log_likelihood_valid"]["by_seed"] == pytest.approx([1.0, 3.0])
 
 
+def test_a_seed_that_lacks_a_method_has_no_part_in_its_pairs(seeds):
+    more = {part: {"ddco": each["ddco"]} for part, each in seeds[1].items()}
+    assert differences([*seeds, more]) == differences(seeds)
+
+
 def test_the_page_gives_the_spread_between_seeds(seeds):
     text = page({"methods": summarize(seeds), "differences": differences(seeds)}, 2, "Made.")
     assert text.startswith("Made.\n")
