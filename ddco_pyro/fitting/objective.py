@@ -37,13 +37,15 @@ class Objective:
     """What a stage maximises: the log-likelihood with the choices that are known, and the log-prior of durations.
 
     Where networks take over :attr:`constants`, the expected log-probability of selections and terminations is in the
-    place of the log-likelihood.
+    place of the log-likelihood. Where levels and meta-policy are trained apart it is the sum of two, and their mean is
+    what is said of it.
     """
 
     def __init__(self, material: Material, progress: Progress, stage: Stage, ranks: Ranks = ALONE) -> None:
         self.material, self.progress, self.stage, self.ranks = material, progress, stage, ranks
         self.known: tuple[Known, Known] = {}, {}
         self.constants: Constants | None = None
+        self._likelihoods = 2 if stage.selecting else 1
         labels = material.labels
         if labels is not None and labels.matter_in(stage):
             self.known = {labels.level: labels.train}, {labels.level: labels.tune}
@@ -91,7 +93,7 @@ class Objective:
                 raise self._not_finite(tables, piece, rows[part])
             (-value / (steps or batch.steps)).backward()
             total += float(value.detach())
-        return total
+        return total / self._likelihoods
 
     def read_ahead(self, model: Hierarchy, shards: Sequence[Tensor]) -> None:
         """Have the pictures of shards of an epoch's minibatches read before :meth:`ascend` asks for them."""
@@ -117,7 +119,7 @@ class Objective:
         return sum(values) / tune.steps
 
     def _tuned(self, model: Hierarchy, rows: Tensor, batch: Batch) -> float:
-        return float(self._total(self._tables(model, batch, self.known[1], rows), batch))
+        return float(self._total(self._tables(model, batch, self.known[1], rows), batch)) / self._likelihoods
 
     def _tables(self, model: Hierarchy, batch: Batch, known: Known, rows: Tensor) -> Tables:
         tables = model.tabulate(batch, self.stage.discovering)
