@@ -90,8 +90,10 @@ def test_differences_are_standardised_apart_from_their_observation():
 
 @pytest.mark.parametrize("key", ["pose", "grid"])
 def test_bins_add_up_to_quantiles(key):
-    """How far each number has come through all of its parts together is scikit-learn's quantile transform."""
-    bins, raw = 4, rows(key)
+    """How far each number has come through all of its parts together is scikit-learn's quantile transform, where
+    quantiles are values that there are.
+    """
+    bins, raw = sum(LENGTHS) - 1, rows(key)
     encoder = fitted(ObservationSpec(key=key, bins=bins))
     seen = alive(encoder.inputs(demo.observations for demo in DEMOS).vector).astype(float)
     width, own = raw.shape[1], slice(raw.shape[1], None)
@@ -111,21 +113,34 @@ def test_differences_are_seen_in_bins_too():
     encoder = fitted(ObservationSpec(key="grid", differences=True, bins=2), ObservationSpec(key="pose"))
     raw = np.concatenate([encoder.features(demo.observations) for demo in DEMOS])
     assert (encoder.given, encoder.sizes) == ([8, 3], [24, 3])
-    middle = np.median(raw[:, :8], axis=0)
-    np.testing.assert_allclose(encoder.high[8:16], middle)
-    np.testing.assert_allclose(encoder.low[16:24], middle)
+    middle = encoder.high[8:16].numpy()
+    np.testing.assert_array_equal(encoder.low[16:24], middle)
+    for dimension, values in zip(middle, raw[:, :8].T, strict=True):
+        assert dimension in values
+        assert abs((np.unique(values) < dimension).mean() - 0.5) <= 0.5 / len(LENGTHS)
     assert torch.isinf(encoder.low[24:]).all()
 
 
-def test_a_part_that_holds_one_value_alone_is_only_centred():
-    """Half of the steps have one value, and so do the parts between quantiles there."""
+def test_a_value_that_most_steps_have_is_one_value_of_a_part():
+    """What is 0 but for a few steps, as the shape of what is seen at times, has its parts where it is not."""
     random = np.random.default_rng(0)
-    jaw = np.where(random.random((40, 1)) < 0.5, 1.25, random.random((40, 1)) / 5)
-    encoder = ObservationEncoder([ObservationSpec(key="jaw", bins=8)], {"jaw": (1,)})
+    area = np.where(random.random((200, 1)) < 0.9, 0.0, random.random((200, 1)) * 100)
+    encoder = ObservationEncoder([ObservationSpec(key="area", bins=4)], {"area": (1,)})
+    encoder.fit(Demonstrations((Demonstration("demo_0", {"area": area}, np.zeros((200, 1))),)))
+    different = np.unique(area)
+    ends = encoder.low[1:].numpy(), encoder.high[1:].numpy()
+    parts = [((different >= low) & (different < high)).sum() for low, high in zip(*ends, strict=True)]
+    np.testing.assert_allclose(parts, (len(different) - 1) / 4, atol=1)
+
+
+def test_a_part_that_holds_one_value_alone_is_only_centred():
+    """Of two values, one of five parts has them at its ends, and the others are of one; of one value, all are."""
+    jaw = np.column_stack([np.arange(40) % 2, np.ones(40)])
+    encoder = ObservationEncoder([ObservationSpec(key="jaw", bins=5)], {"jaw": (2,)})
     encoder.fit(Demonstrations((Demonstration("demo_0", {"jaw": jaw}, np.zeros((40, 1))),)))
     seen = encoder.inputs([{"jaw": jaw}]).vector[0].numpy()
-    assert np.isin(seen.std(0).round(4), [0, 1]).all()
-    assert (seen.std(0) < 1e-6).sum() >= 2
+    parts = seen[:, 2:].reshape(len(jaw), 5, 2)
+    np.testing.assert_allclose(np.sort(parts.std(0), axis=0), [[0, 0]] * 4 + [[1, 0]], atol=1e-6)
 
 
 def test_what_is_not_to_be_standardised_stays_as_it_is():

@@ -82,8 +82,9 @@ class ObservationEncoder(nn.Module):
     """Observations by name to one feature vector: differences appended, standardised where the spec says so.
 
     Where the spec has ``bins``, what networks see of a number x are besides min(max(x, q_k), q_{k+1}) between each two
-    neighbouring quantiles q of the demonstrations given to :meth:`fit`, standardised as x is: a piecewise-linear
-    encoding (Gorishniy, Rubachev and Babenko, On embeddings for numerical features in tabular deep learning, 2022).
+    neighbouring quantiles q of its different values in the demonstrations given to :meth:`fit`, standardised as x is: a
+    piecewise-linear encoding (Gorishniy, Rubachev and Babenko, On embeddings for numerical features in tabular deep
+    learning, 2022).
 
     Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model.
     Pictures are cut and scaled as the spec says when they are read, whether from a file or from memory.
@@ -168,11 +169,13 @@ class ObservationEncoder(nn.Module):
         return np.concatenate([np.tile(np.arange(first, first + count), 1 + spec.bins) for spec, first, count in rows])
 
     def _fit_bins(self, rows: np.ndarray) -> None:
-        """Take the ends of each part from ``rows`` [T, F]: quantiles of them."""
+        """Take the ends of each part from ``rows`` [T, F]: values that there are, with as many different ones between
+        each two. A value that most steps have is one of them: it does not leave all others to a single part.
+        """
         at = 0
         for spec, count, size in zip(self.specs, self.given, self.sizes, strict=True):
             own = rows[:, self.places[at : at + count].numpy()]
-            ends = torch.as_tensor(np.quantile(own, np.linspace(0, 1, spec.bins + 1), axis=0))
+            ends = torch.as_tensor(np.column_stack([_ends(values, spec.bins) for values in own.T]))
             self.low[at + count : at + size] = ends[:-1].flatten()
             self.high[at + count : at + size] = ends[1:].flatten()
             at += size
@@ -276,6 +279,11 @@ def refuse_unusable(demonstrations: Demonstrations, encoder: ObservationEncoder,
                 f"{demo.name}: {place} at step {step} is {sizes[step, column]:.2g} once it is scaled, and networks "
                 f"take at most {LARGEST_SCALED:g}; repair it, or leave {demo.name} out (demonstrations.exclude)"
             )
+
+
+def _ends(values: np.ndarray, bins: int) -> np.ndarray:
+    """The ends [bins + 1] of parts of the range of ``values`` [T] that hold equally many different values."""
+    return np.asarray(np.quantile(np.unique(values), np.linspace(0, 1, bins + 1), method="nearest"))
 
 
 def _transform(spec: ObservationSpec) -> Transform:

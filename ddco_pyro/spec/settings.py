@@ -82,8 +82,9 @@ class ObservationSpec(Model):
 
     bins: Annotated[int, Field(ge=0, le=64)] = 0
     """Vectors alone: behind its numbers and their differences, each of them again as often as this, cut off at the
-    ends of one of as many parts of its range, which hold as many training steps each (a piecewise-linear encoding).
-    So networks see what small differences say in a part of a wide range, as of jaws that are nearly closed."""
+    ends of one of as many parts of its range, which hold as many different values each (a piecewise-linear encoding).
+    So networks see what small differences say in a part of a wide range, as of jaws that are nearly closed, and what
+    differs among the few steps in which a number is not 0."""
 
     crop: Part | None = None
     """Pictures alone: top, left, height and width of the part that is seen, in the file's pixels; null: all of it."""
