@@ -7,12 +7,18 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from planted import make_trainer
 from sklearn.metrics import adjusted_rand_score
 
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.fitting.checkpoint import Progress
 from ddco_pyro.fitting.clusters import Clusters, EqualParts
+from ddco_pyro.fitting.objective import Objective
+from ddco_pyro.fitting.stages import plan
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.conv import POOLED
+from ddco_pyro.spec import parse_spec
 
 LENGTHS = (7, 4, 6)
 PLACES = np.array([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
@@ -87,6 +93,33 @@ def test_steps_that_look_alike_are_told_apart_by_their_controls_alone_if_asked_t
     batch = make_batch(vector, actions)
     assert adjusted_rand_score(move, alive(Clusters(batch, 2, seed=0, controls=True).choices(batch))) == 1
     assert adjusted_rand_score(move, alive(Clusters(batch, 2, seed=0).choices(batch))) < 0.5
+
+
+@pytest.mark.parametrize(("read", "found"), [(["quiet"], "quiet"), ([], "loud")])
+def test_what_options_do_not_read_does_not_begin_them(read, found):
+    """Two observations say different things; the meta-policy reads both, and options those that they name."""
+    steps = sum(LENGTHS)
+    truth = {"quiet": np.arange(steps) % 2, "loud": np.arange(steps) // 2 % 2}
+    rows = {"quiet": truth["quiet"][:, None], "loud": np.repeat(truth["loud"][:, None], 9, axis=1)}
+    cuts = np.cumsum(LENGTHS)[:-1]
+    parts = {key: np.split(each + 0.01 * random_rows(3, each.shape[1]), cuts) for key, each in rows.items()}
+    each = [{key: parts[key][number] for key in parts} for number in range(len(LENGTHS))]
+    demos = tuple(Demonstration(f"demo_{n}", one, np.arange(len(one["quiet"]))[:, None]) for n, one in enumerate(each))
+    networks = {key: {"network": "linear", "inputs": read} for key in ("policy", "termination")}
+    spec = parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": ["quiet", "loud"],
+            "control": {"std": 1.0},
+            "hierarchy": {"levels": [{"count": 2, **networks}]},
+            "training": {"initialize": "vq", "tune_fraction": 0.3},
+        }
+    )
+    material = make_trainer(spec, Demonstrations(demos), None).material
+    objective = Objective(material, Progress(0), plan(spec, 1)[0])
+    known = [int(name.removeprefix("demo_")) for name in material.names]
+    truths = np.concatenate([np.split(truth[found], cuts)[number] for number in known])
+    assert adjusted_rand_score(truths, alive(objective.known[0][1], [LENGTHS[number] for number in known])) == 1
 
 
 @pytest.mark.parametrize(("spread", "found"), [(1.0, "place"), (3.0, "move")])

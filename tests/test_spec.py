@@ -91,6 +91,23 @@ def test_std_is_a_number_or_learned() -> None:
     assert parse_spec(SMALL, {"control.scale": [1, 0.5]}).control.scale == (1.0, 0.5)
 
 
+@pytest.mark.parametrize(
+    ("level", "read"),
+    [
+        ({}, ()),
+        ({"policy": {"inputs": ["a", "b"]}, "termination": {"inputs": ["b", "c"]}}, ("a", "b", "c")),
+        ({"policy": {"inputs": ["a"]}}, ()),
+        ({"trunk": {"network": "branches", "of": {"a": {}, "x": {"inputs": ["c", "a"]}}}}, ("a", "c")),
+        ({"trunk": {"network": "lstm", "over": {"network": "branches", "of": {"a": {"network": "conv"}}}}}, ("a",)),
+        ({"trunk": {"network": "lstm", "inputs": ["b"]}}, ("b",)),
+    ],
+)
+def test_what_the_options_of_a_level_read(level: dict[str, object], read: tuple[str, ...]) -> None:
+    hierarchy = HierarchySpec.model_validate({"levels": [{"count": 2, **level}]})
+    assert hierarchy.read_by(1) == read
+    assert HierarchySpec.model_validate({"levels": [{"count": 2}], "trunk": {"inputs": ["c"]}}).read_by(1) == ("c",)
+
+
 def test_a_network_of_ones_own_takes_options() -> None:
     network = {"network": "my_package.nets:Net", "options": {"width": 3, "names": ["a", "b"]}}
     spec = parse_spec(SMALL, {"hierarchy.meta_policy": network})

@@ -7,7 +7,7 @@ at any level. Where some steps have labels, clusters start from the means of tho
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -32,15 +32,22 @@ class Clusters:
     :param labels: the options of the steps that have one, 1 to m, -1 for the others, [N, T]: the clusters of these
         options start from the means of their steps, the others as k-means++ does from there. Where all options have
         labelled steps clusters move once: further iterations may let two of them change places.
+    :param read: names of the observations that are clustered, those of the options' networks; all where there is none.
 
     Fewer than ``options`` clusters are found where there are fewer distinct observations. Of more steps than
     :func:`most_rows` as many are drawn at random, and the clusters are theirs.
     """
 
     def __init__(
-        self, batch: Batch, options: int, seed: int, controls: bool = False, labels: Tensor | None = None
+        self,
+        batch: Batch,
+        options: int,
+        seed: int,
+        controls: bool = False,
+        labels: Tensor | None = None,
+        read: Sequence[str] = (),
     ) -> None:
-        self._controls = controls
+        self._controls, self._read = controls, read
         self._most = most_rows(next(self._blocks(batch)).shape[1])
         chosen = np.ones(batch.steps, dtype=bool)
         chosen[np.random.default_rng(seed).permutation(batch.steps)[self._most :]] = False
@@ -62,8 +69,10 @@ class Clusters:
         for row, length in enumerate(batch.lengths.tolist()):
             alone, first = batch.inputs.part(torch.tensor([row]), slice(0, length)), 0
             for inputs in alone.chunks(FRAMES_AT_ONCE if alone.images else length):
-                means = [block_means(image[0]) for image in inputs.loaded().images.values()]
-                seen = torch.cat([inputs.vector[0], *means], dim=-1).double().numpy()
+                loaded = inputs.loaded()
+                given = loaded.select(self._read) if self._read else loaded
+                means = [block_means(image[0]) for image in given.images.values()]
+                seen = torch.cat([given.vector[0], *means], dim=-1).double().numpy()
                 last = first + len(seen)
                 yield joined(seen, batch.actions[row, first:last].double().numpy()) if self._controls else seen
                 first = last

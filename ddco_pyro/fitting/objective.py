@@ -61,7 +61,8 @@ class Objective:
             start: EqualParts | Clusters = EqualParts(count)
         else:
             seed = material.seed(self.progress.restart, self.progress.stage)
-            start = Clusters(material.train, count, seed, kind == "vq_controls", self.known[0].get(level))
+            labels, read = self.known[0].get(level), hierarchy.read_by(level)
+            start = Clusters(material.train, count, seed, kind == "vq_controls", labels, read)
         for known, batch in zip(self.known, (material.train, material.tune), strict=True):
             choices = start.choices(batch)
             labelled = known.get(level, choices)

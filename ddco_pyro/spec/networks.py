@@ -164,6 +164,16 @@ class NetworkSpec(UserDefined, Convolution, Recurrent, Branched):
         kind = SETTINGS[self.network]
         return {key: getattr(self, key) for key in kind.model_fields if key not in Network.model_fields}
 
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Names of the observations that it reads, itself or through others; all of them where there is none."""
+        if self.inputs:
+            return self.inputs
+        if self.over is not None:
+            return self.over.reads
+        branches = (branch.inputs or (name,) for name, branch in self.of.items())
+        return tuple(dict.fromkeys(name for names in branches for name in names))
+
     @field_validator("network")
     @classmethod
     def _known_network(cls, name: str) -> str:
