@@ -96,8 +96,8 @@ def test_steps_that_look_alike_are_told_apart_by_their_controls_alone_if_asked_t
 
 
 @pytest.mark.parametrize(("read", "found"), [(["quiet"], "quiet"), ([], "loud")])
-def test_what_options_do_not_read_does_not_begin_them(read, found):
-    """Two observations say different things; the meta-policy reads both, and options those that they name."""
+def test_what_policies_of_options_do_not_read_does_not_begin_them(read, found):
+    """Two observations say different things; terminations and meta-policy read both, policies what they name."""
     steps = sum(LENGTHS)
     truth = {"quiet": np.arange(steps) % 2, "loud": np.arange(steps) // 2 % 2}
     rows = {"quiet": truth["quiet"][:, None], "loud": np.repeat(truth["loud"][:, None], 9, axis=1)}
@@ -105,13 +105,12 @@ def test_what_options_do_not_read_does_not_begin_them(read, found):
     parts = {key: np.split(each + 0.01 * random_rows(3, each.shape[1]), cuts) for key, each in rows.items()}
     each = [{key: parts[key][number] for key in parts} for number in range(len(LENGTHS))]
     demos = tuple(Demonstration(f"demo_{n}", one, np.arange(len(one["quiet"]))[:, None]) for n, one in enumerate(each))
-    networks = {key: {"network": "linear", "inputs": read} for key in ("policy", "termination")}
     spec = parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5"},
             "observations": ["quiet", "loud"],
             "control": {"std": 1.0},
-            "hierarchy": {"levels": [{"count": 2, **networks}]},
+            "hierarchy": {"levels": [{"count": 2, "policy": {"network": "linear", "inputs": read}}]},
             "training": {"initialize": "vq", "tune_fraction": 0.3},
         }
     )

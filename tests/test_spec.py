@@ -95,14 +95,13 @@ def test_std_is_a_number_or_learned() -> None:
     ("level", "read"),
     [
         ({}, ()),
-        ({"policy": {"inputs": ["a", "b"]}, "termination": {"inputs": ["b", "c"]}}, ("a", "b", "c")),
-        ({"policy": {"inputs": ["a"]}}, ()),
+        ({"policy": {"inputs": ["a", "b"]}, "termination": {"inputs": ["b", "c"]}}, ("a", "b")),
         ({"trunk": {"network": "branches", "of": {"a": {}, "x": {"inputs": ["c", "a"]}}}}, ("a", "c")),
         ({"trunk": {"network": "lstm", "over": {"network": "branches", "of": {"a": {"network": "conv"}}}}}, ("a",)),
         ({"trunk": {"network": "lstm", "inputs": ["b"]}}, ("b",)),
     ],
 )
-def test_what_the_options_of_a_level_read(level: dict[str, object], read: tuple[str, ...]) -> None:
+def test_what_the_policies_of_a_level_read(level: dict[str, object], read: tuple[str, ...]) -> None:
     hierarchy = HierarchySpec.model_validate({"levels": [{"count": 2, **level}]})
     assert hierarchy.read_by(1) == read
     assert HierarchySpec.model_validate({"levels": [{"count": 2}], "trunk": {"inputs": ["c"]}}).read_by(1) == ("c",)

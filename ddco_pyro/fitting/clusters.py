@@ -32,7 +32,7 @@ class Clusters:
     :param labels: the options of the steps that have one, 1 to m, -1 for the others, [N, T]: the clusters of these
         options start from the means of their steps, the others as k-means++ does from there. Where all options have
         labelled steps clusters move once: further iterations may let two of them change places.
-    :param read: names of the observations that are clustered, those of the options' networks; all where there is none.
+    :param read: names of the observations that are clustered, those of the options' policies; all where there is none.
 
     Fewer than ``options`` clusters are found where there are fewer distinct observations. Of more steps than
     :func:`most_rows` as many are drawn at random, and the clusters are theirs.

@@ -69,10 +69,9 @@ class HierarchySpec(Model):
     """The policy that selects from the highest level, η."""
 
     def read_by(self, level: int) -> tuple[str, ...]:
-        """Names of the observations that the options of a level, 1 for the lowest, read; all of them where none is."""
-        networks = [reader for _, reader in self.levels[level - 1].readers] if self.trunk is None else [self.trunk]
-        each = [network.reads for network in networks]
-        return tuple(dict.fromkeys(name for names in each for name in names)) if all(each) else ()
+        """Names of the observations that the policies of a level, 1 for the lowest, read; all of them where none is."""
+        own = self.levels[level - 1]
+        return (self.trunk or own.trunk or own.policy).reads
 
     @field_validator("levels")
     @classmethod

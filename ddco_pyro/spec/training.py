@@ -70,9 +70,9 @@ class TrainingSpec(Model):
     """How the model is trained."""
 
     initialize: Literal["vq", "vq_controls", "equal_parts", "random"] = "vq"
-    """``vq``: by vector quantisation of the observations that the options read (SM 2.2); ``vq_controls``: of these and
-    controls; ``equal_parts``: each demonstration cut into as many parts of equal length as there are options, for
-    skills that follow one another; ``random``: random weights."""
+    """``vq``: by vector quantisation of the observations that the options' policies read (SM 2.2); ``vq_controls``: of
+    these and controls; ``equal_parts``: each demonstration cut into as many parts of equal length as there are options,
+    for skills that follow one another; ``random``: random weights."""
     layerwise: bool = True
     """Discover level after level, lowest first, rather than all at once."""
     upper_levels: Literal["clusters", "segments"] = "clusters"

@@ -21,7 +21,7 @@ from ddco_pyro.spec import load_spec
 SPECS = sorted((Path(__file__).parents[2] / "specs").glob("bin_picking*.yaml"))
 SEEDS = (2, 15)  # bins of three objects
 TINY = [
-    "observations=[{key: image, resize: [16, 16]}, grasp, kin]",
+    "observations=[{key: image, resize: [16, 16]}, grasp, kin, load]",
     "demonstrations.valid_fraction=0",
     "compare_with=[]",
     "training.epochs=4",
@@ -45,7 +45,7 @@ def test_both_specs_are_here() -> None:
 def test_specs_are_checked_against_the_task(path: Path) -> None:
     spec = load_spec(path)
     known = dimensions(spec)
-    assert known.shapes == {"image": (72, 72, 2), "grasp": (6,), "kin": (7,)}
+    assert known.shapes == {"image": (72, 72, 2), "grasp": (6,), "kin": (7,), "load": (18,)}
     assert check_networks(spec, known).depth == 1
 
 
