@@ -49,7 +49,7 @@ LABELS = ("phase", "kind")
 FRAMES = 11  # of the bin, as many as a trial has with its end
 PART = (slice(90, 270), slice(90, 390))  # of a frame, where something happens
 
-SHADES = {"image": "#1f3b73", "grasp": "#c9a227", "kin": "#5b8c5a"}
+SHADES = {"image": "#1f3b73", "grasp": "#c9a227", "kin": "#5b8c5a", "load": "#a23b3b"}
 
 Attention = dict[str, dict[str, float]]
 """Of what options and meta-policy do, the part of each input in what it would change with."""

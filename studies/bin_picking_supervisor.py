@@ -3,10 +3,10 @@
     python studies/bin_picking_supervisor.py [--demonstrations 60] [--out DIR]
 
 Collects as many demonstrations as ``specs/bin_picking.yaml`` has, or others, unless they have been. What is held at the
-moment of decision is also read from the observed left mask, where the load is shown, and from how far the jaws are
-closed, by a classifier that is tested on bins it was not trained on: it says how much of that a policy can know. What a
-first grasp takes from a pile of five, as the paper counts, is measured on fresh ones. Writes ``supervisor.json`` and
-``supervisor.md``.
+moment of decision is also read from the observed left mask, from the shape of the load in it, and from how far the jaws
+are closed, by a classifier that is tested on bins it was not trained on: it says how much of that a policy can know.
+What a first grasp takes from a pile of five, as the paper counts, is measured on fresh ones. Writes
+``supervisor.json`` and ``supervisor.md``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import rates
 from ddco_tasks.bin_picking import camera
@@ -41,7 +40,6 @@ FOLDS = 5
 BEST = "the shape and the jaws' angle"
 SENT_BACK = 0.03  # of single objects, at which it is counted how many loads of several and of nothing are told
 BACK = ("several", "nothing")  # what is not carried to a cup
-FEWEST = 4  # pixels; fewer have no shape
 SHOWN_WITHIN = 13  # rows of the observed mask about the place where the load is shown
 PILES, FIRST_PILE = 200, 330_000
 """Fresh piles of five, and the seed of the first."""
@@ -96,21 +94,21 @@ def left_five(demos: Demonstrations) -> list[int]:
 
 
 def from_observations(demos: Demonstrations) -> dict[str, Any]:
-    """How often pixels of the left mask, the shape seen in it, and that with the jaws' angle say what is held.
+    """How often pixels of the left mask, the shape of the load in it, and that with the jaws' angle say what is held.
 
     Every bin is predicted from the others.
     """
-    shown, jaws, held, bins = [], [], [], []
+    pixels, shapes, jaws, held, bins = [], [], [], [], []
     for number, demo in enumerate(demos):
         for t in decisions(demo):
-            shown.append(_where_shown(np.asarray(demo.observations["image"][int(t)])[..., 0]))
+            pixels.append(_where_shown(np.asarray(demo.observations["image"][int(t)])[..., 0]).ravel())
+            shapes.append(demo.observations["load"][t])
             jaws.append(demo.observations["kin"][t, 6])
             held.append(_name(demo, t))
             bins.append(number)
-    shapes = np.array([shape(seen) for seen in shown])
     inputs = {
-        "the pixels of the left mask": np.array([seen.ravel() for seen in shown]),
-        "the shape of the left mask": shapes,
+        "the pixels of the left mask": np.array(pixels),
+        "the shape of the load": np.array(shapes),
         BEST: np.column_stack([shapes, jaws]),
     }
     return {name: _read(one, held, bins) for name, one in inputs.items()}
@@ -144,21 +142,6 @@ def told(back: np.ndarray, held: list[str]) -> dict[str, Any]:
 def _where_shown(mask: np.ndarray) -> np.ndarray:
     row = round(project(SHOWING)[1] * camera.OBSERVED_SIZE / IMAGE_SIZE)
     return (mask[max(0, row - SHOWN_WITHIN) : row + SHOWN_WITHIN] > 0).astype(np.uint8)
-
-
-def shape(seen: np.ndarray) -> np.ndarray:
-    """What is seen in a mask [H, W] of 0 and 1, in numbers: its pixels and those inside it, its parts, its spread along
-    and across, Hu's moments, and where it begins and ends.
-    """
-    rows, columns = np.nonzero(seen)
-    if len(rows) < FEWEST:
-        return np.zeros(15)
-    inside = cv2.erode(seen, np.ones((2, 2), np.uint8)).sum()
-    moments = cv2.HuMoments(cv2.moments(seen, binaryImage=True)).ravel()
-    spread = np.linalg.eigvalsh(np.cov(columns, rows))
-    parts = cv2.connectedComponents(seen)[0]
-    extent = [columns.min(), columns.max(), rows.min()]
-    return np.array([len(rows), inside, parts, *spread, *(np.sign(moments) * np.log(np.abs(moments) + 1e-9)), *extent])
 
 
 def _name(demo: Demonstration, t: int) -> str:
@@ -200,7 +183,7 @@ def main() -> None:
     command = f"python studies/bin_picking_supervisor.py --demonstrations {own.demonstrations}"
     made_by = record(command)
     path = collect("bin_picking", plan.model_copy(update={"count": own.demonstrations}))
-    demos = Demonstrations.read(path, ["image", "kin"], labels=("phase", "held", "kind", "left"))
+    demos = Demonstrations.read(path, ["image", "kin", "load"], labels=("phase", "held", "kind", "left"))
     results = {
         "demonstrations": len(demos),
         "steps": sum(demos.lengths),

@@ -30,6 +30,7 @@ from .geometry import CUPS, IMAGE_SIZE, NEUTRAL_TURN, in_bin, lying_at, upright
 from .instrument import Instrument
 from .objects import KINDS, UNSEEN, scene
 from .physics import MOVE_TIME, SETTLE_TIME, Physics
+from .shape import load_of
 from .supervisor import JAW_OPEN, OVER_CUP
 from .trials import MOST_STEPS, Attempt, End, Trials
 
@@ -136,7 +137,9 @@ class BinPicking(base.Task):
         ``image`` uint8 [72, 72, 2]: masks of the objects, 0 and 255, of the left and the right eye; ``grasp`` [6]: the
         trial's candidate, column and row (pixels of 288) in the left and the right picture, cosine and sine of the
         gripper's turn; ``kin`` [7]: position (mm) and rotation vector (rad) of the gripper as the encoders give them,
-        with kinematic error, and the angle between the jaws (rad), which objects between them keep from closing.
+        with kinematic error, and the angle between the jaws (rad), which objects between them keep from closing;
+        ``load`` [18]: the shape of what the left mask, as it was rendered, has where loads are shown
+        (:func:`ddco_tasks.bin_picking.shape.described`).
         """
         reported = psm.forward(physics.encoders())
         turn = psm.rotation_vector(reported.rotation)
@@ -144,6 +147,7 @@ class BinPicking(base.Task):
         observation["image"] = camera.observed(self._masks)
         observation["grasp"] = self._grasp.copy()
         observation["kin"] = np.concatenate([reported.position * 1e3, turn, [self._jaw]])
+        observation["load"] = load_of(self._masks[..., 0])
         return observation
 
     def get_reward(self, physics: Physics) -> float:
