@@ -14,8 +14,8 @@
 # # Surgical bin picking
 #
 # A da Vinci-like arm with inexact encoders takes pins, needles and wires out of a foam bin and sorts them into two cups
-# (Physical Experiment 2, SM 1.4). It sees masks of the objects, a grasp candidate and what its encoders read. Do
-# options learned from 60 demonstrations clear the bin, and what are they?
+# (Physical Experiment 2, SM 1.4). It sees masks of the objects, the shape of what it holds in them, a grasp candidate
+# and what its encoders read. Do options learned from 60 demonstrations clear the bin, and what are they?
 #
 # This page draws one demonstration; all else shows what `studies/bin_picking*.py` measured, each by the command above
 # its table.
