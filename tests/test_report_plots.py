@@ -5,6 +5,7 @@ import pytest
 from moving_demonstrations import made, reaches, recorded
 
 from ddco_pyro.report.activity import Activity, LevelActivity, bins
+from ddco_pyro.report.plot_likelihood import Likelihood, draw
 from ddco_pyro.report.plot_rows import order
 from ddco_pyro.report.plot_timing import shares, terminations
 from ddco_pyro.report.plot_trajectories import movement, position_key, view
@@ -97,3 +98,13 @@ def test_movement_by_hand():
     within, between = 9 * 2.0, 3 * 4.0  # the variance of 0 to 4 is 2; that of a mean of -2 and one of 2 is 4
     assert movement([line - 2, line + 2]) == pytest.approx(np.sqrt(within / (within + between)))
     assert movement([np.array([[1.0, 2.0, 3.0]])]) == 0
+
+
+def test_a_model_alone_is_compared_with_nothing():
+    """Each method has a place on the left; there is a panel of differences where there are some."""
+    alone, other = Likelihood("ddco", 1.5, 1.0), Likelihood("flat", 0.5, 0.0, (1.0, 0.1), (0.9, 1.1))
+    for rows, panels in ([alone], 1), ([alone, other], 2):
+        axes = draw(rows).axes
+        assert len(axes) == panels
+        held_out = axes[0].collections[1].get_offsets()
+        np.testing.assert_allclose(held_out, [(row.valid, place) for place, row in enumerate(rows)])

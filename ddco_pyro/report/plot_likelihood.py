@@ -56,9 +56,9 @@ def _each(ours: Sequence[Mapping[str, Any]], theirs: Sequence[Mapping[str, Any]]
 
 
 def draw(rows: Sequence[Likelihood]) -> Figure:
-    """Two panels of dots: log-likelihood of each method, and the paired differences."""
+    """Panels of dots: log-likelihood of each method and, where there are several, the paired differences."""
     figure = blank(1.25 + 0.36 * len(rows))
-    left, right = figure.subplots(1, 2, sharey=True)
+    left, *right = figure.subplots(1, min(len(rows), 2), sharey=True, squeeze=False)[0]
     places = np.arange(len(rows))
     left.scatter([row.train for row in rows], places, facecolor="white", edgecolor=INK, label="training", zorder=3)
     left.scatter([row.valid for row in rows], places, color=INK, label="held out", zorder=3)
@@ -67,7 +67,8 @@ def draw(rows: Sequence[Likelihood]) -> Figure:
     left.set_ylim(len(rows) - 0.4, -0.6)
     left.grid(axis="x", color="#e4e4e4")
     figure.legend(loc="outside lower left", ncols=2)
-    _differences(right, rows, places)
+    for axes in right:
+        _differences(axes, rows, places)
     return figure
 
 

@@ -114,10 +114,12 @@ def likelihood(fit: Fit, metrics: Mapping[str, Any]) -> Figures:
     """Held-out log-likelihood."""
     rows = plot_likelihood.likelihoods(metrics, {name: baseline.metrics for name, baseline in fit.baselines.items()})
     alt = "; ".join(f"{words.method(row.name)}: {words.number(row.valid)} nats per step held out" for row in rows)
-    caption = (
-        "Left: log-likelihood of each method. Right: the model’s minus each baseline’s on the same held-out "
-        "demonstrations; diamond: mean with one standard error, dots: single demonstrations."
-    )
+    caption = "Log-likelihood of the model."
+    if len(rows) > 1:
+        caption = (
+            "Left: log-likelihood of each method. Right: the model’s minus each baseline’s on the same held-out "
+            "demonstrations; diamond: mean with one standard error, dots: single demonstrations."
+        )
     picture = keep(plot_likelihood.draw(rows), fit.run_folder / "figures" / "likelihood.png", alt, caption)
     return Figures([picture], tables.likelihood(rows), words.about(row.name for row in rows))
 
