@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+from ddco_tasks.bin_picking.supervisor import SHOWN
 from ddco_tasks.bin_picking.trials import Attempt, End, Trials
 
 from ddco_pyro.fitting.fit import Fit
@@ -14,13 +17,14 @@ from ddco_pyro.simulation.task import Task
 
 @dataclass(frozen=True)
 class Trial:
-    """A trial: its steps in the bin's episode, the objects that the jaws first lifted, and the whole attempt, None
-    where the bin ended before the jaws opened.
+    """A trial: its steps in the bin's episode, the objects that the jaws first lifted, the whole attempt, None where the
+    bin ended before the jaws opened, and what was held where a load is shown, None where it was over.
     """
 
     steps: slice
     lifted: frozenset[int]
     attempt: Attempt | None
+    shown: frozenset[int] | None = None
 
 
 @dataclass(frozen=True)
@@ -68,22 +72,37 @@ ENDINGS = (
 def rolled(fit: Fit, task: Task, seed: int, film: bool = False) -> Bin:
     """The bin of a seed, in which the fitted policy acts."""
     made: list[Any] = []
+    held: list[frozenset[int]] = []  # after each step
 
     def load(seed: int) -> Any:
-        made.append(task.load(seed))
-        return made[-1]
+        environment: Any = task.load(seed)
+        made.append(environment)
+        step = environment.step
+
+        def stepped(control: np.ndarray) -> Any:
+            told = step(control)
+            held.append(environment.physics.held())
+            return told
+
+        environment.step = stepped
+        return environment
 
     watched = replace(task, load=load)
     episode = run_episode(watched, fit.controller(), seed, film=film, observed=fit.spec.observed)
     (environment,) = made
-    return Bin(episode, environment.task.trials, _trials(environment.task, len(episode.choices)))
+    return Bin(episode, environment.task.trials, _trials(environment.task, held))
 
 
-def _trials(task: Any, steps: int) -> list[Trial]:
+def _trials(task: Any, held: Sequence[frozenset[int]]) -> list[Trial]:
     found, start = [], 0
     for attempt in task.trials.attempts:
-        found.append(Trial(slice(start, start + attempt.steps), attempt.lifted, attempt))
+        found.append(_trial(slice(start, start + attempt.steps), attempt.lifted, attempt, held))
         start += attempt.steps
-    if start < steps:
-        found.append(Trial(slice(start, steps), task.lifted or frozenset(), None))
+    if start < len(held):
+        found.append(_trial(slice(start, len(held)), task.lifted or frozenset(), None, held))
     return found
+
+
+def _trial(steps: slice, lifted: frozenset[int], attempt: Attempt | None, held: Sequence[frozenset[int]]) -> Trial:
+    own = held[steps]
+    return Trial(steps, lifted, attempt, own[SHOWN - 1] if len(own) >= SHOWN else None)

@@ -7,6 +7,7 @@ import pytest
 from bin_picking import OURS, summarize
 from bin_picking_films import chosen, part
 from bin_picking_options import ENDS, end, shares, trials
+from bin_picking_recovery import counted
 from bin_picking_trials import ENDINGS, Bin, Trial
 from bin_picking_unseen import place
 from ddco_tasks.bin_picking.trials import Attempt, End, Trials
@@ -100,6 +101,23 @@ def test_a_bin_that_ends_before_the_jaws_open_names_its_last_trial() -> None:
         assert a_bin(trial, End.LOST).ending(trial) == "lost"
     unfinished = Trial(STEPS, NONE, None)
     assert a_bin(unfinished, End.FOAM).ending(unfinished) == "foam"
+
+
+def test_recoveries_are_of_what_is_held_where_it_is_shown() -> None:
+    """What is lost after it was shown alone is nobody's to take back; trials without a decision do not count."""
+    back, cup, lost = ATTEMPTS["nothing taken"], ATTEMPTS["into its cup"], Attempt(2, FIRST, NONE, ("accept",), 10)
+    shown = [(NONE, back), (NONE, lost), (BOTH, ATTEMPTS["several taken"]), (BOTH, cup), (FIRST, cup), (FIRST, lost)]
+    others = [
+        (FIRST, ATTEMPTS["one let go over the bin"]),
+        (FIRST, None),
+        (None, back),
+        (FIRST, ATTEMPTS["not let go"]),
+    ]
+    found = counted([Trial(STEPS, FIRST, attempt, held) for held, attempt in shown + others])
+    assert found == {
+        "nothing": 2, "nothing back": 1, "several": 2, "several back": 1, "one": 3, "one back": 1, "one lost": 1,
+        "due back": 4, "back": 2,
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
