@@ -67,6 +67,13 @@ Markdown(pages["supervisor"])
 Markdown(pages["summary"])
 
 # %% [markdown]
+# Recovery counts what is held when the jaws open, and so what slipped on the way to a cup, which the demonstrator, who does
+# not look again, does not take back either. By what is held where it is shown, when it is decided where to go:
+
+# %%
+Markdown(pages.get("recovery", "Not measured yet."))
+
+# %% [markdown]
 # ## What the options are
 #
 # Which option is active in each step of a demonstrated trial, and which inputs move it.
