@@ -67,8 +67,8 @@ Markdown(pages["supervisor"])
 Markdown(pages["summary"])
 
 # %% [markdown]
-# Recovery counts what is held when the jaws open, and so what slipped on the way to a cup, which the demonstrator, who does
-# not look again, does not take back either. By what is held where it is shown, when it is decided where to go:
+# Recovery counts what is held when the jaws open, and so what slipped on the way to a cup, which the demonstrator, who
+# does not look again, does not take back either. By what is held where it is shown, when it is decided where to go:
 
 # %%
 Markdown(pages.get("recovery", "Not measured yet."))

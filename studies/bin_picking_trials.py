@@ -17,8 +17,8 @@ from ddco_pyro.simulation.task import Task
 
 @dataclass(frozen=True)
 class Trial:
-    """A trial: its steps in the bin's episode, the objects that the jaws first lifted, the whole attempt, None where the
-    bin ended before the jaws opened, and what was held where a load is shown, None where it was over.
+    """A trial: its steps in the bin's episode, the objects that the jaws first lifted, the whole attempt, None where
+    the bin ended before the jaws opened, and what was held where a load is shown, None where it was over.
     """
 
     steps: slice
