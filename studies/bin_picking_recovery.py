@@ -19,6 +19,7 @@ import rates
 import torch
 from bin_picking import OURS, STARTS, clustered
 from bin_picking_trials import Trial, rolled
+from cells import printed
 from ddco_tasks.bin_picking import task
 from joblib import Parallel, delayed
 from provenance import record, sentence, text
@@ -85,6 +86,11 @@ def main() -> None:
     parser.add_argument("--bins", type=int, default=20)
     parser.add_argument("--jobs", type=int, default=1)
     own = parser.parse_args()
+    printed(lambda: run(own))
+
+
+def run(own: argparse.Namespace) -> str:
+    """Play, and write what came of it; the page."""
     command = f"python studies/bin_picking_recovery.py {' '.join(map(str, own.runs))} --bins {own.bins}"
     made_by = record(command)
     names = list(methods(load(own.runs[0])))
@@ -95,7 +101,7 @@ def main() -> None:
     shown = page(results, sentence(command, [made_by]))
     write_text(OUT / "recovery.json", text(results, [made_by]))
     write_text(OUT / "recovery.md", shown)
-    print(shown)
+    return shown
 
 
 if __name__ == "__main__":
