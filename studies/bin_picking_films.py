@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 from bin_picking_trials import ENDINGS, Bin, rolled
+from cells import printed
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
@@ -105,6 +106,11 @@ def main() -> None:
     parser.add_argument("--start", type=int, default=950_000)
     parser.add_argument("--films", type=Path, default=Path("runs/bin-picking-films"))
     own = parser.parse_args()
+    printed(lambda: run(own))
+
+
+def run(own: argparse.Namespace) -> str:
+    """Play, write the films, and what came of it; the page."""
     command = f"python studies/bin_picking_films.py {own.run} --bins {own.bins} --start {own.start}"
     made_by = record(command)
     torch.set_num_threads(1)
@@ -118,7 +124,7 @@ def main() -> None:
     shown = page(results, sentence(command, [made_by]))
     write_text(OUT / "films.json", text(results, [made_by]))
     write_text(OUT / "films.md", shown)
-    print(shown)
+    return shown
 
 
 if __name__ == "__main__":

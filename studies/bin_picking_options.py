@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from cells import printed
 from ddco_tasks.bin_picking.objects import ACCEPTED, KINDS
 from ddco_tasks.bin_picking.supervisor import PHASES
 from matplotlib.axes import Axes
@@ -241,6 +242,11 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--bin", type=int, default=950_000)
     own = parser.parse_args()
+    printed(lambda: run(own))
+
+
+def run(own: argparse.Namespace) -> str:
+    """Look at the fit, and write what came of it; the page."""
     command = f"python studies/bin_picking_options.py {own.run} --bin {own.bin}"
     made_by = record(command)
     torch.set_num_threads(1)
@@ -255,7 +261,7 @@ def main() -> None:
     shown = page(results, sentence(command, [made_by]))
     write_text(OUT / "options.json", text(results, [made_by]))
     write_text(OUT / "options.md", shown)
-    print(shown)
+    return shown
 
 
 if __name__ == "__main__":

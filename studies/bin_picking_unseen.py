@@ -18,6 +18,7 @@ from typing import Any
 import rates
 import torch
 from bin_picking_trials import Trial, rolled
+from cells import printed
 from ddco_tasks.bin_picking import alone
 from ddco_tasks.bin_picking.objects import KINDS, UNSEEN
 from joblib import Parallel, delayed
@@ -99,6 +100,11 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", choices=[*UNSEEN, *KINDS], default=[*UNSEEN, *KINDS])
     parser.add_argument("--jobs", type=int, default=1)
     own = parser.parse_args()
+    printed(lambda: run(own))
+
+
+def run(own: argparse.Namespace) -> str:
+    """Play, and write what came of it; the page."""
     runs, kinds = " ".join(map(str, own.runs)), " ".join(own.kinds)
     command = f"python studies/bin_picking_unseen.py {runs} --grasps {own.grasps} --kinds {kinds}"
     made_by = record(command)
@@ -114,7 +120,7 @@ def main() -> None:
     shown = page(results, len(own.runs), sentence(command, [made_by]))
     write_text(OUT / "unseen.json", text(results, [made_by]))
     write_text(OUT / "unseen.md", shown)
-    print(shown)
+    return shown
 
 
 def _of(kind: str, places: Mapping[tuple[int, str], list[str]], runs: int) -> dict[str, Any]:

@@ -219,8 +219,8 @@ def is_kept(content: Any, settings: Mapping[str, Any], made_by: Record) -> bool:
 def sentence(command: str, records: Iterable[Record | None]) -> str:
     """The line of a page that says what made it."""
     found = distinct(records)
-    made = [_at(one) for one in found if one is None or "added_at" not in one]
-    added = [f"commit {one['added_at']}" for one in found if one is not None and "added_at" in one]
+    made = dict.fromkeys(_at(one) for one in found if one is None or "added_at" not in one)  # each commit once
+    added = dict.fromkeys(f"commit {one['added_at']}" for one in found if one is not None and "added_at" in one)
     parts = ([f" at {', '.join(made)}"] if made else []) + ([f"; added at {', '.join(added)}"] if added else [])
     return f"Made by `{command}`{''.join(parts)}."
 

@@ -234,6 +234,9 @@ def test_a_result_of_several_codes_names_each(checkout):
     assert sentence(COMMAND, records) == (
         f"Made by `{COMMAND}` at commit {first['commit']}, commit {then}, an unknown commit."
     )
+    assert (
+        sentence(COMMAND, [first, first | {"code": "another's"}]) == f"Made by `{COMMAND}` at commit {first['commit']}."
+    )
     write(checkout, "ddco_pyro/above.py", "value = 3\n")
     assert sentence(COMMAND, [record(COMMAND, checkout)]) == (
         f"Made by `{COMMAND}` at commit {then} with uncommitted changes."

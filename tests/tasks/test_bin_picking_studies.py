@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import bin_picking_films
+import bin_picking_options
+import bin_picking_recovery
+import bin_picking_unseen
 import numpy as np
 import pytest
 from bin_picking import OURS, summarize
@@ -23,6 +27,15 @@ PIN, NEEDLE, NOTHING = 0, 1, -1
 JAW = [OPEN, CLOSED, CLOSED, OPEN, OPEN, CLOSED, CLOSED, OPEN, OPEN, CLOSED]
 PHASE = [0, 1, 4, 5, 0, 1, 3, 3, 0, 1]
 OPTIONS = [1, 1, 2, 2, 1, 1, 1, 1, 1, 1]
+
+
+@pytest.mark.parametrize("study", [bin_picking_films, bin_picking_options, bin_picking_recovery, bin_picking_unseen])
+def test_a_run_that_is_not_there_is_one_line(study, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("sys.argv", ["study", str(tmp_path / "nowhere")])
+    with pytest.raises(SystemExit, match="2"):
+        study.main()
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "nowhere" in line
 
 
 def demonstration(name: str, kind: int) -> Demonstration:
