@@ -4,9 +4,10 @@
 
 A seed is a draw of demonstrations and of training. ``layer-wise`` freezes each level once it is discovered, ``joint``
 goes on from the same to train all of them together, ``segments`` discovers the levels above the lowest together, from
-which options of the lowest follow each other, and then trains all of them. ``limit`` is no way to find levels: with
-the truth's lowest level it starts at the truth's own probabilities and maximises the likelihood by EM, over what the
-state has no part in; ``limit-320`` does so on four times as many demonstrations.
+which options of the lowest follow each other, and then trains all of them. ``limit`` and ``search`` are no ways to find
+levels: with the truth's lowest level they maximise the likelihood by EM, over what the state has no part in; ``limit``
+starts at the truth's own probabilities, ``search`` where ``segments`` does, from random ones. ``-320``: the same with
+four times as many demonstrations.
 
 Writes ``planted_levels.json`` after each fit, and ``planted_levels.md`` from it. Fits of the ways that are named are
 not done again where the same code has made them; those of the other ways stay as they are.
@@ -34,21 +35,25 @@ from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plan
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
-from ddco_pyro.fitting.upper import Constants, converged
+from ddco_pyro.fitting.upper import Constants, converged, fitted
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.tables import Tables
 
 COUNTS = (4, 4, 2)
 DEMONSTRATIONS, HELD_OUT, STEPS = 80, 40, 80
 ENDING = -0.85  # a termination's logit: ψ = 0.3 at every level, once the levels below have ended
+MANY = "-320"
+"""At the end of a way's name: with four times as many demonstrations."""
 WAYS = {
     "layer-wise": {"lower_levels": "frozen"},
     "joint": {"lower_levels": "fine_tuned"},
     "segments": {"lower_levels": "fine_tuned", "upper_levels": "segments"},
 }
 
-LIMITS = {"limit": DEMONSTRATIONS, "limit-320": 4 * DEMONSTRATIONS}
+LIMITS = ("limit", "search")
+NAMES = tuple(f"{way}{many}" for way in (*WAYS, *LIMITS) for many in ("", MANY))
 
 Row = dict[str, Any]
 """The ``way``, the ``seed``, what was found, and what made it."""
@@ -58,33 +63,44 @@ def one_fit(way: str, seed: int) -> Row:
     """A way of training on a seed's demonstrations."""
     torch.set_num_threads(1)
     truth = make_truth(make_spec(COUNTS, control=CONTROL), ENDING)
-    demos, _ = plant(truth, LIMITS.get(way, DEMONSTRATIONS), STEPS, seed=1000 + seed)
+    kind = way.removesuffix(MANY)
+    demos, _ = plant(truth, DEMONSTRATIONS * (1 if kind == way else 4), STEPS, seed=1000 + seed)
     held_out, choices = plant(truth, HELD_OUT, STEPS, seed=2000 + seed)
-    if way in LIMITS:
-        found = limit(truth, demos, held_out, choices)
+    if kind in LIMITS:
+        found = constants(truth, demos, held_out, choices, seed if kind == "search" else None)
     else:
-        spec = make_spec(COUNTS, seed, CONTROL, **{**TRAINING, **WAYS[way]})
+        spec = make_spec(COUNTS, seed, CONTROL, **{**TRAINING, **WAYS[kind]})
         with tempfile.TemporaryDirectory() as folder:
             found = recovered(make_trainer(spec, demos, Path(folder)).run(), truth, held_out, choices)
     print(way, seed, found, flush=True)
     return {"way": way, "seed": seed, **found}
 
 
-def limit(truth: Hierarchy, demos: Demonstrations, held_out: Demonstrations, choices: Tensor) -> dict[str, Any]:
-    """What the most likely constants say of demonstrations held out, where the search begins at the truth."""
+def constants(
+    truth: Hierarchy, demos: Demonstrations, held_out: Demonstrations, choices: Tensor, seed: int | None
+) -> dict[str, Any]:
+    """What the most likely constants say of demonstrations held out, and how likely they are in training, ``fitted``.
+
+    :param seed: of the random ones that the search begins at; None where it begins at the truth.
+    """
     with torch.no_grad():
         batches = [encode(part, truth.encoder, truth.scaling) for part in (demos.split(0.2, 0)[0], held_out)]
         pieces = [(truth.tabulate(batch), batch.lengths) for batch in batches]
     tables, lengths = pieces[1]
     selection = tuple(table[0, 0, :, 1:].double().exp() for table in tables.selection)
     start = Constants(selection, tuple(table[0, 0, :, 1].double().exp() for table in tables.termination[1:]))
-    said = {"truth": tables, "found": converged(pieces[:1], start).within(tables)}
-    found: dict[str, Any] = {}
+    best = converged(pieces[:1], start) if seed is None else fitted(pieces[:1], seed)
+    said = {"truth": tables, "found": best.within(tables)}
+    found: dict[str, Any] = {"fitted": _per_step(best.within(pieces[0][0]), pieces[0][1])}
     for name, own in said.items():
         segments = zip(choices.unbind(-1), segment(own, lengths), strict=True)
-        found[name] = float(log_likelihood(own, lengths).sum()) / batches[1].steps
+        found[name] = _per_step(own, lengths)
         found[f"{name} nmi"] = [float(normalized_mutual_info_score(*map(Tensor.flatten, pair))) for pair in segments]
     return found
+
+
+def _per_step(tables: Tables, lengths: Tensor) -> float:
+    return float(log_likelihood(tables, lengths).sum()) / int(lengths.sum())
 
 
 def interval(values: list[float]) -> str:
@@ -103,11 +119,16 @@ def table(rows: list[Row], made_by: str) -> str:
         "| level 3 |",
         "|---|---|---|---|---|---|",
         _line("truth", list({row["seed"]: row for row in rows}.values()), "truth"),
-        *(_line(way, own, "found") for way in (*WAYS, *LIMITS) if (own := _of(rows, way))), "",
+        *(_line(way, own, "found") for way in NAMES if (own := _of(rows, way))), "",
         "| less than the truth's own, paired by seed | nats per step | NMI, level 1 | level 2 | level 3 |",
         "|---|---|---|---|---|",
-        *(_short(way, own) for way in (*WAYS, *LIMITS) if (own := _of(rows, way))),
+        *(_short(way, own) for way in NAMES if (own := _of(rows, way))),
     ]  # fmt: skip
+    for many in ("", MANY):
+        best, searched = ({row["seed"]: row["fitted"] for row in _of(rows, f"{way}{many}")} for way in LIMITS)
+        if seeds := sorted(best.keys() & searched.keys()):
+            more = ", ".join(f"{searched[seed] - best[seed]:+.4f}" for seed in seeds)
+            lines += ["", f"Training log-likelihood of search{many}, minus limit{many}, nats per step by seed: {more}."]
     return "\n".join(lines) + "\n"
 
 
@@ -131,7 +152,7 @@ def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--ways", nargs="+", choices=[*WAYS, *LIMITS], default=[*WAYS, *LIMITS])
+    parser.add_argument("--ways", nargs="+", choices=NAMES, default=[*WAYS, *LIMITS])
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("docs/results"))
     arguments = parser.parse_args()
