@@ -33,6 +33,7 @@ NUMBERS = ("nothing", "one", "several")
 CRITERIA = {
     "nothing or several, taken back": ("back", "due back"),
     "nothing, taken back": ("nothing back", "nothing"),
+    "nothing, and nothing falls through the picture, taken back": ("unseen back", "unseen"),
     "several, taken back": ("several back", "several"),
     "exactly one, let go over the bin": ("one back", "one"),
     "exactly one, lost on the way to a cup": ("one lost", "one"),
@@ -42,17 +43,18 @@ CRITERIA = {
 
 def counted(trials: Sequence[Trial]) -> dict[str, int]:
     """How many trials of a bin showed nothing, one and several objects before the jaws opened; how many of these went
-    back over the bin; and how many, with one object, had lost it when the jaws opened elsewhere.
+    back over the bin; the same of nothing where the picture had nothing either; and how many, with one object, had lost
+    it when the jaws opened elsewhere.
     """
-    found = {f"{name}{back}": 0 for name in NUMBERS for back in ("", " back")} | {"one lost": 0}
+    found = {f"{name}{back}": 0 for name in (*NUMBERS, "unseen") for back in ("", " back")} | {"one lost": 0}
     for trial in trials:
-        if trial.shown is None or trial.attempt is None or not trial.attempt.places:
+        if trial.load is None or trial.attempt is None or not trial.attempt.places:
             continue
-        name = NUMBERS[min(len(trial.shown), 2)]
-        found[name] += 1
-        if trial.attempt.returned:
-            found[f"{name} back"] += 1
-        elif name == "one" and not trial.attempt.carried:
+        name = NUMBERS[min(len(trial.load.held), 2)]
+        for one in [name] if trial.load.seen or trial.load.held else [name, "unseen"]:
+            found[one] += 1
+            found[f"{one} back"] += trial.attempt.returned
+        if name == "one" and not trial.attempt.returned and not trial.attempt.carried:
             found["one lost"] += 1
     due = {"due back": found["nothing"] + found["several"], "back": found["nothing back"] + found["several back"]}
     return found | due

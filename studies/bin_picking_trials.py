@@ -4,27 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from ddco_tasks.bin_picking.supervisor import SHOWN
+from ddco_tasks.bin_picking.geometry import SHOWING
 from ddco_tasks.bin_picking.trials import Attempt, End, Trials
 
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.simulation.episodes import Episode, run_episode
 from ddco_pyro.simulation.task import Task
 
+NEAR = 0.010  # m: a gripper so near to where loads are shown shows what it holds; demonstrated ones are within 8 mm
+
+
+class Load(NamedTuple):
+    """What a step ended with: the objects that were held, whether the gripper was where loads are shown, and whether
+    the picture had anything there.
+    """
+
+    held: frozenset[int]
+    shown: bool
+    seen: bool
+
 
 @dataclass(frozen=True)
 class Trial:
     """A trial: its steps in the bin's episode, the objects that the jaws first lifted, the whole attempt, None where
-    the bin ended before the jaws opened, and what was held where a load is shown, None where it was over.
+    the bin ended before the jaws opened, and the load when it was first shown, None where it never was.
     """
 
     steps: slice
     lifted: frozenset[int]
     attempt: Attempt | None
-    shown: frozenset[int] | None = None
+    load: Load | None = None
 
 
 @dataclass(frozen=True)
@@ -72,7 +84,7 @@ ENDINGS = (
 def rolled(fit: Fit, task: Task, seed: int, film: bool = False) -> Bin:
     """The bin of a seed, in which the fitted policy acts."""
     made: list[Any] = []
-    held: list[frozenset[int]] = []  # after each step
+    loads: list[Load] = []  # after each step
 
     def load(seed: int) -> Any:
         environment: Any = task.load(seed)
@@ -81,7 +93,9 @@ def rolled(fit: Fit, task: Task, seed: int, film: bool = False) -> Bin:
 
         def stepped(control: np.ndarray) -> Any:
             told = step(control)
-            held.append(environment.physics.held())
+            physics = environment.physics
+            shown = np.linalg.norm(physics.gripper().position - SHOWING) < NEAR
+            loads.append(Load(physics.held(), bool(shown), bool(np.any(told.observation["load"]))))
             return told
 
         environment.step = stepped
@@ -90,19 +104,19 @@ def rolled(fit: Fit, task: Task, seed: int, film: bool = False) -> Bin:
     watched = replace(task, load=load)
     episode = run_episode(watched, fit.controller(), seed, film=film, observed=fit.spec.observed)
     (environment,) = made
-    return Bin(episode, environment.task.trials, _trials(environment.task, held))
+    return Bin(episode, environment.task.trials, trials(environment.task, loads))
 
 
-def _trials(task: Any, held: Sequence[frozenset[int]]) -> list[Trial]:
+def trials(task: Any, loads: Sequence[Load]) -> list[Trial]:
+    """The trials of a bin whose steps ended with these loads."""
     found, start = [], 0
     for attempt in task.trials.attempts:
-        found.append(_trial(slice(start, start + attempt.steps), attempt.lifted, attempt, held))
+        found.append(_trial(slice(start, start + attempt.steps), attempt.lifted, attempt, loads))
         start += attempt.steps
-    if start < len(held):
-        found.append(_trial(slice(start, len(held)), task.lifted or frozenset(), None, held))
+    if start < len(loads):
+        found.append(_trial(slice(start, len(loads)), task.lifted or frozenset(), None, loads))
     return found
 
 
-def _trial(steps: slice, lifted: frozenset[int], attempt: Attempt | None, held: Sequence[frozenset[int]]) -> Trial:
-    own = held[steps]
-    return Trial(steps, lifted, attempt, own[SHOWN - 1] if len(own) >= SHOWN else None)
+def _trial(steps: slice, lifted: frozenset[int], attempt: Attempt | None, loads: Sequence[Load]) -> Trial:
+    return Trial(steps, lifted, attempt, next((load for load in loads[steps] if load.shown), None))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import bin_picking_films
 import bin_picking_options
 import bin_picking_recovery
@@ -12,7 +14,8 @@ from bin_picking import OURS, summarize
 from bin_picking_films import chosen, part
 from bin_picking_options import ENDS, end, shares, trials
 from bin_picking_recovery import counted
-from bin_picking_trials import ENDINGS, Bin, Trial
+from bin_picking_trials import ENDINGS, Bin, Load, Trial
+from bin_picking_trials import trials as trials_of
 from bin_picking_unseen import place
 from ddco_tasks.bin_picking.trials import Attempt, End, Trials
 from rates import shown
@@ -126,11 +129,33 @@ def test_recoveries_are_of_what_is_held_where_it_is_shown() -> None:
         (None, back),
         (FIRST, ATTEMPTS["not let go"]),
     ]
-    found = counted([Trial(STEPS, FIRST, attempt, held) for held, attempt in shown + others])
+    loads = [None if held is None else Load(held, shown=True, seen=bool(held)) for held, _ in shown + others]
+    found = counted(
+        [Trial(STEPS, FIRST, attempt, load) for load, (_, attempt) in zip(loads, shown + others, strict=True)]
+    )
+    falling = counted([Trial(STEPS, FIRST, lost, Load(NONE, shown=True, seen=True))])
     assert found == {
-        "nothing": 2, "nothing back": 1, "several": 2, "several back": 1, "one": 3, "one back": 1, "one lost": 1,
-        "due back": 4, "back": 2,
+        "nothing": 2, "nothing back": 1, "unseen": 2, "unseen back": 1, "several": 2, "several back": 1, "one": 3,
+        "one back": 1, "one lost": 1, "due back": 4, "back": 2,
     }  # fmt: skip
+    assert (falling["nothing"], falling["unseen"]) == (1, 0)
+
+
+def test_a_load_is_shown_where_the_gripper_shows_it_be_it_late() -> None:
+    """A grasp that is tried again shows its load some steps later; one that opens its jaws before shows none."""
+    away, empty, showing = Load(FIRST, False, False), Load(NONE, False, False), Load(FIRST, True, True)
+    task = SimpleNamespace(
+        trials=SimpleNamespace(
+            attempts=[Attempt(2, FIRST, FIRST, ("accept",), 9), Attempt(2, NONE, NONE, ("bin",), 6)]
+        ),
+        lifted=None,
+    )
+    late, never, open_ended = trials_of(task, [empty] * 7 + [showing, away] + [empty] * 6 + [away, showing, showing])
+    assert late.load is showing
+    assert late.steps == slice(0, 9)
+    assert never.load is None
+    assert open_ended.load is showing
+    assert open_ended.attempt is None
 
 
 @pytest.mark.parametrize(
