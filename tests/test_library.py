@@ -7,6 +7,7 @@ import importlib
 import json
 import math
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -97,6 +98,16 @@ def test_demonstrations_in_another_order_are_the_same(in_memory: ddco_pyro.Fit, 
     fit = ddco_pyro.fit(in_memory.spec, backwards, out=tmp_path / "run")
     assert numbers(fit) == numbers(in_memory)
     assert numbers(ddco_pyro.fit(in_memory.spec, backwards, out=tmp_path / "run")) == numbers(fit)
+
+
+def test_masks_of_demonstrations_from_memory_say_which_are_held_out(in_memory: ddco_pyro.Fit, tmp_path: Path) -> None:
+    """In whatever order they come, with a run that keeps them or without."""
+    names = two_skills().names
+    given = replace(two_skills(), demonstrations=tuple(reversed(two_skills())), masks={"valid": names[2:5]})
+    kept = ddco_pyro.fit(in_memory.spec, given, out=tmp_path / "run")
+    for fit in (kept, ddco_pyro.fit(in_memory.spec, given)):
+        assert tuple(one["name"] for one in fit.metrics["valid"]) == names[2:5]
+    assert Demonstrations.read(tmp_path / "run" / "demonstrations.hdf5", ["place"]).masks == {"valid": names[2:5]}
 
 
 def test_the_spec_says_what_is_seen_of_demonstrations_from_memory(in_memory: ddco_pyro.Fit) -> None:

@@ -84,7 +84,8 @@ def fit(
     """
     spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else Path(out)
     if isinstance(demonstrations, Demonstrations):
-        demonstrations = demonstrations.select(sorted(demonstrations.names, key=natural))  # as they are read back
+        in_order = demonstrations.select(sorted(demonstrations.names, key=natural))  # as they are read back
+        demonstrations = replace(in_order, masks=demonstrations.masks)
         path = {"demonstrations.path": str(folder / "demonstrations.hdf5")} if folder else {}
         return fit_run(
             with_overrides(spec, path),
