@@ -23,7 +23,7 @@ from ddco_tasks.bin_picking import camera
 from ddco_tasks.bin_picking.environment import load
 from ddco_tasks.bin_picking.geometry import IMAGE_SIZE, SHOWING, project
 from ddco_tasks.bin_picking.objects import KINDS
-from ddco_tasks.bin_picking.supervisor import PHASES, SHOWN, Supervisor
+from ddco_tasks.bin_picking.supervisor import KNOWN, PHASES, Supervisor
 from joblib import Parallel, delayed
 from provenance import record, sentence, text
 from sklearn.ensemble import ExtraTreesClassifier
@@ -60,7 +60,7 @@ def first_grasp(seed: int) -> int:
     demonstrator = Supervisor(environment)
     demonstrator.reset(seed)
     step = environment.reset()
-    for _ in range(SHOWN):
+    for _ in range(KNOWN):
         step = step if step.last() else environment.step(demonstrator.act(step.observation))
     held = 0 if step.last() else len(environment.physics.held())
     environment.close()

@@ -32,14 +32,13 @@ from .objects import KINDS, UNSEEN, scene
 from .physics import MOVE_TIME, SETTLE_TIME, Physics
 from .shape import load_of
 from .supervisor import JAW_OPEN, OVER_CUP
-from .trials import MOST_STEPS, Attempt, End, Trials
+from .trials import MOST_STEPS, Attempt, End, Trials, most_attempts
 
 HERE = Path(__file__).parent
 FEWEST, MOST = 3, 8  # objects in a bin
 REPEATABILITY = np.array([6e-4, 6e-4, 1e-4, 2e-3, 2e-3, 2e-3])  # rad, m: standard deviations, 0.2 mm at the gripper
 JAW_ERROR = 0.01  # rad: standard deviation of the angle that the jaws' encoder reads, as the backlash of the wrist
 LIFTED_HEIGHT = 0.018  # m: a gripper above this has lifted what it holds
-MOST_ATTEMPTS = 4 * MOST  # every fourth attempt at least brings an object into a cup
 BIN_SEEN = in_bin(lying_at(np.stack(np.meshgrid(*2 * [np.arange(IMAGE_SIZE, dtype=float)]), axis=-1)))
 FRAME_SIZE = (360, 480)
 SHARED_SOURCES = ("arm.py", "psm.py", "rendering.py", "vision.py")
@@ -220,7 +219,7 @@ def make_task(
         policies={name: partial(Scripted, policy, controls) for name, policy in scripted.items()},
         outcome=outcome,
         frame=frame,
-        steps=MOST_ATTEMPTS * MOST_STEPS,
+        steps=most_attempts(MOST) * MOST_STEPS,
         measures={key: "rate" if key in RATES or key.startswith("ended") else "mean" for key in MEASURES},
         sources=(HERE / "bin_picking.xml", candidates.WEIGHTS, *sorted(HERE.glob("*.py")), *shared),
     )

@@ -9,7 +9,7 @@ from .geometry import SHOWING, project
 
 HALF_HEIGHT, HALF_WIDTH = 52, 112  # pixels about the place where loads are shown; the rows begin at the picture's edge
 COLUMN, ROW = np.round(project(SHOWING)).astype(int)
-SHOWN = (slice(max(0, ROW - HALF_HEIGHT), ROW + HALF_HEIGHT), slice(COLUMN - HALF_WIDTH, COLUMN + HALF_WIDTH))
+REGION = (slice(max(0, ROW - HALF_HEIGHT), ROW + HALF_HEIGHT), slice(COLUMN - HALF_WIDTH, COLUMN + HALF_WIDTH))
 FEWEST = 4  # pixels; fewer have no shape
 NAMES = (
     "area", "inside", "parts", "largest part", "spread across", "spread along", "hull", "length", "width", "outline",
@@ -20,7 +20,7 @@ NAMES = (
 
 def load_of(left: np.ndarray) -> np.ndarray:
     """The numbers [18] of :func:`described` for what the left eye's mask, uint8 [288, 288], shows of a load."""
-    return described(left[SHOWN])
+    return described(left[REGION])
 
 
 def described(mask: np.ndarray) -> np.ndarray:

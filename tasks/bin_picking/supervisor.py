@@ -28,7 +28,7 @@ LIFT_HEIGHT = 0.028  # m
 HALFWAY = 0.5  # of the way from the showing place to the cup, way point 6
 
 PHASES = ("approach", "grasp", "show", "recover", "carry", "release")
-SHOWN = 6  # from this step of a trial on the person has seen what is held
+KNOWN = 6  # from this step of a trial on the person has seen what is held
 
 
 class WayPoint(NamedTuple):
@@ -88,9 +88,9 @@ class OpenLoop:
     @property
     def annotations(self) -> dict[str, int]:
         """The phase of the step just decided: 0 approach, 1 grasp, 2 show, 3 recover, 4 carry, 5 release."""
-        if self._step < SHOWN:
+        if self._step < KNOWN:
             return {"phase": (0, 0, 0, 1, 2, 2)[self._step]}
-        if len(self._plan) == SHOWN + len(RECOVERY):
+        if len(self._plan) == KNOWN + len(RECOVERY):
             return {"phase": PHASES.index("recover")}
         return {"phase": PHASES.index("release" if self._step == len(self._plan) - 1 else "carry")}
 
@@ -102,8 +102,8 @@ class OpenLoop:
     def _follow(self, observation: Observation) -> None:
         """Go on to the next way point, of the next trial where this one is over."""
         self._step += 1
-        if self._step == SHOWN:
-            self._plan = self._plan[:SHOWN] + self._rest()
+        if self._step == KNOWN:
+            self._plan = self._plan[:KNOWN] + self._rest()
         elif self._step >= len(self._plan):
             self._step, self._plan = 0, grasp_plan(observation["grasp"])
 

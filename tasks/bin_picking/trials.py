@@ -12,6 +12,11 @@ MOST_STEPS = 20  # control steps of a trial; the supervisor takes 10
 MOST_MISSES = 4  # attempts in a row that bring nothing into a cup
 
 
+def most_attempts(objects: int) -> int:
+    """How many attempts a bin with so many objects is given: every fourth at least has to bring one into a cup."""
+    return MOST_MISSES * objects
+
+
 class End(Enum):
     """How a bin ended."""
 
@@ -78,7 +83,7 @@ class Trials:
         even where objects come back.
         """
         last = self.attempts[-MOST_MISSES:]
-        if len(self.attempts) >= MOST_MISSES * len(self.kinds):
+        if len(self.attempts) >= most_attempts(len(self.kinds)):
             return True
         return len(last) == MOST_MISSES and not any(attempt.delivered for attempt in last)
 

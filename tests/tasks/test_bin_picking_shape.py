@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ddco_tasks.bin_picking import geometry, task
-from ddco_tasks.bin_picking.shape import FEWEST, NAMES, SHOWN, described
+from ddco_tasks.bin_picking.shape import FEWEST, NAMES, REGION, described
 
 
 def numbers(mask: np.ndarray) -> dict[str, float]:
@@ -51,7 +51,7 @@ def test_an_object_is_described_where_loads_are_shown_and_nowhere_else() -> None
     centre = environment.physics.centres()[0]
     environment.task.after_step(environment.physics)
     found = dict(zip(NAMES, environment.task.get_observation(environment.physics)["load"], strict=True))
-    seen = [found["column"] + SHOWN[1].start, found["row"] + SHOWN[0].start]
+    seen = [found["column"] + REGION[1].start, found["row"] + REGION[0].start]
     environment.close()
     assert found["area"] > 100
     np.testing.assert_allclose(seen, geometry.project(centre), atol=6.0)
