@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import arena_segments
+import numpy as np
+from matplotlib.axes import Axes
 from needle_success import over_seeds, spread
 
 from ddco_pyro.drawing.pictures import blank, keep, style
@@ -154,27 +156,58 @@ def _expert(one: Result) -> str:
 
 
 def draw(results: Result, path: Path) -> None:
-    """Held-out NMI by number of demonstrations, and success of each method with the most of them, by task."""
+    """By task NMI for each number of demonstrations, and success with the most; success over numbers of them."""
     tasks = results["tasks"]
     with style():
         figure = blank(0.8 + 0.45 * len(tasks))
-        left, right = figure.subplots(1, 2, sharey=True)
-        for row, one in enumerate(tasks.values()):
-            shades = SHADES[-len(one["counts"]) :]
-            for shade, (count, found) in zip(shades, one["counts"].items(), strict=False):
-                values = found["nmi_valid"]["by_seed"]
-                label = f"{count} demonstrations" if row == 0 else None
-                left.plot(values, [row] * len(values), "o", ms=5, color=shade, label=label)
-            most = list(one["counts"].values())[-1]["methods"]
-            for place, (name, found) in enumerate(most.items()):
-                values, height = found["success"]["by_seed"], row + 0.2 * (place - 1)
-                right.plot(values, [height] * len(values), "o", ms=4, alpha=0.6, color=COLOURS[name])
-                mean, label = found["success"]["mean"], name if row == 0 else None
-                right.plot(mean, height, "|", ms=9, mew=2, color=COLOURS[name], label=label)
-        left.set(yticks=range(len(tasks)), yticklabels=list(tasks), xlim=(-0.02, 1.02))
-        left.set(ylim=(len(tasks) - 0.5, -0.5), xlabel="held-out NMI with the expert's phases (dots: seeds)")
-        right.set(xlim=(-0.02, 1.02), xlabel="success rate, most demonstrations")
-        for axes in (left, right):
+        left, middle, right = figure.subplots(1, 3)
+        _agreement(left, tasks)
+        _success_by_task(middle, tasks)
+        _success_by_count(right, tasks)
+        for axes in (left, middle):
+            axes.set(yticks=range(len(tasks)), yticklabels=[], xlim=(-0.02, 1.02), ylim=(len(tasks) - 0.5, -0.5))
             axes.grid(axis="x", color="#e4e4e4")
-            axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, fontsize=7, frameon=False)
-        keep(figure, path, "Agreement of options with the expert's phases, and success, by task", "")
+        left.set_yticklabels(list(tasks))
+        for axes in (left, middle, right):
+            axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, fontsize=7, frameon=False)
+        keep(figure, path, "Agreement of options with the expert's phases, and success", "")
+
+
+def _agreement(axes: Axes, tasks: Result) -> None:
+    for row, one in enumerate(tasks.values()):
+        shades = SHADES[-len(one["counts"]) :]
+        for shade, (count, found) in zip(shades, one["counts"].items(), strict=False):
+            values = found["nmi_valid"]["by_seed"]
+            label = f"{count} demonstrations" if row == 0 else None
+            axes.plot(values, [row] * len(values), "o", ms=5, color=shade, label=label)
+    axes.set_xlabel("held-out NMI with phases (dots: seeds)")
+
+
+def _success_by_task(axes: Axes, tasks: Result) -> None:
+    for row, one in enumerate(tasks.values()):
+        most = list(one["counts"].values())[-1]["methods"]
+        for place, (name, found) in enumerate(most.items()):
+            values, height = found["success"]["by_seed"], row + 0.2 * (place - 1)
+            axes.plot(values, [height] * len(values), "o", ms=4, alpha=0.6, color=COLOURS[name])
+            mean, label = found["success"]["mean"], name if row == 0 else None
+            axes.plot(mean, height, "|", ms=9, mew=2, color=COLOURS[name], label=label)
+    axes.set_xlabel("success rate, most demonstrations")
+
+
+def _success_by_count(axes: Axes, tasks: Result) -> None:
+    """No interval: tasks differ by more than methods do, whose paired differences the page has."""
+    counts = list(next(iter(tasks.values()))["counts"])
+    for name, rates in mean_success(tasks).items():
+        axes.plot(range(len(counts)), rates, "o-", ms=4, color=COLOURS[name], label=name)
+    axes.set(xticks=range(len(counts)), xticklabels=counts, ylim=(0, 1.02))
+    axes.set(xlabel="demonstrations", ylabel="success rate, mean over tasks")
+
+
+def mean_success(tasks: Result) -> dict[str, list[float]]:
+    """Each method's success rate for each number of demonstrations, in the mean over tasks of means over seeds."""
+    counted = [one["counts"] for one in tasks.values()]
+    first = counted[0]
+    return {
+        name: [np.mean([one[count]["methods"][name]["success"]["mean"] for one in counted]).item() for count in first]
+        for name in next(iter(first.values()))["methods"]
+    }

@@ -19,7 +19,7 @@ import pytest
 import torch
 from arena_phases import Phases
 from arena_playing import controls, exported, play
-from arena_results import page, summarize
+from arena_results import draw, mean_success, page, summarize
 from arena_segments import MEASURES
 
 from ddco_pyro.errors import Failed
@@ -335,3 +335,19 @@ def test_success_is_compared_over_tasks():
     text = page(summarize(cells), "Made.")
     assert f"| flat | 0 of 24 | +50.0% [{50 - half:+.1f}%, {50 + half:+.1f}%]; 3; p = 0.25 |" in text
     assert "| ddco | 12 of 24 | - |" in text
+
+
+def test_the_figure_has_success_over_numbers_in_the_mean_over_tasks(tmp_path):
+    """Of 4 episodes: ddco 1 and 3 with five demonstrations, 2 and 4 with ten, flat 0 and 2 with either."""
+    given = {
+        (5, "hammer-v3"): (1, 0),
+        (5, "assembly-v3"): (3, 2),
+        (10, "hammer-v3"): (2, 0),
+        (10, "assembly-v3"): (4, 2),
+    }
+    results = summarize(
+        [cell(0, 0.5, 1.0, 0.5, often, task) | {"count": count} for (count, task), often in given.items()]
+    )
+    assert mean_success(results["tasks"]) == {"ddco": [0.5, 0.75], "flat": [0.25, 0.25]}
+    draw(results, tmp_path / "arena.png")
+    assert (tmp_path / "arena.png").read_bytes().startswith(b"\x89PNG")
