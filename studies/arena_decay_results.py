@@ -1,0 +1,87 @@
+"""What the cells of the decay study say together: a table, a page and a figure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from arena_results import COLOURS, OURS
+
+from ddco_pyro.drawing.pictures import blank, keep, style
+
+Result = dict[str, Any]
+
+
+def summarize(cells: list[Result]) -> Result:
+    """For each number of demonstrations and each rule, means over tasks and training seeds."""
+    counts: Result = {}
+    for count in sorted({cell["count"] for cell in cells}):
+        own = [cell for cell in cells if cell["count"] == count]
+        rules = {steps: [cell for cell in own if cell["steps"] == steps] for steps in sorted({c["steps"] for c in own})}
+        counts[str(count)] = {f"{steps:g}": _summary(fits) for steps, fits in rules.items()}
+    return counts
+
+
+def _summary(cells: list[Result]) -> Result:
+    methods = list(cells[0]["held_out"])
+    return {
+        "fits": len(cells),
+        "weight_decay": float(np.median([cell["weight_decay"] for cell in cells])),
+        "mean": {name: float(np.mean([np.mean(cell["held_out"][name]) for cell in cells])) for name in methods},
+        "median": {name: float(np.mean([np.median(cell["held_out"][name]) for cell in cells])) for name in methods},
+        "nmi": float(np.mean([cell["agreement"]["nmi"] for cell in cells])),
+        "f1_50": float(np.mean([cell["agreement"]["matched_globally"]["f1_50"] for cell in cells])),
+    }
+
+
+def page(results: Result, made_by: str) -> str:
+    """The results as Markdown."""
+    methods = list(next(iter(next(iter(results.values())).values()))["mean"])
+    head = ["demonstrations", "steps", "decay", *(f"{name}, nats" for name in methods), "NMI", "F1@50"]
+    lines = [
+        made_by,
+        "",
+        "Weights decay by (steps / those of the training demonstrations)², of which the median over fits is given; 0: "
+        "they do not. Nats per step held out: the mean over fits of a fit's mean over demonstrations, and of its median "
+        "over them: a few demonstrations that are very unlikely decide the first. Then the options' agreement with the "
+        "expert's phases.",
+        "",
+        f"| {' | '.join(head)} |",
+        "|---" * len(head) + "|",
+    ]
+    for count, rules in results.items():
+        for steps, found in rules.items():
+            nats = [f"{found['mean'][name]:.2f}; {found['median'][name]:.2f}" for name in methods]
+            cells = [
+                count,
+                steps,
+                f"{found['weight_decay']:.2g}",
+                *nats,
+                f"{found['nmi']:.2f}",
+                f"{found['f1_50']:.2f}",
+            ]
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def draw(results: Result, path: Path) -> None:
+    """Held-out nats of the median demonstration, and NMI, by rule: a panel for each number of demonstrations."""
+    with style():
+        figure = blank(4.4)
+        grid = figure.subplots(2, len(results), sharex=True, squeeze=False)
+        for (likelihood, agreement), (count, rules) in zip(grid.T, results.items(), strict=True):
+            for name, colour in COLOURS.items():
+                line = [found["median"][name] for found in rules.values()]
+                likelihood.plot(range(len(rules)), line, "o-", ms=3, color=colour, label=name)
+            agreement.plot(
+                range(len(rules)), [found["nmi"] for found in rules.values()], "o-", ms=3, color=COLOURS[OURS]
+            )
+            agreement.set(ylim=(0.5, 1), xticks=range(len(rules)), xticklabels=list(rules), xlabel="steps")
+            likelihood.set_title(f"{count} demonstrations", fontsize=8)
+            for axes in (likelihood, agreement):
+                axes.grid(axis="y", color="#e4e4e4")
+        grid[0, 0].set_ylabel("nats per step, median")
+        grid[1, 0].set_ylabel("NMI with phases")
+        grid[0, -1].legend(fontsize=6, frameon=False)
+        keep(figure, path, "Held-out likelihood and agreement by how much weights decay", "")
