@@ -43,9 +43,9 @@ def page(results: Result, made_by: str) -> str:
         made_by,
         "",
         "Weights decay by (steps / those of the training demonstrations)², of which the median over fits is given; 0: "
-        "they do not. Nats per step held out: the mean over fits of a fit's mean over demonstrations, and of its median "
-        "over them: a few demonstrations that are very unlikely decide the first. Then the options' agreement with the "
-        "expert's phases.",
+        "they do not. Nats per step held out: the mean over fits of a fit's mean over demonstrations, and of its "
+        "median over them: a few demonstrations that are very unlikely decide the first. Then the options' agreement "
+        "with the expert's phases.",
         "",
         f"| {' | '.join(head)} |",
         "|---" * len(head) + "|",

@@ -127,7 +127,7 @@ def table(rows: list[Row], made_by: str) -> str:
     for many in ("", MANY):
         best, searched = ({row["seed"]: row["fitted"] for row in _of(rows, f"{way}{many}")} for way in LIMITS)
         if seeds := sorted(best.keys() & searched.keys()):
-            more = ", ".join(f"{searched[seed] - best[seed]:+.4f}" for seed in seeds)
+            more = ", ".join(f"{searched[seed] - best[seed]:+.0e}" for seed in seeds)
             lines += ["", f"Training log-likelihood of search{many}, minus limit{many}, nats per step by seed: {more}."]
     return "\n".join(lines) + "\n"
 
