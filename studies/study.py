@@ -14,6 +14,7 @@ from joblib import Parallel, delayed
 from provenance import record, sentence, text
 
 from ddco_pyro.data.files import write_text
+from ddco_pyro.errors import BadInput
 
 
 class Shown(Protocol):
@@ -64,8 +65,13 @@ class Study:
         printed(lambda: self.run(own))
 
     def run(self, own: argparse.Namespace) -> str:
-        """Do what is not done yet, and write ``summary.json``, ``summary.md`` and ``NAME.png``; the page."""
+        """Do what is not done yet, and write ``summary.json``, ``summary.md`` and ``NAME.png``; the page.
+
+        :raises BadInput: there is no cell to do.
+        """
         settings, cells = self.defaults.given(own), self.cells(own)
+        if not cells:
+            raise BadInput(f"{self.name}.py: there is nothing to do: one of {', '.join(self.axes)} is empty or 0")
         made_by = record(cells[0].command(settings))
         self.simulator(settings).made()  # or nothing else has to begin
         kept = Parallel(n_jobs=own.jobs, verbose=10)(delayed(cell.run)(settings, made_by) for cell in cells)

@@ -49,7 +49,7 @@ def run(monkeypatch, tmp_path, words):
     """Run it with these words; what has been done so far."""
     monkeypatch.setattr("sys.argv", ["toy.py", *words, "--runs", f"{tmp_path}/runs", "--out", f"{tmp_path}/out"])
     parser = described("A toy.")
-    parser.add_argument("--tasks", nargs="+", default=["a", "b"])
+    parser.add_argument("--tasks", nargs="*", default=["a", "b"])
     parser.add_argument("--seed", type=int, default=4)
     simulator = SimpleNamespace(made=lambda: None)
 
@@ -80,6 +80,13 @@ def test_what_cannot_be_done_is_one_line(tmp_path, monkeypatch, capsys, task, li
         run(monkeypatch, tmp_path, ["--tasks", task])
     assert (ended.value.code, capsys.readouterr().err.splitlines()[-1]) == (status, line)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_study_without_cells_says_so(tmp_path, monkeypatch, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run(monkeypatch, tmp_path, ["--tasks"])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == "toy.py: there is nothing to do: one of tasks, seed is empty or 0\n"
 
 
 def test_a_cell_by_itself_is_the_studys(tmp_path, monkeypatch, capsys):
