@@ -12,6 +12,8 @@ from dataclasses import replace
 import apart
 import arena
 import arena_cell
+import arena_decay_cell
+import arena_decay_results
 import arena_venv
 import h5py
 import numpy as np
@@ -266,6 +268,36 @@ def test_the_same_demonstrations_are_held_out_from_all_cells(tmp_path):
     assert used[5, 0] != used[5, 1]
     with pytest.raises(Failed, match="has 8 demonstrations to train on, 9 are asked for"):
         arena_cell.chosen(tmp_path / "demos.hdf5", arena_cell.ArenaCell("task", 9, 0))
+
+
+def decay_cell(steps, ours, flat, nmi):
+    return {
+        "count": 5,
+        "steps": steps,
+        "weight_decay": 0.5,
+        "held_out": {"ddco": ours, "flat": flat},
+        "agreement": {"nmi": nmi, "matched_globally": {"f1_50": 0.5}},
+    }
+
+
+def test_the_decay_page_of_two_fits_worked_by_hand():
+    """An odd demonstration is in the means, of -18 and 0, and not in the medians, 1 and 0."""
+    fits = [decay_cell(250.0, [1.0, 1.0, -56.0], [0.0, 2.0, 4.0], 0.6), decay_cell(250.0, [0.0] * 3, [-1.0] * 3, 0.8)]
+    found = arena_decay_results.summarize([*fits, decay_cell(0.0, [-1.0], [-2.0], 0.5)])
+    assert list(found["5"]) == ["0", "250"]
+    lines = arena_decay_results.page(found, "").splitlines()
+    assert "| 5 | 250 | 0.5 | -9.00; 0.50 | 0.50; 0.50 | 0.70 | 0.50 |" in lines
+
+
+def test_a_decays_steps_are_those_of_the_demonstrations_trained_on(tmp_path):
+    with h5py.File(tmp_path / "demos.hdf5", "w") as file:
+        for number, steps in enumerate([3, 5, 7, 11]):
+            file[f"data/demo_{number}/actions"] = np.zeros((steps, 2))
+        file["mask/train"], file["mask/valid"] = [b"demo_0", b"demo_1", b"demo_3"], [b"demo_2"]
+    cell = arena_cell.ArenaCell("hammer-v3", 2, 0)
+    used = arena_cell.chosen(tmp_path / "demos.hdf5", cell)[0]
+    steps = {"demo_0": 3, "demo_1": 5, "demo_3": 11}
+    assert arena_decay_cell.trained_steps(tmp_path / "demos.hdf5", cell) == sum(steps[name] for name in used)
 
 
 def test_other_settings_are_other_cells():
