@@ -1,7 +1,7 @@
-"""How much weights should decay with few demonstrations: rules of ``ddco-pyro init`` on development seeds.
+"""What weights that decay do with few demonstrations: likelihood, segments and success, on development seeds.
 
-    python studies/arena_decay.py [--tasks pick-place-v3 ...] [--counts 5 10 20 50] [--steps 0 250 500 1000]
-        [--seeds 101 102] [--jobs 2] [--set KEY=VALUE]... [--demonstrations 70] [--noise 0.1] [--out DIR] [--runs DIR]
+    python studies/arena_decay.py [--tasks pick-place-v3 ...] [--counts 5 10 20] [--steps 0 80 250] [--seeds 101]
+        [--episodes 20] [--jobs 2] [--set KEY=VALUE]... [--demonstrations 70] [--noise 0.1] [--out DIR] [--runs DIR]
 
 With the demonstrations and the environment of ``studies/arena.py``. Weights decay by (STEPS / steps of the training
 demonstrations)², those of policies without options too. A cell that this code has done with these settings is not done
@@ -33,9 +33,9 @@ def main() -> None:
     """Run the study."""
     parser = described(__doc__)
     parser.add_argument("--tasks", nargs="+", default=list(DEVELOPED), choices=TASKS, metavar="TASK")
-    parser.add_argument("--counts", type=int, nargs="+", default=[5, 10, 20, 50])
-    parser.add_argument("--steps", type=float, nargs="+", default=[0, 250, 500, 1000])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[101, 102])
+    parser.add_argument("--counts", type=int, nargs="+", default=[5, 10, 20])
+    parser.add_argument("--steps", type=float, nargs="+", default=[0, 80, 250])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[101])
     axes = ("tasks", "counts", "steps", "seeds")
     defaults = arena_decay_cell.DEFAULTS
     Study("arena_decay", axes, cells, sawyer, arena_decay_results, defaults, jobs=2).main(parser)

@@ -1,23 +1,23 @@
 """One cell of the decay study: a task of Meta-World, a number of demonstrations, a rule and a training seed.
 
-    python studies/arena_decay_cell.py TASK COUNT STEPS SEED [--set KEY=VALUE]... [--runs DIR]
+    python studies/arena_decay_cell.py TASK COUNT STEPS SEED [--episodes 20] [--set KEY=VALUE]... [--runs DIR]
 
-As a cell of the arena, but weights decay by (STEPS / steps of the training demonstrations)², and nothing is played.
+As a cell of the arena, but weights decay by (STEPS / steps of the training demonstrations)².
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 from apart import HELD_OUT
-from arena_cell import ArenaCell, chosen, fitted_cell, sawyer
+from arena_cell import ArenaCell, chosen, sawyer
 from cells import Cell, Settings
 
-DEFAULTS = Settings({"demonstrations": 70, "noise": 0.1}, Path("runs/arena"))
+DEFAULTS = Settings({"demonstrations": 70, "noise": 0.1, "episodes": 20}, Path("runs/arena"))
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class DecayCell(Cell):
     seed: int
 
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
-        """Fit, and say how likely held-out demonstrations are, and how well options agree with phases on them."""
+        """What the arena's cell with that decay says."""
         own = settings.values
         source = sawyer(settings).collected(
             self.task, number=own["demonstrations"], held_out=HELD_OUT, noise=own["noise"]
@@ -40,15 +40,13 @@ class DecayCell(Cell):
         cell = ArenaCell(self.task, self.count, self.seed)
         decay = (self.steps / trained_steps(source, cell)) ** 2
         changes = (*settings.overrides, f"training.optimizer.weight_decay={decay:.3g}")
-        fitted = fitted_cell(cell, source, changes, folder)
-        rows = [row for row in fitted.metrics["demonstrations_by_likelihood"] if row["part"] == "valid"]
+        found = cell.results(replace(settings, overrides=changes), folder)
+        methods = found["methods"]
         return {
             "weight_decay": decay,
-            "held_out": {
-                name: [row["log_likelihood_per_step"][name] for row in rows]
-                for name in rows[0]["log_likelihood_per_step"]
-            },
-            "agreement": fitted.metrics["agreement"]["valid"][0],
+            "held_out": {name: [row["log_likelihood_per_step"][name] for row in found["held_out"]] for name in methods},
+            "success": {name: one["success"] for name, one in methods.items()},
+            "agreement": found["agreement"]["valid"][0],
         }
 
 

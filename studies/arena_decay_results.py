@@ -30,6 +30,11 @@ def _summary(cells: list[Result]) -> Result:
         "weight_decay": float(np.median([cell["weight_decay"] for cell in cells])),
         "mean": {name: float(np.mean([np.mean(cell["held_out"][name]) for cell in cells])) for name in methods},
         "median": {name: float(np.mean([np.median(cell["held_out"][name]) for cell in cells])) for name in methods},
+        "success": {
+            name: {"successes": sum(map(sum, played)), "trials": sum(map(len, played))}
+            for name in methods
+            for played in [[cell["success"][name] for cell in cells]]
+        },
         "nmi": float(np.mean([cell["agreement"]["nmi"] for cell in cells])),
         "f1_50": float(np.mean([cell["agreement"]["matched_globally"]["f1_50"] for cell in cells])),
     }
@@ -39,13 +44,14 @@ def page(results: Result, made_by: str) -> str:
     """The results as Markdown."""
     methods = list(next(iter(next(iter(results.values())).values()))["mean"])
     head = ["demonstrations", "steps", "decay", *(f"{name}, nats" for name in methods), "NMI", "F1@50"]
+    head += [f"success {name}" for name in methods]
     lines = [
         made_by,
         "",
         "Weights decay by (steps / those of the training demonstrations)², of which the median over fits is given; 0: "
         "they do not. Nats per step held out: the mean over fits of a fit's mean over demonstrations, and of its "
         "median over them: a few demonstrations that are very unlikely decide the first. Then the options' agreement "
-        "with the expert's phases.",
+        "with the expert's phases, and successes in Meta-World, every method from the same starts.",
         "",
         f"| {' | '.join(head)} |",
         "|---" * len(head) + "|",
@@ -66,22 +72,27 @@ def page(results: Result, made_by: str) -> str:
 
 
 def draw(results: Result, path: Path) -> None:
-    """Held-out nats of the median demonstration, and NMI, by rule: a panel for each number of demonstrations."""
+    """Held-out nats of the median demonstration, success, and NMI by rule: a column for each number of demonstrations."""
     with style():
-        figure = blank(4.4)
-        grid = figure.subplots(2, len(results), sharex=True, squeeze=False)
-        for (likelihood, agreement), (count, rules) in zip(grid.T, results.items(), strict=True):
+        figure = blank(5.6)
+        grid = figure.subplots(3, len(results), sharex=True, sharey="row", squeeze=False)
+        for column, (count, rules) in zip(grid.T, results.items(), strict=True):
             for name, colour in COLOURS.items():
-                line = [found["median"][name] for found in rules.values()]
-                likelihood.plot(range(len(rules)), line, "o-", ms=3, color=colour, label=name)
-            agreement.plot(
+                rates = [
+                    found["success"][name]["successes"] / found["success"][name]["trials"] for found in rules.values()
+                ]
+                for axes, line in zip(
+                    column, ([found["median"][name] for found in rules.values()], rates), strict=False
+                ):
+                    axes.plot(range(len(rules)), line, "o-", ms=3, color=colour, label=name)
+            column[2].plot(
                 range(len(rules)), [found["nmi"] for found in rules.values()], "o-", ms=3, color=COLOURS[OURS]
             )
-            agreement.set(ylim=(0.5, 1), xticks=range(len(rules)), xticklabels=list(rules), xlabel="steps")
-            likelihood.set_title(f"{count} demonstrations", fontsize=8)
-            for axes in (likelihood, agreement):
+            column[2].set(xticks=range(len(rules)), xticklabels=list(rules), xlabel="steps with which the decay is 1")
+            column[0].set_title(f"{count} demonstrations", fontsize=8)
+            for axes in column:
                 axes.grid(axis="y", color="#e4e4e4")
-        grid[0, 0].set_ylabel("nats per step, median")
-        grid[1, 0].set_ylabel("NMI with phases")
+        for axes, label in zip(grid[:, 0], ("nats per step, median", "success", "NMI with phases"), strict=True):
+            axes.set_ylabel(label)
         grid[0, -1].legend(fontsize=6, frameon=False)
-        keep(figure, path, "Held-out likelihood and agreement by how much weights decay", "")
+        keep(figure, path, "Held-out likelihood, success and agreement by how much weights decay", "")

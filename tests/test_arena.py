@@ -276,6 +276,7 @@ def decay_cell(steps, ours, flat, nmi):
         "steps": steps,
         "weight_decay": 0.5,
         "held_out": {"ddco": ours, "flat": flat},
+        "success": {"ddco": [True, False], "flat": [False, False]},
         "agreement": {"nmi": nmi, "matched_globally": {"f1_50": 0.5}},
     }
 
@@ -286,7 +287,7 @@ def test_the_decay_page_of_two_fits_worked_by_hand():
     found = arena_decay_results.summarize([*fits, decay_cell(0.0, [-1.0], [-2.0], 0.5)])
     assert list(found["5"]) == ["0", "250"]
     lines = arena_decay_results.page(found, "").splitlines()
-    assert "| 5 | 250 | 0.5 | -9.00; 0.50 | 0.50; 0.50 | 0.70 | 0.50 |" in lines
+    assert "| 5 | 250 | 0.5 | -9.00; 0.50 | 0.50; 0.50 | 0.70 | 0.50 | 2 of 4 | 0 of 4 |" in lines
 
 
 def test_a_decays_steps_are_those_of_the_demonstrations_trained_on(tmp_path):

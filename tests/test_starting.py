@@ -17,7 +17,7 @@ from scipy import stats
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.data.inspection import inspect
-from ddco_pyro.data.starting import _batch, _epochs, _weight_decay, starting_spec
+from ddco_pyro.data.starting import _batch, _epochs, starting_spec
 from ddco_pyro.spec import load_spec
 
 
@@ -98,19 +98,6 @@ def test_what_it_writes_lets_every_method_converge(tmp_path: Path) -> None:
 def test_epochs_follow_from_the_gradient_steps(lengths: list[int], epochs: int) -> None:
     found = np.array(lengths)
     assert _epochs(found, _batch(found)) == epochs
-
-
-@pytest.mark.parametrize(
-    ("lengths", "decay"),
-    [
-        ([100, 150], 1.0),
-        ([50] * 10, 0.25),
-        ([100] * 25, 0.01),  # ten times the steps, a hundredth of the decay
-        ([20] * 3, 3.0),  # and not 17.4
-    ],
-)
-def test_weights_decay_where_there_are_few_steps(lengths: list[int], decay: float) -> None:
-    assert _weight_decay(np.array(lengths)) == pytest.approx(decay)
 
 
 def test_three_demonstrations_are_enough(tmp_path: Path) -> None:

@@ -230,21 +230,8 @@ def test_weight_decay_of_adamw_is_apart_from_the_gradient(name, apart, tmp_path)
         spec = make_spec((2,), optimizer={"name": name, "lr": 0.01, "weight_decay": decay}, **settings)
         after.append(make_trainer(spec, random_demonstrations(), tmp_path / str(decay)).run().state_dict())
     none, once, twice = (torch.cat([value.flatten() for value in one.values()]) for one in after)
-    assert (none != once).sum() > 5  # of 24 weights; of Adam's first step only the sign is another
+    assert (none != once).sum() > 10
     assert torch.allclose(twice - none, 2 * (once - none), atol=1e-7) == apart
-
-
-@pytest.mark.parametrize("name", ["adam", "adamw", "momentum"])
-def test_weights_decay_and_biases_and_sigma_do_not(name, tmp_path):
-    settings = {"initialize": "random", "layerwise": False, "epochs": 1, "batch_size": 100}
-    after = []
-    for decay in (0.0, 1.0):
-        spec = make_spec((2,), optimizer={"name": name, "lr": 0.01, "weight_decay": decay}, **settings)
-        spec = with_overrides(spec, {"control.std": {"learn": True, "floor": 0.01, "per_option": True}})
-        after.append(dict(make_trainer(spec, random_demonstrations(), tmp_path / str(decay)).run().named_parameters()))
-    moved = {key for key, value in after[0].items() if not torch.equal(value, after[1][key])}
-    assert moved == {key for key in after[0] if key.endswith("weight")}
-    assert {key.rpartition(".")[2] for key in after[0]} == {"weight", "bias", "raw_own"}
 
 
 @pytest.mark.parametrize(

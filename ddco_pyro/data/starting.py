@@ -31,13 +31,6 @@ the policies beside it to stop by :data:`PATIENCE` on the files of docs/decision
 EPOCHS = (200, 2000)
 """Fewest and most epochs of a model."""
 
-DECAYED_STEPS = 250
-"""Of so few steps in all the weights' decay is 1, of twice as many a quarter, and so on: few are fitted too closely
-(docs/decisions.md)."""
-
-MOST_DECAY = 3.0
-"""No decay is larger: of larger ones nothing is known."""
-
 PATIENCE = 50
 """Epochs without improvement before a stage stops; with 20 flat policies stopped too early (docs/decisions.md)."""
 
@@ -113,8 +106,7 @@ def _lines(inspection: Inspection, path: str) -> Iterator[str]:
     yield f"  meta_policy: {_smallest(inspection)}"
     yield "training:"
     yield "  initialize: vq_controls           # clusters of observations and controls; vq: of observations alone"
-    decay = f"{_weight_decay(lengths):.1e}"
-    yield f"  optimizer: {{name: adam, lr: 3.0e-3, weight_decay: {decay}}}   # decay: the larger, the fewer the steps"
+    yield "  optimizer: {name: adam, lr: 3.0e-3}"
     batch = _batch(lengths)
     yield f"  epochs: {_epochs(lengths, batch)}                      # of all stages together, at most"
     yield f"  patience: {PATIENCE}                      # a stage stops after so many epochs without improvement"
@@ -140,10 +132,6 @@ def _batch(lengths: np.ndarray) -> int:
 def _epochs(lengths: np.ndarray, batch: int) -> int:
     wanted = GRADIENT_STEPS / np.ceil(len(lengths) / batch)
     return int(np.clip(round(wanted, -1), *EPOCHS))
-
-
-def _weight_decay(lengths: np.ndarray) -> float:
-    return float(min(MOST_DECAY, (DECAYED_STEPS / lengths.sum()) ** 2))
 
 
 def _validation(inspection: Inspection) -> Iterator[str]:

@@ -12,10 +12,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
-from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -98,8 +96,8 @@ class Training:
         now, training, states = self.progress, self.spec.training, self._restart.states
         cap = share(training.epochs, sum(end["epochs"] for end in now.ended), stages_left)
         objective = Objective(self._material, now, stage, self._ranks)
-        named = {name: p for name, p in model.named_parameters() if name.startswith(stage.trained)}
-        parameters, optimizer = list(named.values()), _optimizer(training.optimizer, named)
+        parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
+        optimizer = _optimizer(training.optimizer, parameters)
         if now.epoch > 0:
             restore_optimizer(optimizer, states["optimizer"])
             objective.constants = Constants.of(states.get("constants", {}))
@@ -181,18 +179,8 @@ def learning_rate(spec: OptimizerSpec, epoch: int, cap: int | None) -> float:
     return rate * 0.5 * (1 + math.cos(math.pi * epoch / cap))
 
 
-UNDECAYED = ("bias", "raw", "raw_own")
-"""Names of parameters that no decay takes from: biases, and those that σ is computed from."""
-
-
-def _optimizer(spec: OptimizerSpec, named: Mapping[str, nn.Parameter]) -> torch.optim.Optimizer:
-    """Of parameters in their order, which its checkpoints keep."""
-    runs = groupby(named, key=lambda name: name.rpartition(".")[2] in UNDECAYED)
-    groups = [
-        {"params": [named[name] for name in run], "weight_decay": 0.0 if free else spec.weight_decay}
-        for free, run in runs
-    ]
+def _optimizer(spec: OptimizerSpec, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
     if spec.name == "momentum":
-        return torch.optim.SGD(groups, lr=spec.lr, momentum=spec.momentum)
+        return torch.optim.SGD(parameters, lr=spec.lr, momentum=spec.momentum, weight_decay=spec.weight_decay)
     kind = torch.optim.AdamW if spec.name == "adamw" else torch.optim.Adam
-    return kind(groups, lr=spec.lr)
+    return kind(parameters, lr=spec.lr, weight_decay=spec.weight_decay)

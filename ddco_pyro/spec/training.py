@@ -25,8 +25,7 @@ class OptimizerSpec(Model):
     momentum: Share = 0.9
     """Momentum (``momentum`` only)."""
     weight_decay: float = Field(default=0.0, ge=0)
-    """L2 penalty of the networks' weights, not of biases and σ: half of it times their squares is added to the negative
-    log-likelihood per step; of ``adamw`` by which part, times the learning rate, every weight shrinks in a step."""
+    """L2 penalty; of ``adamw`` by which part, times the learning rate, every weight shrinks in a step."""
 
 
 class LabelsSpec(Model):
