@@ -58,21 +58,16 @@ def page(results: Result, made_by: str) -> str:
     ]
     for count, rules in results.items():
         for steps, found in rules.items():
-            nats = [f"{found['mean'][name]:.2f}; {found['median'][name]:.2f}" for name in methods]
-            cells = [
-                count,
-                steps,
-                f"{found['weight_decay']:.2g}",
-                *nats,
-                f"{found['nmi']:.2f}",
-                f"{found['f1_50']:.2f}",
-            ]
+            cells = [count, steps, f"{found['weight_decay']:.2g}"]
+            cells += [f"{found['mean'][name]:.2f}; {found['median'][name]:.2f}" for name in methods]
+            cells += [f"{found[name]:.2f}" for name in ("nmi", "f1_50")]
+            cells += ["{successes} of {trials}".format(**found["success"][name]) for name in methods]
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
 def draw(results: Result, path: Path) -> None:
-    """Held-out nats of the median demonstration, success, and NMI by rule: a column for each number of demonstrations."""
+    """Nats of the median demonstration, success, and NMI by rule: a column for each number of demonstrations."""
     with style():
         figure = blank(5.6)
         grid = figure.subplots(3, len(results), sharex=True, sharey="row", squeeze=False)
