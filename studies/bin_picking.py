@@ -166,7 +166,8 @@ def paired(bins: Mapping[str, Sequence[Bin]], name: str) -> dict[str, Any] | Non
     return None if name == OURS or len(ours) != len(theirs) else paired_difference(ours, theirs)
 
 
-def _shown(found: Mapping[str, Any] | None) -> str:
+def alone(found: Mapping[str, Any] | None) -> str:
+    """What :func:`paired` says, as the page has it."""
     return "-" if found is None else f"{found['only_ours']}, {found['only_theirs']} (p = {found['p_value']:.2g})"
 
 
@@ -179,7 +180,7 @@ def page(summary: Mapping[str, Any], seconds: Sequence[Mapping[str, float]], mad
         lines.append(f"| {name} | {' | '.join(cells)} | {PAPER.get(name, '-')} |")
     cells = [", ".join(map(str, one["cleared by seed"])) for one in summary.values()]
     lines.append(f"| bins cleared, by seed | {' | '.join(cells)} | - |")
-    cells = [_shown(one["paired"]) for one in summary.values()]
+    cells = [alone(one["paired"]) for one in summary.values()]
     lines.append(f"| cleared by {OURS} alone, by this alone | {' | '.join(cells)} | - |")
     cells = [f"{one['delivered']:.0%}" for one in summary.values()]
     lines.append(f"| objects brought into cups | {' | '.join(cells)} | - |")
