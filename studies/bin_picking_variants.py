@@ -80,8 +80,8 @@ def page(rows: Mapping[str, Mapping[str, Any]], seconds: Mapping[str, Sequence[f
             lines.append(f"| {' | '.join([variant, name, *cells])} |")
     lines += [
         "",
-        "Rates, and p, as in [summary.md](summary.md). Likelihoods of other controls are in units of their own. Fits: of all "
-        "methods of the row's variant, on one thread.",
+        "Rates, and p, as in [summary.md](summary.md). Likelihoods of other controls are in units of their own. Fits: "
+        "of all methods of the row's variant, on one thread.",
     ]
     return "\n".join(lines) + "\n"
 
