@@ -100,6 +100,12 @@ display(Markdown(pages.get("films", "Not measured yet.").partition("![")[0]), *f
 Markdown(pages.get("variants", "Not measured yet."))
 
 # %% [markdown]
+# With ten and twenty demonstrations again, four training seeds:
+
+# %%
+Markdown(pages.get("fewer", "Not measured yet."))
+
+# %% [markdown]
 # ## Objects that no demonstration has shown
 #
 # Each alone in the bin, and the known ones for comparison.
