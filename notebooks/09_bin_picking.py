@@ -100,7 +100,7 @@ display(Markdown(pages.get("films", "Not measured yet.").partition("![")[0]), *f
 Markdown(pages.get("variants", "Not measured yet."))
 
 # %% [markdown]
-# With ten and twenty demonstrations again, four training seeds:
+# With ten, twenty and forty demonstrations again, four and three training seeds:
 
 # %%
 Markdown(pages.get("fewer", "Not measured yet."))
