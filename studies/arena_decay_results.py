@@ -30,14 +30,18 @@ def _summary(cells: list[Result]) -> Result:
         "weight_decay": float(np.median([cell["weight_decay"] for cell in cells])),
         "mean": {name: float(np.mean([np.mean(cell["held_out"][name]) for cell in cells])) for name in methods},
         "median": {name: float(np.mean([np.median(cell["held_out"][name]) for cell in cells])) for name in methods},
-        "success": {
-            name: {"successes": sum(map(sum, played)), "trials": sum(map(len, played))}
-            for name in methods
-            for played in [[cell["success"][name] for cell in cells]]
-        },
+        "success": {name: _counted([cell["success"][name] for cell in cells]) for name in methods},
         "nmi": float(np.mean([cell["agreement"]["nmi"] for cell in cells])),
         "f1_50": float(np.mean([cell["agreement"]["matched_globally"]["f1_50"] for cell in cells])),
     }
+
+
+def _counted(played: list[list[bool]]) -> dict[str, int]:
+    return {"successes": sum(map(sum, played)), "trials": sum(map(len, played))}
+
+
+def _rate(found: Result, name: str) -> float:
+    return float(found["success"][name]["successes"] / found["success"][name]["trials"])
 
 
 def page(results: Result, made_by: str) -> str:
@@ -68,26 +72,24 @@ def page(results: Result, made_by: str) -> str:
 
 def draw(results: Result, path: Path) -> None:
     """Nats of the median demonstration, success, and NMI by rule: a column for each number of demonstrations."""
+    shown = (
+        ("nats per step, median", COLOURS, lambda found, name: found["median"][name]),
+        ("success", COLOURS, _rate),
+        ("NMI with phases", {OURS: COLOURS[OURS]}, lambda found, _: found["nmi"]),
+    )
     with style():
         figure = blank(5.6)
-        grid = figure.subplots(3, len(results), sharex=True, sharey="row", squeeze=False)
-        for column, (count, rules) in zip(grid.T, results.items(), strict=True):
-            for name, colour in COLOURS.items():
-                rates = [
-                    found["success"][name]["successes"] / found["success"][name]["trials"] for found in rules.values()
-                ]
-                for axes, line in zip(
-                    column, ([found["median"][name] for found in rules.values()], rates), strict=False
-                ):
-                    axes.plot(range(len(rules)), line, "o-", ms=3, color=colour, label=name)
-            column[2].plot(
-                range(len(rules)), [found["nmi"] for found in rules.values()], "o-", ms=3, color=COLOURS[OURS]
-            )
-            column[2].set(xticks=range(len(rules)), xticklabels=list(rules), xlabel="steps with which the decay is 1")
-            column[0].set_title(f"{count} demonstrations", fontsize=8)
-            for axes in column:
+        grid = figure.subplots(len(shown), len(results), sharex=True, sharey="row", squeeze=False)
+        for row, (label, colours, value) in zip(grid, shown, strict=True):
+            row[0].set_ylabel(label)
+            for axes, rules in zip(row, results.values(), strict=True):
                 axes.grid(axis="y", color="#e4e4e4")
-        for axes, label in zip(grid[:, 0], ("nats per step, median", "success", "NMI with phases"), strict=True):
-            axes.set_ylabel(label)
+                for name, colour in colours.items():
+                    line = [value(found, name) for found in rules.values()]
+                    axes.plot(range(len(rules)), line, "o-", ms=3, color=colour, label=name)
+        for axes, rules in zip(grid[-1], results.values(), strict=True):
+            axes.set(xticks=range(len(rules)), xticklabels=list(rules), xlabel="steps with which the decay is 1")
+        for axes, count in zip(grid[0], results, strict=True):
+            axes.set_title(f"{count} demonstrations", fontsize=8)
         grid[0, -1].legend(fontsize=6, frameon=False)
         keep(figure, path, "Held-out likelihood, success and agreement by how much weights decay", "")
