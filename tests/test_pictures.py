@@ -170,7 +170,7 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
         encoder.inputs(demo.observations for demo in demos), torch.zeros(8, 40, 2), torch.tensor(demos.lengths)
     )
     for seed in (1, 2):
-        seen = whole.shifted(encoder.shifts, seed)
+        seen = whole.varied(encoder.shifts, seed)
         shifts = seen.inputs.images.shifts["camera"]
         assert np.abs(shifts).max() <= 3
         assert len(np.unique(shifts, axis=0)) > 3
@@ -178,7 +178,7 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
         for row, n in enumerate((5, 2)):
             expected = shifted(demos[n].observations["camera"], *shifts[n])
             np.testing.assert_array_equal(pictures[row, : len(expected)], expected)
-    again, other = (whole.shifted(encoder.shifts, seed).inputs.images.shifts["camera"] for seed in (2, 1))
+    again, other = (whole.varied(encoder.shifts, seed).inputs.images.shifts["camera"] for seed in (2, 1))
     assert (again == shifts).all()
     assert (other != shifts).any()
 
@@ -188,7 +188,10 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
     [
         ({"key": "camera", "crop": [3, 3, 10, 4]}, r"'camera' crop: \[3, 3, 10, 4\] is not within 12 × 10 pixels"),
         ({"key": "pose", "grey": True}, r"'pose' has shape \[3\] at each step: crop, resize, grey and frames are for"),
-        ({"key": "pose", "augment": {"shift": 2}}, r"'pose' has shape \[3\] at each step: augment is for pictures"),
+        (
+            {"key": "pose", "augment": {"shift": 2}},
+            r"'pose' has shape \[3\] at each step: augment.shift is for pictures",
+        ),
         (
             {"key": "camera", "crop": [3, 3, 0, 4]},
             r"observations.1.crop: is top, left, height, width; height and width",

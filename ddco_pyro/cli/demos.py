@@ -148,7 +148,13 @@ def encode(
         typer.Option("--as", metavar="NAME", help="The new observation; KEY_features by default.", show_default=False),
     ] = None,
     updates: Annotated[int, typer.Option(min=1, help="Gradient steps of the autoencoder.")] = 2000,
-    seed: Annotated[int, typer.Option(min=0, max=2**32 - 2, help="Of weights, and of the order of pictures.")] = 0,
+    moved: Annotated[
+        int, typer.Option(min=0, help="Versions of each demonstration to write besides, with pictures moved.")
+    ] = 0,
+    shift: Annotated[int, typer.Option(min=0, help="Pixels by which they are moved, at most.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**32 - 2, help="Of weights, of the order of pictures, and of how they are moved.")
+    ] = 0,
     allow_code: Annotated[
         bool, typer.Option("--allow-code", help="Import the user code that --encoder names.")
     ] = False,
@@ -161,9 +167,11 @@ def encode(
     from ddco_pyro.encoding import Encoding
     from ddco_pyro.encoding import encode as write
 
-    encoding = Encoding(observation, encoder, size, seed, name, updates)
+    encoding = Encoding(observation, encoder, size, seed, name, updates, moved, shift)
     with console.Progress("encoding") as progress:
         encoded = write(file, out, encoding, progress, allow_code)
     about = encoded.about
     of = f"{about.size} of {about.features} features, {about.explained:.1%} of their variance"
-    print(f"{out}: {encoded.demonstrations} demonstrations, obs/{encoding.key}: {of}; the encoder: {encoded.folder}")
+    versions = f", {moved} times of moved pictures in obs/{encoding.key}_moved" if moved else ""
+    what = f"obs/{encoding.key}: {of}{versions}"
+    print(f"{out}: {encoded.demonstrations} demonstrations, {what}; the encoder: {encoded.folder}")

@@ -13,6 +13,7 @@ from ddco_pyro.data.checks import check_shape, check_steps, problems_of_masks
 from ddco_pyro.data.control_dimensions import ControlDimension, ControlStatistics, notes
 from ddco_pyro.data.control_parts import control_parts, described
 from ddco_pyro.data.hdf5 import DemonstrationsError
+from ddco_pyro.data.pictures import MOVED
 from ddco_pyro.data.sources import Column, Format, Source, open_source
 from ddco_pyro.data.values import LARGEST, NUMBERS, rounding, usable
 from ddco_pyro.spec import ControlSpec
@@ -174,6 +175,16 @@ class Inspection:
     def actions(self) -> Field | None:
         """The control."""
         return self.fields.get("actions")
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """Keys of vectors of which the file has other versions, of moved pictures, with the keys of those."""
+        pairs = ((field, self.fields.get(f"obs/{field.key}{MOVED}")) for field in self.observations)
+        return {
+            field.key: other.key
+            for field, other in pairs
+            if other and other.shape[1:] == field.shape and not other.affected and self.everywhere(other)
+        }
 
     def everywhere(self, array: Field) -> bool:
         """Whether every demonstration has this array."""

@@ -19,6 +19,10 @@ PICTURE_DIMENSIONS = 3
 """A step of pictures is [H, W, C]."""
 
 
+MOVED = "_moved"
+"""What the key of features of pictures that were moved ends with, behind that of the features themselves."""
+
+
 class TransformError(BadInput):
     """Pictures cannot be cut or scaled as asked."""
 

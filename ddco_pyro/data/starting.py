@@ -157,8 +157,10 @@ def _labels(inspection: Inspection) -> Iterator[str]:
 
 
 def _observations(inspection: Inspection) -> Iterator[str]:
-    vectors, left_out = [], []
+    vectors, left_out, versions = [], [], inspection.versions
     for field in inspection.observations:
+        if field.key in versions.values():
+            continue
         reason = _unusable(inspection, field) or _constant(field)
         if reason:
             left_out.append((field, reason))
@@ -173,7 +175,9 @@ def _observations(inspection: Inspection) -> Iterator[str]:
     yield "observations:                       # standardised; differences: appends x_t - x_(t-1), a velocity"
     for field in vectors:
         moving = "" if field.still else ", differences: true"
-        yield f"  - {{key: {_text(field.key)}{moving}}}"
+        other = versions.get(field.key)
+        varied = f", augment: {{versions: {_text(other)}}}" if other else ""
+        yield f"  - {{key: {_text(field.key)}{moving}{varied}}}"
     for field in images:
         comment = "# " if vectors else ""
         note = "   # an image: with it, every network has to be network: conv" if vectors else ""

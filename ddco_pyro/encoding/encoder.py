@@ -65,7 +65,7 @@ class Encoder:
         return self.reduced(self.kind(picture[None]))[0]
 
     def reduced(self, features: np.ndarray) -> np.ndarray:
-        """Features as the encoder gives them, [M, F], to float32 [M, size]."""
+        """Features as the encoder gives them, [..., F], to float32 [..., size]."""
         return features.astype(np.float32) if self.projection is None else self.projection(features)
 
     def write(self, folder: Path) -> None:

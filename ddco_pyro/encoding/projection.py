@@ -22,7 +22,7 @@ class Projection:
     explained: float
 
     def __call__(self, features: np.ndarray) -> np.ndarray:
-        """[M, F] to float32 [M, N]."""
+        """[..., F] to float32 [..., N]."""
         return ((features - self.mean) @ self.components.T).astype(np.float32)
 
 

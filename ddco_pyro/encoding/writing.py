@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shutil
 from collections.abc import Iterator
 from contextlib import nullcontext
@@ -20,6 +21,7 @@ import numpy as np
 
 from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.data.hdf5 import DemonstrationsError, opened
+from ddco_pyro.data.pictures import MOVED, shifted
 from ddco_pyro.data.resumable import parts_of
 from ddco_pyro.data.sources import Column, Recording, format_of
 from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
@@ -41,7 +43,10 @@ SIZE = 64
 ROWS = 1024
 """Rows of features that are reduced at once."""
 
-_KEY, _IDENTITY, _CHECKPOINT, _UNREDUCED = "features", "identity.json", "autoencoder.safetensors", "features.hdf5"
+FEATURES, VERSIONS = "features", "versions"
+"""Of the pictures as they are, and of them moved."""
+
+_IDENTITY, _CHECKPOINT, _UNREDUCED = "identity.json", "autoencoder.safetensors", "features.hdf5"
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,11 @@ class Encoding:
         are no more than that, or those of a fit.
     :param name: the new observation's key; ``<observation>_features`` by default.
     :param updates: gradient steps of the autoencoder.
+    :param moved: how many times each demonstration is encoded besides, with all of its pictures moved alike, into
+        ``<name>_moved`` [T, moved, size]; a spec has them as other versions of the features (``augment``).
+    :param shift: pixels of the stored pictures, at most, by which they are moved along either axis; the edge is
+        repeated.
+    :raises BadInput: ``moved`` without ``shift``, or the other way round, or a negative one.
     """
 
     observation: str
@@ -62,11 +72,25 @@ class Encoding:
     seed: int = 0
     name: str | None = None
     updates: int = UPDATES
+    moved: int = 0
+    shift: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.moved, self.shift) < 0 or (self.moved > 0) != (self.shift > 0):
+            raise BadInput(
+                f"--moved {self.moved} --shift {self.shift}: pictures are moved so many times, by so many pixels at "
+                "most; give both, 1 at least, or neither"
+            )
 
     @property
     def key(self) -> str:
         """The new observation's key."""
         return self.name or f"{self.observation}_features"
+
+    @property
+    def keys(self) -> dict[str, str]:
+        """The new observations' keys, by what they hold: :data:`FEATURES` or :data:`VERSIONS`."""
+        return {FEATURES: self.key} | ({VERSIONS: f"{self.key}{MOVED}"} if self.moved else {})
 
 
 @dataclass(frozen=True)
@@ -111,8 +135,12 @@ class _Job:
     ) -> None:
         self.source, self.out, self.encoding, self.on_event = source, out, encoding, on_event
         self.pictures = Pictures(source, encoding.observation)
-        if encoding.key in source.recording(source.names[0]).observations:
-            raise DemonstrationsError(f"obs/{encoding.key} is there already; choose another name with --as")
+        for key in encoding.keys.values():
+            if key in source.recording(source.names[0]).observations:
+                raise DemonstrationsError(f"obs/{key} is there already; choose another name with --as")
+        if encoding.shift >= min(self.pictures.shape[:2]):
+            height, width, _ = self.pictures.shape
+            raise BadInput(f"--shift {encoding.shift}: would move pictures of {height} × {width} pixels out of sight")
         kind = kind_of(encoding.encoder, allow_code)
         self.kind = kind.made(encoding.encoder, self.pictures, encoding.seed, allow_code)
         self.about = _about(encoding, self.pictures, self.kind)
@@ -172,25 +200,44 @@ class _Job:
             if parts is None:
                 return
             for name in self.source.names[len(parts.done) :]:
-                recording = self.source.recording(name)
-                shape = (recording.actions.shape[0], self.about.features)
-                column = Column(shape, np.dtype(np.float32), partial(self._features_of, name))
-                parts.add(Recording(name, {_KEY: column}, recording.actions))
+                actions = self.source.recording(name).actions
+                blocks = {FEATURES: partial(self._features_of, name), VERSIONS: partial(self._versions_of, name)}
+                columns = {
+                    kind: Column(self._shape(actions, kind, self.about.features), np.dtype(np.float32), blocks[kind])
+                    for kind in self.encoding.keys
+                }
+                parts.add(Recording(name, columns, actions))
                 self.on_event(DemonstrationsDone(len(parts.done), len(self.source.names)))
             parts.finish({}, {})
 
-    def _features_of(self, name: str) -> Iterator[np.ndarray]:
-        for block in self.pictures.of(name):
-            values = self.kind(block)
-            if values.shape[1] != self.about.features:
-                raise BadInput(
-                    f"encoder {self.about.encoder!r} gives {values.shape[1]} features in {name}, and "
-                    f"{self.about.features} in {self.pictures.training[0]}; it has to give as many of every picture"
-                )
-            yield values.astype(np.float32)
+    def _shape(self, actions: Column, kind: str, features: int) -> tuple[int, ...]:
+        """[T, F] or, of moved pictures, [T, moved, F]."""
+        return actions.shape[0], *((self.encoding.moved,) if kind == VERSIONS else ()), features
 
-    def _unreduced(self, source: Robomimic, name: str) -> Iterator[np.ndarray]:
-        return batches(source.recording(name).observations[_KEY], ROWS)
+    def _features_of(self, name: str) -> Iterator[np.ndarray]:
+        """Of the pictures of a demonstration, [M, F] at a time."""
+        return map(partial(self._features, name), self.pictures.of(name))
+
+    def _versions_of(self, name: str) -> Iterator[np.ndarray]:
+        """Of the same pictures, moved, [M, moved, F] at a time."""
+        most = self.encoding.shift
+        random = np.random.default_rng((self.encoding.seed, self.source.names.index(name)))
+        moves = random.integers(-most, most + 1, (self.encoding.moved, 2)).tolist()
+        for block in self.pictures.of(name):
+            yield np.stack([self._features(name, shifted(block, *by)) for by in moves], axis=1)
+
+    def _features(self, name: str, block: np.ndarray) -> np.ndarray:
+        values = self.kind(block)
+        if values.shape[1] != self.about.features:
+            raise BadInput(
+                f"encoder {self.about.encoder!r} gives {values.shape[1]} features in {name}, and "
+                f"{self.about.features} in {self.pictures.training[0]}; it has to give as many of every picture"
+            )
+        return values.astype(np.float32)
+
+    def _unreduced(self, source: Robomimic, name: str, kind: str = FEATURES) -> Iterator[np.ndarray]:
+        column = source.recording(name).observations[kind]
+        return batches(column, max(1, ROWS // math.prod(column.shape[1:-1])))
 
     def _projection(self) -> Projection | None:
         if self.encoding.size is None and self.about.size == self.about.features:
@@ -205,11 +252,16 @@ class _Job:
         with unreduced as features, one_thread(), robomimic_file(self.out, attributes, self.source.masks) as data:
             for name in self.source.names:
                 recording = self.source.recording(name)
-                shape = (recording.actions.shape[0], self.about.size)
-                blocks = partial(map, encoder.reduced, self._unreduced(features, name))
                 others = {key: column for key, column in recording.observations.items() if key != self.pictures.key}
-                observations = {**others, self.encoding.key: Column(shape, np.dtype(np.float32), blocks)}
-                write_recording(data, replace(recording, observations=observations))
+                encoded = {
+                    key: Column(
+                        self._shape(recording.actions, kind, self.about.size),
+                        np.dtype(np.float32),
+                        partial(map, encoder.reduced, self._unreduced(features, name, kind)),
+                    )
+                    for kind, key in self.encoding.keys.items()
+                }
+                write_recording(data, replace(recording, observations=others | encoded))
 
 
 def _about(encoding: Encoding, pictures: Pictures, kind: Kind) -> About:

@@ -45,6 +45,7 @@ class Objective:
         self.material, self.progress, self.stage, self.ranks = material, progress, stage, ranks
         self.known: tuple[Known, Known] = {}, {}
         self.constants: Constants | None = None
+        self._varied: tuple[tuple[int, int, int], Batch] | None = None
         self._likelihoods = 2 if stage.selecting else 1
         labels = material.labels
         if labels is not None and labels.matter_in(stage):
@@ -105,8 +106,10 @@ class Objective:
 
     def _seen(self, model: Hierarchy) -> Batch:
         """The training demonstrations as they are seen in this epoch."""
-        now = self.progress
-        return self.material.train.shifted(model.encoder.shifts, self.material.seed(now.restart, now.stage, now.epoch))
+        epoch = self.progress.restart, self.progress.stage, self.progress.epoch
+        if self._varied is None or self._varied[0] != epoch:
+            self._varied = epoch, self.material.train.varied(model.encoder.shifts, self.material.seed(*epoch))
+        return self._varied[1]
 
     def tune(self, model: Hierarchy) -> float:
         """What is maximised of the tuning demonstrations, per step: the mean, or the median over demonstrations."""

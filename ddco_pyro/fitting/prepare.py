@@ -91,7 +91,7 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
         kept = Path(own.path) if own.path else None
         path = collect(str(spec.demonstrated_task), own, kept, on_event, spec.observed)
     _refuse_what_cannot_be_read(spec, path)
-    return Demonstrations.read(path, spec.observed, _labels(spec), own.exclude)
+    return Demonstrations.read(path, spec.trained_with, _labels(spec), own.exclude)
 
 
 def outline(spec: Spec) -> Demonstrations:
@@ -103,7 +103,7 @@ def outline(spec: Spec) -> Demonstrations:
     path = Path(str(spec.demonstrations.path))
     _refuse_what_cannot_be_read(spec, path)
     controls = Demonstrations.read(path, [], _labels(spec), spec.demonstrations.exclude)
-    keys = spec.observed
+    keys = spec.trained_with
     with opened(path) as file:
         return replace(
             controls, demonstrations=tuple(_outlined(file[f"data/{demo.name}"], demo, keys) for demo in controls)
@@ -123,7 +123,7 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
 
     :raises DemonstrationsError: they lack one of them.
     """
-    keys, labels, exclude = spec.observed, _labels(spec), set(spec.demonstrations.exclude)
+    keys, labels, exclude = spec.trained_with, _labels(spec), set(spec.demonstrations.exclude)
     first = demos[0]
     if (first.observations.keys(), first.labels.keys(), exclude) == ({*keys}, {*labels}, set()):
         return demos
@@ -167,7 +167,7 @@ def _labels(spec: Spec) -> tuple[str, ...]:
 
 def _needed(spec: Spec) -> str:
     """What to do about a file that is not there."""
-    read = ["actions", *(f"obs/{key}" for key in spec.observed), *(f"labels/{name}" for name in _labels(spec))]
+    read = ["actions", *(f"obs/{key}" for key in spec.trained_with), *(f"labels/{name}" for name in _labels(spec))]
     return (
         "put it there, or fit to another with --set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, "
         f"with {', '.join(read)} in each data/<demonstration>"
@@ -182,7 +182,7 @@ def _refuse_what_cannot_be_read(spec: Spec, path: Path) -> None:
         "leave observations out, make its demonstrations fewer, shorter or equally long, scale pictures down, or lower "
         "filters or hidden"
     )
-    what = f"{path}: a fit to {', '.join(spec.observed)}"
+    what = f"{path}: a fit to {', '.join(spec.trained_with)}"
     refuse_too_much(memory_needed(spec, path), what, remedy)
 
 
@@ -191,7 +191,7 @@ def memory_needed(spec: Spec, path: Path) -> float:
 
     :raises DemonstrationsError: the file cannot be read or does not hold what the spec names.
     """
-    stored = extent(path, spec.observed, spec.demonstrations.exclude)
+    stored = extent(path, spec.trained_with, spec.demonstrations.exclude)
     shapes = {place.removeprefix("obs/"): shape for place, shape in stored.shapes.items() if place != "actions"}
     size = Dimensions(shapes, math.prod(stored.shapes["actions"]), max(1, *stored.lengths))
     try:

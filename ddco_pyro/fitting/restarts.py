@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -77,7 +78,8 @@ class Trainer:
         self.first.encoder.fit(train)
         self.first.scaling.fit(train)
         encoder, scaling = self.first.encoder, self.first.scaling
-        encoded = encode(train, encoder, scaling), encode(tune, encoder, scaling)
+        varied = replace(encode(train, encoder, scaling), versions=encoder.versions(train))
+        encoded = varied, encode(tune, encoder, scaling)
         fitted = encoder.state_dict(), scaling.state_dict()
         labels = Labels.of(spec, train, tune)
         self.material = Material(spec, dimensions, *encoded, train.names, *fitted, labels)

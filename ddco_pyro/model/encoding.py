@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from ddco_pyro.data.values import rounding
 from ddco_pyro.model.controls import ControlScaling, refuse_impossible
 from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError
-from ddco_pyro.spec import STEP, ObservationSpec
+from ddco_pyro.spec import STEP, AugmentSpec, ObservationSpec
 
 Shapes = Mapping[str, tuple[int, ...]]
 STEPS_AT_ONCE = 8192
@@ -31,12 +31,14 @@ NARROWEST = 1e-6
 @dataclass(frozen=True)
 class Batch:
     """N demonstrations padded to T steps: ``inputs``; ``actions`` [N, T, A'] in scaled units, of the control dimensions
-    that vary; ``lengths`` [N].
+    that vary; ``lengths`` [N]; of vectors that are varied in training, their other ``versions`` [N, V, T, F_key] by
+    name.
     """
 
     inputs: Inputs
     actions: Tensor
     lengths: Tensor
+    versions: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.lengths)
@@ -53,19 +55,28 @@ class Batch:
             yield rows, self.select(rows) if len(rows) < len(self) else self
 
     def select(self, rows: Tensor, at_most: int | None = None) -> Batch:
-        """The demonstrations ``rows`` [M], padded to the longest among them; their first ``at_most`` steps if given."""
+        """The demonstrations ``rows`` [M] as they are seen here, padded to the longest among them; their first
+        ``at_most`` steps if given.
+        """
         lengths = self.lengths[rows].clamp(max=at_most or int(self.lengths.max()))
         steps = int(lengths.max())
         return Batch(self.inputs.part(rows, slice(0, steps)), self.actions[rows, :steps], lengths)
 
-    def shifted(self, most: Mapping[str, int], seed: int) -> Batch:
-        """The same with the pictures of each demonstration moved at random.
+    def varied(self, most: Mapping[str, int], seed: int) -> Batch:
+        """The same with the pictures of each demonstration moved at random, and with vectors as they are or as one of
+        their other versions.
 
         :param most: by observation, the most pixels along either axis.
         """
         random = np.random.default_rng(seed)
         shifts = {key: random.integers(-pixels, pixels + 1, (len(self), 2)) for key, pixels in most.items()}
-        return self._with(lambda images: replace(images, shifts=shifts))
+        vectors = dict(self.inputs.vectors)
+        for key, others in self.versions.items():
+            chosen = torch.as_tensor(random.integers(-1, others.shape[1], len(self)))
+            (rows,) = torch.where(chosen >= 0)
+            vectors[key] = vectors[key].index_copy(0, rows, others[rows, chosen[rows]])
+        varied = Batch(Inputs(vectors, self.inputs.images, self.inputs.time), self.actions, self.lengths)
+        return varied._with(lambda images: replace(images, shifts=shifts))
 
     def read_by(self, readers: Readers) -> Batch:
         """The same with pictures that are in files read by these."""
@@ -112,7 +123,7 @@ class ObservationEncoder(nn.Module):
         pictures = [spec for spec in specs if len(shapes[spec.key]) == PICTURE_DIMENSIONS]
         self.transforms = {spec.key: _transform(spec) for spec in pictures}
         self.shifts = {spec.key: spec.augment.shift for spec in pictures if spec.augment}
-        seen = {spec.key: _seen_shape(spec, shapes[spec.key]) for spec in specs}
+        seen = {spec.key: _seen_shape(spec, shapes) for spec in specs}
         self.images = {spec.key: seen[spec.key] for spec in pictures}
         self.given = [int(np.prod(shapes[spec.key])) * spec.given for spec in self.specs]
         self.sizes = [int(np.prod(shapes[spec.key])) * spec.seen for spec in self.specs]
@@ -243,6 +254,23 @@ class ObservationEncoder(nn.Module):
         images = Frames(pictures, self.transforms, rows, slice(0, steps)) if pictures else {}
         return Inputs(by_key, images, torch.arange(steps))
 
+    def versions(self, demonstrations: Demonstrations) -> dict[str, Tensor]:
+        """The other versions of vectors that are varied in training, as networks see them, [N, V, T, F_key] by name."""
+        named = {spec.key: spec.augment.versions for spec in self.specs if spec.augment and spec.augment.versions}
+        return {
+            key: torch.stack(
+                [
+                    self.inputs(
+                        {**demo.observations, key: np.asarray(demo.observations[name])[:, version]}
+                        for demo in demonstrations
+                    ).vectors[key]
+                    for version in range(demonstrations.observation_shapes[name][0])
+                ],
+                dim=1,
+            )
+            for key, name in named.items()
+        }
+
 
 LARGEST_SCALED = 1e12
 """No feature or control may be larger, once it is scaled: float32 has to hold the square of what networks make of it,
@@ -290,19 +318,41 @@ def _transform(spec: ObservationSpec) -> Transform:
     return Transform(spec.crop, spec.resize, spec.grey, spec.frames)
 
 
-def _seen_shape(spec: ObservationSpec, stored: tuple[int, ...]) -> tuple[int, ...]:
+def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
     """What is seen of a step of an observation.
 
-    :raises ShapeError: it cannot be cut or scaled as the spec says.
+    :raises ShapeError: it cannot be cut, scaled or varied as the spec says.
     """
+    stored = shapes[spec.key]
     if spec.bins and len(stored) == PICTURE_DIMENSIONS:
         raise ShapeError(f"observations: {spec.key!r} has pictures: bins are for vectors")
-    if spec.augment and len(stored) != PICTURE_DIMENSIONS:
-        raise ShapeError(f"observations: {spec.key!r} has shape {list(stored)} at each step: augment is for pictures")
+    if spec.augment:
+        _refuse_other_versions(spec.key, spec.augment, shapes)
     try:
         return _transform(spec).shape(stored)
     except TransformError as error:
         raise ShapeError(f"observations: {spec.key!r} {error}") from error
+
+
+def _refuse_other_versions(key: str, augment: AugmentSpec, shapes: Shapes) -> None:
+    """See that an observation can be varied so; versions are not there where a model is read again.
+
+    :raises ShapeError: it cannot.
+    """
+    stored, versions = shapes[key], augment.versions
+    picture = len(stored) == PICTURE_DIMENSIONS
+    if augment.shift and not picture:
+        raise ShapeError(f"observations: {key!r} has shape {list(stored)} at each step: augment.shift is for pictures")
+    if versions is None:
+        return
+    if picture:
+        raise ShapeError(f"observations: {key!r} has pictures: augment.versions is for vectors; shift moves pictures")
+    there = shapes.get(versions)
+    if there is not None and (not there or not there[0] or there[1:] != stored):
+        raise ShapeError(
+            f"observations: {key!r} augment.versions: {versions!r} has shape {list(there)} at each step, it has to be "
+            f"[versions{''.join(f', {size}' for size in stored)}]"
+        )
 
 
 def _pictures(values: Observed) -> Observed:

@@ -9,6 +9,7 @@ from ddco_pyro.spec.networks import Activation, ConvolutionLayer, MetaPolicySpec
 from ddco_pyro.spec.reading import dump_spec, load_spec, spec_schema
 from ddco_pyro.spec.settings import (
     STEP,
+    AugmentSpec,
     ControlSpec,
     DemonstrationsSpec,
     InferenceSpec,
@@ -27,6 +28,7 @@ from ddco_pyro.spec.whole import Spec, parse_spec, with_overrides
 __all__ = [
     "STEP",
     "Activation",
+    "AugmentSpec",
     "BaselineSpec",
     "ControlSpec",
     "ConvolutionLayer",

@@ -58,11 +58,14 @@ STEP = "step"
 
 
 class AugmentSpec(Model):
-    """How pictures are varied while networks are trained, and at no other time."""
+    """How an observation is varied while networks are trained, and at no other time."""
 
     shift: int = Field(default=0, ge=0)
-    """Pixels, at most, by which all pictures of a trajectory are moved in an epoch, along either axis; the edge is
-    repeated."""
+    """Pictures alone: pixels, at most, by which all pictures of a trajectory are moved in an epoch, along either axis;
+    the edge is repeated."""
+    versions: Text | None = None
+    """Vectors alone: the key of other versions of it, [T, V, ...], such as features of pictures that were moved. In an
+    epoch all of a trajectory is seen as it is or as one of them, each equally likely."""
 
 
 Size = Annotated[Items[Count], Field(min_length=2, max_length=2)]
@@ -96,7 +99,7 @@ class ObservationSpec(Model):
     """Pictures alone: how many are seen together, the last one and those before it, along the channels; before the
     first step the first one is repeated. A single picture does not tell how fast anything moves."""
     augment: AugmentSpec | None = None
-    """Pictures alone: how they are varied in training; null: not at all."""
+    """How it is varied in training; null: not at all."""
 
     @model_validator(mode="after")
     def _something_is_left(self) -> ObservationSpec:
@@ -108,6 +111,8 @@ class ObservationSpec(Model):
     def _steps_are_even(self) -> ObservationSpec:
         if self.key == STEP and self.differences:
             raise invalid(("differences", f"{STEP} grows by the same at each step; leave it out"))
+        if self.key == STEP and self.augment:
+            raise invalid(("augment", f"{STEP} is made from nothing that could be varied; leave it out"))
         return self
 
     @property

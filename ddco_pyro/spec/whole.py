@@ -66,6 +66,12 @@ class Spec(Model):
         return [observation.key for observation in self.observations if observation.key != STEP]
 
     @property
+    def trained_with(self) -> list[str]:
+        """Names of the observations that demonstrations to train with have to hold: those, and their other versions."""
+        versions = (observation.augment.versions for observation in self.observations if observation.augment)
+        return list(dict.fromkeys([*self.observed, *filter(None, versions)]))
+
+    @property
     def seen(self) -> dict[str, int]:
         """By place in a file, such as ``obs/pose``: how many numbers networks see for each that is observed."""
         return {f"obs/{observation.key}": observation.seen for observation in self.observations}
