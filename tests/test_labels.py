@@ -14,7 +14,6 @@ import yaml
 from command_line import call
 from oracle import paths
 from planted import CONTROL, make_spec, make_trainer, make_truth, plant
-from sklearn.cluster import KMeans
 from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
@@ -208,18 +207,31 @@ def test_the_clusters_of_labelled_options_start_from_their_steps(order):
         np.testing.assert_array_equal(choices[0], numbers[truth])
 
 
-def test_a_short_option_with_labels_is_not_given_half_of_a_long_one():
-    """As k-means to its end does, which knows of sums of squares alone."""
-    places = np.concatenate([[0.0, 0.2], np.linspace(1.5, 8, 40), np.full(40, 20.0)])
-    truth = np.repeat([1, 2, 3], [2, 40, 40])
-    states = np.column_stack([places, np.zeros(82)])
-    labels = np.full(82, -1)
-    labels[[0, 17, 42]] = 1, 2, 3
+def test_labels_of_every_option_name_the_other_steps():
+    """Two options side by side along a way that both have gone: what is nearest to the mean of either says little."""
+    random, truth = np.random.default_rng(0), np.arange(400) % 3 + 1
+    along = random.uniform(-10, 10, 400)
+    states = np.column_stack(
+        [along, np.select([truth == 1, truth == 2], [0.0, 1.0], 9.0) + 0.1 * random.normal(size=400)]
+    )
+    labels = np.where((along > 0) | (np.arange(400) > 200), -1, truth)  # of the near half of the first ones
+    labels[np.flatnonzero(truth == 2)[:3]] = 2  # and of a few others, so that the means are apart along the way
     batch = make_batchable(Demonstrations((Demonstration("demo", {"state": states}, states),)))
-    to_its_end = KMeans(3, init=states[[0, 17, 42]], n_init=1).fit_predict(states) + 1
+    rows = batch.inputs.vector[0].numpy()
+    means = np.stack([rows[labels == option].mean(0) for option in (1, 2, 3)])
+    nearest = np.linalg.norm(rows[:, None] - means, axis=-1).argmin(1) + 1
     choices = Clusters(batch, 3, seed=0, labels=torch.tensor(labels[None])).choices(batch)[0].numpy()
-    assert (to_its_end[truth < 3] == truth[truth < 3]).mean() < 0.65
-    assert (choices[truth < 3] == truth[truth < 3]).mean() > 0.75
+    assert (nearest == truth).mean() < 0.9
+    assert (choices == truth).mean() > 0.99
+    some = np.where(labels == 3, -1, labels)
+    begun = Clusters(batch, 3, seed=0, labels=torch.tensor(some[None])).choices(batch)[0].numpy()
+    assert len(np.unique(begun)) == 3
+
+
+def test_one_option_needs_no_telling_apart():
+    batch = make_batchable(Demonstrations((Demonstration("demo", {"state": np.eye(4)[:, :2]}, np.eye(4)[:, :2]),)))
+    choices = Clusters(batch, 1, seed=0, labels=torch.tensor([[1, -1, -1, -1]])).choices(batch)
+    assert choices.tolist() == [[1, 1, 1, 1]]
 
 
 def make_batchable(demos):

@@ -2,7 +2,8 @@
 
 The paper clones one policy from each cluster. Here the whole model is trained with the choices of a level clamped to
 the clusters, which clones those policies and starts the terminations from the clusters' boundaries in the same way,
-at any level. Where some steps have labels, clusters start from the means of those (seeded k-means, Basu et al. 2002).
+at any level. Where every option has labelled steps, what tells those apart names all others (multinomial logistic
+regression); where some options have, their clusters start from the means of those (seeded k-means, Basu et al. 2002).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 import torch
 from sklearn.cluster import KMeans
+from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import euclidean_distances
 from torch import Tensor
 
@@ -21,7 +23,7 @@ from ddco_pyro.model.hierarchy import BYTES_AT_ONCE
 from ddco_pyro.model.networks.conv import POOLED
 
 ITERATIONS = 300
-"""Of k-means at most."""
+"""Of k-means, or of logistic regression, at most."""
 
 
 class Clusters:
@@ -29,9 +31,9 @@ class Clusters:
 
     :param controls: cluster observations and controls together, with as much weight on the controls as on the
         observations: steps that look alike but are acted on differently are then told apart.
-    :param labels: the options of the steps that have one, 1 to m, -1 for the others, [N, T]: the clusters of these
-        options start from the means of their steps, the others as k-means++ does from there. Where all options have
-        labelled steps clusters move once: further iterations may let two of them change places.
+    :param labels: the options of the steps that have one, 1 to m, -1 for the others, [N, T]. Where every option has
+        labelled steps, a step belongs to the option that logistic regression of those gives it to. Where not, the
+        clusters of these options start from the means of their steps, the others as k-means++ does from there.
     :param read: names of the observations that are clustered, those of the options' policies; all where there is none.
 
     Fewer than ``options`` clusters are found where there are fewer distinct observations. Of more steps than
@@ -52,15 +54,19 @@ class Clusters:
         chosen = np.ones(batch.steps, dtype=bool)
         chosen[np.random.default_rng(seed).permutation(batch.steps)[self._most :]] = False
         rows = np.concatenate(list(_only(chosen, self._blocks(batch))))
-        start = "k-means++" if labels is None else _Start(labels[_alive(batch)].numpy()[chosen])
-        number = distinct(rows, options)
-        most = 1 if isinstance(start, _Start) and start.names(number) else ITERATIONS
-        self._kmeans = KMeans(number, init=start, n_init=10, max_iter=most, random_state=seed).fit(rows)
+        known = None if labels is None else labels[_alive(batch)].numpy()[chosen]
+        self._namer: LogisticRegression | KMeans
+        if known is not None and options > 1 and len(_labelled(known, options)) == options:
+            self._namer = LogisticRegression(max_iter=ITERATIONS).fit(rows[known > 0], known[known > 0] - 1)
+        else:
+            start = "k-means++" if known is None else _Start(known)
+            number = distinct(rows, options)
+            self._namer = KMeans(number, init=start, n_init=10, max_iter=ITERATIONS, random_state=seed).fit(rows)
 
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
         choices = torch.zeros(batch.inputs.batch, dtype=torch.long)
-        each = [self._kmeans.predict(rows) for rows in _together(self._blocks(batch), self._most)]
+        each = [self._namer.predict(rows) for rows in _together(self._blocks(batch), self._most)]
         choices[_alive(batch)] = torch.as_tensor(np.concatenate(each), dtype=torch.long) + 1
         return choices
 
@@ -129,20 +135,18 @@ class _Start:
     def __init__(self, labels: np.ndarray) -> None:
         self.labels = labels
 
-    def _labelled(self, clusters: int) -> list[int]:
-        return [int(option) for option in np.unique(self.labels) if 0 < option <= clusters]
-
-    def names(self, clusters: int) -> bool:
-        """Whether every cluster has labelled rows."""
-        return len(self._labelled(clusters)) == clusters
-
     def __call__(self, rows: np.ndarray, clusters: int, random_state: np.random.RandomState) -> np.ndarray:
-        labelled = self._labelled(clusters)
+        labelled = _labelled(self.labels, clusters)
         means = {option: rows[self.labels == option].mean(0) for option in labelled}
         for option in set(range(1, clusters + 1)) - set(labelled):
             far = euclidean_distances(rows, np.stack(list(means.values())), squared=True).min(1)
             means[option] = rows[random_state.choice(len(rows), p=far / far.sum())]
         return np.stack([means[option] for option in range(1, clusters + 1)])
+
+
+def _labelled(labels: np.ndarray, options: int) -> list[int]:
+    """The first so many options that have labels, sorted."""
+    return [int(option) for option in np.unique(labels) if 0 < option <= options]
 
 
 def _alive(batch: Batch) -> Tensor:
