@@ -156,7 +156,7 @@ def test_from_pictures_to_a_policy_by_commands(source: Path, tmp_path: Path) -> 
     given = ("encode", source, "--observation", "camera", "--size", 4)
     ended = call(*given, "--out", out, "--moved", VERSIONS, "--shift", 2)
     assert ended.status == 0
-    assert "3 times of moved pictures in obs/camera_features_moved" in ended.out
+    assert "; of moved pictures, 3 times: obs/camera_features_moved; " in ended.out
     assert call(*given, "--out", bare).status == 0
     assert call("init", out, "--out", spec).status == 0
     written = yaml.safe_load(spec.read_text())["observations"]

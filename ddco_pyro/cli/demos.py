@@ -172,6 +172,6 @@ def encode(
         encoded = write(file, out, encoding, progress, allow_code)
     about = encoded.about
     of = f"{about.size} of {about.features} features, {about.explained:.1%} of their variance"
-    versions = f", {moved} times of moved pictures in obs/{encoding.key}_moved" if moved else ""
+    versions = f"; of moved pictures, {moved} times: obs/{encoding.key}_moved" if moved else ""
     what = f"obs/{encoding.key}: {of}{versions}"
     print(f"{out}: {encoded.demonstrations} demonstrations, {what}; the encoder: {encoded.folder}")
