@@ -25,7 +25,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
-from ddco_pyro.errors import Failed
+from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.spec import load_spec
@@ -48,6 +48,11 @@ class ArenaCell(Cell):
     count: int
     seed: int
 
+    def __post_init__(self) -> None:
+        """:raises BadInput: there is nothing to train on."""
+        if self.count < 1:
+            raise BadInput(f"{self.count} demonstrations to train on: it has to be 1 or more")
+
     @property
     def name(self) -> str:
         """Of its files."""
@@ -56,7 +61,7 @@ class ArenaCell(Cell):
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """Fit, play, and say how often each method succeeded."""
         begun, world, own = time.perf_counter(), sawyer(settings), settings.values
-        source = world.collected(self.task, number=own["demonstrations"], held_out=HELD_OUT, noise=own["noise"])
+        source = recorded(self.task, settings)
         fitted = fitted_cell(self, source, settings.overrides, folder)
         trained = time.perf_counter()
         methods = {OURS: fitted} | fitted.baselines
@@ -91,6 +96,16 @@ def sawyer(settings: Settings) -> Apart:
     return Apart("arena_metaworld.py", "arena_requirements.txt", settings.runs)
 
 
+def recorded(task: str, settings: Settings) -> Path:
+    """The demonstrations of a task, which all cells of these settings share.
+
+    :raises BadInput: there is no such task.
+    :raises Failed: the simulator cannot be used, or its expert fails.
+    """
+    own = settings.values
+    return sawyer(settings).collected(task, number=own["demonstrations"], held_out=HELD_OUT, noise=own["noise"])
+
+
 def fitted_cell(cell: ArenaCell, source: Path, overrides: tuple[str, ...], folder: Path) -> Fit:
     """A fit of the spec that ``ddco-pyro init`` writes for the training demonstrations, and of its baselines."""
     names, valid, unused = chosen(source, cell)
@@ -110,12 +125,12 @@ def chosen(source: Path, cell: ArenaCell) -> tuple[list[str], list[str], list[st
 
     A seed's demonstrations are among those that it has where there are more of them.
 
-    :raises Failed: there are not so many.
+    :raises BadInput: there are not so many.
     """
     with h5py.File(source) as file:
         train, valid = ([name.decode() for name in file[f"mask/{mask}"]] for mask in ("train", "valid"))
     if cell.count > len(train):
-        raise Failed(f"{source}: has {len(train)} demonstrations to train on, {cell.count} are asked for")
+        raise BadInput(f"{source}: has {len(train)} demonstrations to train on, {cell.count} are asked for")
     first = set(np.random.default_rng(cell.seed).permutation(len(train))[: cell.count])
     used = [name for place, name in enumerate(train) if place in first]
     return used, valid, [name for name in train if name not in used]

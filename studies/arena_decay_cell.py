@@ -13,9 +13,10 @@ from typing import Any
 
 import h5py
 import numpy as np
-from apart import HELD_OUT
-from arena_cell import ArenaCell, chosen, sawyer
+from arena_cell import ArenaCell, chosen, recorded
 from cells import Cell, Settings
+
+from ddco_pyro.errors import BadInput
 
 DEFAULTS = Settings({"demonstrations": 70, "noise": 0.1, "episodes": 20}, Path("runs/arena"))
 
@@ -31,12 +32,14 @@ class DecayCell(Cell):
     steps: float
     seed: int
 
+    def __post_init__(self) -> None:
+        """:raises BadInput: steps are counted."""
+        if self.steps < 0:
+            raise BadInput(f"a decay that is 1 with {self.steps:g} steps: it has to be 0 or more")
+
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """What the arena's cell with that decay says."""
-        own = settings.values
-        source = sawyer(settings).collected(
-            self.task, number=own["demonstrations"], held_out=HELD_OUT, noise=own["noise"]
-        )
+        source = recorded(self.task, settings)
         cell = ArenaCell(self.task, self.count, self.seed)
         decay = (self.steps / trained_steps(source, cell)) ** 2
         changes = (*settings.overrides, f"training.optimizer.weight_decay={decay:.3g}")

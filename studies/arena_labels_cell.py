@@ -14,11 +14,11 @@ from typing import Any
 
 import h5py
 import numpy as np
-from apart import HELD_OUT
-from arena_cell import LABELS, ArenaCell, fitted_cell, sawyer
+from arena_cell import LABELS, ArenaCell, fitted_cell, recorded
 from arena_segments import flat
 from cells import Cell, Settings
 
+from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.agreement import agreement
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.labels import option_labels
@@ -38,12 +38,16 @@ class LabelsCell(Cell):
     labelled: int
     seed: int
 
+    def __post_init__(self) -> None:
+        """:raises BadInput: there are not so many demonstrations to label."""
+        if not 0 <= self.labelled <= TRAINED:
+            raise BadInput(
+                f"{self.labelled} labelled demonstrations: it has to be 0 to {TRAINED}, which are trained on"
+            )
+
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """Fit, and say how well options agree with phases on held-out demonstrations."""
-        own = settings.values
-        source = sawyer(settings).collected(
-            self.task, number=own["demonstrations"], held_out=HELD_OUT, noise=own["noise"]
-        )
+        source = recorded(self.task, settings)
         kinds = phases(source)
         changes = [*settings.overrides, "compare_with=[]", f"hierarchy.levels.0.count={len(kinds)}"]
         if self.labelled:

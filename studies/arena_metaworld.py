@@ -13,6 +13,7 @@ episode.
 from __future__ import annotations
 
 import os
+import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -146,7 +147,8 @@ def main() -> None:
     own = parser.parse_args()
     warnings.filterwarnings("ignore")  # the experts' gains are meant to saturate
     if own.task not in ENV_POLICY_MAP:
-        raise SystemExit(f"there is no task {own.task!r}; Meta-World has: {', '.join(sorted(ENV_POLICY_MAP))}")
+        print(f"there is no task {own.task!r}; Meta-World has: {', '.join(sorted(ENV_POLICY_MAP))}", file=sys.stderr)
+        raise SystemExit(2)
     controllers = named_controllers(own.controllers)
     if own.what == "collect":
         collect(own.task, own.out, own.number, own.held_out, own.noise)

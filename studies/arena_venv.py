@@ -8,10 +8,13 @@ import sys
 from pathlib import Path
 
 from ddco_pyro.data.files import only_one, write_text
-from ddco_pyro.errors import Failed
+from ddco_pyro.errors import BadInput, Failed
 
 MADE = ".made"
 """In the environment: the pins that it was made from, once all of them are installed."""
+
+BAD_INPUT = 2
+"""The exit status of a script that cannot use what it was given."""
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -34,7 +37,8 @@ def made(folder: Path, pins: Path, python: str = sys.executable) -> Path:
 def run(python: Path, script: Path, *arguments: str | Path) -> None:
     """Run a script on one thread.
 
-    :raises Failed: it ended with an error; its last line.
+    :raises BadInput: it says that what it was given cannot be used; its last line.
+    :raises Failed: it ended with another error; its last line.
     """
     command = [str(python), "-W", "ignore", str(script), *map(str, arguments)]
     _run(command, f"{script.name} {arguments[0]} {arguments[1]}", ONE_THREAD)
@@ -53,4 +57,4 @@ def _run(command: list[str], what: str, environment: dict[str, str] | None = Non
         raise Failed(f"{what}: {command[0]}: {error.strerror}") from error
     if ended.returncode:
         said = (ended.stderr.strip() or ended.stdout.strip() or f"exit status {ended.returncode}").splitlines()
-        raise Failed(f"{what}: {said[-1].strip()}")
+        raise (BadInput if ended.returncode == BAD_INPUT else Failed)(f"{what}: {said[-1].strip()}")

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import rates
-from cells import Cell, Settings, printed
+from cells import Cell, Settings, printed, some
 from joblib import Parallel, delayed
 from provenance import record, sentence, text
 from scipy import stats
@@ -218,7 +218,7 @@ def main() -> None:
 def run(own: argparse.Namespace) -> str:
     """Do what is not done yet, and write what all cells that are done say together; the page."""
     settings = DEFAULTS.given(own)
-    cells = [Fitted(spec, seed) for seed in range(own.seeds) for spec in own.specs]
+    cells = some([Fitted(spec, seed) for seed in range(own.seeds) for spec in own.specs])
     command = f"python studies/bin_picking.py --seeds {own.seeds} --specs {' '.join(own.specs)} {settings.words()}"
     if not own.summarize:
         made_by = record(cells[0].command(settings))

@@ -19,7 +19,7 @@ from typing import Any
 
 import rates
 from bin_picking import DEFAULTS, OURS, SPECS, Fitted, alone, evaluated, summarize
-from cells import Cell, Settings, described, printed
+from cells import Cell, Settings, described, printed, some
 from joblib import Parallel, delayed
 from provenance import record, sentence, text
 
@@ -97,7 +97,7 @@ def main() -> None:
     DEFAULTS.add_to(parser)
     own = parser.parse_args()
     settings = DEFAULTS.given(own)
-    cells = [Variant(variant, seed) for seed in range(own.seeds) for variant in own.variants]
+    cells = some([Variant(variant, seed) for seed in range(own.seeds) for variant in own.variants])
 
     def run() -> str:
         if not own.summarize:

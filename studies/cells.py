@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, get_type_hints
+from typing import Any, ClassVar, TypeVar, get_type_hints
 
 import torch
 from provenance import Record, is_kept, record, text
@@ -106,8 +106,16 @@ class Cell(ABC):
         defaults.add_to(parser)
         own = parser.parse_args()
         settings = defaults.given(own)
-        cell = cls(*(getattr(own, field.name) for field in fields(cls)))
-        printed(lambda: json.dumps(cell.run(settings, record(cell.command(settings))), indent=1))
+        words = [getattr(own, field.name) for field in fields(cls)]
+
+        def work() -> str:
+            cell = cls(*words)
+            return json.dumps(cell.run(settings, record(cell.command(settings))), indent=1)
+
+        printed(work)
+
+
+C = TypeVar("C", bound=Cell)
 
 
 def described(text: str | None) -> argparse.ArgumentParser:
@@ -122,6 +130,16 @@ def printed(work: Callable[[], str]) -> None:
     except (BadInput, Failed) as error:
         print(error, file=sys.stderr)
         raise SystemExit(2 if isinstance(error, BadInput) else 1) from None
+
+
+def some(cells: list[C]) -> list[C]:
+    """The cells of a study.
+
+    :raises BadInput: there are none.
+    """
+    if not cells:
+        raise BadInput(f"{Path(sys.argv[0]).name}: there is nothing to do: a list or a number is empty or 0")
+    return cells
 
 
 def digest(settings: Mapping[str, Any]) -> str:

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pushing_pictures_results as shown
-from cells import Settings, described, printed
+from cells import Settings, described, printed, some
 from joblib import Parallel, delayed
 from provenance import record, sentence, text
 from pushing_pictures_cell import DEFAULTS, METHODS, PictureCell, spec_of
@@ -79,7 +79,7 @@ def main() -> None:
 
 def run(own: argparse.Namespace) -> str:
     """Do what is not done yet, and write what there is; the page."""
-    settings, asked = DEFAULTS.given(own), cells(own)
+    settings, asked = DEFAULTS.given(own), some(cells(own))
     made_by, until = record(asked[0].command(settings)), time.monotonic() + 60 * own.minutes
     if not own.summarize:
         Parallel(n_jobs=own.jobs, verbose=10)(delayed(_begun)(cell, settings, made_by, until) for cell in asked)

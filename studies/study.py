@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from apart import Apart
-from cells import Cell, Settings, printed
+from cells import Cell, Settings, printed, some
 from joblib import Parallel, delayed
 from provenance import record, sentence, text
 
 from ddco_pyro.data.files import write_text
-from ddco_pyro.errors import BadInput
 
 
 class Shown(Protocol):
@@ -69,9 +68,7 @@ class Study:
 
         :raises BadInput: there is no cell to do.
         """
-        settings, cells = self.defaults.given(own), self.cells(own)
-        if not cells:
-            raise BadInput(f"{self.name}.py: there is nothing to do: one of {', '.join(self.axes)} is empty or 0")
+        settings, cells = self.defaults.given(own), some(self.cells(own))
         made_by = record(cells[0].command(settings))
         self.simulator(settings).made()  # or nothing else has to begin
         kept = Parallel(n_jobs=own.jobs, verbose=10)(delayed(cell.run)(settings, made_by) for cell in cells)

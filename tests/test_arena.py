@@ -12,8 +12,10 @@ from dataclasses import replace
 import apart
 import arena
 import arena_cell
+import arena_decay
 import arena_decay_cell
 import arena_decay_results
+import arena_labels
 import arena_venv
 import h5py
 import numpy as np
@@ -24,7 +26,7 @@ from arena_playing import controls, exported, play
 from arena_results import draw, mean_success, page, summarize
 from arena_segments import MEASURES
 
-from ddco_pyro.errors import Failed
+from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.export import write_numpy
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -248,6 +250,33 @@ def test_an_error_in_the_environment_is_its_last_line():
     assert str(refused.value).startswith("arena_metaworld.py collect pick-place-v3: ModuleNotFoundError")
 
 
+def test_what_the_environments_script_cannot_use_is_bad_input(tmp_path):
+    script = tmp_path / "world.py"
+    script.write_text("import sys\nprint('there is no task x', file=sys.stderr)\nraise SystemExit(2)\n")
+    with pytest.raises(BadInput, match=r"^world.py collect x: there is no task x$"):
+        arena_venv.run(sys.executable, script, "collect", "x")
+
+
+@pytest.mark.parametrize(
+    ("study", "words", "why"),
+    [
+        (arena, ["--counts", "5", "0"], "0 demonstrations to train on: it has to be 1 or more"),
+        (arena, ["--seeds", "0"], "arena.py: there is nothing to do: a list or a number is empty or 0"),
+        (arena_labels, ["--labelled", "60"], "60 labelled demonstrations: it has to be 0 to 50, which are trained on"),
+        (arena_decay, ["--steps", "-80"], "a decay that is 1 with -80 steps: it has to be 0 or more"),
+    ],
+)
+def test_cells_that_there_cannot_be_are_refused_before_an_environment_is_made(
+    tmp_path, monkeypatch, capsys, study, words, why
+):
+    where = ["--runs", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", [f"{study.__name__}.py", *words, *where])
+    with pytest.raises(SystemExit) as ended:
+        study.main()
+    assert (ended.value.code, capsys.readouterr().err) == (2, f"{why}\n")
+    assert list(tmp_path.iterdir()) == []
+
+
 # --- cells ------------------------------------------------------------------------------------------------------------
 
 
@@ -266,7 +295,7 @@ def test_the_same_demonstrations_are_held_out_from_all_cells(tmp_path):
     for seed in (0, 1):
         assert set(used[2, seed][0]) < set(used[5, seed][0]) < set(used[8, seed][0])
     assert used[5, 0] != used[5, 1]
-    with pytest.raises(Failed, match="has 8 demonstrations to train on, 9 are asked for"):
+    with pytest.raises(BadInput, match="has 8 demonstrations to train on, 9 are asked for"):
         arena_cell.chosen(tmp_path / "demos.hdf5", arena_cell.ArenaCell("task", 9, 0))
 
 

@@ -86,7 +86,7 @@ def test_a_study_without_cells_says_so(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit) as ended:
         run(monkeypatch, tmp_path, ["--tasks"])
     assert ended.value.code == 2
-    assert capsys.readouterr().err == "toy.py: there is nothing to do: one of tasks, seed is empty or 0\n"
+    assert capsys.readouterr().err == "toy.py: there is nothing to do: a list or a number is empty or 0\n"
 
 
 def test_a_cell_by_itself_is_the_studys(tmp_path, monkeypatch, capsys):
