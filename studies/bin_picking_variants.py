@@ -11,6 +11,7 @@ and ``variants.md`` of all cells that are done.
 
 from __future__ import annotations
 
+import argparse
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -96,16 +97,17 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs/results/bin_picking"))
     DEFAULTS.add_to(parser)
     own = parser.parse_args()
+    printed(lambda: run(own))
+
+
+def run(own: argparse.Namespace) -> str:
+    """Do what is not done yet, and write what all cells that are done say; the page."""
     settings = DEFAULTS.given(own)
     cells = some([Variant(variant, seed) for seed in range(own.seeds) for variant in own.variants])
-
-    def run() -> str:
-        if not own.summarize:
-            made_by = record(cells[0].command(settings))
-            Parallel(n_jobs=own.jobs)(delayed(cell.run)(settings, made_by) for cell in cells)
-        return write(own.out, own.variants, own.seeds, settings)
-
-    printed(run)
+    if not own.summarize:
+        made_by = record(cells[0].command(settings))
+        Parallel(n_jobs=own.jobs)(delayed(cell.run)(settings, made_by) for cell in cells)
+    return write(own.out, own.variants, own.seeds, settings)
 
 
 def write(out: Path, variants: Sequence[str], seeds: int, settings: Settings) -> str:
