@@ -115,7 +115,7 @@ def contents(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-MODELS = [{}, {"optimizer": {"name": "momentum"}, "clip_gradient": 0.1, "duration": {"mean": 4}}]
+MODELS = [{}, {"optimizer": {"name": "momentum"}, "clip_gradient": 0.1, "average": 0.9, "duration": {"mean": 4}}]
 
 
 @pytest.mark.slow

@@ -106,6 +106,7 @@ def specs(draw: st.DrawFn) -> dict[str, Any]:
             "epochs": draw(counts),
             "patience": draw(st.none() | counts),
             "clip_gradient": draw(st.none() | positive),
+            "average": draw(st.none() | st.floats(0.01, 0.99)),
         },
         "selection": {"grid": draw(st.sampled_from([{}, {"seed": [1, 2]}, {"control.std": [0.1, {"learn": True}]}]))},
         "rollout": {"policies": draw(st.lists(texts, max_size=2))},

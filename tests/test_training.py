@@ -11,6 +11,7 @@ import torch
 from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plant, recovered
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.fitting.averaging import Average
 from ddco_pyro.fitting.checkpoint import Progress, Restart
 from ddco_pyro.fitting.convergence import RISING, StageEnd
 from ddco_pyro.fitting.objective import Objective, TrainingError
@@ -234,6 +235,35 @@ def test_weight_decay_of_adamw_is_apart_from_the_gradient(name, apart, tmp_path)
     assert torch.allclose(twice - none, 2 * (once - none), atol=1e-7) == apart
 
 
+def test_the_running_mean_of_the_weights_is_evaluated_and_kept(tmp_path, monkeypatch):
+    """By its closed form, from the weights after each gradient step of the stage."""
+    decay, steps, shown = 0.7, [], []
+
+    def update(self, model, old=Average.update):
+        old(self, model)
+        steps.append({name: value.detach().clone() for name, value in model.named_parameters()})
+
+    def tune(self, model, old=Objective.tune):
+        shown.append({name: value.detach().clone() for name, value in model.named_parameters()})
+        return float(len(shown))  # every epoch is the best so far
+
+    monkeypatch.setattr(Average, "update", update)
+    monkeypatch.setattr(Objective, "tune", tune)
+    spec = flat(average=decay, epochs=3, batch_size=4)
+    final = make_trainer(spec, random_demonstrations(), tmp_path).run()
+    assert (len(steps), len(shown)) == (3 * 2, 1 + 3)
+    for epoch, seen in enumerate(shown[1:], start=1):
+        taken = steps[: 2 * epoch]
+        last = len(taken) - 1
+        for name, value in seen.items():
+            mean = decay**last * taken[0][name] + sum(
+                (1 - decay) * decay ** (last - place) * step[name] for place, step in enumerate(taken) if place
+            )
+            torch.testing.assert_close(value, mean)
+    assert all(torch.equal(value, shown[-1][name]) for name, value in final.named_parameters())
+    assert any(not torch.equal(value, steps[-1][name]) for name, value in final.named_parameters())
+
+
 @pytest.mark.parametrize(
     ("optimizer", "training", "rows"),
     [
@@ -241,8 +271,9 @@ def test_weight_decay_of_adamw_is_apart_from_the_gradient(name, apart, tmp_path)
         pytest.param("momentum", {"epochs": 18}, 2 * 6 * 3, marks=pytest.mark.slow),
         pytest.param("adam", {"epochs": 30, "patience": 1}, None, marks=pytest.mark.slow),
         ("adam", {"epochs": 20, "upper_levels": "segments"}, 2 * 5 * 4),
+        ("adam", {"epochs": 18, "average": 0.9}, 2 * 6 * 3),
     ],
-    ids=["adam", "momentum", "stages that stop early", "levels from segments"],
+    ids=["adam", "momentum", "stages that stop early", "levels from segments", "mean weights"],
 )
 def test_resuming_gives_the_same_bits(tmp_path, optimizer, training, rows):
     spec = make_spec((2, 2), optimizer={"name": optimizer, "lr": 0.01}, restarts=2, **training)

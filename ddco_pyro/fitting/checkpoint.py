@@ -47,7 +47,8 @@ class Progress:
 @dataclass
 class Restart:
     """A restart that is being trained: its progress, and the tensors of its ``model``, its ``optimizer``, of the
-    ``best`` epoch of this stage, and the ``constants`` that it takes over, if any. One that is done has the best alone.
+    ``best`` epoch of this stage, and the ``average`` of weights and the ``constants`` that it takes over, if any. One
+    that is done has the best alone.
     """
 
     progress: Progress

@@ -22,6 +22,7 @@ from torch import nn
 
 from ddco_pyro.data.reading import Readers
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
+from ddco_pyro.fitting.averaging import Average
 from ddco_pyro.fitting.checkpoint import Restart, copy_of, optimizer_state, restore_optimizer
 from ddco_pyro.fitting.convergence import StageEnd, share
 from ddco_pyro.fitting.devices import device_of, generators, repeatable
@@ -97,9 +98,10 @@ class Training:
         cap = share(training.epochs, sum(end["epochs"] for end in now.ended), stages_left)
         objective = Objective(self._material, now, stage, self._ranks)
         parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
-        optimizer = _optimizer(training.optimizer, parameters)
+        optimizer, average = _optimizer(training.optimizer, parameters), Average.of(model, training.average)
         if now.epoch > 0:
             restore_optimizer(optimizer, states["optimizer"])
+            average.restore(states)
             objective.constants = Constants.of(states.get("constants", {}))
         else:
             objective.find_constants(model)
@@ -111,19 +113,24 @@ class Training:
         while (cap is None or now.epoch < cap) and (training.patience is None or now.stale < training.patience):
             over = now.epoch > first and time.monotonic() > deadline
             if over or (until is not None and now.epoch >= until):
-                self._keep(model, optimizer)
+                self._keep(model, optimizer, average)
                 return False
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate(training.optimizer, now.epoch, cap)
-            train = self._epoch(model, optimizer, parameters, objective)
-            self._record(stage, train, objective.tune(model), model)
-            self._save(model, optimizer)
+            train = self._epoch(model, optimizer, average, parameters, objective)
+            self._record(stage, train, objective.tune(average.model), average.model)
+            self._save(model, optimizer, average)
         model.load_state_dict(states["best"])
         now.ended.append(asdict(StageEnd.of(stage.name, cap, now.tune, training.patience)))
         return True
 
     def _epoch(
-        self, model: Hierarchy, optimizer: torch.optim.Optimizer, parameters: list[nn.Parameter], objective: Objective
+        self,
+        model: Hierarchy,
+        optimizer: torch.optim.Optimizer,
+        average: Average,
+        parameters: list[nn.Parameter],
+        objective: Objective,
     ) -> float:
         """One pass over the training demonstrations; the log-likelihood per step seen on the way."""
         now, total = self.progress, 0.0
@@ -140,6 +147,7 @@ class Training:
                 if self.spec.training.clip_gradient is not None:
                     nn.utils.clip_grad_norm_(parameters, self.spec.training.clip_gradient)
                 optimizer.step()
+                average.update(model)
             model.eval()
         return total / self._material.train.steps
 
@@ -155,15 +163,14 @@ class Training:
         now.history.append(asdict(row))
         self._on_event(row)
 
-    def _keep(self, model: Hierarchy, optimizer: torch.optim.Optimizer) -> None:
-        self._restart.states["model"] = copy_of(model)
-        self._restart.states["optimizer"] = optimizer_state(optimizer)
+    def _keep(self, model: Hierarchy, optimizer: torch.optim.Optimizer, average: Average) -> None:
+        self._restart.states |= {"model": copy_of(model), "optimizer": optimizer_state(optimizer), **average.states()}
 
-    def _save(self, model: Hierarchy, optimizer: torch.optim.Optimizer) -> None:
+    def _save(self, model: Hierarchy, optimizer: torch.optim.Optimizer, average: Average) -> None:
         """Keep it as a checkpoint, unless that was done just before."""
         if self._checkpoint is not None and time.monotonic() - self._saved_at > SAVE_EVERY:
             self._saved_at = time.monotonic()
-            self._keep(model, optimizer)
+            self._keep(model, optimizer, average)
             self._restart.write(self._checkpoint)
 
 

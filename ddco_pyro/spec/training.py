@@ -86,6 +86,9 @@ class TrainingSpec(Model):
     """Passes over the training demonstrations in all stages together, at most: the same budget of gradient steps for
     every model, whatever its number of stages. A stage may take an even share of what is left; null for no limit but
     patience."""
+    average: Annotated[float, Field(gt=0, lt=1)] | None = None
+    """Decay, in every gradient step of a stage, of the running mean of the weights that is evaluated and kept in the
+    place of the last weights; null for the last ones."""
     batch_size: Count = 16
     """Trajectories in each gradient step."""
     shards: Count = 1
