@@ -23,7 +23,7 @@ from pushing_cell import EVALUATION, HELD_OUT, HELD_OUT_SEED, LABELS, POOL, TRAI
 
 from ddco_pyro.acting.lockstep import play
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.pictures import Transform, shifted
+from ddco_pyro.data.pictures import MOVED, Transform, shifted
 from ddco_pyro.encoding.fitted import FittedReader, from_fit
 from ddco_pyro.fitting.building import Dimensions, baseline_spec, parameters
 from ddco_pyro.fitting.fit import Fit
@@ -45,10 +45,10 @@ METHODS = {
 }
 """The spec of each method. ``_flat``: as many parameters as the hierarchy beside it has with the options of its spec;
 ``ff_two``: of two pictures side by side instead of one; ``encoded``: perceptrons over what the convolutions of
-``ff_flat``, fitted to the same demonstrations, give of a picture and of :data:`COPIES` less one that are moved."""
+``ff_flat``, fitted to the same demonstrations, give of a picture, or in training of one that is moved."""
 
 ENCODED = (
-    "observations=[camera_features]",
+    "observations=[{key: camera_features, augment: {versions: camera_features_moved}}]",
     "control.std=0.35",
     "training.optimizer={name: adam, lr: 1.0e-3, schedule: cosine}",
     "training.batch_size=16",
@@ -56,8 +56,8 @@ ENCODED = (
 """What is changed in ``pushing_mlp.yaml`` to read features. Of σ of 1, 0.5, 0.35 and 0.25 this one is the likeliest
 on the held-out demonstrations of a development seed, for options and flat policy alike."""
 
-COPIES = 8
-"""How often the features of each demonstration are trained with: as it is, and moved as ``ff_flat`` sees it."""
+VERSIONS = 24
+"""How many versions of the features of each demonstration there are, of pictures moved as ``ff_flat`` sees them."""
 
 DEVELOPMENT = 7
 """The first training seed by which nothing but settings is chosen."""
@@ -81,15 +81,13 @@ class PictureCell(Cell):
         """Fit and play."""
         spec_of(self, settings)  # what is wrong in it is said before anything is drawn
         own, test, tasks = settings.values, held_out(settings.runs, self.seed), (WATCHED, LIMITED)
-        demos = seen = self.demonstrations(settings)
+        demos = self.demonstrations(settings)
         if self.method.startswith("encoded"):
             reader = self._reader(settings, folder)
-            seen, demos, test = (
-                _encoded(reader, each) for each in (moved(demos, spec_of(self, settings)), demos, test)
-            )
+            demos, test = encoded(reader, demos, VERSIONS, self.seed), encoded(reader, test)
             tasks = tuple(_seen_through(reader, task) for task in tasks)
         begun, before = time.perf_counter(), time.process_time()
-        spec, trained = self.fitted(settings, seen, folder)
+        spec, trained = self.fitted(settings, demos, folder)
         fitted, cpu = time.perf_counter(), time.process_time() - before
         found = Fit(spec, trained.hierarchy)
         likelihood = {name: per_step(found, each) for name, each in (("train", demos), ("held_out", test))}
@@ -127,16 +125,15 @@ class PictureCell(Cell):
 
 def spec_of(cell: PictureCell, settings: Settings) -> Spec:
     """The spec of a cell, whose pictures are small already."""
-    encoded = cell.method.startswith("encoded")
+    features = cell.method.startswith("encoded")
     changed: dict[str, Any] = {"seed": cell.seed, "demonstrations.count": cell.count}
     if cell.options:
         changed["hierarchy.levels.0.count"] = cell.options
-    if not encoded:
+    if not features:
         changed |= {"observations.0.resize": None, "observations.0.frames": 2 if "_two" in cell.method else 1}
-    base = load_spec(SPECS / f"{METHODS[cell.method]}.yaml", [*(ENCODED if encoded else ()), *settings.overrides])
+    base = load_spec(SPECS / f"{METHODS[cell.method]}.yaml", [*(ENCODED if features else ()), *settings.overrides])
     spec = with_overrides(base, changed)
     trained = cell.count - max(1, round(cell.count * spec.training.tune_fraction))
-    trained *= COPIES if encoded else 1
     epochs = int(np.ceil(settings.values["updates"] / np.ceil(trained / spec.training.batch_size)))
     return with_overrides(spec, {"training.epochs": epochs})
 
@@ -175,25 +172,19 @@ def recorded(folder: Path, first: int, count: int) -> Demonstrations:
     return replace(kept, demonstrations=tuple(map(_in_memory, kept)))
 
 
-def moved(demos: Demonstrations, spec: Spec) -> Demonstrations:
-    """Each demonstration :data:`COPIES` times, but those that the spec tunes with, which nothing is trained with."""
+def encoded(reader: FittedReader, demos: Demonstrations, versions: int = 0, seed: int = 0) -> Demonstrations:
+    """Features in the place of the pictures, and so many versions of them, each of pictures that are moved alike."""
     shift = load_spec(SPECS / "pushing_image_ff.yaml").observations[0].augment.shift
-    kept, tune = demos.split(spec.training.tune_fraction, spec.seed)
-    random, copies = np.random.default_rng(spec.seed), list(kept)
-    for number in range(1, COPIES):
-        for demo in kept:
-            by = random.integers(-shift, shift + 1, 2).tolist()
-            pictures = shifted(np.asarray(demo.observations["camera"]), *by)
-            copies.append(replace(demo, name=f"{demo.name}_{number}", observations={"camera": pictures}))
-    masks = {"train": tuple(copy.name for copy in copies), "valid": tune.names}
-    return replace(demos, demonstrations=(*copies, *tune), masks=masks)
-
-
-def _encoded(reader: FittedReader, demos: Demonstrations) -> Demonstrations:
-    """Features in the place of the pictures."""
-    rows = ({"camera_features": reader.encode(np.asarray(demo.observations["camera"]))} for demo in demos)
-    both = zip(demos, rows, strict=True)
-    return replace(demos, demonstrations=tuple(replace(demo, observations=row) for demo, row in both))
+    moves = np.random.default_rng(seed).integers(-shift, shift + 1, (len(demos), versions, 2)).tolist()
+    copies = []
+    for demo, own in zip(demos, moves, strict=True):
+        pictures = np.asarray(demo.observations["camera"])
+        seen = {"camera_features": reader.encode(pictures)}
+        if own:
+            each = [reader.encode(shifted(pictures, *by)) for by in own]
+            seen[f"camera_features{MOVED}"] = np.stack(each, axis=1)
+        copies.append(replace(demo, observations=seen))
+    return replace(demos, demonstrations=tuple(copies))
 
 
 def _seen_through(reader: FittedReader, task: Task) -> Task:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pushing_pictures as study
 import pytest
 from cells import described
 from provenance import ROOT, sources, tree
-from pushing_pictures_cell import COPIES, DEFAULTS, METHODS, SIZE, PictureCell, moved, spec_of
+from pushing_pictures_cell import DEFAULTS, METHODS, SIZE, PictureCell, encoded, spec_of
 from pushing_pictures_results import at_one_std, differences, row_of
 from scipy import stats
 
@@ -60,28 +61,31 @@ def test_differences_are_paired_by_seed_and_number():
     assert "0.500 ± 6.353 held-out" in line
 
 
-def test_features_are_of_moved_pictures_too_but_not_of_those_to_tune_with():
+def test_features_have_versions_of_pictures_that_are_moved():
+    """Each demonstration by moves of its own, all of its pictures alike; what is read here is the picture itself."""
     pictures = np.random.default_rng(0).integers(0, 256, (10, 4, *SIZE, 3), dtype=np.uint8)
     demos = Demonstrations(
         tuple(Demonstration(f"demo_{at}", {"camera": own}, np.zeros((4, 2))) for at, own in enumerate(pictures))
     )
-    spec = spec_of(PictureCell("encoded", 2, 10, 3), DEFAULTS)
-    train, tune = moved(demos, spec).split(spec.training.tune_fraction, spec.seed)
-    assert (len(train), len(tune), len(set(train.names))) == (9 * COPIES, 1, 9 * COPIES)
-    assert not {name.rsplit("_", 1)[0] if name.count("_") > 1 else name for name in train.names} & set(tune.names)
-    whole, by = {demo.name: demo.observations["camera"] for demo in demos}, set()
-    for demo in train:
-        inside, seen = whole[demo.name[: len("demo_0")]][:, 3:-3, 3:-3], demo.observations["camera"]
+    reader = SimpleNamespace(encode=lambda seen: seen.reshape(len(seen), -1).astype(np.float32))
+    kept, by = encoded(reader, demos, versions=6, seed=3), set()
+    assert kept.names == demos.names
+    for demo, whole in zip(kept, pictures, strict=True):
+        np.testing.assert_array_equal(demo.observations["camera_features"], whole.reshape(4, -1))
+        inside = whole[:, 3:-3, 3:-3]
         height, width = inside.shape[1:3]
-        places = [
-            (row, column)
-            for row in range(7)
-            for column in range(7)
-            if (seen[:, row : row + height, column : column + width] == inside).all()
-        ]
-        assert len(places) == 1
-        by.update(places)
+        for version in demo.observations["camera_features_moved"].swapaxes(0, 1):
+            seen = version.reshape(4, *SIZE, 3)
+            places = [
+                (row, column)
+                for row in range(7)
+                for column in range(7)
+                if (seen[:, row : row + height, column : column + width] == inside).all()
+            ]
+            assert len(places) == 1
+            by.update(places)
     assert len(by) > 20  # of 49
+    assert list(encoded(reader, demos)[0].observations) == ["camera_features"]
 
 
 def test_likelihoods_are_compared_at_one_std():
