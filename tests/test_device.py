@@ -37,7 +37,6 @@ TIMES = {"network": "per_timestep", "hidden": [4], "inputs": ["pose"]}
 BRANCHES = {"network": "branches", "of": {"camera": MEANS, "pose": {"network": "mlp", "hidden": [3]}}, "hidden": [4]}
 SAME = {
     "mlp": {"policy": MLP, "termination": LINEAR},
-    "spatial softmax": {"policy": SPATIAL, "termination": LINEAR},
 }
 """Those of which a double computes every number as the host does."""
 
@@ -45,6 +44,7 @@ DROPPING = {"policy": {**MLP, "dropout": 0.2}, "termination": LINEAR}
 """Dropout draws other numbers on every kind of device."""
 
 OTHER = {
+    "spatial softmax": {"policy": SPATIAL, "termination": LINEAR},
     "field means": {"policy": MEANS, "termination": MLP},
     "per_timestep": {"policy": TIMES, "termination": MLP},
     "lstm": {"policy": LSTM, "termination": LINEAR},
