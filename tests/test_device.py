@@ -78,7 +78,14 @@ def spec_of(level: dict[str, Any], **training: Any) -> Spec:
             "observations": ["pose", "camera"],
             "control": {"std": {"learn": True}},
             "hierarchy": {"levels": [{"count": 2, **level}], "meta_policy": LINEAR},
-            "training": {"epochs": 3, "batch_size": 3, "clip_gradient": 1.0, "layerwise": False, **training},
+            "training": {
+                "epochs": 3,
+                "batch_size": 3,
+                "clip_gradient": 1.0,
+                "average": 0.5,
+                "layerwise": False,
+                **training,
+            },
         }
     )
 
