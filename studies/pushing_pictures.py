@@ -6,8 +6,8 @@ flat policy (``encoded``), goals against options, and augmentation.
         [--set KEY=VALUE]... [--summarize] [--minutes 60] [--jobs 1] [--out DIR] [--runs DIR]
 
 Does cells one seed after the other, and begins none after so many minutes; what this code has done with these settings
-is not done again. Writes ``NAME.json``, ``NAME.md`` and ``NAME.png`` of all cells that are done, and says which are
-not.
+is not done again, and neither is what ``NAME.json`` has of these settings, by whatever code. Writes ``NAME.json``,
+``NAME.md`` and ``NAME.png`` of all cells that are done, and says which are not.
 """
 
 from __future__ import annotations
@@ -17,12 +17,14 @@ import itertools
 import json
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import pushing_pictures_results as shown
 from cells import Settings, described, printed, some
 from joblib import Parallel, delayed
-from provenance import record, sentence, text
+from provenance import Record, record, sentence, text
 from pushing_pictures_cell import DEFAULTS, METHODS, PictureCell, spec_of
 
 from ddco_pyro.data.files import write_text
@@ -40,6 +42,9 @@ OWN_OPTIONS = {"ff": 2, "rnn": 4, "encoded": 2}
 
 COUNT = 40
 """Demonstrations where their number is not what is varied."""
+
+FIELDS = tuple(field.name for field in fields(PictureCell))
+"""Of a row, what names its cell."""
 
 
 def cells(own: argparse.Namespace) -> list[PictureCell]:
@@ -79,11 +84,30 @@ def main() -> None:
 
 def run(own: argparse.Namespace) -> str:
     """Do what is not done yet, and write what there is; the page."""
-    settings, asked = DEFAULTS.given(own), some(cells(own))
+    settings, asked, before = DEFAULTS.given(own), some(cells(own)), Page.read(own)
     made_by, until = record(asked[0].command(settings)), time.monotonic() + 60 * own.minutes
     if not own.summarize:
-        Parallel(n_jobs=own.jobs, verbose=10)(delayed(_begun)(cell, settings, made_by, until) for cell in asked)
-    return write(own, settings, asked)
+        todo = [cell for cell in asked if cell not in before.rows]
+        Parallel(n_jobs=own.jobs, verbose=10)(delayed(_begun)(cell, settings, made_by, until) for cell in todo)
+    return write(own, settings, asked, before)
+
+
+@dataclass(frozen=True)
+class Page:
+    """What ``NAME.json`` has of cells with the settings that are asked for."""
+
+    rows: dict[PictureCell, shown.Row]
+    records: list[Record | None]
+
+    @classmethod
+    def read(cls, own: argparse.Namespace) -> Page:
+        """Nothing, where there is no file, or one of other settings."""
+        path = own.out / f"{own.study}.json"
+        content = json.loads(path.read_text()) if path.exists() else {"results": {}}
+        if content["results"].get("settings") != DEFAULTS.given(own).kept():
+            return cls({}, [])
+        rows = {PictureCell(*(row[name] for name in FIELDS)): row for row in content["results"]["cells"]}
+        return cls(rows, content["provenance"])
 
 
 def _part(own: argparse.Namespace) -> str:
@@ -98,22 +122,25 @@ def _begun(cell: PictureCell, settings: Settings, made_by: dict[str, str], until
         cell.run(settings, made_by)
 
 
-def write(own: argparse.Namespace, settings: Settings, asked: Sequence[PictureCell]) -> str:
+def write(own: argparse.Namespace, settings: Settings, asked: Sequence[PictureCell], before: Page) -> str:
     """Write what there is of a study; the page."""
-    paths = {cell: cell.path(settings) for cell in asked}
+    paths = {cell: cell.path(settings) for cell in asked if cell not in before.rows}
     done = {cell: json.loads(path.read_text()) for cell, path in paths.items() if path.exists()}
-    missing = [cell.name for cell in asked if cell not in done]
-    stds = {cell: spec_of(cell, settings).control.std for cell in done}
-    rows = shown.at_one_std(
-        [shown.row_of(cell, content["results"]) | {"std": stds[cell]} for cell, content in done.items()]
-    )
-    records = [content["provenance"][0] for content in done.values()]
+    missing = [cell.name for cell in paths if cell not in done]
+    new = [_row(cell, content, spec_of(cell, settings).control.std) for cell, content in done.items()]
+    rows = shown.at_one_std([*before.rows.values(), *new])
+    records = [*before.records, *(content["provenance"][0] for content in done.values())]
     command = f"python studies/pushing_pictures.py {own.study} --seeds {own.seeds} {_part(own)} {settings.words()}"
     page = shown.page(own.study, rows, missing, sentence(command, records))
-    write_text(own.out / f"{own.study}.json", text({"cells": rows, "missing": missing}, records))
+    results = {"settings": settings.kept(), "cells": rows, "missing": missing}
+    write_text(own.out / f"{own.study}.json", text(results, records))
     write_text(own.out / f"{own.study}.md", page)
     shown.draw(own.study, rows, own.out / f"{own.study}.png")
     return page
+
+
+def _row(cell: PictureCell, content: dict[str, Any], std: Any) -> shown.Row:
+    return shown.row_of(cell, content["results"]) | {"std": std, "commit": content["provenance"][0]["commit"]}
 
 
 if __name__ == "__main__":

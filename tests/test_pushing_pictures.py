@@ -131,17 +131,41 @@ def test_results_depend_on_the_specs_of_their_cells():
     assert {f"specs/{name}.yaml" for name in METHODS.values()} <= known.keys()
 
 
+def kept_cell(runs: Path, cell: PictureCell, goals: list[float], commit: str = "y") -> None:
+    """As a cell that is done is kept."""
+    record = {"command": "x", "commit": commit, "dirty": False, "code": "z", "files": 1}
+    path = cell.path(replace(DEFAULTS, runs=runs))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"provenance": [record], "results": results(goals, -3.0)}))
+
+
 def test_what_is_not_done_is_said(tmp_path: Path):
-    cell = PictureCell("ff_flat", 0, 80, 0)
     own = arguments("demonstrations", "--summarize", "--out", str(tmp_path), "--runs", str(tmp_path / "runs"))
-    content = {"provenance": [{"command": "x", "commit": "y", "dirty": False, "code": "z", "files": 1}]}
-    path = cell.path(replace(DEFAULTS, runs=tmp_path / "runs"))
-    path.parent.mkdir(parents=True)
-    path.write_text(json.dumps(content | {"results": results([2.0, 1.0], -3.0)}))
+    kept_cell(tmp_path / "runs", PictureCell("ff_flat", 0, 80, 0), [2.0, 1.0])
     page = study.run(own)
     assert "| ff_flat | 80 | 1.5 |" in page
     assert "Cells that are not measured yet: 12 of ff, 12 of rnn_flat," in page
     assert (tmp_path / "demonstrations.png").stat().st_size > 5000
+
+
+def test_what_the_page_has_is_not_done_again(tmp_path: Path):
+    """Fits are gone, and another cell was done elsewhere, at another commit; other settings have another page."""
+    words = ("demonstrations", "--counts", "80", "--methods", "ff_flat", "--seeds", "2", "--out", str(tmp_path))
+    kept_cell(tmp_path / "here", PictureCell("ff_flat", 0, 80, 0), [2.0, 1.0])
+    study.run(arguments(*words, "--summarize", "--runs", str(tmp_path / "here")))
+    kept_cell(tmp_path / "there", PictureCell("ff_flat", 0, 80, 0), [9.0, 9.0])  # not read: the page has this cell
+    kept_cell(tmp_path / "there", PictureCell("ff_flat", 0, 80, 1), [4.0, 5.0], commit="later")
+    page = study.run(arguments(*words, "--summarize", "--runs", str(tmp_path / "there")))
+    assert "at commit y, commit later." in page
+    assert "not measured yet" not in page
+    kept = json.loads((tmp_path / "demonstrations.json").read_text())
+    assert [(row["seed"], row["goals"], row["commit"]) for row in kept["results"]["cells"]] == [
+        (0, 1.5, "y"),
+        (1, 4.5, "later"),
+    ]
+    assert study.run(arguments(*words, "--minutes", "0", "--runs", str(tmp_path / "none"))) == page  # nothing to do
+    other = study.run(arguments(*words, "--summarize", "--updates", "7", "--runs", str(tmp_path / "there")))
+    assert "Cells that are not measured yet: 2 of ff_flat." in other
 
 
 def test_likelihoods_without_a_number_for_std_stay_as_they_are():
