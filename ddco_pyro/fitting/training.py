@@ -18,23 +18,21 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import nn
 
 from ddco_pyro.data.reading import Readers
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
-from ddco_pyro.fitting.averaging import Average
-from ddco_pyro.fitting.checkpoint import Restart, copy_of, optimizer_state, restore_optimizer
+from ddco_pyro.fitting.ascent import Ascent, learning_rate
+from ddco_pyro.fitting.checkpoint import Restart, copy_of
 from ddco_pyro.fitting.convergence import StageEnd, share
 from ddco_pyro.fitting.devices import device_of, generators, repeatable
 from ddco_pyro.fitting.material import Material
 from ddco_pyro.fitting.objective import Objective
 from ddco_pyro.fitting.ranks import ALONE, Ranks
-from ddco_pyro.fitting.shards import ascend, cut
+from ddco_pyro.fitting.shards import cut
 from ddco_pyro.fitting.stages import Stage, plan
 from ddco_pyro.fitting.upper import Constants
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import OptimizerSpec
 
 SAVE_EVERY = 1.0  # s between checkpoints, at least: an epoch of a small model takes less time than its checkpoint
 
@@ -97,11 +95,9 @@ class Training:
         now, training, states = self.progress, self.spec.training, self._restart.states
         cap = share(training.epochs, sum(end["epochs"] for end in now.ended), stages_left)
         objective = Objective(self._material, now, stage, self._ranks)
-        parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
-        optimizer, average = _optimizer(training.optimizer, parameters), Average.of(model, training.average)
+        ascent = Ascent(model, stage, training, objective)
         if now.epoch > 0:
-            restore_optimizer(optimizer, states["optimizer"])
-            average.restore(states)
+            ascent.restore(states)
             objective.constants = Constants.of(states.get("constants", {}))
         else:
             objective.find_constants(model)
@@ -113,27 +109,19 @@ class Training:
         while (cap is None or now.epoch < cap) and (training.patience is None or now.stale < training.patience):
             over = now.epoch > first and time.monotonic() > deadline
             if over or (until is not None and now.epoch >= until):
-                self._keep(model, optimizer, average)
+                states |= ascent.states()
                 return False
-            for group in optimizer.param_groups:
-                group["lr"] = learning_rate(training.optimizer, now.epoch, cap)
-            train = self._epoch(model, optimizer, average, parameters, objective)
-            self._record(stage, train, objective.tune(average.model), average.model)
-            self._save(model, optimizer, average)
+            ascent.set_rate(learning_rate(training.optimizer, now.epoch, cap))
+            train, kept = self._epoch(ascent), ascent.average.model
+            self._record(stage, train, objective.tune(kept), kept)
+            self._save(ascent)
         model.load_state_dict(states["best"])
         now.ended.append(asdict(StageEnd.of(stage.name, cap, now.tune, training.patience)))
         return True
 
-    def _epoch(
-        self,
-        model: Hierarchy,
-        optimizer: torch.optim.Optimizer,
-        average: Average,
-        parameters: list[nn.Parameter],
-        objective: Objective,
-    ) -> float:
+    def _epoch(self, ascent: Ascent) -> float:
         """One pass over the training demonstrations; the log-likelihood per step seen on the way."""
-        now, total = self.progress, 0.0
+        now, model, total = self.progress, ascent.model, 0.0
         with torch.random.fork_rng(devices=generators(model.device)):
             place = now.restart, now.stage, now.epoch
             torch.manual_seed(self._material.seed(*place))
@@ -141,13 +129,9 @@ class Training:
             minibatches = torch.randperm(len(self._material.train)).split(self.spec.training.batch_size)
             seeds = (partial(self._material.seed, *place, number) for number in range(len(minibatches)))
             shards = [cut(rows, self.spec.training.shards, seed) for rows, seed in zip(minibatches, seeds, strict=True)]
-            objective.read_ahead(model, [shard.rows for each in shards for shard in self._ranks.own(each)])
+            ascent.objective.read_ahead(model, [shard.rows for each in shards for shard in self._ranks.own(each)])
             for rows, each in zip(minibatches, shards, strict=True):
-                total += ascend(objective, model, parameters, each, int(self._material.train.lengths[rows].sum()))
-                if self.spec.training.clip_gradient is not None:
-                    nn.utils.clip_grad_norm_(parameters, self.spec.training.clip_gradient)
-                optimizer.step()
-                average.update(model)
+                total += ascent.step(each, int(self._material.train.lengths[rows].sum()))
             model.eval()
         return total / self._material.train.steps
 
@@ -163,31 +147,9 @@ class Training:
         now.history.append(asdict(row))
         self._on_event(row)
 
-    def _keep(self, model: Hierarchy, optimizer: torch.optim.Optimizer, average: Average) -> None:
-        self._restart.states |= {"model": copy_of(model), "optimizer": optimizer_state(optimizer), **average.states()}
-
-    def _save(self, model: Hierarchy, optimizer: torch.optim.Optimizer, average: Average) -> None:
+    def _save(self, ascent: Ascent) -> None:
         """Keep it as a checkpoint, unless that was done just before."""
         if self._checkpoint is not None and time.monotonic() - self._saved_at > SAVE_EVERY:
             self._saved_at = time.monotonic()
-            self._keep(model, optimizer, average)
+            self._restart.states |= ascent.states()
             self._restart.write(self._checkpoint)
-
-
-def learning_rate(spec: OptimizerSpec, epoch: int, cap: int | None) -> float:
-    """The learning rate of a stage's epoch, counted from 0.
-
-    :param cap: the epochs that the stage may take.
-    """
-    rate = spec.lr * min(1.0, (epoch + 1) / (spec.warmup + 1))
-    if spec.schedule == "constant":
-        return rate
-    assert cap is not None  # a spec with this schedule has a budget
-    return rate * 0.5 * (1 + math.cos(math.pi * epoch / cap))
-
-
-def _optimizer(spec: OptimizerSpec, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
-    if spec.name == "momentum":
-        return torch.optim.SGD(parameters, lr=spec.lr, momentum=spec.momentum, weight_decay=spec.weight_decay)
-    kind = torch.optim.AdamW if spec.name == "adamw" else torch.optim.Adam
-    return kind(parameters, lr=spec.lr, weight_decay=spec.weight_decay)
