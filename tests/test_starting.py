@@ -8,7 +8,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import yaml
 from command_line import call
 from gripper import planted
 from random_demonstrations import demonstrations
@@ -17,7 +16,7 @@ from scipy import stats
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.data.inspection import inspect
-from ddco_pyro.data.starting import _batch, _epochs, starting_spec
+from ddco_pyro.data.starting import PICTURES, VECTORS, Recipe, _batch, _epochs, starting_spec
 from ddco_pyro.spec import load_spec
 
 
@@ -87,17 +86,19 @@ def test_what_it_writes_lets_every_method_converge(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("lengths", "epochs"),
+    ("recipe", "lengths", "epochs"),
     [
-        ([22] * 120, 2000),  # 3 gradient steps in an epoch: 6000 in all
-        ([57] * 100, 1000),  # 6
-        ([100] * 1000, 200),  # 100, and 200 epochs at least
-        ([10] * 5, 2000),  # 3, in minibatches of 2
+        (VECTORS, [22] * 120, 2000),  # 3 gradient steps in an epoch: 6000 in all
+        (VECTORS, [57] * 100, 1000),  # 6
+        (VECTORS, [100] * 1000, 200),  # 100, and 200 epochs at least
+        (VECTORS, [10] * 5, 2000),  # 3, in minibatches of 2
+        (PICTURES, [125] * 80, 100),  # 40, in minibatches of 2: 4000 in all
+        (PICTURES, [600] * 200, 20),  # 200, and 20 epochs at least
     ],
 )
-def test_epochs_follow_from_the_gradient_steps(lengths: list[int], epochs: int) -> None:
+def test_epochs_follow_from_the_gradient_steps(recipe: Recipe, lengths: list[int], epochs: int) -> None:
     found = np.array(lengths)
-    assert _epochs(found, _batch(found)) == epochs
+    assert _epochs(found, _batch(found, recipe), recipe) == epochs
 
 
 def test_three_demonstrations_are_enough(tmp_path: Path) -> None:
@@ -164,7 +165,7 @@ def test_of_many_broken_demonstrations_the_key_is_left_out(path: Path) -> None:
     text = broken(path, 9, ["demo_2", "demo_8"])
     assert "exclude" not in text
     assert "# - pose   # has 2 NaN and 0 infinite values" in text
-    assert "- camera" in text
+    assert "- {key: camera}" in text
     assert "exclude" not in broken(path, 10, ["demo_2"], valid=("demo_2",))  # nothing would be held out
     with pytest.raises(DemonstrationsError, match="actions has 1 NaN and 0 infinite values; repair them first"):
         broken(path, 4, ["demo_1"], "actions")  # a quarter
@@ -187,13 +188,26 @@ def test_masks_of_the_file_decide_what_is_held_out(path: Path, tmp_path: Path) -
     assert "valid_fraction" not in text
 
 
-def test_pictures_alone_are_read_by_convolutions(path: Path, tmp_path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        for group in file["data"].values():
-            del group["obs/pose"]
-    spec = write(tmp_path, starting_spec(inspect(path), path))
-    assert yaml.safe_load(spec.read_text())["observations"] == ["camera"]
-    assert call("check", spec).status == 0
+def test_pictures_alone_are_seen_by_one_network(tmp_path: Path) -> None:
+    """Two cameras, a small one as it is and a larger one reduced; what is written can be fitted."""
+    random, records = np.random.default_rng(2), []
+    for number in range(6):
+        seen = {name: random.integers(0, 256, (5, *size, 3), dtype=np.uint8) for name, size in CAMERAS.items()}
+        records.append(Demonstration(f"demo_{number}", seen, random.normal(size=(5, 2))))
+    Demonstrations(tuple(records)).write(tmp_path / "seen.hdf5")
+    assert call("init", tmp_path / "seen.hdf5", "--out", tmp_path / "spec.yaml").status == 0
+    spec = load_spec(tmp_path / "spec.yaml")
+    assert [(one.key, one.resize, one.augment and one.augment.shift) for one in spec.observations] == [
+        ("2nd eye", None, None),
+        ("eye", (32, 64), 3),
+    ]
+    assert set(spec.hierarchy.trunk.of) == set(CAMERAS)
+    ended = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--set", "training.epochs=2")
+    assert ended.status == 0, ended.err
+    assert list(ddco_pyro.load(tmp_path / "run").baselines) == ["flat_equal"]
+
+
+CAMERAS = {"eye": (40, 80), "2nd eye": (12, 16)}
 
 
 def write(folder: Path, text: str) -> Path:

@@ -6,12 +6,14 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from ddco_pyro.data.control_dimensions import all_constant
 from ddco_pyro.data.hdf5 import DemonstrationsError, natural
 from ddco_pyro.data.inspection import Field, Inspection, inspect
+from ddco_pyro.data.starting_pictures import seen, sight
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.spec.reading import read_yaml
 
@@ -21,18 +23,48 @@ MANY = 100
 LEAST = 3
 """Demonstrations that a fit needs: to train, to stop early, and to validate."""
 
-STEPS_PER_BATCH = 1000
-"""A minibatch has about so many steps: enough for a steady gradient, and several of them in an epoch."""
+MOST_EPOCHS = 2000
+"""Of a model."""
 
-GRADIENT_STEPS = 6000
-"""A model may take about so many gradient steps in all: about a minute of one core, and enough for a hierarchy and for
-the policies beside it to stop by :data:`PATIENCE` on the files of docs/decisions.md."""
+PERCEPTRON = "{network: mlp, hidden: [32]}"
 
-EPOCHS = (200, 2000)
-"""Fewest and most epochs of a model."""
 
-PATIENCE = 50
-"""Epochs without improvement before a stage stops; with 20 flat policies stopped too early (docs/decisions.md)."""
+class Recipe(NamedTuple):
+    """What ``training`` says.
+
+    :param batch_steps: a minibatch has about so many steps: enough for a steady gradient, and several in an epoch.
+    :param gradient_steps: a model may take about so many in all.
+    :param epochs: a model may take so many at least.
+    """
+
+    batch_steps: int
+    gradient_steps: int
+    epochs: int
+    initialize: str
+    optimizer: str
+    patience: str
+
+
+VECTORS = Recipe(
+    batch_steps=1000,
+    gradient_steps=6000,
+    epochs=200,
+    initialize="vq_controls           # clusters of observations and controls; vq: of observations alone",
+    optimizer="{name: adam, lr: 3.0e-3}",
+    patience="50                      # a stage stops after so many epochs without improvement",
+)
+"""About a minute of one core, and enough for a hierarchy and for the policies beside it to stop on the files of
+docs/decisions.md; with a patience of 20 flat policies stopped too early there."""
+
+PICTURES = Recipe(
+    batch_steps=250,
+    gradient_steps=4000,
+    epochs=20,
+    initialize="equal_parts           # of each demonstration, one for each option; then everything together",
+    optimizer="{name: adam, lr: 1.0e-3, schedule: cosine}",
+    patience="null                    # the learning rate falls to the end",
+)
+"""Of pictures of 48 x 64 pixels some six minutes of one core for each model."""
 
 
 def starting_spec(inspection: Inspection, path: str | Path) -> str:
@@ -97,25 +129,35 @@ def _lines(inspection: Inspection, path: str) -> Iterator[str]:
     yield "  kind: auto                        # decided from the demonstrations; so it is:"
     yield from (f"  # {note}" for note in inspection.notes)
     yield "  std: {learn: true, floor: 0.01, per_option: true}   # in units of each dimension's own spread"
+    pictures = [_text(field.key) for field in _images(inspection)] if _only_images(inspection) else []
     yield "hierarchy:"
+    yield from sight(pictures) if pictures else ()
     yield "  levels:"
     yield "    - name: option"
     yield "      count: 4                      # how many options; try others: --set hierarchy.levels.0.count=3"
-    yield f"      policy: {_smallest(inspection)}   # perceptrons where skills are crooked: {_network(inspection)}"
-    yield f"      termination: {_smallest(inspection)}"
-    yield f"  meta_policy: {_smallest(inspection)}"
+    crooked = "" if pictures else f"   # perceptrons where skills are crooked: {PERCEPTRON}"
+    yield f"      policy: {{network: linear}}{crooked}"
+    yield "      termination: {network: linear}"
+    yield "  meta_policy: {network: linear}"
     yield "training:"
-    yield "  initialize: vq_controls           # clusters of observations and controls; vq: of observations alone"
-    yield "  optimizer: {name: adam, lr: 3.0e-3}"
-    batch = _batch(lengths)
-    yield f"  epochs: {_epochs(lengths, batch)}                      # of all stages together, at most"
-    yield f"  patience: {PATIENCE}                      # a stage stops after so many epochs without improvement"
-    yield "  tune_by: median                   # of the tuning demonstrations, which one odd one cannot decide"
-    yield f"  batch_size: {batch}                    # demonstrations in a gradient step"
+    yield from _training(lengths, PICTURES if pictures else VECTORS)
     yield "# Is the hierarchy worth it? Policies without options, trained beside it with the same budget."
     yield "compare_with:"
-    yield f"  - {{kind: flat, policy: {_network(inspection)}}}"
-    yield f"  - {{kind: flat_equal, policy: {_network(inspection)}}}   # as wide as gives it the hierarchy's parameters"
+    network = "*sight" if pictures else PERCEPTRON
+    if not pictures:  # the network that all read is nearly all of the hierarchy
+        yield f"  - {{kind: flat, policy: {network}}}"
+    yield f"  - {{kind: flat_equal, policy: {network}}}   # as wide as gives it the hierarchy's parameters"
+
+
+def _training(lengths: np.ndarray, recipe: Recipe) -> Iterator[str]:
+    batch = _batch(lengths, recipe)
+    epochs = _epochs(lengths, batch, recipe)
+    yield f"  initialize: {recipe.initialize}"
+    yield f"  optimizer: {recipe.optimizer}"
+    yield f"  epochs: {epochs}                      # of all stages together, at most"
+    yield f"  patience: {recipe.patience}"
+    yield "  tune_by: median                   # of the tuning demonstrations, which one odd one cannot decide"
+    yield f"  batch_size: {batch}                    # demonstrations in a gradient step"
 
 
 def _text(value: str) -> str:
@@ -124,14 +166,14 @@ def _text(value: str) -> str:
     return value if plain else json.dumps(value)
 
 
-def _batch(lengths: np.ndarray) -> int:
-    """Demonstrations in a minibatch: :data:`STEPS_PER_BATCH` steps, but at least two minibatches in an epoch."""
-    return int(np.clip(round(STEPS_PER_BATCH / lengths.mean()), 1, max(1, len(lengths) // 2)))
+def _batch(lengths: np.ndarray, recipe: Recipe) -> int:
+    """Demonstrations in a minibatch: as many steps as the recipe says, and at least two minibatches in an epoch."""
+    return int(np.clip(round(recipe.batch_steps / lengths.mean()), 1, max(1, len(lengths) // 2)))
 
 
-def _epochs(lengths: np.ndarray, batch: int) -> int:
-    wanted = GRADIENT_STEPS / np.ceil(len(lengths) / batch)
-    return int(np.clip(round(wanted, -1), *EPOCHS))
+def _epochs(lengths: np.ndarray, batch: int, recipe: Recipe) -> int:
+    wanted = recipe.gradient_steps / np.ceil(len(lengths) / batch)
+    return int(np.clip(round(wanted, -1), recipe.epochs, MOST_EPOCHS))
 
 
 def _validation(inspection: Inspection) -> Iterator[str]:
@@ -166,7 +208,7 @@ def _observations(inspection: Inspection) -> Iterator[str]:
             left_out.append((field, reason))
         elif not field.image:
             vectors.append(field)
-    images = [field for field in inspection.observations if field.image and not _unusable(inspection, field)]
+    images = _images(inspection)
     if not vectors and not images:
         raise DemonstrationsError(
             f"{inspection.path}: no observation can be used; see what is wrong with: "
@@ -179,9 +221,10 @@ def _observations(inspection: Inspection) -> Iterator[str]:
         varied = f", augment: {{versions: {_text(other)}}}" if other else ""
         yield f"  - {{key: {_text(field.key)}{moving}{varied}}}"
     for field in images:
-        comment = "# " if vectors else ""
-        note = "   # an image: with it, every network has to be network: conv" if vectors else ""
-        yield f"  {comment}- {_text(field.key)}{note}"
+        if vectors:
+            yield f"  # - {_text(field.key)}   # an image: networks that read it beside vectors are network: branches"
+        else:
+            yield seen(_text(field.key), field.shape)
     for field, reason in left_out:
         yield f"  # - {_text(field.key)}   # {reason}"
 
@@ -212,13 +255,9 @@ def _constant(field: Field) -> str:
     return "is constant but for rounding" if len(field.constant + field.rounding) == len(field.minimum) else ""
 
 
+def _images(inspection: Inspection) -> list[Field]:
+    return [field for field in inspection.observations if field.image and not _unusable(inspection, field)]
+
+
 def _only_images(inspection: Inspection) -> bool:
     return all(field.image or _constant(field) for field in inspection.observations if not _unusable(inspection, field))
-
-
-def _network(inspection: Inspection) -> str:
-    return "{network: conv, filters: 8, hidden: [32]}" if _only_images(inspection) else "{network: mlp, hidden: [32]}"
-
-
-def _smallest(inspection: Inspection) -> str:
-    return "{network: conv, filters: 8, hidden: []}" if _only_images(inspection) else "{network: linear}"
