@@ -41,6 +41,7 @@ class Recipe(NamedTuple):
     gradient_steps: int
     epochs: int
     initialize: str
+    layerwise: str
     optimizer: str
     patience: str
 
@@ -50,6 +51,7 @@ VECTORS = Recipe(
     gradient_steps=6000,
     epochs=200,
     initialize="vq_controls           # clusters of observations and controls; vq: of observations alone",
+    layerwise="true                   # options first, then the meta-policy, then everything together",
     optimizer="{name: adam, lr: 3.0e-3}",
     patience="50                      # a stage stops after so many epochs without improvement",
 )
@@ -60,7 +62,8 @@ PICTURES = Recipe(
     batch_steps=250,
     gradient_steps=4000,
     epochs=20,
-    initialize="equal_parts           # of each demonstration, one for each option; then everything together",
+    initialize="equal_parts           # of each demonstration, one for each option",
+    layerwise="false                  # then everything together",
     optimizer="{name: adam, lr: 1.0e-3, schedule: cosine}",
     patience="null                    # the learning rate falls to the end",
 )
@@ -153,6 +156,7 @@ def _training(lengths: np.ndarray, recipe: Recipe) -> Iterator[str]:
     batch = _batch(lengths, recipe)
     epochs = _epochs(lengths, batch, recipe)
     yield f"  initialize: {recipe.initialize}"
+    yield f"  layerwise: {recipe.layerwise}"
     yield f"  optimizer: {recipe.optimizer}"
     yield f"  epochs: {epochs}                      # of all stages together, at most"
     yield f"  patience: {recipe.patience}"
