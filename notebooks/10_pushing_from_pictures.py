@@ -64,9 +64,9 @@ display(Markdown(pages["demonstrations"]), drawn["demonstrations"])
 # %% [markdown]
 # ## Options over what a flat policy sees
 #
-# A flat policy learns to see more easily than options with layers of their own. Here its convolutions are kept (`ddco-pyro encode --encoder
-# RUN`), and perceptrons are fitted to what they give of each picture: two options, and a flat one with as many
-# parameters.
+# A flat policy learns to see more easily than options with layers of their own. Here its convolutions are kept
+# (`ddco-pyro encode --encoder RUN`), and perceptrons are fitted to what they give of each picture: two options, and a
+# flat one with as many parameters.
 
 # %%
 display(Markdown(pages["encoded"]), drawn["encoded"])
