@@ -115,7 +115,7 @@ class Cell(ABC):
         printed(work)
 
 
-C = TypeVar("C", bound=Cell)
+T = TypeVar("T")
 
 
 def described(text: str | None) -> argparse.ArgumentParser:
@@ -132,8 +132,8 @@ def printed(work: Callable[[], str]) -> None:
         raise SystemExit(2 if isinstance(error, BadInput) else 1) from None
 
 
-def some(cells: list[C]) -> list[C]:
-    """The cells of a study.
+def some(cells: list[T]) -> list[T]:
+    """What a study is to do: its cells, or training seeds.
 
     :raises BadInput: there are none.
     """

@@ -15,7 +15,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from cells import printed
+from cells import printed, some
 from joblib import Parallel, delayed
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -100,8 +100,8 @@ def run() -> str:
     command = f"python studies/needle_curve.py --counts {' '.join(map(str, arguments.counts))} "
     command += f"{'--clock ' * arguments.clock}{words(arguments)}"
     made_by = record(command)
+    cells = some([(seed, count) for count in arguments.counts for seed in range(arguments.seeds)])
     if not arguments.summarize:
-        cells = [(seed, count) for count in arguments.counts for seed in range(arguments.seeds)]
         Parallel(n_jobs=arguments.jobs)(delayed(run_seed)(*cell, arguments, made_by, arguments.clock) for cell in cells)
     kept = {count: _kept(arguments.out, count, arguments.seeds) for count in _counts(arguments.out)}
     curve = {
