@@ -19,6 +19,7 @@ from pushing_cell import EPISODES, Cell, fit_made_by
 from scipy import stats
 
 from ddco_pyro.data.files import whole_file, write_text
+from ddco_pyro.errors import Failed
 
 COLOURS = {
     "flat linear": "#9a9a9a",
@@ -84,11 +85,11 @@ def grouped(rows: Sequence[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]
     return groups
 
 
-def write(study: str, cells: Sequence[Cell], folder: Path, out: Path, command: str) -> None:
-    """NAME.csv, NAME.md and NAME.png of the cells that are done, and NAME.json, which says what made them."""
+def write(study: str, cells: Sequence[Cell], folder: Path, out: Path, command: str) -> str:
+    """NAME.csv, NAME.md and NAME.png of the cells that are done, and NAME.json, which says what made them; the page."""
     rows = rows_of(cells, folder)
     if not rows:
-        raise SystemExit(f"{study}: nothing has been measured yet")
+        raise Failed(f"{study}: nothing has been measured yet")
     rows_text = io.StringIO()
     writer = csv.DictWriter(rows_text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -100,12 +101,14 @@ def write(study: str, cells: Sequence[Cell], folder: Path, out: Path, command: s
     records = made_by(cells, folder)
     head = [f"{sentence(command, records)} {whole}", "", _protocol(supervisor), ""]
     write_text(out / f"{study}.json", text(None, records))
-    write_text(out / f"{study}.md", "\n".join([*head, *describe(rows)]) + "\n")
+    page = "\n".join([*head, *describe(rows)]) + "\n"
+    write_text(out / f"{study}.md", page)
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
     draw(figure, rows, supervisor)
     with whole_file(out / f"{study}.png") as temporary:
         figure.savefig(temporary, dpi=120, format="png")
+    return page
 
 
 def _supervisor(out: Path) -> float | None:

@@ -30,6 +30,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from cells import described, printed, some
 from ddco_tasks.pushing import environment as pushing
 from joblib import Parallel, delayed
 from provenance import Record, record
@@ -139,7 +140,7 @@ def try_executions(name: str, number: int, seed: int, folder: Path) -> list[dict
     return found
 
 
-def sweep(folder: Path, jobs: int, names: Sequence[str]) -> None:
+def sweep(folder: Path, jobs: int, names: Sequence[str]) -> str:
     """Choose every method's optimiser and execution from the same grids; what was chosen for other methods stays."""
     for seed in SWEPT_SEEDS:
         spec = spec_of(Cell("flat MLP", None, SWEPT_DEMONSTRATIONS, seed), {})
@@ -160,6 +161,7 @@ def sweep(folder: Path, jobs: int, names: Sequence[str]) -> None:
     command = shlex.join(["python", "studies/pushing_studies.py", "sweep", "--methods", *names])
     found = {"command": command, "chosen": chosen, **{key: others[key] + rows[key] for key in rows}}
     write_text(SETTINGS, json.dumps(found, indent=1) + "\n")
+    return str(SETTINGS)
 
 
 def best(rows: Sequence[dict[str, Any]], name: str, measure: str, *keys: str) -> tuple[Any, ...]:
@@ -181,7 +183,7 @@ def prepare(cells: Sequence[Cell], folder: Path) -> None:
 
 def main() -> None:
     """Run one study."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = described(__doc__)
     parser.add_argument("study", choices=["sweep", *STUDIES])
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--demonstrations", type=int, nargs="+", default=COUNTS)
@@ -193,19 +195,22 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=-1)
     parser.add_argument("--runs", type=Path, default=Path("runs/pushing-studies"))
     parser.add_argument("--out", type=Path, default=Path("docs/results/pushing"))
-    arguments = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"
+    printed(lambda: study(parser.parse_args()))
+
+
+def study(arguments: argparse.Namespace) -> str:
+    """Do what is asked for, and write what there is; the page, or the file of what was chosen."""
     if arguments.study == "sweep":
-        sweep(arguments.runs, arguments.jobs, arguments.methods)
-        return
+        return sweep(arguments.runs, arguments.jobs, arguments.methods)
     command = command_of(arguments)
     made_by = record(command)
-    cells = [cell for seed in range(arguments.seeds) for cell in STUDIES[arguments.study](seed)]
+    cells = some([cell for seed in range(arguments.seeds) for cell in STUDIES[arguments.study](seed)])
     if not arguments.summarize:
-        asked = cells_of(arguments, cells)
+        asked = some(cells_of(arguments, cells))
         prepare(asked, arguments.runs)
         work(asked, arguments, made_by)
-    write(arguments.study, cells, arguments.runs, arguments.out, command)
+    return write(arguments.study, cells, arguments.runs, arguments.out, command)
 
 
 def command_of(arguments: argparse.Namespace) -> str:

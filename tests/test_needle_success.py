@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 
-import needle_curve
 import needle_success
 import numpy as np
 import pytest
@@ -117,15 +115,6 @@ def test_the_table_of_the_readme_is_that_of_the_study():
     rows = re.findall(r"^\|.*\|$", study, re.MULTILINE)
     assert len(rows) >= 6
     assert "\n".join(rows) in (ROOT / "README.md").read_text()
-
-
-@pytest.mark.parametrize("study", [needle_success, needle_curve])
-def test_no_seeds_are_refused(tmp_path, monkeypatch, capsys, study):
-    monkeypatch.setattr(sys, "argv", [f"{study.__name__}.py", "--seeds", "0", "--out", str(tmp_path)])
-    with pytest.raises(SystemExit) as ended:
-        study.main()
-    why = f"{study.__name__}.py: there is nothing to do: a list or a number is empty or 0\n"
-    assert (ended.value.code, capsys.readouterr().err) == (2, why)
 
 
 def test_the_page_is_made_of_its_numbers():
