@@ -3,7 +3,8 @@
     python studies/pushing_pictures_cell.py METHOD OPTIONS COUNT SEED [--updates 4000] [--episodes 5] [--runs DIR]
 
 OPTIONS is 0 for a flat policy. Demonstrations and evaluation episodes are those of ``pushing_studies.py`` with the same
-seeds. Pictures are drawn three times as fine as they are seen, 48 x 64, and reduced by means. Keeps a JSON with
+seeds. Pictures are drawn three times as fine as they are seen, 48 x 64, and reduced by means; ``ff_large`` sees all of
+480 x 640 (some 10 GB in memory for 40 demonstrations, and a GPU: ``--set training.device=cuda``). Keeps a JSON with
 held-out log-likelihoods, what came of each episode, without a limit and with 250 steps for each goal, and the seconds
 that everything took.
 """
@@ -34,18 +35,19 @@ from ddco_pyro.simulation.task import Task
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 
 SPECS = Path(__file__).parents[1] / "specs"
-SIZE, FINER = (48, 64), 3
+SIZE, FINER, LARGE = (48, 64), 3, (480, 640)
 SUPERVISOR = "scripted_noisy_0.3"
 
 METHODS = {
-    **dict.fromkeys(("ff", "ff_flat", "ff_two", "ff_two_flat"), "pushing_image_ff"),
+    **dict.fromkeys(("ff", "ff_flat", "ff_two", "ff_two_flat", "ff_large", "ff_large_flat"), "pushing_image_ff"),
     **dict.fromkeys(("rnn", "rnn_flat"), "pushing_image_rnn"),
     **{"ff_hybrid": "pushing_image_ff_hybrid", "rnn_hybrid": "pushing_image_rnn_hybrid"},
     **dict.fromkeys(("encoded", "encoded_flat"), "pushing_mlp"),
 }
 """The spec of each method. ``_flat``: as many parameters as the hierarchy beside it has with the options of its spec;
-``ff_two``: of two pictures side by side instead of one; ``encoded``: perceptrons over what the convolutions of
-``ff_flat``, fitted to the same demonstrations, give of a picture, or in training of one that is moved."""
+``ff_two``: of two pictures side by side instead of one; ``ff_large``: of pictures as the camera has them; ``encoded``:
+perceptrons over what the convolutions of ``ff_flat``, fitted to the same demonstrations, give of a picture, or in
+training of one that is moved."""
 
 ENCODED = (
     "observations=[{key: camera_features, augment: {versions: camera_features_moved}}]",
@@ -55,6 +57,10 @@ ENCODED = (
 )
 """What is changed in ``pushing_mlp.yaml`` to read features. Of σ of 1, 0.5, 0.35 and 0.25 this one is the likeliest
 on the held-out demonstrations of a development seed, for options and flat policy alike."""
+
+REDUCING = [{"filters": 16, "kernel": 5, "stride": 5}, {"filters": 16, "kernel": 5, "stride": 2, "padding": 2}]
+"""Two convolutions before those of the spec, by which pictures of ``LARGE`` have maps of ``SIZE``: a network of
+``ff_large`` learns to reduce its pictures."""
 
 VERSIONS = 24
 """How many versions of the features of each demonstration there are, of pictures moved as ``ff_flat`` sees them."""
@@ -80,8 +86,8 @@ class PictureCell(Cell):
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """Fit and play."""
         spec_of(self, settings)  # what is wrong in it is said before anything is drawn
-        own, test, tasks = settings.values, held_out(settings.runs, self.seed), (WATCHED, LIMITED)
-        demos = self.demonstrations(settings)
+        own, tasks = settings.values, (watched(pushing.task, self.camera), watched(pushing.limited, self.camera))
+        demos, test = self.demonstrations(settings), held_out(settings.runs, self.seed, self.camera)
         if self.method.startswith("encoded"):
             reader = self._reader(settings, folder)
             demos, test = encoded(reader, demos, VERSIONS, self.seed), encoded(reader, test)
@@ -104,10 +110,17 @@ class PictureCell(Cell):
             "seconds": {"fit": fitted - begun, "fit_processor": cpu, "play": ended - fitted},
         }
 
+    @property
+    def camera(self) -> Camera:
+        """What it sees."""
+        return Camera(LARGE, pushing.camera(*LARGE).draw) if self.method.startswith("ff_large") else CAMERA
+
     def demonstrations(self, settings: Settings) -> Demonstrations:
         """What is trained with."""
-        demos = pool(settings.runs, self.seed)
-        return demos.select(demos.names[: self.count])
+        if self.camera is CAMERA:
+            demos = pool(settings.runs, self.seed)
+            return demos.select(demos.names[: self.count])
+        return drawn(self.camera, TRAINING + 1000 * self.seed, self.count)
 
     def fitted(self, settings: Settings, demos: Demonstrations, folder: Path) -> tuple[Spec, Trained]:
         """The fit, which is done only once."""
@@ -132,10 +145,22 @@ def spec_of(cell: PictureCell, settings: Settings) -> Spec:
     if not features:
         changed |= {"observations.0.resize": None, "observations.0.frames": 2 if "_two" in cell.method else 1}
     base = load_spec(SPECS / f"{METHODS[cell.method]}.yaml", [*(ENCODED if features else ()), *settings.overrides])
+    if cell.method.startswith("ff_large"):
+        changed |= _large(base)
     spec = with_overrides(base, changed)
     trained = cell.count - max(1, round(cell.count * spec.training.tune_fraction))
     epochs = int(np.ceil(settings.values["updates"] / np.ceil(trained / spec.training.batch_size)))
     return with_overrides(spec, {"training.epochs": epochs})
+
+
+def _large(spec: Spec) -> dict[str, Any]:
+    """What a spec is changed to where its pictures are ten times as large, in the hierarchy and in its baseline."""
+    layers = [layer.model_dump(exclude_defaults=True) for layer in spec.hierarchy.trunk.of["camera"].layers]
+    places = ("hierarchy.trunk", "compare_with.0.policy")
+    shift = LARGE[0] // SIZE[0] * spec.observations[0].augment.shift
+    return {f"{place}.of.camera.layers": REDUCING + layers for place in places} | {
+        "observations.0.augment.shift": shift
+    }
 
 
 def _finely_drawn(environment: dm_env.Environment) -> np.ndarray:
@@ -146,9 +171,11 @@ def _finely_drawn(environment: dm_env.Environment) -> np.ndarray:
 
 
 CAMERA = Camera(SIZE, _finely_drawn)
-WATCHED = replace(pushing.task, cameras={"camera": CAMERA})
-SINGLE = replace(pushing.single, cameras={"camera": CAMERA})
-LIMITED = replace(pushing.limited, cameras={"camera": CAMERA})
+
+
+def watched(task: Task, camera: Camera = CAMERA) -> Task:
+    """The task with a camera that policies may look at."""
+    return replace(task, cameras={"camera": camera})
 
 
 def pool(folder: Path, seed: int) -> Demonstrations:
@@ -156,20 +183,26 @@ def pool(folder: Path, seed: int) -> Demonstrations:
     return recorded(folder, TRAINING + 1000 * seed, POOL)
 
 
-def held_out(folder: Path, seed: int) -> Demonstrations:
+def held_out(folder: Path, seed: int, camera: Camera = CAMERA) -> Demonstrations:
     """Demonstrations that nothing is trained on; others for a development seed."""
-    return recorded(folder, HELD_OUT_SEED + 1000 * (seed >= DEVELOPMENT), HELD_OUT)
+    first = HELD_OUT_SEED + 1000 * (seed >= DEVELOPMENT)
+    return recorded(folder, first, HELD_OUT) if camera is CAMERA else drawn(camera, first, HELD_OUT)
 
 
 def recorded(folder: Path, first: int, count: int) -> Demonstrations:
     """Demonstrations of one goal each from seeds ``first`` on, with pictures and labels in memory; kept in a file."""
     path = folder / "demonstrations" / f"{first}.hdf5"
     if not path.exists():
-        seeds = range(first, first + count)
-        episodes = [run_episode(SINGLE, SUPERVISOR, seed, observed=["camera"], keep=["camera"]) for seed in seeds]
-        Demonstrations(tuple(one.record for one in episodes)).write(path)
+        drawn(CAMERA, first, count).write(path)
     kept = Demonstrations.read(path, labels=LABELS)
     return replace(kept, demonstrations=tuple(map(_in_memory, kept)))
+
+
+def drawn(camera: Camera, first: int, count: int) -> Demonstrations:
+    """Demonstrations of one goal each from seeds ``first`` on, in memory and nowhere else."""
+    task, seeds = watched(pushing.single, camera), range(first, first + count)
+    episodes = [run_episode(task, SUPERVISOR, seed, observed=["camera"], keep=["camera"]) for seed in seeds]
+    return Demonstrations(tuple(one.record for one in episodes))
 
 
 def encoded(reader: FittedReader, demos: Demonstrations, versions: int = 0, seed: int = 0) -> Demonstrations:

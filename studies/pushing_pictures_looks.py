@@ -20,10 +20,11 @@ from typing import Any
 import numpy as np
 import torch
 from cells import described
+from ddco_tasks.pushing import environment as pushing
 from matplotlib.figure import Figure
 from provenance import record, sentence, text
 from pushing_cell import EVALUATION
-from pushing_pictures_cell import DEFAULTS, METHODS, WATCHED, PictureCell, held_out
+from pushing_pictures_cell import DEFAULTS, METHODS, PictureCell, held_out, watched
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking
@@ -84,7 +85,7 @@ def draw(frames: list[np.ndarray], choices: np.ndarray) -> Figure:
 
 def played(policy: Policy, seed: int) -> Episode:
     """An episode, of which the way of the arm's tip is kept."""
-    return run_episode(WATCHED, policy, seed, observed=["camera"], keep=["tip"])
+    return run_episode(watched(pushing.task), policy, seed, observed=["camera"], keep=["tip"])
 
 
 def row_of(episode: Episode) -> dict[str, float]:

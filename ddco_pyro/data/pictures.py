@@ -214,6 +214,6 @@ def padded(
 def shifted(frames: np.ndarray, down: int, right: int) -> np.ndarray:
     """Pictures [T, H, W, C] moved by whole pixels; the edge is repeated."""
     height, width = frames.shape[1:3]
-    rows = np.clip(np.arange(height) - down, 0, height - 1)
-    columns = np.clip(np.arange(width) - right, 0, width - 1)
-    return frames[:, rows][:, :, columns]
+    before, behind = (max(down, 0), max(right, 0)), (max(-down, 0), max(-right, 0))
+    wider = np.pad(frames, [(0, 0), *zip(before, behind, strict=True), (0, 0)], mode="edge")
+    return wider[:, behind[0] :, behind[1] :][:, :height, :width]
