@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ddco_pyro.model.networks.conv import SHARPNESS, Conv
 from ddco_pyro.model.networks.inputs import Inputs, InputShape
+from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import ConvolutionLayer
 
 _KEY = "picture"
@@ -35,8 +36,7 @@ class Convolutions(nn.Module):
     def __init__(self, kind: str, shape: Sequence[int], seed: int) -> None:
         super().__init__()
         layers = (_FIRST, ConvolutionLayer(filters=BUILT_IN[kind], kernel=3, padding=1))
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+        with seeded(seed):
             images = InputShape({}, {_KEY: tuple(shape)})
             self.maps = Conv(images, None, 1, (), 0.0, "relu", 0, 0, layers, "spatial_softmax", 0, False)
         if kind == "random_conv":  # nothing will train them, and strong maps that are random tell less
@@ -64,8 +64,7 @@ class Autoencoder(nn.Module):
         super().__init__()
         self.encoder = encoder
         self.target = (min(TARGET, shape[0]), min(TARGET, shape[1]))
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed + 1)
+        with seeded(seed + 1):
             outputs = self.target[0] * self.target[1] * shape[2]
             self.decoder = nn.Sequential(nn.Linear(encoder.features, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, outputs))
 

@@ -24,8 +24,9 @@ from ddco_pyro.export.recording import MOST, record, tolerance
 from ddco_pyro.export.runner import TOLERANCE
 from ddco_pyro.export.weights import weights_and_networks
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.model.hierarchy import HOST, Hierarchy
+from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.links import TERMINATION_BOUND
+from ddco_pyro.model.seeding import HOST
 from ddco_pyro.spec import STEP, RolloutSpec
 
 __all__ = ["TOLERANCE", "Exported", "export", "write_numpy"]

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import torch
 
-from ddco_pyro.model.hierarchy import HOST
+from ddco_pyro.model.seeding import HOST
 from ddco_pyro.spec import SpecError, TrainingSpec
 
 WORKSPACE = "CUBLAS_WORKSPACE_CONFIG"
@@ -33,11 +33,6 @@ def device_of(training: TrainingSpec) -> torch.device:
 def described(device: torch.device) -> str:
     """Its kind, and which of that kind where it matters: what a run's bits depend on."""
     return f"cuda ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else device.type
-
-
-def generators(device: torch.device) -> list[torch.device]:
-    """The devices beside the host whose generators draw in training (``torch.random.fork_rng``)."""
-    return [device] if device.type == "cuda" else []
 
 
 @contextmanager

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from ddco_pyro.data.reading import Readers
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy
@@ -15,6 +14,7 @@ from ddco_pyro.fitting.devices import device_of
 from ddco_pyro.fitting.labels import Labels
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import Spec
 
 
@@ -37,8 +37,7 @@ class Material:
 
     def hierarchy(self, restart: int) -> Hierarchy:
         """A restart's hierarchy before any training, in evaluation mode, its networks on the spec's device."""
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.seed(restart))
+        with seeded(self.seed(restart)):
             hierarchy = build_hierarchy(self.spec, self.dimensions)
         hierarchy.encoder.load_state_dict(self.encoder)
         hierarchy.scaling.load_state_dict(self.scaling)

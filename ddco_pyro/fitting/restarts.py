@@ -15,8 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import EpochEnded, OnEvent, RestartStopped, ignore
@@ -31,6 +29,7 @@ from ddco_pyro.fitting.ranks import ALONE, Ranks
 from ddco_pyro.fitting.training import advance
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import Spec
 
 SLICE = 10.0
@@ -72,8 +71,7 @@ class Trainer:
         self.ranks = ranks
         self.spec, self.checkpoints, self.on_event = spec, checkpoints, on_event
         self.jobs = useful_jobs(jobs, spec.training.restarts)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(spec.seed)
+        with seeded(spec.seed):
             self.first = build_hierarchy(spec, dimensions)  # its encoder and scaling are those of all restarts
         self.first.encoder.fit(train)
         self.first.scaling.fit(train)

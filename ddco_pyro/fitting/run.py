@@ -39,6 +39,7 @@ from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.encoding import refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import Spec, dump_spec, load_spec, with_overrides
 
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
@@ -293,8 +294,7 @@ def _check_engines(trainer: Trainer) -> EngineCheck:
     """
     first, batch = trainer.first, trainer.material.train
     few = batch.select(torch.arange(min(len(batch), TRAJECTORIES)), STEPS)
-    with torch.random.fork_rng(devices=[]), torch.no_grad():
-        torch.manual_seed(trainer.spec.seed)
+    with seeded(trainer.spec.seed), torch.no_grad():
         outputs = first(few.inputs)
     if not all(bool(torch.isfinite(values).all()) for values in outputs.tensors()):
         raise TrainingError(

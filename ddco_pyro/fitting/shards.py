@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from ddco_pyro.fitting.objective import Objective
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.seeding import seed
 
 Gradients = list[np.ndarray | None]
 """Of each parameter; None where there is none."""
@@ -73,7 +74,7 @@ def _part(
     for parameter in parameters:
         parameter.grad = None
     if shard.seed is not None:
-        torch.manual_seed(shard.seed)
+        seed(shard.seed, model.device)
     value = objective.ascend(model, shard.rows, steps)
     return value, [None if parameter.grad is None else parameter.grad.cpu().numpy() for parameter in parameters]
 

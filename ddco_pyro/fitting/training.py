@@ -24,7 +24,7 @@ from ddco_pyro.events import EpochEnded, OnEvent, ignore
 from ddco_pyro.fitting.ascent import Ascent, learning_rate
 from ddco_pyro.fitting.checkpoint import Restart, copy_of
 from ddco_pyro.fitting.convergence import StageEnd, share
-from ddco_pyro.fitting.devices import device_of, generators, repeatable
+from ddco_pyro.fitting.devices import device_of, repeatable
 from ddco_pyro.fitting.material import Material
 from ddco_pyro.fitting.objective import Objective
 from ddco_pyro.fitting.ranks import ALONE, Ranks
@@ -33,6 +33,7 @@ from ddco_pyro.fitting.stages import Stage, plan
 from ddco_pyro.fitting.upper import Constants
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.seeding import seeded
 
 SAVE_EVERY = 1.0  # s between checkpoints, at least: an epoch of a small model takes less time than its checkpoint
 
@@ -122,9 +123,8 @@ class Training:
     def _epoch(self, ascent: Ascent) -> float:
         """One pass over the training demonstrations; the log-likelihood per step seen on the way."""
         now, model, total = self.progress, ascent.model, 0.0
-        with torch.random.fork_rng(devices=generators(model.device)):
-            place = now.restart, now.stage, now.epoch
-            torch.manual_seed(self._material.seed(*place))
+        place = now.restart, now.stage, now.epoch
+        with seeded(self._material.seed(*place), model.device):
             model.train()
             minibatches = torch.randperm(len(self._material.train)).split(self.spec.training.batch_size)
             seeds = (partial(self._material.seed, *place, number) for number in range(len(minibatches)))

@@ -23,6 +23,7 @@ from ddco_pyro.model.networks import Inputs, InputShape, build, build_trunk, nam
 from ddco_pyro.model.networks.activations import training_bytes
 from ddco_pyro.model.networks.state import Carried, State, States, Trunk, remembers
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
+from ddco_pyro.model.seeding import HOST
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
 
@@ -30,7 +31,6 @@ BYTES_AT_ONCE = 256 * 10**6
 """Most bytes that networks take for the steps that go through them together, one step at least; less where less memory
 is allowed (:func:`ddco_pyro.data.memory.share`)."""
 
-HOST = torch.device("cpu")
 """Where everything but networks is: tables, inference, emissions and their spreads."""
 
 Emits = Literal["options", "control"]

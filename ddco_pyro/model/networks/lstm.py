@@ -120,7 +120,7 @@ class StackedLstm(nn.Module):
     def _weights(self) -> Iterator[list[Tensor]]:
         """Weights and biases of each copy, as torch has them."""
         for weight, bias, recurrent in zip(self.inputs.weight, self.inputs.bias, self.recurrent, strict=True):
-            yield [weight.mT, recurrent.mT, bias[0], torch.zeros_like(bias[0])]
+            yield [weight.mT.contiguous(), recurrent.mT.contiguous(), bias[0], torch.zeros_like(bias[0])]  # for GPUs
 
 
 def _in_windows(
