@@ -59,6 +59,7 @@ def row_of(cell: Any, results: dict[str, Any]) -> Row:
         "parameters": results["parameters"],
         "minutes": (seconds["fit"] + seconds["play"]) / 60,
         "processor": seconds["fit_processor"] / 60,
+        "device": results["steps"]["device"],
     }
 
 
@@ -94,6 +95,9 @@ def page(study: str, rows: Sequence[Row], missing: Sequence[str], made_by: str) 
     lines[-1] += f"Policies from the state, on the same demonstrations and episodes: `{STATE}`."
     ordered = sorted(rows, key=lambda row: (row["method"], -row[across], row["seed"]))
     lines += ["", *table(ordered, COLUMNS, "method", across), "", *differences(rows, across)]
+    if on := Counter((row["device"], row["method"]) for row in rows if row.get("device", "cpu") != "cpu"):
+        each = ", ".join(f"{count} of {method} on {device}" for (device, method), count in on.items())
+        lines += ["", f"Fitted on a GPU, whose last digits are others: {each}."]
     if missing:
         kinds = Counter(name.partition("-")[0] for name in missing)
         left = ", ".join(f"{count} of {method}" for method, count in kinds.items())

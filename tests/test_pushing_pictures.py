@@ -13,7 +13,7 @@ import pytest
 from cells import described
 from provenance import ROOT, sources, tree
 from pushing_pictures_cell import DEFAULTS, METHODS, SIZE, PictureCell, encoded, spec_of
-from pushing_pictures_results import at_one_std, differences, row_of
+from pushing_pictures_results import at_one_std, differences, page, row_of
 from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
@@ -26,6 +26,7 @@ def results(goals, held_out):
         "unlimited": {"goals": goals, "topples": [0.0, 1.0], "lost": [0.0, 0.0], "dwell": None, "own_control": None},
         "limited": {"goals": [2.0 * one for one in goals]},
         "parameters": 7,
+        "steps": {"device": "cpu"},
         "seconds": {"fit": 90.0, "fit_processor": 30.0, "play": 30.0},
     }
 
@@ -40,6 +41,17 @@ def test_a_row_has_means_over_episodes():
     row = row_of(PictureCell("ff", 2, 80, 1), results([4.0, 1.0], -3.0))
     assert (row["goals"], row["limited"], row["topples"]) == (2.5, 5.0, 0.5)
     assert (row["minutes"], row["processor"]) == (2.0, 0.5)
+
+
+def test_a_page_says_what_was_fitted_on_a_gpu():
+    """Cells of both are on one page; rows of before say nothing of it."""
+    cells = [PictureCell("rnn_flat", 0, 80, seed) for seed in range(3)]
+    rows = at_one_std([row_of(cell, results([1.0], -3.0)) | {"std": 1.0} for cell in cells])
+    older = {name: value for name, value in rows[1].items() if name != "device"}
+    assert "GPU" not in page("demonstrations", [rows[0], older], [], "")
+    gpu = rows[2] | {"device": "cuda (NVIDIA H200)"}
+    text = page("demonstrations", [rows[0], older, gpu], [], "")
+    assert text.count("Fitted on a GPU, whose last digits are others: 1 of rnn_flat on cuda (NVIDIA H200).") == 1
 
 
 def test_differences_are_paired_by_seed_and_number():

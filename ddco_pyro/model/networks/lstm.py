@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager
 
 import torch
 from torch import Tensor, nn
@@ -92,7 +93,7 @@ class StackedLstm(nn.Module):
         if batch[1] == 1:
             return self._step(values, h.transpose(0, 1), c.transpose(0, 1))
         sequences = values.unflatten(1, batch).expand(self.size[0], -1, -1, -1)
-        with _full_precision(values.device):
+        with _for_loop(values.device):
             each = [
                 torch.lstm(sequence.to(self.recurrent.dtype), own, weights, True, 1, 0.0, self.training, False, True)
                 for sequence, own, weights in zip(sequences, self._states(h, c), self._weights(), strict=True)
@@ -147,6 +148,15 @@ def _in_windows(
     return torch.cat(parts, dim=2).flatten(1, 2), h, c
 
 
-def _full_precision(device: torch.device) -> AbstractContextManager[None]:
-    """Not every processor has what torch's loop takes in bfloat16, so there it is float32 on all of them."""
-    return torch.autocast("cpu", enabled=False) if device.type == "cpu" else nullcontext()
+def _for_loop(device: torch.device) -> AbstractContextManager[None]:
+    """Not every processor has what torch's loop takes in bfloat16, so there it is float32 on all of them. A GPU warns
+    that it brings weights together each time.
+    """
+    return torch.autocast("cpu", enabled=False) if device.type == "cpu" else _without_warning()
+
+
+@contextmanager
+def _without_warning() -> Iterator[None]:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "RNN module weights are not part of single contiguous chunk", UserWarning)
+        yield
