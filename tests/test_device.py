@@ -236,16 +236,16 @@ def test_a_run_goes_on_where_it_was_begun(demos: Demonstrations, tmp_path, monke
         assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
-def test_a_fit_on_the_host_leaves_the_generators_of_gpus_alone(
-    demos: Demonstrations, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Torch's own seeding reaches all GPUs there are, whose numbers a user may be drawing."""
+def test_a_fit_leaves_generators_as_they_were(demos: Demonstrations, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of GPUs too, which torch's own seeding reaches."""
     seeded: list[int] = []
     monkeypatch.setattr(torch.cuda, "manual_seed_all", seeded.append)
     torch.manual_seed(0)
     assert seeded == [0]
+    before = torch.get_rng_state()
     ddco_pyro.fit(spec_of(DROPPING, epochs=1, initialize="random"), demos)
     assert seeded == [0]
+    assert torch.equal(torch.get_rng_state(), before)
 
 
 # --- a GPU ------------------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from ddco_pyro.fitting.widths import nearest_widths
 from ddco_pyro.model.encoding import Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import ShapeError
+from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code
 
 
@@ -51,9 +52,10 @@ class Dimensions:
         return cls(shapes, size, max(demonstrations.lengths), constant, control)
 
 
-def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
-    """The spec's networks for these dimensions, randomly initialised.
+def build_hierarchy(spec: Spec, dimensions: Dimensions, seed: int | None = None) -> Hierarchy:
+    """The spec's networks for these dimensions, randomly initialised; torch's generator is left as it was.
 
+    :param seed: of their numbers; None for the spec's.
     :raises SpecError: something in the spec does not fit the observations or the control.
     """
     missing = [key for key in spec.observed if key not in dimensions.shapes]
@@ -74,7 +76,8 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
     refuse_unknown_dimensions(spec.control, dimensions.control_size)
     _refuse_giants(spec, dimensions)
     try:
-        return _hierarchy(spec, dimensions)
+        with seeded(spec.seed if seed is None else seed):
+            return _hierarchy(spec, dimensions)
     except ShapeError as error:
         raise SpecError(str(error)) from error
 

@@ -14,7 +14,6 @@ from ddco_pyro.fitting.devices import device_of
 from ddco_pyro.fitting.labels import Labels
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import Spec
 
 
@@ -37,8 +36,7 @@ class Material:
 
     def hierarchy(self, restart: int) -> Hierarchy:
         """A restart's hierarchy before any training, in evaluation mode, its networks on the spec's device."""
-        with seeded(self.seed(restart)):
-            hierarchy = build_hierarchy(self.spec, self.dimensions)
+        hierarchy = build_hierarchy(self.spec, self.dimensions, self.seed(restart))
         hierarchy.encoder.load_state_dict(self.encoder)
         hierarchy.scaling.load_state_dict(self.scaling)
         return hierarchy.place(device_of(self.spec.training)).eval()

@@ -29,7 +29,6 @@ from ddco_pyro.fitting.ranks import ALONE, Ranks
 from ddco_pyro.fitting.training import advance
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import Spec
 
 SLICE = 10.0
@@ -71,8 +70,7 @@ class Trainer:
         self.ranks = ranks
         self.spec, self.checkpoints, self.on_event = spec, checkpoints, on_event
         self.jobs = useful_jobs(jobs, spec.training.restarts)
-        with seeded(spec.seed):
-            self.first = build_hierarchy(spec, dimensions)  # its encoder and scaling are those of all restarts
+        self.first = build_hierarchy(spec, dimensions)  # its encoder and scaling are those of all restarts
         self.first.encoder.fit(train)
         self.first.scaling.fit(train)
         encoder, scaling = self.first.encoder, self.first.scaling
