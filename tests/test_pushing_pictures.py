@@ -12,11 +12,12 @@ import pushing_pictures as study
 import pytest
 from cells import described
 from provenance import ROOT, sources, tree
-from pushing_pictures_cell import DEFAULTS, METHODS, SIZE, PictureCell, encoded, spec_of
+from pushing_pictures_cell import DEFAULTS, LARGE, METHODS, SIZE, PictureCell, encoded, spec_of
 from pushing_pictures_results import at_one_std, differences, page, row_of
 from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.fitting.building import Dimensions, build_hierarchy, parameters
 from ddco_pyro.spec import load_spec
 
 
@@ -41,6 +42,18 @@ def test_a_row_has_means_over_episodes():
     row = row_of(PictureCell("ff", 2, 80, 1), results([4.0, 1.0], -3.0))
     assert (row["goals"], row["limited"], row["topples"]) == (2.5, 5.0, 0.5)
     assert (row["minutes"], row["processor"]) == (2.0, 0.5)
+
+
+def test_pictures_as_the_camera_has_them_end_in_the_same_maps():
+    """So the networks differ by the two convolutions before the others, and by the 16 maps that the third one reads."""
+    small, large = (
+        parameters(build_hierarchy(spec_of(PictureCell(method, 2, 40, 0), DEFAULTS), Dimensions(shapes, 3, 100)))
+        for method, shapes in (("ff", {"camera": (*SIZE, 3)}), ("ff_large", {"camera": (*LARGE, 3)}))
+    )
+    assert large - small == 16 * (75 + 1) + 16 * (16 * 25 + 1) + 16 * 25 * (16 - 3)
+    spec = spec_of(PictureCell("ff_large", 2, 40, 0), DEFAULTS)
+    assert spec.observations[0].augment.shift == 30
+    assert spec.compare_with[0].policy.of["camera"] == spec.hierarchy.trunk.of["camera"]
 
 
 def test_a_page_says_what_was_fitted_on_a_gpu():
