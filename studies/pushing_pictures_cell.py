@@ -4,9 +4,9 @@
 
 OPTIONS is 0 for a flat policy. Demonstrations and evaluation episodes are those of ``pushing_studies.py`` with the same
 seeds. Pictures are drawn three times as fine as they are seen, 48 x 64, and reduced by means; ``ff_large`` sees all of
-480 x 640 (some 10 GB in memory for 40 demonstrations, and a GPU: ``--set training.device=cuda``). Keeps a JSON with
-held-out log-likelihoods, what came of each episode, without a limit and with 250 steps for each goal, and the seconds
-that everything took.
+480 x 640, which takes a GPU (``--set training.device=cuda``) and memory for all pictures, 0.9 MB each
+(``DDCO_PYRO_MEMORY=80GB`` allows so much). Keeps a JSON with held-out log-likelihoods, what came of each episode,
+without a limit and with 250 steps for each goal, and the seconds that everything took.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import MOVED, Transform, shifted
 from ddco_pyro.encoding.fitted import FittedReader, from_fit
 from ddco_pyro.fitting.building import Dimensions, baseline_spec, parameters
+from ddco_pyro.fitting.devices import device_of
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import Trained, train
 from ddco_pyro.simulation.cameras import Camera, Encoded
@@ -85,7 +86,7 @@ class PictureCell(Cell):
 
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """Fit and play."""
-        spec_of(self, settings)  # what is wrong in it is said before anything is drawn
+        device_of(spec_of(self, settings).training)  # what is wrong is said before anything is drawn
         own, tasks = settings.values, (watched(pushing.task, self.camera), watched(pushing.limited, self.camera))
         demos, test = self.demonstrations(settings), held_out(settings.runs, self.seed, self.camera)
         if self.method.startswith("encoded"):

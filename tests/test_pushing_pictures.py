@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pushing_pictures as study
 import pytest
+import torch
 from cells import described
 from provenance import ROOT, sources, tree
 from pushing_pictures_cell import DEFAULTS, LARGE, METHODS, SIZE, PictureCell, encoded, spec_of
@@ -18,7 +19,7 @@ from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy, parameters
-from ddco_pyro.spec import load_spec
+from ddco_pyro.spec import SpecError, load_spec
 
 
 def results(goals, held_out):
@@ -54,6 +55,14 @@ def test_pictures_as_the_camera_has_them_end_in_the_same_maps():
     spec = spec_of(PictureCell("ff_large", 2, 40, 0), DEFAULTS)
     assert spec.observations[0].augment.shift == 30
     assert spec.compare_with[0].policy.of["camera"] == spec.hierarchy.trunk.of["camera"]
+
+
+def test_a_gpu_that_is_missing_is_said_before_anything_is_drawn(monkeypatch, tmp_path):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr("pushing_pictures_cell.run_episode", lambda *_, **__: pytest.fail("pictures are drawn"))
+    settings = replace(DEFAULTS, runs=tmp_path, overrides=("training.device=cuda",))
+    with pytest.raises(SpecError, match="has no GPU here"):
+        PictureCell("ff_large", 2, 40, 0).results(settings, tmp_path)
 
 
 def test_a_page_says_what_was_fitted_on_a_gpu():
