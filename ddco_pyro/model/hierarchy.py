@@ -31,8 +31,6 @@ BYTES_AT_ONCE = 256 * 10**6
 """Most bytes that networks take for the steps that go through them together, one step at least; less where less memory
 is allowed (:func:`ddco_pyro.data.memory.share`)."""
 
-"""Where everything but networks is: tables, inference, emissions and their spreads."""
-
 Emits = Literal["options", "control"]
 
 Answers = Sequence[Tensor]

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 import torch
 
 HOST = torch.device("cpu")
+"""Where everything but networks is: tables, inference, emissions and their spreads."""
 
 
 def seed(value: int, device: torch.device = HOST) -> None:
