@@ -27,29 +27,37 @@ def steep(gain: float) -> Fit:
     """A policy of pairs of hidden units that differ by 1 / gain, of which it takes gain times the difference: what
     float32 rounds in a unit it has gain times.
     """
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": ["state"],
-            "baseline": {"kind": "flat", "policy": {"network": "mlp", "hidden": [2 * HALF]}},
-        }
-    )
-    torch.manual_seed(2)
-    hierarchy = Hierarchy(spec, {"state": (5,)}, 2, 7)
-    first, *_, last = hierarchy.meta_policy.network.layers
+    fit = perceptron(2 * HALF)
+    first, *_, last = fit.hierarchy.meta_policy.network.layers
     with torch.no_grad():
         first.weight[..., HALF:] = first.weight[..., :HALF]
         first.bias[..., HALF:] = first.bias[..., :HALF] + 1 / gain
         last.weight[:, HALF:] = -last.weight[:, :HALF]
         last.weight.mul_(gain)
-    return Fit(spec, hierarchy.eval())
+    return fit
+
+
+def perceptron(units: int) -> Fit:
+    """A policy with so many hidden units, which acts with its mean."""
+    spec = parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": ["state"],
+            "baseline": {"kind": "flat", "policy": {"network": "mlp", "hidden": [units]}},
+            "rollout": {"control": "mean"},
+        }
+    )
+    torch.manual_seed(2)
+    return Fit(spec, Hierarchy(spec, {"state": (5,)}, 2, 7).eval())
 
 
 STEEP = 40.0
 
 
 def measured(folder: Path) -> float:
-    """How far the original's controls, as recorded, are from those of float64."""
+    """How far the original's controls are from those of float64: what it says of an episode at once (``control_0``),
+    and what it did (``controls``), one step after the other.
+    """
     with np.load(folder / "weights.npz") as file:
         names = [f"caller_0.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")]
         weight, bias, weight_2, bias_2 = (file[name][0].astype(np.float64) for name in names)
@@ -58,8 +66,9 @@ def measured(folder: Path) -> float:
         for episode in file["seeds"]:
             seen = file[f"observation_{episode}_state"].astype(np.float32).astype(np.float64)
             exact = np.maximum(seen @ weight + bias, 0) @ weight_2 + bias_2
-            error = np.abs(file[f"control_0_{episode}"][:, 0] - exact) / np.maximum(1, np.abs(exact))
-            largest = max(largest, error.max())
+            for name in ("control_0", "controls"):
+                error = np.abs(file[f"{name}_{episode}"].reshape(exact.shape) - exact) / np.maximum(1, np.abs(exact))
+                largest = max(largest, error.max())
     return largest
 
 
@@ -79,6 +88,12 @@ def test_a_sound_fit_may_differ_by_what_float32_does(tmp_path, capsys, monkeypat
         runner.main()
     assert ended.value.code == 0
     assert f" of {allowed(tmp_path):.1e} that are allowed; " in capsys.readouterr().out
+
+
+def test_a_wide_layer_rounds_more_one_step_at_a_time(tmp_path):
+    """A product with a vector adds up in another order than one with a matrix; exported forms act step by step."""
+    export(perceptron(8000), tmp_path, onnx=True)
+    assert allowed(tmp_path) == pytest.approx(max(1e-6, 4 * measured(tmp_path)), rel=1e-6)
 
 
 def test_where_float32_is_exact_enough_the_tolerance_is_as_it_was(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,6 +14,8 @@ from ddco_pyro.export import runner
 from ddco_pyro.model.encoding import ObservationEncoder
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.networks.state import States
+from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.spec import STEP
 
 EPISODES, STEPS = 3, 20
@@ -21,7 +24,8 @@ than the longest demonstration, so that networks of every step of time are among
 
 ROUNDINGS = 4
 """An exported form may differ from the original by so many times what the original, in float32, differs from the same
-networks in float64: either errs by about that, in other places, and these are the largest of a few thousand numbers."""
+networks in float64, in a whole episode at once or one step at a time (which adds in another order): either errs by
+about that, in other places, and these are the largest of a few thousand numbers."""
 
 MOST = 1e-4
 """No form may differ by more: networks whose own rounding is beyond a quarter of this say nothing in float32."""
@@ -46,7 +50,8 @@ def record(controller: Controller, hierarchy: Hierarchy) -> dict[str, np.ndarray
         arrays |= {f"observation_{episode}_{key}": obs for key, obs in seen.items()}
         arrays[f"controls_{episode}"] = np.stack([control for control, _ in acted])
         arrays[f"choices_{episode}"] = np.array([choices for _, choices in acted], dtype=int).reshape(steps, -1)
-        arrays |= {f"{name}_{episode}": values for name, values in _said(hierarchy, seen).items()}
+        said = _said(hierarchy, hierarchy.encoder.inputs([seen]))
+        arrays |= {f"{name}_{episode}": values for name, values in said.items()}
     return arrays
 
 
@@ -58,27 +63,38 @@ def tolerance(hierarchy: Hierarchy, episodes: Mapping[str, np.ndarray]) -> float
     """
     exact, largest = copy.deepcopy(hierarchy).double(), 0.0
     for number in episodes["seeds"]:
+        inputs = hierarchy.encoder.inputs([runner.seen(episodes, number)])
+        vectors = {key: vector.double() for key, vector in inputs.vectors.items()}
         try:
-            said = _said(exact, runner.seen(episodes, number), torch.float64)
+            said = _said(exact, replace(inputs, vectors=vectors))
         except RuntimeError:  # torch does not mix types
             return runner.TOLERANCE
-        rounded = {name: episodes[f"{name}_{number}"] for name in said}
-        largest = max(largest, *(runner.difference({}, name, rounded[name], said[name]) for name in said))
+        recorded = {name: episodes[f"{name}_{number}"] for name in said}
+        for rounded in (recorded, _said_stepwise(hierarchy, inputs)):
+            largest = max(largest, *(runner.difference({}, name, rounded[name], said[name]) for name in said))
     return float(np.clip(ROUNDINGS * largest, runner.TOLERANCE, MOST))
 
 
-def _said(
-    hierarchy: Hierarchy, episode: Mapping[str, np.ndarray], dtype: torch.dtype = torch.float32
-) -> runner.Outputs:
-    """The runner's outputs at every step, [T, ...], from one pass over the episode, as in training.
-
-    :param dtype: that of the networks; what they see is rounded to float32 whatever it is.
-    """
-    out: runner.Outputs = {}
-    inputs = hierarchy.encoder.inputs([episode])
-    vectors = {key: vector.to(dtype) for key, vector in inputs.vectors.items()}
+def _said(hierarchy: Hierarchy, inputs: Inputs) -> runner.Outputs:
+    """The runner's outputs at every step, [T, ...], from one pass over the episode, as in training."""
     with torch.no_grad():
-        said = hierarchy(Inputs(vectors, inputs.images, inputs.time))
+        return _named(hierarchy(inputs))
+
+
+def _said_stepwise(hierarchy: Hierarchy, inputs: Inputs) -> runner.Outputs:
+    """The same from one step after the other, as a controller has them."""
+    each: list[runner.Outputs] = []
+    states: States | None = None
+    with torch.no_grad():
+        for step in inputs.chunks(1):
+            said, states = hierarchy.advance(step, states)
+            each.append(_named(said))
+    return {name: np.concatenate([one[name] for one in each]) for name in each[0]}
+
+
+def _named(said: Outputs) -> runner.Outputs:
+    """The outputs for one episode by the runner's names, [T, ...]."""
+    out: runner.Outputs = {}
     for level, caller in enumerate(said.callers):
         if caller.selection is not None:
             out[f"selection_{level}"] = caller.selection[0].numpy()
