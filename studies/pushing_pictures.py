@@ -6,8 +6,8 @@ flat policy (``encoded``), goals against options, and augmentation.
         [--set KEY=VALUE]... [--summarize] [--minutes 60] [--jobs 1] [--out DIR] [--runs DIR]
 
 Does cells one seed after the other, and begins none after so many minutes; what this code has done with these settings
-is not done again, and neither is what ``NAME.json`` has of these settings, by whatever code. Writes ``NAME.json``,
-``NAME.md`` and ``NAME.png`` of all cells that are done, and says which are not.
+is not done again, and neither is what the JSON of this study, or of another in DIR, has of these settings, by whatever
+code. Writes ``NAME.json``, ``NAME.md`` and ``NAME.png`` of all cells that are done, and says which are not.
 """
 
 from __future__ import annotations
@@ -84,7 +84,8 @@ def main() -> None:
 
 def run(own: argparse.Namespace) -> str:
     """Do what is not done yet, and write what there is; the page."""
-    settings, asked, before = DEFAULTS.given(own), some(cells(own)), Page.read(own)
+    settings, asked = DEFAULTS.given(own), some(cells(own))
+    before = Page.known(own, asked)
     made_by, until = record(asked[0].command(settings)), time.monotonic() + 60 * own.minutes
     if not own.summarize:
         todo = [cell for cell in asked if cell not in before.rows]
@@ -100,9 +101,20 @@ class Page:
     records: list[Record | None]
 
     @classmethod
-    def read(cls, own: argparse.Namespace) -> Page:
-        """Nothing, where there is no file, or one of other settings."""
-        path = own.out / f"{own.study}.json"
+    def known(cls, own: argparse.Namespace, asked: Sequence[PictureCell]) -> Page:
+        """With the cells that are asked for and that other studies' pages beside it have."""
+        page = cls.read(own, own.study)
+        for other in (cls.read(own, name) for name in STUDIES):
+            taken = {cell: other.rows[cell] for cell in asked if cell in other.rows.keys() - page.rows.keys()}
+            commits = {row["commit"] for row in taken.values()}
+            records = [one for one in other.records if one is not None and one["commit"] in commits]
+            page = cls({**page.rows, **taken}, [*page.records, *records])
+        return page
+
+    @classmethod
+    def read(cls, own: argparse.Namespace, name: str) -> Page:
+        """That of a study. Nothing, where there is no file, or one of other settings."""
+        path = own.out / f"{name}.json"
         content = json.loads(path.read_text()) if path.exists() else {"results": {}}
         if content["results"].get("settings") != DEFAULTS.given(own).kept():
             return cls({}, [])

@@ -202,6 +202,20 @@ def test_what_the_page_has_is_not_done_again(tmp_path: Path):
     assert "Cells that are not measured yet: 2 of ff_flat." in other
 
 
+def test_cells_of_another_study_are_taken_over(tmp_path: Path):
+    """Two options with 40 demonstrations are a cell of two studies; what made the other cells is not told again."""
+    shared, other, runs = PictureCell("ff", 2, 40, 0), PictureCell("ff", 2, 80, 0), tmp_path / "runs"
+    for cell, goals, commit in ((shared, 3.0, "y"), (other, 9.0, "older")):
+        kept_cell(runs, cell, [goals], commit)
+    words = ("--seeds", "1", "--methods", "ff", "--summarize", "--out", str(tmp_path))
+    study.run(arguments("demonstrations", *words, "--runs", str(runs)))
+    page = study.run(arguments("options", *words, "--options", "2", "--runs", str(tmp_path / "none")))
+    assert "at commit y." in page
+    assert "not measured yet" not in page
+    kept = json.loads((tmp_path / "options.json").read_text())
+    assert [(row["count"], row["goals"]) for row in kept["results"]["cells"]] == [(40, 3.0)]
+
+
 def test_likelihoods_without_a_number_for_std_stay_as_they_are():
     """There may be no cell yet, and σ may be learnt."""
     assert at_one_std([]) == []
