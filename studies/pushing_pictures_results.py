@@ -35,6 +35,9 @@ COLUMNS = {
 ACROSS = {"demonstrations": "count", "encoded": "count", "options": "options", "augmentation": "options"}
 """What each study varies."""
 
+WORDS = {"count": "{} demonstrations", "options": "k = {}"}
+"""Of what is varied, with its number."""
+
 CONTROLS = 3
 """Joints of the arm."""
 
@@ -106,27 +109,39 @@ def page(study: str, rows: Sequence[Row], missing: Sequence[str], made_by: str) 
 
 
 def differences(rows: Sequence[Row], across: str) -> list[str]:
-    """Each hierarchy minus the flat policy of equal size, and minus that whose features it reads; paired by seed."""
-    if across != "count":
-        return []
+    """Each hierarchy minus what it is to be compared with, paired by seed."""
+    groups = grouped(rows, "method", across)
     return [
-        line
-        for (method, count), own in grouped(rows, "method", "count").items()
-        for other, called in {f"{method}_flat": "flat of equal size", **OTHERS.get(method, {})}.items()
-        for line in _against(own, [row for row in rows if row["method"] == other and row["count"] == count], called)
+        _against(pairs, f"{method} minus {called}, {WORDS[across].format(place)}")
+        for (method, place), own in groups.items()
+        for other, called in _compared(method, place, across).items()
+        if (pairs := _pairs(own, groups.get(other, [])))
     ]
 
 
-def _against(ours: Sequence[Row], theirs: Sequence[Row], called: str) -> list[str]:
+def _compared(method: str, place: int, across: str) -> dict[tuple[str, int], str]:
+    """The method and place of what a hierarchy is compared with, and what that is called: with numbers of
+    demonstrations the flat policy of equal size and that whose features it reads; with numbers of options a single one,
+    and for a meta-policy that may act itself the same options without that.
+    """
+    if across == "count":
+        others = {f"{method}_flat": "flat of equal size", **OTHERS.get(method, {})}
+        return {(other, place): called for other, called in others.items()}
+    alone = method.removesuffix("_hybrid")
+    hybrid = {(alone, place): "the same without own control"} if alone != method else {}
+    return hybrid | ({(method, 1): "one option"} if place > 1 else {})
+
+
+def _pairs(ours: Sequence[Row], theirs: Sequence[Row]) -> list[tuple[Row, Row]]:
     by_seed = {row["seed"]: row for row in theirs}
-    pairs = [(row, by_seed[row["seed"]]) for row in ours if row["seed"] in by_seed]
-    if not pairs:
-        return []
-    method, count = ours[0]["method"], ours[0]["count"]
+    return [(row, by_seed[row["seed"]]) for row in ours if row["seed"] in by_seed]
+
+
+def _against(pairs: Sequence[tuple[Row, Row]], which: str) -> str:
     goals, limited = (_difference(pairs, measure, "{:.1f}") for measure in ("goals", "limited"))
     nats = _difference(pairs, "at_one_std", "{:.3f}")
-    which = f"{method} minus {called}, {count} demonstrations, paired by seed ({len(pairs)})"
-    return [f"- {which}: {goals} goals ({limited} with the limit), {nats} held-out nats/step."]
+    found = f"{goals} goals ({limited} with the limit), {nats} held-out nats/step"
+    return f"- {which}, paired by seed ({len(pairs)}): {found}."
 
 
 def _difference(pairs: Sequence[tuple[Row, Row]], measure: str, form: str) -> str:
@@ -153,6 +168,7 @@ def draw(study: str, rows: Sequence[Row], path: Path) -> None:
             each = [(row[across], row[measure]) for row in own if row[measure] is not None]
             axes.scatter(*zip(*each, strict=True), s=9, color=line[0].get_color(), alpha=0.5)
         axes.set(xlabel={"count": "demonstrations", "options": "options k"}[across], ylabel=label)
-    figure.axes[0].legend(fontsize=8)
+    if rows:
+        figure.axes[0].legend(fontsize=8)
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=120, format="png")
