@@ -35,8 +35,8 @@ COLUMNS = {
 ACROSS = {"demonstrations": "count", "encoded": "count", "options": "options", "augmentation": "options"}
 """What each study varies."""
 
-WORDS = {"count": "{} demonstrations", "options": "k = {}"}
-"""Of what is varied, with its number."""
+WORDS = {"count": "{method} minus {other}, {place} demonstrations", "options": "{method}, k = {place}, minus {other}"}
+"""What is compared, by what is varied."""
 
 CONTROLS = 3
 """Joints of the arm."""
@@ -112,24 +112,24 @@ def differences(rows: Sequence[Row], across: str) -> list[str]:
     """Each hierarchy minus what it is to be compared with, paired by seed."""
     groups = grouped(rows, "method", across)
     return [
-        _against(pairs, f"{method} minus {called}, {WORDS[across].format(place)}")
+        _against(pairs, WORDS[across].format(method=method, other=called, place=place))
         for (method, place), own in groups.items()
-        for other, called in _compared(method, place, across).items()
+        for other, called in _compared(method, place, across, min(at for name, at in groups if name == method)).items()
         if (pairs := _pairs(own, groups.get(other, [])))
     ]
 
 
-def _compared(method: str, place: int, across: str) -> dict[tuple[str, int], str]:
+def _compared(method: str, place: int, across: str, least: int) -> dict[tuple[str, int], str]:
     """The method and place of what a hierarchy is compared with, and what that is called: with numbers of
-    demonstrations the flat policy of equal size and that whose features it reads; with numbers of options a single one,
-    and for a meta-policy that may act itself the same options without that.
+    demonstrations the flat policy of equal size and that whose features it reads; with numbers of options the fewest
+    that were measured, and for a meta-policy that may act itself the same options without that.
     """
     if across == "count":
         others = {f"{method}_flat": "flat of equal size", **OTHERS.get(method, {})}
         return {(other, place): called for other, called in others.items()}
     alone = method.removesuffix("_hybrid")
     hybrid = {(alone, place): "the same without own control"} if alone != method else {}
-    return hybrid | ({(method, 1): "one option"} if place > 1 else {})
+    return hybrid | ({(method, least): f"k = {least}"} if place > least else {})
 
 
 def _pairs(ours: Sequence[Row], theirs: Sequence[Row]) -> list[tuple[Row, Row]]:

@@ -95,21 +95,21 @@ def test_differences_are_paired_by_seed_and_number():
     assert "0.500 ± 6.353 held-out" in line
 
 
-def test_numbers_of_options_are_compared_with_one_and_hybrids_with_options_alone():
+def test_numbers_of_options_are_compared_with_the_fewest_and_hybrids_with_options_alone():
     """4 − 1 and 2 − 4 goals: 0.5 ± 12.706 · 2.5; one seed alone has no interval."""
     rows = [
         row_of(PictureCell(method, options, 40, seed), results([goals], -3.0)) | {"std": 1.0}
         for method, options, seed, goals in [
-            ("ff", 1, 0, 1.0),
-            ("ff", 1, 1, 4.0),
+            ("ff", 2, 0, 1.0),
+            ("ff", 2, 1, 4.0),
             ("ff", 4, 0, 4.0),
             ("ff", 4, 1, 2.0),
             ("ff_hybrid", 4, 0, 9.0),
         ]
     ]
     one, hybrid = differences(at_one_std(rows), "options")
-    assert one.startswith("- ff minus one option, k = 4, paired by seed (2): 0.5 ± 31.8 goals")
-    assert hybrid.startswith("- ff_hybrid minus the same without own control, k = 4, paired by seed (1): 5.0 goals (")
+    assert one.startswith("- ff, k = 4, minus k = 2, paired by seed (2): 0.5 ± 31.8 goals")
+    assert hybrid.startswith("- ff_hybrid, k = 4, minus the same without own control, paired by seed (1): 5.0 goals (")
 
 
 def test_features_have_versions_of_pictures_that_are_moved():
