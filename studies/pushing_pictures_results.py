@@ -168,6 +168,7 @@ def draw(study: str, rows: Sequence[Row], path: Path) -> None:
             each = [(row[across], row[measure]) for row in own if row[measure] is not None]
             axes.scatter(*zip(*each, strict=True), s=9, color=line[0].get_color(), alpha=0.5)
         axes.set(xlabel={"count": "demonstrations", "options": "options k"}[across], ylabel=label)
+        axes.set_xticks(sorted({row[across] for row in rows}))
     if rows:
         figure.axes[0].legend(fontsize=8)
     with whole_file(path) as temporary:
