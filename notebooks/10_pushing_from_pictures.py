@@ -62,6 +62,23 @@ plt.show()
 display(Markdown(pages["demonstrations"]), drawn["demonstrations"])
 
 # %% [markdown]
+# ## How many options
+#
+# With 40 demonstrations. The paper's text has four feed-forward options and two recurrent ones, its supplement two and
+# four.
+
+# %%
+display(Markdown(pages["options"]), drawn["options"])
+
+# %% [markdown]
+# ## A meta-policy that may act itself
+#
+# How often it does: *steps under own control* (SM 1.5).
+
+# %%
+display(Markdown(pages["augmentation"]), drawn["augmentation"])
+
+# %% [markdown]
 # ## Options over what a flat policy sees
 #
 # A flat policy learns to see more easily than options with layers of their own. Here its convolutions are kept
