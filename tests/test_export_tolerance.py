@@ -90,7 +90,7 @@ def test_a_sound_fit_may_differ_by_what_float32_does(tmp_path, capsys, monkeypat
     assert f" of {allowed(tmp_path):.1e} that are allowed; " in capsys.readouterr().out
 
 
-def test_a_wide_layer_rounds_more_one_step_at_a_time(tmp_path):
+def test_what_a_wide_layer_rounds_one_step_at_a_time_counts(tmp_path):
     """A product with a vector adds up in another order than one with a matrix; exported forms act step by step."""
     export(perceptron(8000), tmp_path, onnx=True)
     assert allowed(tmp_path) == pytest.approx(max(1e-6, 4 * measured(tmp_path)), rel=1e-6)
