@@ -122,6 +122,28 @@ class Single(torch.nn.Module):
         return self.network(inputs.map(torch.Tensor.float, inputs.time))
 
 
+def test_large_pictures_are_compared_with_few_bytes(tmp_path, monkeypatch):
+    """60 pictures of 240 kB, in which places are told apart still: each has as many colours as its squares."""
+    network = {"network": "conv", "layers": [{"filters": 4, "kernel": 5, "stride": 8}]}
+    spec = parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": ["camera"],
+            "baseline": {"kind": "flat", "policy": network},
+        }
+    )
+    monkeypatch.setattr(module, "_programs", lambda program, onnx: {})  # take seconds and are written as they were
+    module._write(Fit(spec, Hierarchy(spec, {"camera": (250, 331, 3)}, 2, 7).eval()), tmp_path, onnx=False)
+    assert (tmp_path / "check.npz").stat().st_size < 1.5e6
+    with np.load(tmp_path / "check.npz") as file:
+        pictures = file["observation_1_camera"]
+    assert pictures.shape == (20, 250, 331, 3)
+    assert pictures.dtype == np.uint8
+    rows, columns = ((np.diff(pictures[0], axis=axis) != 0).any(axis=(1 - axis, 2)).sum() for axis in (0, 1))
+    assert (rows, columns) == (49, 66)
+    assert (np.diff(pictures, axis=0) != 0).mean() > 0.99
+
+
 def test_no_fit_is_so_unsound_that_anything_goes(tmp_path):
     """A hundred thousand times the difference of units: what it says is rounding to 1 %."""
     with pytest.raises(

@@ -101,7 +101,7 @@ def _write(fit: Fit, folder: Path, onnx: bool) -> list[str]:
         (folder / name).write_bytes(content)
     episodes = record(fit.controller(), fit.hierarchy)
     episodes["tolerance"] = np.array(tolerance(fit.hierarchy, episodes))
-    np.savez(folder / "check.npz", **episodes)  # type: ignore[arg-type]
+    np.savez_compressed(folder / "check.npz", **episodes)  # type: ignore[arg-type]
     return [*forms, "torch", *(["onnx"] if onnx else [])]
 
 

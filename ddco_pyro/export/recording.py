@@ -22,6 +22,9 @@ EPISODES, STEPS = 3, 20
 """Made-up episodes on which every form has to act as the original does; without images the first one is a step longer
 than the longest demonstration, so that networks of every step of time are among what is compared."""
 
+FINEST = 48
+"""Made-up pictures have about so many squares across the shorter side, or as many as they have pixels."""
+
 ROUNDINGS = 4
 """An exported form may differ from the original by so many times what the original, in float32, differs from the same
 networks in float64, in a whole episode at once or one step at a time (which adds in another order): either errs by
@@ -121,9 +124,15 @@ def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generato
             values = _walk(values[0], differences, mean[:length], std[:length])
         observations[spec.key] = values.reshape(steps, *shape)
         at += size
-    return observations | {
-        key: random.integers(0, 256, (steps, *encoder.shapes[key]), dtype=np.uint8) for key in encoder.images
-    }
+    return observations | {key: _pictures(steps, encoder.shapes[key], random) for key in encoder.images}
+
+
+def _pictures(steps: int, shape: tuple[int, ...], random: np.random.Generator) -> np.ndarray:
+    """Noise [T, H, W, C], of squares where pictures are large: every pixel of its own would be most of an export."""
+    side = max(1, min(shape[:2]) // FINEST)
+    fewer = tuple(-(-size // side) for size in shape[:2])
+    noise = random.integers(0, 256, (steps, *fewer, *shape[2:]), dtype=np.uint8)
+    return noise.repeat(side, 1).repeat(side, 2)[:, : shape[0], : shape[1]]
 
 
 def _walk(start: np.ndarray, differences: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
