@@ -135,8 +135,9 @@ def _convolution(layer: ConvolutionLayer, channels: int, copies: int, groups: in
 
 def _standardized(pictures: Tensor) -> Tensor:
     """Each picture [M, C, H, W] less its mean, over its standard deviation, that of a single bright number at least."""
-    variance, mean = torch.var_mean(pictures, (1, 2, 3), correction=0, keepdim=True)
-    return (pictures - mean) / variance.clamp(min=1 / pictures[0].numel()).sqrt()
+    centred = pictures - pictures.mean((1, 2, 3), keepdim=True)
+    variance = centred.square().mean((1, 2, 3), keepdim=True)  # torch.var_mean is several times as slow
+    return centred / variance.clamp(min=1 / pictures[0].numel()).sqrt()
 
 
 def _field_means(maps: Tensor, count: int) -> Tensor:
