@@ -26,6 +26,7 @@ from ddco_pyro.acting.lockstep import play
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import MOVED, Transform, shifted
 from ddco_pyro.encoding.fitted import FittedReader, from_fit
+from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.building import Dimensions, baseline_spec, parameters
 from ddco_pyro.fitting.devices import device_of
 from ddco_pyro.fitting.fit import Fit
@@ -83,6 +84,13 @@ class PictureCell(Cell):
     options: int
     count: int
     seed: int
+
+    def __post_init__(self) -> None:
+        """:raises BadInput: a flat policy has options, or a hierarchy has none."""
+        flat = self.method.endswith("_flat")
+        if (self.options < 1) != flat or self.options < 0:
+            allowed = "0, as it is a flat policy" if flat else "1 or more; flat policies are methods of their own"
+            raise BadInput(f"{self.method} with {self.options} options: it has to be {allowed}")
 
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """Fit and play."""

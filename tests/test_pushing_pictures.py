@@ -18,6 +18,7 @@ from pushing_pictures_results import at_one_std, differences, page, row_of
 from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy, parameters
 from ddco_pyro.spec import SpecError, load_spec
 
@@ -175,6 +176,27 @@ def test_specs_of_cells(method, options, frames, emits):
     assert spec.hierarchy.levels[0].count == options
     assert spec.hierarchy.meta_policy.emits == emits
     assert spec.training.epochs == 112
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ("options", "--methods", "ff", "--options", "2", "0"),
+            "ff with 0 options: it has to be 1 or more; flat",
+        ),
+        (("augmentation", "--options", "-1"), "ff with -1 options: it has to be 1 or more"),
+    ],
+)
+def test_a_hierarchy_has_options(words, message):
+    """With none, the flat policy beside it would stand on the page under its name."""
+    with pytest.raises(BadInput, match=f"^{message}"):
+        study.cells(arguments(*words))
+
+
+def test_a_flat_policy_has_no_options():
+    with pytest.raises(BadInput, match=r"^ff_flat with 2 options: it has to be 0, as it is a flat policy$"):
+        PictureCell("ff_flat", 2, 40, 0)
 
 
 def test_results_depend_on_the_specs_of_their_cells():
