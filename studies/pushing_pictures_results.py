@@ -41,8 +41,12 @@ WORDS = {"count": "{method} minus {other}, {place} demonstrations", "options": "
 CONTROLS = 3
 """Joints of the arm."""
 
-OTHERS = {"encoded": {"ff_flat": "the flat policy whose features it reads"}}
-"""Flat policies that a hierarchy is compared with besides the one of equal size."""
+OTHERS = {
+    "encoded": {"ff_flat": "the flat policy whose features it reads"},
+    "ff_two": {"ff": "the same of one picture"},
+    "ff_two_flat": {"ff_flat": "the same of one picture"},
+}
+"""What a method is compared with besides the flat policy of equal size."""
 
 FEWEST = 3
 """Training seeds of whose mean the figure has an interval; every seed is a dot."""
@@ -109,7 +113,7 @@ def page(study: str, rows: Sequence[Row], missing: Sequence[str], made_by: str) 
 
 
 def differences(rows: Sequence[Row], across: str) -> list[str]:
-    """Each hierarchy minus what it is to be compared with, paired by seed."""
+    """Each method minus what it is to be compared with, paired by seed."""
     groups = grouped(rows, "method", across)
     return [
         _against(pairs, WORDS[across].format(method=method, other=called, place=place))
@@ -120,8 +124,8 @@ def differences(rows: Sequence[Row], across: str) -> list[str]:
 
 
 def _compared(method: str, place: int, across: str, least: int) -> dict[tuple[str, int], str]:
-    """The method and place of what a hierarchy is compared with, and what that is called: with numbers of
-    demonstrations the flat policy of equal size and that whose features it reads; with numbers of options the fewest
+    """The method and place of what a method is compared with, and what that is called: with numbers of
+    demonstrations the flat policy of equal size and those in :data:`OTHERS`; with numbers of options the fewest
     that were measured, and for a meta-policy that may act itself the same options without that.
     """
     if across == "count":
