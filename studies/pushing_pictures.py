@@ -1,7 +1,8 @@
 """Pushing from pictures (paper §5.1, SM 1.2, SM 1.5): goals against demonstrations, the same over the features of a
-flat policy (``encoded``), goals against options, and augmentation.
+flat policy (``encoded``), of pictures as the camera has them beside small ones (``large``), goals against options, and
+augmentation.
 
-    python studies/pushing_pictures.py demonstrations|encoded|options|augmentation [--seeds 3]
+    python studies/pushing_pictures.py demonstrations|encoded|large|options|augmentation [--seeds 3]
         [--methods ff ff_flat ...] [--counts 80 40 20 10] [--options 1 2 3 4 5 6] [--updates 4000] [--episodes 5]
         [--set KEY=VALUE]... [--summarize] [--minutes 60] [--jobs 1] [--out DIR] [--runs DIR]
 
@@ -32,6 +33,7 @@ from ddco_pyro.data.files import write_text
 STUDIES = {
     "demonstrations": ("ff_flat", "ff", "rnn_flat", "rnn", "ff_two_flat", "ff_two"),
     "encoded": ("ff_flat", "encoded_flat", "encoded"),
+    "large": ("ff_flat", "ff_large_flat", "ff", "ff_large"),
     "options": ("ff", "rnn"),
     "augmentation": ("ff", "ff_hybrid", "rnn", "rnn_hybrid"),
 }

@@ -32,7 +32,10 @@ COLUMNS = {
     "minutes": ("minutes", "{:.1f}"),
     "of them processor, fit": ("processor", "{:.1f}"),
 }
-ACROSS = {"demonstrations": "count", "encoded": "count", "options": "options", "augmentation": "options"}
+ACROSS = {
+    **dict.fromkeys(("demonstrations", "encoded", "large"), "count"),
+    **dict.fromkeys(("options", "augmentation"), "options"),
+}
 """What each study varies."""
 
 WORDS = {"count": "{method} minus {other}, {place} demonstrations", "options": "{method}, k = {place}, minus {other}"}
@@ -43,6 +46,8 @@ CONTROLS = 3
 
 OTHERS = {
     "encoded": {"ff_flat": "the flat policy whose features it reads"},
+    "ff_large": {"ff": "the same of small pictures"},
+    "ff_large_flat": {"ff_flat": "the same of small pictures"},
     "ff_two": {"ff": "the same of one picture"},
     "ff_two_flat": {"ff_flat": "the same of one picture"},
 }

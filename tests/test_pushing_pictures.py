@@ -113,23 +113,23 @@ def test_numbers_of_options_are_compared_with_the_fewest_and_hybrids_with_option
     assert hybrid.startswith("- ff_hybrid, k = 4, minus the same without own control, paired by seed (1): 5.0 goals (")
 
 
-def test_policies_of_two_pictures_are_compared_with_those_of_one():
+@pytest.mark.parametrize(("other", "words"), [("two", "one picture"), ("large", "small pictures")])
+def test_policies_of_other_pictures_are_compared_with_those_of_one_small_one(other, words):
     """Flat ones 1 − 4 goals, options 2 − 5, and 2 − 1 beside the flat ones."""
     rows = [
         row_of(PictureCell(method, options, 80, 0), results([goals], -3.0)) | {"std": 1.0}
         for method, options, goals in [
             ("ff", 2, 5.0),
             ("ff_flat", 0, 4.0),
-            ("ff_two", 2, 2.0),
-            ("ff_two_flat", 0, 1.0),
+            (f"ff_{other}", 2, 2.0),
+            (f"ff_{other}_flat", 0, 1.0),
         ]
     ]
     _, *lines = (line.partition(" goals")[0] for line in differences(at_one_std(rows), "count"))
-    words = "- {} minus {}, 80 demonstrations, paired by seed (1): {}"
     assert lines == [
-        words.format("ff_two", "flat of equal size", "1.0"),
-        words.format("ff_two", "the same of one picture", "-3.0"),
-        words.format("ff_two_flat", "the same of one picture", "-3.0"),
+        f"- ff_{other} minus flat of equal size, 80 demonstrations, paired by seed (1): 1.0",
+        f"- ff_{other} minus the same of {words}, 80 demonstrations, paired by seed (1): -3.0",
+        f"- ff_{other}_flat minus the same of {words}, 80 demonstrations, paired by seed (1): -3.0",
     ]
 
 
