@@ -4,9 +4,10 @@
 
 OPTIONS is 0 for a flat policy. Demonstrations and evaluation episodes are those of ``pushing_studies.py`` with the same
 seeds. Pictures are drawn three times as fine as they are seen, 48 x 64, and reduced by means; ``ff_large`` sees all of
-480 x 640, which takes a GPU (``--set training.device=cuda``), or 4 s of processor time for each gradient step, and memory
-for all pictures, 0.9 MB each (``DDCO_PYRO_MEMORY=18GB`` allows 80 demonstrations). Keeps a JSON with held-out log-likelihoods, what came of each episode,
-without a limit and with 250 steps for each goal, and the seconds that everything took.
+480 x 640, which takes a GPU (``--set training.device=cuda``), or 4 s of processor time for each gradient step, and
+memory for all pictures, 0.9 MB each (``DDCO_PYRO_MEMORY=18GB`` allows 80 demonstrations). Keeps a JSON with held-out
+log-likelihoods, what came of each episode, without a limit and with 250 steps for each goal, and the seconds that
+everything took.
 """
 
 from __future__ import annotations
