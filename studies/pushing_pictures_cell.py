@@ -89,7 +89,7 @@ class PictureCell(Cell):
     def __post_init__(self) -> None:
         """:raises BadInput: a flat policy has options, or a hierarchy has none."""
         flat = self.method.endswith("_flat")
-        if (self.options < 1) != flat or self.options < 0:
+        if self.options != 0 if flat else self.options < 1:
             allowed = "0, as it is a flat policy" if flat else "1 or more; flat policies are methods of their own"
             raise BadInput(f"{self.method} with {self.options} options: it has to be {allowed}")
 
