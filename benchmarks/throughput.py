@@ -131,7 +131,7 @@ def reading(path: Path) -> Iterator[tuple[str, float]]:
 
 def _job(demo: Demonstration, number: int) -> Job:
     pictures = {"camera": (demo.observations["camera"],)}
-    return Job(number, pictures, slice(0, len(demo)), {"camera": Transform()}, {})
+    return Job((number,), pictures, slice(0, len(demo)), {"camera": Transform()}, {})
 
 
 def encoding(path: Path) -> Iterator[tuple[str, float]]:

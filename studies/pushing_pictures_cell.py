@@ -4,10 +4,10 @@
 
 OPTIONS is 0 for a flat policy. Demonstrations and evaluation episodes are those of ``pushing_studies.py`` with the same
 seeds. Pictures are drawn three times as fine as they are seen, 48 x 64, and reduced by means; ``ff_large`` sees all of
-480 x 640, which takes a GPU (``--set training.device=cuda``), or 4 s of processor time for each gradient step, and
-memory for all pictures, 0.9 MB each (``DDCO_PYRO_MEMORY=18GB`` allows 80 demonstrations). Keeps a JSON with held-out
-log-likelihoods, what came of each episode, without a limit and with 250 steps for each goal, and the seconds that
-everything took.
+480 x 640, which takes a GPU, or 4 s of processor time for each gradient step, and memory for all pictures, 0.9 MB each
+(``DDCO_PYRO_MEMORY=18GB`` allows 80 demonstrations). Fits are done on a GPU where there is one; those that are done are
+taken from the folder of the cell's fits, wherever they were. Keeps a JSON with held-out log-likelihoods, what came of
+each episode, without a limit and with 250 steps for each goal, and the seconds that everything took.
 """
 
 from __future__ import annotations
@@ -154,7 +154,8 @@ def spec_of(cell: PictureCell, settings: Settings) -> Spec:
         changed["hierarchy.levels.0.count"] = cell.options
     if not features:
         changed |= {"observations.0.resize": None, "observations.0.frames": 2 if "_two" in cell.method else 1}
-    base = load_spec(SPECS / f"{METHODS[cell.method]}.yaml", [*(ENCODED if features else ()), *settings.overrides])
+    always = ("training.device=auto", *(ENCODED if features else ()))
+    base = load_spec(SPECS / f"{METHODS[cell.method]}.yaml", [*always, *settings.overrides])
     if cell.method.startswith("ff_large"):
         changed |= _large(base)
     spec = with_overrides(base, changed)

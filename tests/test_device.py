@@ -17,6 +17,7 @@ from elsewhere import THERE, Device, Elsewhere
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.pictures import padded
 from ddco_pyro.export import export
 from ddco_pyro.fitting import devices
 from ddco_pyro.fitting.restarts import OtherDevice
@@ -75,7 +76,7 @@ def spec_of(level: dict[str, Any], **training: Any) -> Spec:
     return parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.2},
-            "observations": ["pose", "camera"],
+            "observations": ["pose", {"key": "camera", "augment": {"shift": 1}}],
             "control": {"std": {"learn": True}},
             "hierarchy": {"levels": [{"count": 2, **level}], "meta_policy": LINEAR},
             "training": {
@@ -130,6 +131,23 @@ def test_a_fit_with_networks_elsewhere(demos: Demonstrations, network: str, monk
     assert there.metrics["training"]["device"] == THERE.type
     each = [fit.metrics["log_likelihood_per_step"]["valid"] for fit in (there, here)]
     assert each[0] == pytest.approx(each[1], rel=0 if network in SAME else 1e-3)
+
+
+def test_pictures_stay_on_a_device_with_room(demos: Demonstrations, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are read once, and the fit is the same, bit for bit; where there is no room for all they are read anew."""
+    spec = spec_of(OTHER["field means"])
+    on(monkeypatch, THERE)
+    read: list[int] = []
+    monkeypatch.setattr("ddco_pyro.data.reading.padded", lambda *given: read.append(1) or padded(*given))
+    fits, asked = [], []
+    for room in (float("inf"), 1.0):
+        monkeypatch.setattr("ddco_pyro.fitting.material.room", lambda device, room=room: room)
+        with Device():
+            fits.append(weights(ddco_pyro.fit(spec, demos)))
+        asked.append(len(read) - sum(asked))
+    for name, values in fits[0].items():
+        np.testing.assert_array_equal(fits[1][name], values, err_msg=name)
+    assert asked[0] < asked[1]
 
 
 def test_the_double_refuses_what_was_left_on_the_host() -> None:
@@ -236,6 +254,20 @@ def test_a_run_goes_on_where_it_was_begun(demos: Demonstrations, tmp_path, monke
         assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
+def test_what_is_trained_elsewhere_is_finished_anywhere(demos: Demonstrations, tmp_path, monkeypatch) -> None:
+    """A restart that is done is taken as it is, and the run says where that was."""
+    spec = spec_of(DROPPING, initialize="random")
+    on(monkeypatch, THERE)
+    with Device():
+        there = ddco_pyro.fit(spec, demos, tmp_path)
+    (tmp_path / "metrics.json").unlink()
+    on(monkeypatch, torch.device("cpu"))
+    here = ddco_pyro.fit(spec, demos, tmp_path)
+    for name, values in weights(there).items():
+        np.testing.assert_array_equal(weights(here)[name], values)
+    assert here.metrics["training"]["device"] == THERE.type
+
+
 def test_a_fit_leaves_generators_as_they_were(demos: Demonstrations, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of GPUs too, which torch's own seeding reaches."""
     seeded: list[int] = []
@@ -271,7 +303,8 @@ def test_a_gpu_gives_the_same_bits_again(demos: Demonstrations, network: str) ->
 def test_a_chunk_drops_the_same_in_both_passes_on_a_gpu(demos: Demonstrations, monkeypatch: pytest.MonkeyPatch) -> None:
     """The gradient of chunks that are computed twice is that of the same chunks, all kept."""
     fit = ddco_pyro.fit(spec_of(DROPPING, epochs=1, device="cuda"), demos)
-    monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", 3 * fit.hierarchy.step_bytes)
+    part = 3 * fit.hierarchy.step_bytes / torch.cuda.get_device_properties(0).total_memory
+    monkeypatch.setattr("ddco_pyro.model.hierarchy.PART_OF_A_GPU", part)
     model = fit.hierarchy.train()
     inputs = model.encoder.inputs([demos[6].observations])
 

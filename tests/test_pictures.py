@@ -14,6 +14,7 @@ import pytest
 import torch
 import yaml
 from command_line import call
+from elsewhere import THERE, Device
 from killing import struck
 
 import ddco_pyro
@@ -181,6 +182,26 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
     again, other = (whole.varied(encoder.shifts, seed).inputs.images.shifts["camera"] for seed in (2, 1))
     assert (again == shifts).all()
     assert (other != shifts).any()
+
+
+@pytest.mark.parametrize("stored", [False, True], ids=["in memory", "in a file"])
+def test_pictures_that_a_device_holds_are_those_that_are_read(kept: Path, stored: bool) -> None:
+    """Moved, cut, and behind those before them; of some trajectories, from a later step on, and past their ends."""
+    encoder = ObservationEncoder(
+        parse_spec(spec_of(kept, {**RAW, "augment": {"shift": 3}})).observations, demonstrations().observation_shapes
+    )
+    demos = Demonstrations.read(kept) if stored else demonstrations()
+    inputs = encoder.inputs(demo.observations for demo in demos)
+    whole = Batch(inputs, torch.zeros(8, 40, 2), torch.tensor(demos.lengths))
+    assert whole.picture_bytes == sum(demos.lengths) * 5 * 4 * 2
+    for rows, steps in (([5, 2], slice(0, 40)), ([2, 0, 7], slice(7, 13)), ([1], slice(3, 4))):
+        with Device():
+            expected, held = (
+                batch.varied(encoder.shifts, 1).select(torch.tensor(rows)).inputs.part(slice(None), steps).loaded()
+                for batch in (whole, whole.held(THERE))
+            )
+            assert held.images["camera"].device == THERE
+            np.testing.assert_array_equal(held.images["camera"].cpu(), expected.images["camera"])
 
 
 @pytest.mark.parametrize(

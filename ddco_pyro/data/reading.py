@@ -30,15 +30,20 @@ Read = dict[str, np.ndarray]
 class Job(NamedTuple):
     """What is to be read together.
 
-    :param key: tells it from other jobs of the same plan.
+    :param rows: what the trajectories are called.
     :param arrays: of each observation the pictures of each trajectory; ``transforms`` and ``shifts`` likewise.
     """
 
-    key: Hashable
+    rows: tuple[int, ...]
     arrays: Mapping[str, tuple[Observed, ...]]
     steps: slice
     transforms: Mapping[str, Transform]
     shifts: Mapping[str, np.ndarray]
+
+    @property
+    def key(self) -> Hashable:
+        """Tells it from other jobs of the same plan."""
+        return (*self.arrays, self.rows, self.steps.start, self.steps.stop)
 
 
 def read(job: Job) -> Read:

@@ -77,7 +77,7 @@ class Clusters:
             for inputs in alone.chunks(FRAMES_AT_ONCE if alone.images else length):
                 loaded = inputs.loaded()
                 given = loaded.select(self._read) if self._read else loaded
-                means = [block_means(image[0]) for image in given.images.values()]
+                means = [block_means(image[0].cpu()) for image in given.images.values()]
                 seen = torch.cat([given.vector[0], *means], dim=-1).double().numpy()
                 last = first + len(seen)
                 yield joined(seen, batch.actions[row, first:last].double().numpy()) if self._controls else seen

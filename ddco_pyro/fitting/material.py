@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from ddco_pyro.data.reading import Readers
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.checkpoint import State
-from ddco_pyro.fitting.devices import device_of
+from ddco_pyro.fitting.devices import device_of, room
 from ddco_pyro.fitting.labels import Labels
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -44,6 +45,15 @@ class Material:
     def read_by(self, readers: Readers) -> Material:
         """The same with pictures that are in files read by these."""
         return replace(self, train=self.train.read_by(readers), tune=self.tune.read_by(readers))
+
+    def held(self, device: torch.device) -> Material:
+        """The same with all pictures on the device of the networks, where there is room for them (:func:`room`).
+
+        :raises DemonstrationsError: a file cannot be read.
+        """
+        if self.train.picture_bytes + self.tune.picture_bytes > room(device):
+            return self
+        return replace(self, train=self.train.held(device), tune=self.tune.held(device))
 
     def seed(self, *where: int) -> int:
         """A seed for a restart, one of its stages, an epoch of a stage, or a shard of one of its minibatches."""

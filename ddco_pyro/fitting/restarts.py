@@ -126,7 +126,7 @@ class Trainer:
         return [restart for restart in self.restarts if restart.progress.restart not in self.stopped]
 
     def _begun(self, number: int) -> Restart:
-        """A restart as it was kept, or as it begins.
+        """A restart as it was kept, or as it begins; one that is done is taken from any device.
 
         :raises Damaged: it does not hold what was written.
         :raises OtherDevice: it was begun on another kind of device.
@@ -135,7 +135,7 @@ class Trainer:
         if path is None or not path.exists():
             return Restart(Progress(number, device=device))
         restart = Restart.read(path)
-        if restart.progress.device != device:
+        if restart.progress.device != device and not restart.progress.done:
             raise OtherDevice(
                 f"{path}: was trained on {restart.progress.device}, and networks are on {device} here, where the last "
                 "digits differ; continue it there, or remove it: this restart then begins anew"

@@ -58,7 +58,7 @@ def advance(
     deadline = time.monotonic() + seconds
     device = device_of(material.spec.training)
     with one_thread(), repeatable(device), Readers(material.spec.training.workers) as readers:
-        training = Training(material.read_by(readers), restart, checkpoint, on_event, ranks)
+        training = Training(material.read_by(readers).held(device), restart, checkpoint, on_event, ranks)
         return restart, training.run(until, deadline)
 
 

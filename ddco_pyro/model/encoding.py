@@ -82,6 +82,18 @@ class Batch:
         """The same with pictures that are in files read by these."""
         return self._with(lambda images: replace(images, readers=readers) if images.stored else images)
 
+    def held(self, device: torch.device) -> Batch:
+        """The same with all pictures on a device.
+
+        :raises DemonstrationsError: a file cannot be read.
+        """
+        return self._with(lambda images: images.held(device))
+
+    @property
+    def picture_bytes(self) -> int:
+        """Bytes of all pictures as they are seen."""
+        return self.inputs.images.size if isinstance(self.inputs.images, Frames) else 0
+
     def _with(self, change: Callable[[Frames], Frames]) -> Batch:
         images = self.inputs.images
         if not isinstance(images, Frames):

@@ -31,6 +31,9 @@ BYTES_AT_ONCE = 256 * 10**6
 """Most bytes that networks take for the steps that go through them together, one step at least; less where less memory
 is allowed (:func:`ddco_pyro.data.memory.share`)."""
 
+PART_OF_A_GPU = 0.1
+"""The same of the memory of a GPU, whatever else is there: GPUs of one kind cut alike."""
+
 Emits = Literal["options", "control"]
 
 Answers = Sequence[Tensor]
@@ -144,7 +147,7 @@ class Hierarchy(nn.Module):
     def place(self, device: torch.device) -> Hierarchy:
         """Have the networks, and nothing else, on a device. Whatever calls them gives and gets tensors on the host."""
         if device != self.device:
-            _ = self.step_bytes  # counted on the host: chunks are the same wherever networks are
+            _ = self.step_bytes  # counted on the host
             for network in self.networks().values():
                 network.to(device)
             self.device = device
@@ -192,7 +195,7 @@ class Hierarchy(nn.Module):
     @property
     def steps_in_memory(self) -> int:
         """Steps that networks can be trained on at a time: longer trajectories are processed in chunks of time."""
-        return max(1, int(min(BYTES_AT_ONCE, share())) // max(1, self.step_bytes))
+        return max(1, int(_bytes_at_once(self.device)) // max(1, self.step_bytes))
 
     @property
     def steps_at_once(self) -> int:
@@ -269,6 +272,12 @@ class Hierarchy(nn.Module):
         """The tables of a batch: every network once, over all options, steps and trajectories."""
         outputs: Outputs = self(batch.inputs, discovering)
         return outputs.tables(batch.actions)
+
+
+def _bytes_at_once(device: torch.device) -> float:
+    if device.type == "cuda":
+        return PART_OF_A_GPU * torch.cuda.get_device_properties(device).total_memory
+    return min(BYTES_AT_ONCE, share())
 
 
 def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
