@@ -167,14 +167,15 @@ def draw(study: str, rows: Sequence[Row], path: Path) -> None:
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, (measure, label) in zip(figure.subplots(1, len(measures)), measures.items(), strict=True):
-        for (method,), own in grouped(rows, "method").items():
+        methods = grouped(rows, "method")
+        for (method,), aside, own in zip(methods, _aside(rows, across, len(methods)), methods.values(), strict=True):
             groups = grouped(sorted(own, key=lambda row: row[across]), across)
             found = [over_seeds(group, measure) for group in groups.values()]
-            places, means = [place for (place,) in groups], [mean for mean, _, _ in found]
+            places, means = [place + aside for (place,) in groups], [mean for mean, _, _ in found]
             enough = [len(group) >= FEWEST for group in groups.values()]
             bars = [half if many else np.nan for (_, half, _), many in zip(found, enough, strict=True)]
             line = axes.errorbar(places, means, bars, marker="o", ms=4, capsize=2, label=method)
-            each = [(row[across], row[measure]) for row in own if row[measure] is not None]
+            each = [(row[across] + aside, row[measure]) for row in own if row[measure] is not None]
             axes.scatter(*zip(*each, strict=True), s=9, color=line[0].get_color(), alpha=0.5)
         axes.set(xlabel={"count": "demonstrations", "options": "options k"}[across], ylabel=label)
         axes.set_xticks(sorted({row[across] for row in rows}))
@@ -182,3 +183,9 @@ def draw(study: str, rows: Sequence[Row], path: Path) -> None:
         figure.axes[0].legend(fontsize=8)
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=120, format="png")
+
+
+def _aside(rows: Sequence[Row], across: str, methods: int) -> list[float]:
+    """How far each method's points are drawn beside their place, so that bars of several can be told apart."""
+    places = [row[across] for row in rows]
+    return list(np.ptp(places or [0]) * 0.012 * (np.arange(methods) - (methods - 1) / 2))
