@@ -188,4 +188,4 @@ def draw(study: str, rows: Sequence[Row], path: Path) -> None:
 def _aside(rows: Sequence[Row], across: str, methods: int) -> list[float]:
     """How far each method's points are drawn beside their place, so that bars of several can be told apart."""
     places = [row[across] for row in rows]
-    return list(np.ptp(places or [0]) * 0.012 * (np.arange(methods) - (methods - 1) / 2))
+    return list((np.ptp(places or [0]) or 1) * 0.012 * (np.arange(methods) - (methods - 1) / 2))
