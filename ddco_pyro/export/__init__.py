@@ -183,7 +183,7 @@ def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
     return {
         "kind": part.kind,
         "dims": list(part.dims),
-        "noise": places + decides,
+        "places": places + decides,
         "size": part.size,
         "values": list(part.values),
         "ends": list(ends),

@@ -148,10 +148,10 @@ class Runner:
         level, actor = next(((d, h - 1) for d, h in enumerate(self.choices) if h > 0), (len(self.choices), 0))
         numbers, first = outputs[f"control_{level}"][actor].astype(np.float64), 0
         sampled = self.about["control"] == "sample"
-        noise = generator.standard_normal(sum(len(part["noise"]) for part in self.about["parts"])) if sampled else None
+        noise = generator.standard_normal(sum(len(part["places"]) for part in self.about["parts"])) if sampled else None
         control = np.array(self.about["constant"])  # dimensions that never varied in the demonstrations stay so
         for part in self.about["parts"]:
-            own, z = numbers[first : first + part["size"]], None if noise is None else noise[part["noise"]]
+            own, z = numbers[first : first + part["size"]], None if noise is None else noise[part["places"]]
             std = np.array(part["std"][level]) if part["std"] else np.zeros(0)
             control[part["dims"]] = KINDS[part["kind"]](part, own, std[actor] if std.ndim == 2 else std, z)
             first += part["size"]
