@@ -41,6 +41,49 @@ def test_each_dimension_is_described(cuts: list[int]) -> None:
     ]
 
 
+def resting(steps: int = STEPS) -> np.ndarray:
+    """At 0.25 in half of the steps; at -0 in nine tenths of these; at 0 in a tenth, at 1 and -1 as often; rounded."""
+    random = np.random.default_rng(1)
+    found = random.uniform(-0.9, 0.9, (steps, 4))
+    half, tenth = np.arange(steps) % 2 == 0, np.arange(steps) % 20
+    found[half, 0] = 0.25
+    found[half & (tenth != 4), 1] = -0.0
+    for value, at in ((0.0, (3, 5)), (1.0, (7, 9)), (-1.0, (11, 13))):
+        found[np.isin(tenth, at), 2] = value
+    found[:, 3] = found[:, 3].round(3)
+    return found
+
+
+@pytest.mark.parametrize("cuts", [[], [1, 2, 3], [60, 150], list(range(1, STEPS))])
+def test_a_value_inside_the_range_is_counted_and_with_whom_it_is_taken(cuts: list[int]) -> None:
+    first, second, third, fourth = control_dimensions(np.split(resting(), cuts))
+    assert [(each.inside, each.at_inside) for each in (first, second, third)] == [(0.25, 100), (0.0, 90), (0.0, 20)]
+    assert [each.together for each in (first, second, third)] == [(1,), (0,), ()]
+    assert first.note == "exactly 0.25 in 50.0 % of the steps"
+    ends = "exactly at its minimum -1 in 10.0 % of the steps, at its maximum 1 in 10.0 % of the steps"
+    assert third.note == f"exactly 0 in 10.0 % of the steps; {ends}"
+    assert fourth.note == ""
+
+
+def test_five_in_a_hundred_are_a_value_and_four_are_none() -> None:
+    controls = np.random.default_rng(0).normal(size=(100, 1))
+    controls[10:14] = 0.1
+    assert control_dimensions([controls])[0].note == ""
+    controls[14] = 0.1
+    assert control_dimensions([controls])[0].note == "exactly 0.1 in 5.0 % of the steps"
+
+
+def test_counts_of_many_steps_do_not_depend_on_blocks() -> None:
+    """Of 9000 steps, more than are counted together; one value becomes common after the first 5000."""
+    controls = resting(9000)
+    late = controls[:, 3]
+    late[5000:][np.arange(4000) % 4 != 0] = 0.5
+    whole, cut = (control_dimensions(np.split(controls, cuts)) for cuts in ([], [10, 4100, 8500]))
+    assert whole == cut
+    assert [each.at_inside for each in whole[:3]] == [4500, 4050, 900]
+    assert (whole[3].inside, whole[3].at_inside) == (0.5, int((late[4096:] == 0.5).sum()))
+
+
 def test_a_short_file_does_not_sit_on_its_extremes() -> None:
     """In 20 steps a value that is taken once is taken in 5 % of them."""
     assert notes(control_dimensions([np.arange(20.0)[:, None]])) == []

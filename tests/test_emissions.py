@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 
+import numpy as np
 import pyro
 import pytest
 import torch
@@ -17,7 +18,7 @@ from ddco_pyro.inference.check import compare_engines
 from ddco_pyro.model.actor import Acting
 from ddco_pyro.model.ahmm import ahmm
 from ddco_pyro.model.discrete import Binary, Categorical
-from ddco_pyro.model.emissions import Clipped, Gaussian, Product
+from ddco_pyro.model.emissions import Clipped, Gaussian, Hurdle, Product
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import complete
 
@@ -171,6 +172,87 @@ def test_far_from_a_bound_value_and_gradient_stay_finite(far, std):
         assert float(gradients[0]) == pytest.approx(z / std, rel=2e-4)
 
 
+def hurdle(logit, mean, std=STD):
+    return Hurdle(logit, clipped(mean, std))
+
+
+def test_a_hurdle_density_sums_to_one_with_its_masses():
+    """The value, both bounds' masses, and between them the trapezoidal rule in the control's own units."""
+    logit = torch.tensor([[-1.5], [0.0], [2.0]], dtype=torch.float64)
+    mean = torch.tensor([[-1.4], [0.3], [2.0]], dtype=torch.float64)
+    slab = Clipped(mean, STD[:1], SCALE[:1].log(), LOW[:1], HIGH[:1])
+    grid = torch.linspace(-1, 1, 200_002, dtype=torch.float64)  # the value, 0, is between two of its points
+    inside, step = grid[1:-1, None], grid[1] - grid[0]
+    spread = Hurdle(logit.expand(len(inside), 3, 1), Clipped(mean.expand(len(inside), 3, 1), *_fixed(slab)))
+    continuous = spread.log_density(inside).exp().sum(0) * step * SCALE[0]
+    masses = sum(
+        Hurdle(logit, slab).log_density(torch.tensor([at], dtype=torch.float64)).exp() for at in (-1.0, 0.0, 1.0)
+    )
+    torch.testing.assert_close(continuous + masses, torch.ones(3, dtype=torch.float64), rtol=0, atol=2e-4)
+
+
+def _fixed(slab):
+    return slab.std, slab.log_scale, slab.low, slab.high
+
+
+def test_a_hurdle_is_its_value_and_scipys_normal():
+    """One probability for all dimensions; a control of which one dimension alone is at its value is continuous."""
+    logit, mean = numbers(4, 2, 1), numbers(4, 2, 2, seed=1)
+    emission = Hurdle(logit, Gaussian(mean, STD, SCALE.log()))
+    actions = torch.tensor([[0.0, 0.0], [0.0, 0.3], [1e-30, 0.0], [-0.0, 0.0]], dtype=torch.float64)
+    found = emission.log_density(actions)
+    for n, k in itertools.product(range(4), range(2)):
+        expected = -np.log1p(np.exp(-float(logit[n, k])))
+        if n in (1, 2):
+            at, centre, spread = (tensor.numpy() * SCALE.numpy() for tensor in (actions[n], mean[n, k], STD))
+            expected = -np.log1p(np.exp(float(logit[n, k]))) + stats.norm.logpdf(at, centre, spread).sum()
+        assert float(found[n, k]) == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_likeliest_hurdle_has_the_share_the_mean_and_the_spread_of_the_data():
+    """In closed form: p is the share of the steps at the value, μ and σ are those of the others."""
+    actions = torch.where(numbers(400, 1, seed=1) > 0.3, 0.0, 1.5 + 0.4 * numbers(400, 2))
+    free = actions[(actions != 0).all(1)]
+    share = 1 - len(free) / len(actions)
+    logit = torch.full((1, 1), np.log(share / (1 - share)), dtype=torch.float64).requires_grad_()
+    mean, std = free.mean(0, keepdim=True).requires_grad_(), free.std(0, correction=0).requires_grad_()
+    value = Hurdle(logit, Gaussian(mean, std, torch.zeros(2, dtype=torch.float64))).log_density(actions).sum()
+    for gradient in torch.autograd.grad(value, [logit, mean, std]):
+        assert gradient.abs().max() < 1e-9
+    assert 0.2 < share < 0.8
+
+
+def test_a_hurdle_is_drawn_as_often_as_it_is_likely():
+    """Of each caller: the share at the value, and moments of the others, within five standard errors."""
+    logit, mean = torch.tensor([[-2.0], [0.1], [1.5]], dtype=torch.float64), numbers(3, 2)
+    emission = Hurdle(logit, Gaussian(mean, STD, SCALE.log()))
+    torch.manual_seed(0)
+    drawn = emission.draw(torch.randn(20_000, emission.noise, dtype=torch.float64))
+    at = (drawn == 0).all(-1)
+    p = logit.sigmoid().squeeze(-1)
+    assert ((at.double().mean(0) - p).abs() < 5 * (p * (1 - p) / len(at)).sqrt()).all()
+    for k in range(3):
+        free = drawn[~at[:, k], k]
+        assert (free != 0).all()
+        assert ((free.mean(0) - mean[k]) / STD).abs().max() < 5 / len(free) ** 0.5
+        assert (free.std(0) / STD - 1).abs().max() < 5 / (2 * len(free)) ** 0.5
+    assert torch.equal(emission.mode, torch.where(p[:, None] >= 0.5, 0.0, mean))
+
+
+def test_a_hurdles_divergence_is_the_mean_of_log_ratios():
+    """By draws of both callers, σ differing: within five standard errors."""
+    logit, mean = torch.tensor([[-1.0], [0.7]], dtype=torch.float64), numbers(2, 2)
+    emission = Hurdle(logit, Gaussian(mean, torch.stack([STD, 1.5 * STD]), SCALE.log()))
+    torch.manual_seed(0)
+    drawn = emission.draw(torch.randn(50_000, emission.noise, dtype=torch.float64))
+    total, variance = 0.0, 0.0
+    for i in range(2):
+        scores = emission.log_density(drawn[:, i])
+        ratio = scores[:, i] - scores[:, 1 - i]
+        total, variance = total + 0.5 * float(ratio.mean()), variance + 0.25 * float(ratio.var()) / len(ratio)
+    assert float(emission.divergence(0, 1)) == pytest.approx(total, abs=5 * variance**0.5)
+
+
 KINDS = {
     "gaussian": lambda: Gaussian(numbers(2, 3, 2, 2), STD, SCALE.log()),
     "gaussian, own σ": lambda: Gaussian(numbers(2, 3, 2, 2), torch.stack([STD, 2 * STD]), SCALE.log()),
@@ -179,8 +261,17 @@ KINDS = {
     "binary": lambda: Binary(numbers(2, 3, 2, 2)),
     "categorical": lambda: Categorical(numbers(2, 3, 2, 4), torch.tensor(False)),
     "rows": lambda: Categorical(numbers(2, 3, 2, 4), torch.tensor(True)),
+    "hurdle": lambda: Hurdle(numbers(2, 3, 2, 1, seed=2), Gaussian(numbers(2, 3, 2, 2), STD, SCALE.log())),
+    "hurdle, clipped, own σ": lambda: hurdle(
+        numbers(2, 3, 2, 1, seed=2), numbers(2, 3, 2, 2), torch.stack([STD, 2 * STD])
+    ),
+    "hurdles": lambda: Product((((1,), one_hurdle(5)), ((0,), one_hurdle(6)))),
     "product": lambda: Product((((2, 0), clipped(numbers(2, 3, 2, 2))), ((1,), Binary(numbers(2, 3, 2, 1, seed=1))))),
 }
+
+
+def one_hurdle(seed):
+    return Hurdle(numbers(2, 3, 2, 1, seed=seed), Gaussian(numbers(2, 3, 2, 1), STD[:1], SCALE[:1].log()))
 
 
 def actions_of(kind):
@@ -189,7 +280,11 @@ def actions_of(kind):
     switches = torch.randint(0, 2, (2, 3, 2), generator=generator).double()
     reals = numbers(2, 3, 2, seed=4).clamp(LOW, HIGH)
     index = torch.randint(0, 4, (2, 3), generator=generator)
+    resting = torch.tensor([[[1, 1], [0, 0], [1, 0]], [[1, 1], [0, 1], [0, 0]]])
     return {
+        "hurdle": torch.where(resting == 1, 0.0, reals),
+        "hurdle, clipped, own σ": torch.where(resting == 1, 0.0, reals),
+        "hurdles": torch.where(resting == 1, 0.0, reals),
         "binary": switches,
         "categorical": index.unsqueeze(-1).double(),
         "rows": torch.nn.functional.one_hot(index, 4).double(),
@@ -244,7 +339,7 @@ def test_draws_have_the_density_and_stay_possible(kind):
     torch.manual_seed(0)
     means = []
     for _ in range(2):
-        noise = torch.randn(1000, *emission.shape[:-2], emission.shape[-1], dtype=torch.float64)
+        noise = torch.randn(1000, *emission.shape[:-2], emission.noise, dtype=torch.float64)
         drawn = torch.stack([emission.draw(one) for one in noise])[..., 0, :]  # of the first caller
         means.append(torch.stack([emission.log_density(one)[..., 0] for one in drawn]))
     assert all(torch.isfinite(mean).all() for mean in means)

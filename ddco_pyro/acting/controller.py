@@ -98,7 +98,7 @@ class Controller:
             self._choices = self._chosen(now, generators)
             steps = (None if emission is None else emission.steps()[0] for emission in outputs.emissions)
             acting = Acting(tuple(steps), self._choices)
-            control = acting.mode if self.control == "mean" else acting.draw(_noise(generators, acting.event_shape[0]))
+            control = acting.mode if self.control == "mean" else acting.draw(_noise(generators, acting.noise))
         rows = torch.arange(len(self.seeds))
         ended = [table[rows, choice, 1].exp() for table, choice in zip(now.termination, self._choices, strict=True)]
         self.all_terminations = _columns(ended, len(self.seeds))
@@ -125,7 +125,7 @@ def _columns(levels: Sequence[Tensor], number: int) -> np.ndarray:
 
 
 def _noise(generators: Sequence[np.random.Generator], size: int) -> Tensor:
-    """Standard normal numbers for each episode, float64 [N, A]."""
+    """Standard normal numbers for each episode, float64 [N, size]."""
     return torch.from_numpy(np.stack([generator.standard_normal(size) for generator in generators]))
 
 

@@ -175,13 +175,15 @@ def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
     """What the runner has to know of a part of the control; σ of each level's callers, lowest first, if it has one."""
     scaling = hierarchy.scaling
     part, places = scaling.parts[number], list(scaling.groups[number])
-    first = sum(before.size for before in scaling.parts[:number] if before.continuous)
-    std = [caller.std()[..., first : first + part.size].tolist() for caller in hierarchy.callers()]
+    before = scaling.parts[:number]
+    first = sum(len(other.dims) for other in before if other.continuous)
+    std = [caller.std()[..., first : first + len(places)].tolist() for caller in hierarchy.callers()]
+    decides = [len(scaling.varying) + sum(bool(other.exact) for other in before)] if part.exact else []
     ends = ([None if math.isinf(end) else end for end in values] for values in (part.low, part.high))
     return {
         "kind": part.kind,
         "dims": list(part.dims),
-        "places": places,
+        "places": places + decides,
         "size": part.size,
         "values": list(part.values),
         "ends": list(ends),

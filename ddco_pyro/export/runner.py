@@ -148,7 +148,7 @@ class Runner:
         level, actor = next(((d, h - 1) for d, h in enumerate(self.choices) if h > 0), (len(self.choices), 0))
         numbers, first = outputs[f"control_{level}"][actor].astype(np.float64), 0
         sampled = self.about["control"] == "sample"
-        noise = generator.standard_normal(len(self.about["varying"])) if sampled else None
+        noise = generator.standard_normal(sum(len(part["places"]) for part in self.about["parts"])) if sampled else None
         control = np.array(self.about["constant"])  # dimensions that never varied in the demonstrations stay so
         for part in self.about["parts"]:
             own, z = numbers[first : first + part["size"]], None if noise is None else noise[part["places"]]
@@ -172,6 +172,12 @@ def _continuous(part: Part, mean: np.ndarray, std: np.ndarray, z: np.ndarray | N
             ):
                 control[place] = end
     return control
+
+
+def _hurdle(part: Part, numbers: np.ndarray, std: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+    """The value, which is where scaled units begin, or what is continuous; the last of ``z`` decides."""
+    exactly = numbers[0] >= 0 if z is None else _phi(z[-1]) < 1 / (1 + np.exp(-numbers[0]))
+    return np.array(part["shift"]) if exactly else _continuous(part, numbers[1:], std, None if z is None else z[:-1])
 
 
 def _binary(part: Part, logits: np.ndarray, _: np.ndarray, z: np.ndarray | None) -> np.ndarray:
@@ -198,6 +204,7 @@ def _phi(z: float) -> float:
 KINDS: dict[str, Callable[[Part, np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]] = {
     "gaussian": _continuous,
     "clipped": _continuous,
+    "hurdle": _hurdle,
     "binary": _binary,
     "categorical": _categorical,
 }

@@ -207,6 +207,8 @@ class ControlRange(Record):
     at_minimum: int
     at_maximum: int
     steps: AtLeastOne
+    inside: Finite | None = None
+    at_inside: int = 0
 
 
 class Branches(Record):

@@ -79,10 +79,16 @@ class Acting(TorchDistribution):
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
         """A control of who acts, [..., N, A] in scaled units."""
-        return self.draw(torch.randn(*sample_shape, *self.batch_shape, *self.event_shape))
+        return self.draw(torch.randn(*sample_shape, *self.batch_shape, self.noise))
+
+    @property
+    def noise(self) -> int:
+        """How many standard normal numbers a control is drawn from."""
+        number: int = self.emissions[0].noise
+        return number
 
     def draw(self, noise: Tensor) -> Tensor:
-        """The control [..., N, A] that standard normal numbers of this shape stand for."""
+        """The control [..., N, A] that standard normal numbers [..., N, noise] stand for."""
         with torch.no_grad():
             draws = [None if emission is None else emission.draw(noise) for emission in self.emissions]
             return self._of_actor(draws, torch.nan)

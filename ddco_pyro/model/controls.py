@@ -14,7 +14,7 @@ from ddco_pyro.data.control_dimensions import number
 from ddco_pyro.data.control_parts import ControlPart
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.model.discrete import Binary, Categorical
-from ddco_pyro.model.emissions import Clipped, Emission, Gaussian, Product
+from ddco_pyro.model.emissions import Clipped, Emission, Gaussian, Hurdle, Product
 from ddco_pyro.spec import ControlSpec, LearnedStd
 
 INITIAL_STD = 0.5
@@ -25,7 +25,8 @@ class ControlScaling(nn.Module):
     """The A' of A control dimensions that vary, as the model sees them, and back.
 
     Continuous ones are in units of their own spread, z = (a - shift) / scale; switches are 0 and 1, discrete actions
-    their index. Constant ones are no part of the model and put back into what it emits; bounds and switches' values are
+    their index. A hurdle is 0 at its value and nowhere else; its spread is that of the steps where it is not there.
+    Constant ones are no part of the model and put back into what it emits; bounds, switches' and hurdles' values are
     emitted exactly.
 
     :param size: A.
@@ -82,8 +83,13 @@ class ControlScaling(nn.Module):
         """Where the spec says ``standardize``: take mean and spread of these demonstrations' controls."""
         if self.standardized.any():
             rows = np.concatenate([demo.actions[:, self.varying.numpy()] for demo in demonstrations])
-            spread = rows.std(0)
-            shift, scale = rows.mean(0), np.where(spread > 1e-9, spread, 1.0)
+            shift, spread = rows.mean(0), rows.std(0)
+            for dims, part in zip(self.groups, self.parts, strict=True):
+                if part.exact:
+                    places = list(dims)
+                    free = rows[(rows[:, places] != part.exact).any(1)][:, places]
+                    shift[places], spread[places] = part.exact, free.std(0) if len(free) else 1.0
+            scale = np.where(spread > 1e-9, spread, 1.0)
             self.shift.copy_(torch.as_tensor(np.where(self.standardized, shift, self.shift.numpy())))
             self.scale.copy_(torch.as_tensor(np.where(self.standardized, scale, self.scale.numpy())))
 
@@ -146,13 +152,13 @@ class ControlScaling(nn.Module):
         each = numbers.split(sizes, dim=-1) if len(sizes) > 1 else (numbers,)  # a split's gradient is a copy
         for dims, part, own in zip(self.groups, self.parts, each, strict=True):
             if part.continuous:
-                deviation, at = std[..., at : at + part.size], at + part.size
-                log_scale = self.scale[list(dims)].log()
-                emission: Emission = Gaussian(own, deviation, log_scale)
-                if part.kind == "clipped":
+                deviation, at = std[..., at : at + len(dims)], at + len(dims)
+                mean = own[..., 1:] if part.exact else own
+                slab = Gaussian(mean, deviation, self.scale[list(dims)].log())
+                if part.bounded:
                     low, high = (end[list(dims)] for end in self.ends())
-                    emission = Clipped(own, deviation, log_scale, low, high)
-                groups.append((dims, emission))
+                    slab = Clipped(mean, deviation, slab.log_scale, low, high)
+                groups.append((dims, Hurdle(own[..., :1], slab) if part.exact else slab))
             elif part.kind == "binary":
                 groups.append((dims, Binary(own)))
             else:
@@ -173,6 +179,7 @@ def _declared(
             if part.kind == "binary":
                 shift[at], scale[at] = part.low[place], part.high[place] - part.low[place]
             elif part.continuous:
+                shift[at] = part.exact[place] if part.exact else 0.0
                 named = next((scaled for scaled in spec.parts if dimension in scaled.dims and scaled.name in own), None)
                 declared = own[named.name] if named else spec.scale
                 standardized[at] = declared == "standardize"

@@ -14,6 +14,8 @@ from typing import Any, ClassVar, Protocol, Self
 
 import torch
 from torch import Tensor
+from torch.nn.functional import logsigmoid
+from torch.special import ndtr
 
 from ddco_pyro.model.links import weighted_squares
 
@@ -49,8 +51,13 @@ class Emission(Steps, Protocol):
         """The most likely control of each caller, [..., K, A]."""
         ...
 
+    @property
+    def noise(self) -> int:
+        """How many standard normal numbers a control is drawn from."""
+        ...
+
     def draw(self, noise: Tensor) -> Tensor:
-        """The controls [..., K, A] that standard normal numbers [..., A] stand for."""
+        """The controls [..., K, A] that standard normal numbers [..., noise] stand for."""
         ...
 
     def divergence(self, i: int, j: int) -> Tensor:
@@ -83,6 +90,11 @@ class Kind(ABC):
     def shape(self) -> torch.Size:
         """[..., K, A]: a number for each dimension, unless a kind says otherwise."""
         return self.numbers.shape
+
+    @property
+    def noise(self) -> int:
+        """A: a standard normal number for each dimension."""
+        return self.shape[-1]
 
     @abstractmethod
     def by_dimension(self, actions: Tensor) -> Tensor:
@@ -138,27 +150,27 @@ class Gaussian(Kind):
 
     def divergence(self, i: int, j: int) -> Tensor:
         """Mean of both divergences; ½ Σ (μ_i - μ_j)² / σ² where callers share σ."""
+        return 0.5 * (self.relative_entropy(i, j) + self.relative_entropy(j, i))
+
+    def relative_entropy(self, i: int, j: int) -> Tensor:
+        """KL(π_i ‖ π_j) of two callers, [...] nats."""
         mean, std = self.mean.double(), self.std.double()
         apart = (mean[..., i, :] - mean[..., j, :]).square()
         first, second = (std, std) if std.dim() == 1 else (std[i], std[j])
-        first, second = first.square(), second.square()
-        return 0.25 * ((first + apart) / second + (second + apart) / first - 2).sum(-1)
+        return (0.5 * (first.square() + apart) / second.square() - 0.5 + second.log() - first.log()).sum(-1)
 
 
 @dataclass(frozen=True)
-class Clipped(Kind):
+class Clipped(Gaussian):
     """A continuous control with bounds that it reaches: a = min(max(z, low), high) of z ~ N(μ, σ²), a censored normal.
 
     Within its bounds it has the normal's density; on a bound, or beyond, the probability of what lies there, Φ. That is
-    a mass, whatever the units: densities and masses are different measures.
+    a mass, whatever the units: densities and masses are different measures. Divergences are those of the normals before
+    they are clipped, upper bounds of those after.
 
-    :param mean: μ, [..., K, A] in scaled units; ``std`` and ``log_scale`` as those of :class:`Gaussian`.
     :param low: the lower bound of each dimension, -inf where it has none, [A] in scaled units; ``high`` likewise.
     """
 
-    mean: Tensor
-    std: Tensor
-    log_scale: Tensor
     low: Tensor
     high: Tensor
 
@@ -174,6 +186,10 @@ class Clipped(Kind):
         beyond = torch.where(below.expand(inside.shape)[at], low - mean, mean - high) / std
         return inside.index_put(at, log_ndtr(beyond))
 
+    def log_density(self, actions: Tensor) -> Tensor:
+        """The sum over dimensions, float64 [..., K]."""
+        return self.by_dimension(actions).sum(-1)
+
     @property
     def mode(self) -> Tensor:
         """μ within the bounds: the control without noise."""
@@ -183,9 +199,82 @@ class Clipped(Kind):
         """μ + σ·z within the bounds."""
         return (self.mean + self.std * noise.unsqueeze(-2)).clamp(self.low, self.high)
 
+
+@dataclass(frozen=True)
+class Hurdle:
+    """A two-part control: exactly one value with probability p = logistic(y), continuous otherwise (a hurdle model).
+
+    All dimensions are at their values at once, or none is. The value is 0 in scaled units, and nothing else is, so the
+    comparison is exact at any scale.
+
+    :param logit: y, [..., K, 1].
+    :param slab: the continuous part.
+    """
+
+    logit: Tensor
+    slab: Gaussian
+
+    @property
+    def shape(self) -> torch.Size:
+        """[..., K, A]."""
+        return self.slab.shape
+
+    @property
+    def noise(self) -> int:
+        """A + 1: the last one decides which part a control is of."""
+        return self.slab.noise + 1
+
+    @property
+    def numbers(self) -> Tensor:
+        """y, then what the network gave for the slab."""
+        return torch.cat([self.logit, self.slab.numbers], dim=-1)
+
+    def by_dimension(self, actions: Tensor) -> Tensor:
+        """log π(a_d | s), [..., K, A]: each dimension has its share of which part a control is of."""
+        at = _at_value(actions).unsqueeze(-1)
+        return self._part(at) / self.shape[-1] + torch.where(at, 0.0, self.slab.by_dimension(actions))
+
+    def log_density(self, actions: Tensor) -> Tensor:
+        """log p at the value, log (1 - p) and the slab's log-density elsewhere, [..., K]."""
+        at = _at_value(actions)
+        return self._part(at.unsqueeze(-1)).squeeze(-1) + torch.where(at, 0.0, self.slab.log_density(actions))
+
+    def _part(self, at: Tensor) -> Tensor:
+        """The log-probability of being at the value, or of not being there, [..., K, 1]."""
+        return logsigmoid(torch.where(at, self.logit, -self.logit))
+
+    @property
+    def mode(self) -> Tensor:
+        """The mode of the more likely part."""
+        return torch.where(self.logit >= 0, 0.0, self.slab.mode)
+
+    def draw(self, noise: Tensor) -> Tensor:
+        """The value where Φ(z) of the last number is less than p; elsewhere what the slab draws from the others."""
+        at = ndtr(noise[..., -1:]).unsqueeze(-2) < self.logit.sigmoid()
+        return torch.where(at, 0.0, self.slab.draw(noise[..., :-1]))
+
     def divergence(self, i: int, j: int) -> Tensor:
-        """Mean of both divergences of the normals before they are clipped: an upper bound of those after."""
-        return Gaussian(self.mean, self.std, self.log_scale).divergence(i, j)
+        """Mean of both divergences: of which part it is, and of the slabs as often as these are seen."""
+        first, second = (self.logit[..., caller, 0].double() for caller in (i, j))
+        part = 0.5 * (first.sigmoid() - second.sigmoid()) * (first - second)
+        slabs = (
+            (-first).sigmoid() * self.slab.relative_entropy(i, j),
+            (-second).sigmoid() * self.slab.relative_entropy(j, i),
+        )
+        return part + 0.5 * sum_of(slabs)
+
+    def steps(self) -> list[Hurdle]:
+        """The same at each step."""
+        return [Hurdle(*parts) for parts in zip(self.logit.unbind(1), self.slab.steps(), strict=True)]
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Hurdle:
+        """The same of changed tensors."""
+        return Hurdle(change(self.logit), self.slab.map(change))
+
+
+def _at_value(actions: Tensor) -> Tensor:
+    """Whether a hurdle's controls [..., A] are at its value, [..., 1]."""
+    return (actions == 0).all(-1, keepdim=True)
 
 
 @dataclass(frozen=True)
@@ -221,9 +310,19 @@ class Product:
         """The most likely control of each group."""
         return self._joined([emission.mode for _, emission in self.groups])
 
+    @property
+    def noise(self) -> int:
+        """The sum of the groups' numbers."""
+        return sum(emission.noise for _, emission in self.groups)
+
     def draw(self, noise: Tensor) -> Tensor:
-        """The controls that standard normal numbers stand for, each group's own."""
-        return self._joined([emission.draw(noise[..., dims]) for dims, emission in self.groups])
+        """The controls that standard normal numbers stand for: the first A each dimension's, then what groups add."""
+        draws, first = [], self.shape[-1]
+        for dimensions, emission in self.groups:
+            last = first + emission.noise - len(dimensions)
+            draws.append(emission.draw(noise[..., [*dimensions, *range(first, last)]]))
+            first = last
+        return self._joined(draws)
 
     def divergence(self, i: int, j: int) -> Tensor:
         """The sum of the groups' divergences."""

@@ -137,8 +137,8 @@ class LearnedStd(Model):
     floor: Positive = 0.01
     """Lower bound, in scaled units."""
     per_option: bool = False
-    """Whether each option has its own. With ``gaussian`` controls that sit on a bound, one option may collect those
-    steps, whatever the skill; ``clipped`` and ``binary`` ones are safe."""
+    """Whether each option has its own. With ``gaussian`` controls that sit on a bound or a value, one option may
+    collect those steps, whatever the skill; ``clipped``, ``hurdle`` and ``binary`` ones are safe."""
 
 
 Std = Annotated[
@@ -157,7 +157,7 @@ Scale = Annotated[
     ),
 ]
 
-Kind = Literal["auto", "gaussian", "clipped", "binary", "categorical"]
+Kind = Literal["auto", "gaussian", "clipped", "hurdle", "binary", "categorical"]
 
 
 class PartSpec(Model):
@@ -174,17 +174,21 @@ class PartSpec(Model):
     scale: Scale | None = None
     """As ``control.scale``, which null stands for; a list has a number for each of these dimensions."""
     bounds: Annotated[Items[float], Field(min_length=2, max_length=2)] | None = None
-    """``clipped`` alone: the lower and the upper bound, in the control's own units; null: the extremes on which the
-    demonstrations sit."""
+    """``clipped`` and ``hurdle`` alone: the lower and the upper bound, in the control's own units; null: the extremes
+    on which the demonstrations sit."""
+    value: float | None = None
+    """``hurdle`` alone: the value that each of these dimensions often has exactly; null: the commonest inside its
+    range."""
 
 
 class ControlSpec(Model):
     """The distribution of the control that a caller emits."""
 
     kind: Kind = "auto"
-    """``gaussian``: free; ``clipped``: a Gaussian with bounds that it reaches; ``binary``: a switch between two values;
-    ``categorical``: discrete actions, as integers or rows with a single 1; ``auto``: decided for each dimension from
-    the demonstrations, and shown by ``check``."""
+    """``gaussian``: free; ``clipped``: a Gaussian with bounds that it reaches; ``hurdle``: exactly one value with a
+    probability, else free or clipped; ``binary``: a switch between two values; ``categorical``: discrete actions, as
+    integers or rows with a single 1; ``auto``: decided for each dimension from the demonstrations, and shown by
+    ``check``."""
     std: Std = 0.1
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``."""
     scale: Scale = "standardize"
@@ -204,9 +208,14 @@ class ControlSpec(Model):
                     where = f"control dimension {dimension} is in {dimensions[dimension]!r} already"
                     raise invalid((f"parts.{number}.dims", where))
                 dimensions[dimension] = part.name
-            if part.bounds is not None and (part.kind != "clipped" or part.bounds[0] >= part.bounds[1]):
-                problem = "are for kind: clipped" if part.kind != "clipped" else "must be a lower and a higher number"
-                raise invalid((f"parts.{number}.bounds", problem))
+            if part.bounds is not None and part.kind not in ("clipped", "hurdle"):
+                raise invalid((f"parts.{number}.bounds", "are for kind: clipped or hurdle"))
+            if part.bounds is not None and part.bounds[0] >= part.bounds[1]:
+                raise invalid((f"parts.{number}.bounds", "must be a lower and a higher number"))
+            if part.value is not None and part.kind != "hurdle":
+                raise invalid((f"parts.{number}.value", "is for kind: hurdle"))
+            if part.value is not None and part.bounds and not part.bounds[0] < part.value < part.bounds[1]:
+                raise invalid((f"parts.{number}.value", "must lie between the bounds"))
         return self
 
 

@@ -1,0 +1,238 @@
+"""Controls that are exactly one value in many steps: what is decided, fitted, emitted, exported and compared."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from command_line import call
+from odd_files.atoms import ROWS, at_bounds, no_ops
+
+import ddco_pyro
+from ddco_pyro.acting.controller import Controller
+from ddco_pyro.data.control_dimensions import control_dimensions
+from ddco_pyro.data.control_parts import control_parts, described
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.export import TOLERANCE, export, runner
+from ddco_pyro.spec import ControlSpec, SpecError, dump_spec, parse_spec, with_overrides
+
+
+def spec_of(options=3, epochs=6, path="unused.hdf5", **control):
+    linear = {"network": "linear"}
+    return parse_spec(
+        {
+            "demonstrations": {"path": str(path), "valid_fraction": 0.34},
+            "observations": ["state"],
+            "control": {"std": {"learn": True, "per_option": True}, **control},
+            "hierarchy": {
+                "levels": [{"count": options, "policy": linear, "termination": linear}],
+                "meta_policy": linear,
+            },
+            "training": {"epochs": epochs, "optimizer": {"lr": 0.03}, "initialize": "vq_controls"},
+        }
+    )
+
+
+# --- without skill ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_without_skill_options_gain_nothing(at_once):
+    """Half of the steps are exactly 0 at random: three options and a flat policy, held out, nats per step.
+
+    With Gaussian controls the options seem better by more than a nat; with a probability at 0 the difference is
+    within three of its standard errors, which are below 0.025.
+    """
+    demos, gained = no_ops(30, at_once=at_once), {}
+    for kind in ("gaussian", "auto"):
+        spec = with_overrides(spec_of(epochs=100, kind=kind), {"compare_with": ["flat"]})
+        gained[kind] = ddco_pyro.fit(spec, demos).metrics["comparison"]["flat"]["difference"]
+    assert gained["gaussian"]["nats_per_step"] > 1
+    assert abs(gained["auto"]["nats_per_step"]) < 3 * gained["auto"]["standard_error"] < 0.075
+
+
+# --- what is decided --------------------------------------------------------------------------------------------------
+
+
+def decided(demos, **control):
+    return control_parts(ControlSpec(**control), control_dimensions(demo.actions for demo in demos))
+
+
+def test_dimensions_that_rest_at_once_share_a_probability():
+    (together,) = decided(no_ops())
+    assert (together.kind, together.dims, together.exact, together.size) == ("hurdle", (0, 1, 2), (0.0, 0.0, 0.0), 4)
+    assert described([together]) == ["control dimensions 0-2: hurdle (exactly 0 in 49.6 % of the steps)"]
+    apart = decided(no_ops(at_once=False))
+    assert [(part.kind, part.dims, part.size) for part in apart] == [("hurdle", (d,), 2) for d in range(3)]
+
+
+def test_beside_its_value_a_hurdle_is_clipped_where_it_has_bounds():
+    for part in decided(at_bounds()):
+        assert (part.kind, part.low, part.high) == ("hurdle", (-1.0,), (1.0,))
+        assert part.why.endswith("; often at an extreme")
+
+
+def test_a_value_is_that_of_the_demonstrations_however_it_is_rounded():
+    """0.1 in a file of float32 is another number than 0.1 in a spec."""
+    stored = float(np.float32(0.1))
+    controls = np.where(np.arange(60) % 2 == 0, stored, np.random.default_rng(0).normal(size=60))[:, None]
+    for value in (0.1, stored, None):
+        parts = [{"name": "stick", "dims": [0], "kind": "hurdle", "value": value}]
+        (part,) = control_parts(ControlSpec(parts=parts), control_dimensions([controls]))
+        assert part.exact == (stored,)
+
+
+def test_a_declared_value_may_be_an_extreme():
+    controls = np.abs(no_ops()[0].actions[:, :1])
+    parts = [{"name": "pedal", "dims": [0], "kind": "hurdle", "value": 0.0}]
+    (part,) = control_parts(ControlSpec(parts=parts), control_dimensions([controls]))
+    assert (part.exact, part.low, part.high) == ((0.0,), (-np.inf,), (np.inf,))
+    assert [part.kind for part in control_parts(ControlSpec(), control_dimensions([controls]))] == ["clipped"]
+
+
+def test_a_declared_gaussian_is_told_what_its_comparisons_are_worth():
+    (part,) = decided(no_ops(), kind="gaussian")
+    assert part.why == (
+        "as declared; exactly 0 in 49.6 % of the steps, and options gain by collecting these steps, without any skill"
+    )
+
+
+@pytest.mark.parametrize(
+    ("control", "message"),
+    [
+        ({"parts": [{"name": "a", "dims": [0], "kind": "hurdle", "value": 0.5}]}, r"parts\.0\.value: .* exactly 0\.5 "),
+        ({"parts": [{"name": "a", "dims": [0], "value": 0.0}]}, "parts.0.value: is for kind: hurdle"),
+        (
+            {"parts": [{"name": "a", "dims": [0], "kind": "hurdle", "value": 1.0, "bounds": [-1, 1]}]},
+            "parts.0.value: must lie between the bounds",
+        ),
+    ],
+)
+def test_values_that_do_not_fit_are_refused(control, message):
+    with pytest.raises(SpecError, match=message):
+        decided(no_ops(), **spec_of(**control).control.model_dump())
+
+
+def test_a_dimension_without_such_a_value_is_no_hurdle():
+    with pytest.raises(SpecError, match="control dimension 0 is at no value inside its range in 5 % of the steps"):
+        control_parts(ControlSpec(kind="hurdle"), control_dimensions([np.linspace(-1, 1, 50)[:, None]]))
+
+
+# --- from file to controller ------------------------------------------------------------------------------------------
+
+STILL = float(np.float32(0.3))
+
+
+def mixed():
+    """Two dimensions that rest at 0.3 and 0 at once, one that rests at 0 and reaches ±1, and a switch."""
+    random, made = np.random.default_rng(0), []
+    for index in range(8):
+        state = random.normal(size=(40, 4))
+        rests, halts = state[:, :1] > 0.5, state[:, 1:2] < -0.4
+        free = state + random.normal(0, 0.2, state.shape)
+        pair = np.where(rests, [STILL, 0.0], free[:, :2] + [2.0, -0.5])
+        third = np.where(halts, 0.0, free[:, 2:3].clip(-1, 1))
+        controls = np.concatenate([third, pair, free[:, 3:] > 0], axis=1)
+        made.append(Demonstration(f"demo_{index}", {"state": state}, controls))
+    return Demonstrations(tuple(made))
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("hurdle")
+    mixed().write(folder / "demos.hdf5")
+    return ddco_pyro.fit(spec_of(2, epochs=40, path=folder / "demos.hdf5"), out=folder / "run")
+
+
+def test_what_was_decided_comes_back_from_the_run(fitted):
+    assert [(part.kind, part.dims) for part in fitted.hierarchy.scaling.parts] == [
+        ("hurdle", (0,)), ("hurdle", (1, 2)), ("binary", (3,)),
+    ]  # fmt: skip
+    again = ddco_pyro.load(fitted.folder)
+    assert again.hierarchy.scaling.parts == fitted.hierarchy.scaling.parts
+    np.testing.assert_array_equal(again.log_likelihood(mixed()), fitted.log_likelihood(mixed()))
+    assert again.metrics["measure"] == {
+        "0": ["hurdle", -1.0, 1.0, 0.0, [0]],
+        "1": ["hurdle", None, None, STILL, [1, 2]],
+        "2": ["hurdle", None, None, 0.0, [1, 2]],
+        "3": ["binary", 0.0, 1.0],
+    }
+    assert again.metrics["engine_check"]["value"] < 1e-6
+
+
+def test_what_dimensions_add_is_the_likelihood(fitted):
+    each = fitted.metrics["log_likelihood_by_dimension"]["valid"]
+    total = fitted.metrics["log_likelihood_per_step"]["valid"]
+    assert sum(each["by_dimension"]) + each["options"] == pytest.approx(total, rel=1e-6)
+
+
+def test_scaling_keeps_exactly_the_value_apart(fitted):
+    """The nearest numbers to the value are not the value, and what is scaled comes back exactly."""
+    scaling = fitted.hierarchy.scaling
+    rows = np.tile([0.0, STILL, 0.0, 1.0], (3, 1))
+    rows[1:, 1] = np.nextafter(STILL, -1), np.nextafter(STILL, 1)
+    scaled = np.float32(scaling.scaled(rows))
+    assert ((scaled[:, 1] == 0) == [True, False, False]).all()
+    assert (scaled[:, [0, 2]] == 0).all()
+    np.testing.assert_array_equal(scaling.unscaled(torch.from_numpy(scaled))[0], rows[0])
+
+
+@pytest.mark.parametrize("control", ["mean", "sample"])
+def test_values_are_emitted_exactly_and_exports_act_alike(fitted, control, tmp_path):
+    rollout = fitted.spec.rollout.model_copy(update={"control": control})
+    acting = ddco_pyro.load(fitted.folder)
+    changed = acting.__class__(
+        acting.spec.model_copy(update={"rollout": rollout}), acting.hierarchy, acting.metrics, acting.folder
+    )
+    differences = export(changed, tmp_path / "out", onnx=control == "sample")
+    assert all(difference < TOLERANCE for difference, _ in differences.values())
+    exported, original = runner.Runner(tmp_path / "out"), changed.controller()
+    ours, theirs = [], []
+    for observation in np.random.default_rng(3).normal(0, 1.5, (150, 4)):
+        ours.append(exported.act({"state": observation}))
+        theirs.append(original.act({"state": observation}))
+    ours, theirs = np.stack(ours), np.stack(theirs)
+    np.testing.assert_allclose(ours, theirs, atol=1e-5)
+    for own in (ours, theirs):
+        rests = own[:, 1] == STILL
+        assert 0.1 < rests.mean() < 0.9
+        np.testing.assert_array_equal(rests, own[:, 2] == 0)
+        assert {-1.0, 0.0, 1.0} <= set(own[:, 0])
+        assert (np.abs(own[:, 0]) <= 1).all()
+
+
+def test_a_controller_rests_as_often_as_the_demonstrations(fitted):
+    """Samples in the states of the demonstrations, where resting depends on the state."""
+    controller, demos = Controller(fitted.hierarchy, "sample"), mixed()
+    controller.reset_all(range(len(demos)))
+    steps = [controller.act_all([{"state": demo.observations["state"][t]} for demo in demos]) for t in range(40)]
+    shown = np.concatenate([demo.actions for demo in demos])
+    for dimension, value in ((0, 0.0), (1, STILL)):
+        share = (np.concatenate(steps)[:, dimension] == value).mean()
+        assert abs(share - (shown[:, dimension] == value).mean()) < 0.1
+
+
+def test_a_hurdle_is_not_ranked_against_a_density(fitted, tmp_path):
+    other = spec_of(2, path=fitted.spec.demonstrations.path, kind="gaussian", parts=[{"name": "jaw", "dims": [3]}])
+    run = ddco_pyro.fit(other, out=tmp_path / "run").folder
+    ended = call("compare", fitted.folder, run)
+    assert ended.status == 2
+    said = "control dimension 0 is hurdle with bounds -1 and 1 at 0, of dimension 0 in one and gaussian in the other"
+    assert said in ended.err
+
+
+def test_commands_say_it_in_a_line(fitted, tmp_path):
+    (tmp_path / "spec.yaml").write_text(dump_spec(fitted.spec))
+    line = "control dimensions 1-2: hurdle (exactly 0.3 in"
+    checked = call("check", tmp_path / "spec.yaml")
+    assert sum(said.startswith(line) for said in checked.out.splitlines()) == 1
+    assert line in call("inspect", fitted.spec.demonstrations.path).out
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_files_with_such_values_are_inspected_begun_and_fitted(row, tmp_path):
+    path = ROWS[row].make(tmp_path)
+    assert call("inspect", path).status == 0
+    assert call("init", path, "--out", tmp_path / "spec.yaml").status == 0
+    small = ("--set", "training.epochs=2", "--set", "compare_with=[]", "--out", tmp_path / "run")
+    assert call("fit", tmp_path / "spec.yaml", *small).status == 0
