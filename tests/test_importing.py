@@ -127,11 +127,11 @@ def test_lerobots_videos_frame_by_frame(out: Path) -> None:
 @no_file_is_left_open
 def test_a_video_need_not_be_read_to_its_end() -> None:
     video = next((LEROBOT / "videos").rglob("*.mp4"))
-    frames = _frames(video, 0.0, 20, 10.0, (16, 32))
+    frames = _frames(video, "demo_0", 0.0, 20, 10.0, (16, 32))
     assert next(frames).shape == (16, 32, 3)
     frames.close()
     with pytest.raises(DemonstrationsError, match="has 26 frames from second 0 on, and 99 are needed"):
-        list(_frames(video, 0.0, 99, 10.0, (16, 32)))
+        list(_frames(video, "demo_0", 0.0, 99, 10.0, (16, 32)))
     gc.collect()
 
 
@@ -193,9 +193,9 @@ def no_json(dataset: Path) -> None:
         (remove_video, r"file-000\.mp4: the video is missing; leave its observation out with --observation"),
         (no_video, r"file-000\.mp4: cannot be decoded: .*Invalid data found"),
         (small_video, r"file-000\.mp4: is \d+ x \d+, and meta/info\.json says 11 x 12"),
-        (older, r"is a LeRobot dataset v2\.1, and v3\.x can be read; convert it with LeRobot's own script first"),
+        (older, r"is a LeRobot dataset v2\.1, and v3\.x can be read; convert it with LeRobot's own script: python -m"),
         (cut, r"demo_0: cannot be read, or is damaged"),
-        (no_rows, r"the rows of episode 0 are missing or not together"),
+        (no_rows, r"demo_0: its rows are missing in .*file-000\.parquet"),
         (no_json, r"info\.json: cannot be read, or is damaged"),
     ],
 )
