@@ -276,6 +276,35 @@ def test_minaris_environment_is_never_made(written_by_minari, out: Path) -> None
         import_demonstrations(folder, out)
 
 
+def test_minaris_episodes_are_counted(written_by_minari, out: Path) -> None:
+    """One is gone, one says that it is longer, and one has an observation too many."""
+    folder, _ = written_by_minari(spaces.Box(-1, 1, (2,)))
+    with h5py.File(folder / "data" / "main_data.hdf5", "r+") as file:
+        del file["episode_1"]
+        file["episode_2"].attrs["total_steps"] = 9
+        joints = file["episode_3/observations/arm/joints"][:]
+        del file["episode_3/observations/arm/joints"]
+        file["episode_3/observations/arm/joints"] = np.concatenate([joints, joints[:1]])
+    left_out = import_demonstrations(folder, out, choice=Choice(skip_broken=True)).left_out
+    assert Demonstrations.read(out).names == ("demo_0",)
+    for name, message in {
+        "demo_1": "demo_1 is missing: the metadata counts 4 episodes, and the dataset has 3",
+        "demo_2": "demo_2: total_steps is 9, and there are 7 actions",
+        "demo_3": "demo_3: obs/arm/joints has 10 steps, but actions has 8",
+    }.items():
+        assert message in left_out[name]
+
+
+def test_minaris_paths_stay_in_the_dataset(written_by_minari, out: Path) -> None:
+    folder, _ = written_by_minari(spaces.Box(-1, 1, (2,)))
+    main = folder / "data" / "main_data.hdf5"
+    main.rename(folder.parent / "elsewhere.hdf5")
+    main.symlink_to(folder.parent / "elsewhere.hdf5")
+    for path in (folder, folder / "data", main):
+        with pytest.raises(DemonstrationsError, match=r"main_data\.hdf5 leads out of the dataset"):
+            import_demonstrations(path, out)
+
+
 # --- whole or not at all, and resumed ---------------------------------------------------------------------------------
 
 

@@ -15,7 +15,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.importing import Choice, import_demonstrations
 from ddco_pyro.data.inspection import inspect
-from ddco_pyro.data.sources.paths import check_keys, filled, inside
+from ddco_pyro.data.sources.metadata import check_keys, filled, inside
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.spec import parse_spec
 

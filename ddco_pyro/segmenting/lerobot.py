@@ -15,7 +15,7 @@ from pyarrow import parquet
 
 from ddco_pyro.data.files import whole_folder, write_text
 from ddco_pyro.data.sources.lerobot import SUBTASK, LeRobot
-from ddco_pyro.data.sources.paths import inside
+from ddco_pyro.data.sources.metadata import inside
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting import Segmented
 from ddco_pyro.segmenting.lerobot_forms import PERSISTENT, Form, subtask_names

@@ -19,7 +19,7 @@ import numpy as np
 
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
-from ddco_pyro.data.sources.paths import check_keys, check_links, filled, inside
+from ddco_pyro.data.sources.metadata import check_keys, check_links, filled, first_missing, inside
 from ddco_pyro.data.sources.recording import Column, Format, Recording, damaged, of_array
 from ddco_pyro.data.sources.video import video_column
 
@@ -68,7 +68,7 @@ class LeRobot:
         self._episodes, self._twice = _episodes(folder)
         if not self._episodes:
             raise DemonstrationsError(f"{folder}: meta/episodes holds no episodes; at least one is needed")
-        self._missing = self._not_named()
+        self._missing = first_missing(folder, self.info.get("total_episodes"), self._episodes, "meta/episodes")
         self.names = tuple(f"demo_{index}" for index in (*self._episodes, *self._missing))
         fps = self.info.get("fps")
         self.frequency = float(fps) if isinstance(fps, int | float) and 0 < fps < math.inf else None
@@ -80,20 +80,6 @@ class LeRobot:
         meta = sorted((folder / "meta").rglob("*.parquet"))
         data = (folder / path for path in self.data_files)
         self.files = (folder / "meta" / "info.json", *meta, *(path for path in data if path.is_file()))
-
-    def _not_named(self) -> Mapping[int, str]:
-        """The first episode that ``meta/info.json`` counts and ``meta/episodes`` does not name, with what is wrong.
-
-        :raises DemonstrationsError: ``meta/episodes`` names more than are counted.
-        """
-        total, named = self.info.get("total_episodes"), len(self._episodes)
-        if not isinstance(total, int) or total == named:
-            return {}
-        counts = f"meta/info.json counts {total} episodes, and meta/episodes names {named}"
-        if total < named:
-            raise DemonstrationsError(f"{self.folder}: {counts}; correct total_episodes")
-        first = next(index for index in range(named + 1) if index not in self._episodes)
-        return {first: f"{counts}; a file of meta/episodes is missing"}
 
     def _data_files(self) -> tuple[Path, ...]:
         """The files that hold the episodes' rows, relative to the folder; some may be missing.
@@ -154,7 +140,7 @@ class LeRobot:
         """
         index = int(name.removeprefix("demo_"))
         if index in self._missing:
-            raise DemonstrationsError(f"{name}: {self._missing[index]}")
+            raise DemonstrationsError(f"{name} {self._missing[index]}")
         if index in self._twice:
             raise DemonstrationsError(f"{name}: meta/episodes names it twice; remove one of the two")
         path = self.data_file(index)

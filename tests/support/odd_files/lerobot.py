@@ -223,9 +223,9 @@ ROWS = {
     "lerobot episode twice": Row(changed(rewritten(EPISODES, twice)), "demo_2: meta/episodes names it twice"),
     "lerobot episodes missing": Row(
         changed(rewritten(EPISODES, lambda table: table.slice(0, 3))),
-        "demo_3: meta/info.json counts 4 episodes, and meta/episodes names 3",
+        "demo_3 is missing: the metadata counts 4 episodes, and meta/episodes has 3",
     ),
-    "lerobot uncounted episode": Row(changed(info(total_episodes=3)), "counts 3 episodes, and meta/episodes names 4"),
+    "lerobot uncounted episode": Row(changed(info(total_episodes=3)), "counts 3 episodes, and meta/episodes has 4"),
     "lerobot many episodes counted": Row(changed(info(total_episodes=10**12)), "counts 1000000000000 episodes"),
     "lerobot uncounted frames": Row(changed(info(total_frames=27)), "counts 27 frames, and 26 are there"),
     "lerobot without episodes": Row(

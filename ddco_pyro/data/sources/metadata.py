@@ -1,10 +1,10 @@
-"""Paths and names that a foreign dataset's metadata gives: nothing outside its folder is read, copied or written."""
+"""Checks of what a foreign dataset's metadata says: paths stay in its folder, names can be stored, counts are right."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path, PurePosixPath
 
 from ddco_pyro.data.hdf5 import DemonstrationsError
@@ -107,3 +107,19 @@ def check_keys(keys: Iterable[str]) -> None:
         for above in ("/".join(parts[:length]) for length in range(1, len(parts))):
             if above in known:
                 raise DemonstrationsError(f"observations are called {above!r} and {key!r}; rename one")
+
+
+def first_missing(folder: Path, total: object, there: Collection[int], named: str) -> dict[int, str]:
+    """The first episode that a dataset counts and does not have, with what is wrong; empty where all are there.
+
+    :param total: the number of episodes that its metadata counts; not checked unless it is one.
+    :param there: the numbers of its episodes.
+    :param named: where they are, for messages.
+    :raises DemonstrationsError: there are more than are counted.
+    """
+    if not isinstance(total, int) or total == len(there):
+        return {}
+    counts = f"the metadata counts {total} episodes, and {named} has {len(there)}"
+    if total < len(there):
+        raise DemonstrationsError(f"{folder}: {counts}; correct total_episodes")
+    return {next(index for index in range(len(there) + 1) if index not in there): f"is missing: {counts}"}
