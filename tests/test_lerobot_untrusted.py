@@ -185,12 +185,14 @@ def test_data_need_not_lie_under_data(tmp_path: Path, run: Path) -> None:
 
 def test_placeholders() -> None:
     assert filled(
-        "d/{chunk_index:03d}/{video_key}/{file_index}", {"chunk_index": 7, "file_index": 12, "video_key": "a.b"}
+        Path("d"),
+        "d/{chunk_index:03d}/{video_key}/{file_index}",
+        {"chunk_index": 7, "file_index": 12, "video_key": "a.b"},
     ) == ("d/007/a.b/12")
-    assert filled("{chunk_index:012d}", {"chunk_index": 1}) == "000000000001"
+    assert filled(Path("d"), "{chunk_index:012d}", {"chunk_index": 1}) == "000000000001"
     for template in ("{chunk_index:3d}", "{chunk_index!r}", "{{x}}", "{video_key:03d}", "{file_index", "{}"):
         with pytest.raises(DemonstrationsError, match=r"may have only \{chunk_index\}, \{video_key\}, and"):
-            filled(template, {"chunk_index": 1, "video_key": "a"})
+            filled(Path("d"), template, {"chunk_index": 1, "video_key": "a"})
 
 
 def test_inside(tmp_path: Path) -> None:
@@ -203,7 +205,7 @@ def test_inside(tmp_path: Path) -> None:
 
 
 def test_keys_of_observations() -> None:
-    check_keys(["a", "b/c", "b/d", "..", "ab"])
+    check_keys(Path("d"), ["a", "b/c", "b/d", "..", "ab"])
     for keys in (["a//b"], ["/a"], ["."], ["\ud800"], ["a", "a"], ["a/b/c", "a"], [2000 * "x"]):
         with pytest.raises(DemonstrationsError):
-            check_keys(keys)
+            check_keys(Path("d"), keys)

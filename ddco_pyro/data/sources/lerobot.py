@@ -64,7 +64,7 @@ class LeRobot:
                 f"{folder}: is a LeRobot dataset {version}, and {VERSION}x can be read; {_CONVERT}"
             )
         self.features: dict[str, Any] = self.info["features"]
-        check_keys(_key(key) for key in self.features if key.startswith(OBSERVATION))
+        check_keys(folder, (_key(key) for key in self.features if key.startswith(OBSERVATION)))
         self._episodes, self._twice = _episodes(folder)
         if not self._episodes:
             raise DemonstrationsError(f"{folder}: meta/episodes holds no episodes; at least one is needed")
@@ -116,7 +116,7 @@ class LeRobot:
     def _path(self, template: str, index: int, prefix: str, **more: str) -> Path:
         try:
             numbers = {name: int(self._episodes[index][f"{prefix}/{name}"]) for name in ("chunk_index", "file_index")}
-            path = filled(str(self.info[template]), {**numbers, "episode_index": index, **more})
+            path = filled(self.folder, str(self.info[template]), {**numbers, "episode_index": index, **more})
         except _DAMAGE as error:
             raise damaged(self.folder, f"demo_{index}: {template}", error) from error
         return inside(self.folder, path)

@@ -56,7 +56,7 @@ def check_links(folder: Path) -> None:
                 raise DemonstrationsError(f"{folder}: {relative} is no regular file; remove it")
 
 
-def filled(template: str, values: Mapping[str, int | str]) -> str:
+def filled(folder: Path, template: str, values: Mapping[str, int | str]) -> str:
     """A template such as ``data/chunk-{chunk_index:03d}.parquet`` with its placeholders filled in.
 
     Numbers may be padded with zeros to a width of at most 12; no other format is known.
@@ -68,17 +68,19 @@ def filled(template: str, values: Mapping[str, int | str]) -> str:
         name, width = found[1], int(found[2] or 0)
         value = values.get(name)
         if value is None or width > _WIDEST or (width and isinstance(value, str)):
-            raise DemonstrationsError(_unknown(template, values))
+            raise _unknown(folder, template, values)
         return str(value).zfill(width)
 
     if set(_PLACEHOLDER.sub("", template)) & set("{}"):
-        raise DemonstrationsError(_unknown(template, values))
+        raise _unknown(folder, template, values)
     return _PLACEHOLDER.sub(fill, template)
 
 
-def _unknown(template: str, values: Iterable[str]) -> str:
+def _unknown(folder: Path, template: str, values: Iterable[str]) -> DemonstrationsError:
     known = ", ".join(f"{{{name}}}" for name in values)
-    return f"the path {template[:200]!r} may have only {known}, and numbers as {{chunk_index:03d}}"
+    return DemonstrationsError(
+        f"{folder}: the path {template[:200]!r} may have only {known}, and numbers as {{chunk_index:03d}}"
+    )
 
 
 def _storable(key: str) -> bool:
@@ -90,7 +92,7 @@ def _storable(key: str) -> bool:
     return length <= 1000 and "\0" not in key and all(part not in ("", ".") for part in key.split("/"))
 
 
-def check_keys(keys: Iterable[str]) -> None:
+def check_keys(folder: Path, keys: Iterable[str]) -> None:
     """See that observations can be stored under these keys beside each other.
 
     :raises DemonstrationsError: one is no path in HDF5, stands twice, or lies below another.
@@ -98,15 +100,17 @@ def check_keys(keys: Iterable[str]) -> None:
     known: set[str] = set()
     for key in keys:
         if not _storable(key):
-            raise DemonstrationsError(f"an observation is called {key[:100]!r}, which cannot be stored; rename it")
+            raise DemonstrationsError(
+                f"{folder}: an observation is called {key[:100]!r}, which cannot be stored; rename it"
+            )
         if key in known:
-            raise DemonstrationsError(f"two observations are called {key!r}; rename one")
+            raise DemonstrationsError(f"{folder}: two observations are called {key!r}; rename one")
         known.add(key)
     for key in known:
         parts = key.split("/")
         for above in ("/".join(parts[:length]) for length in range(1, len(parts))):
             if above in known:
-                raise DemonstrationsError(f"observations are called {above!r} and {key!r}; rename one")
+                raise DemonstrationsError(f"{folder}: observations are called {above!r} and {key!r}; rename one")
 
 
 def first_missing(folder: Path, total: object, there: Collection[int], named: str) -> dict[int, str]:

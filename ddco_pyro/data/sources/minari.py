@@ -60,7 +60,7 @@ class Minari:
         if said is not None and said != steps:
             raise DemonstrationsError(f"{self.folder}: {name}: total_steps is {said}, and there are {steps} actions")
         leaves = list(_leaves(episode["observations"], ""))
-        check_keys(key for key, _ in leaves)
+        check_keys(self.folder, (key for key, _ in leaves))
         # an observation of another number of steps is left as it is, and refused for it
         observations = {key: of_array(array[:-1] if len(array) == steps + 1 else array) for key, array in leaves}
         seed = facts.get("seed")
