@@ -127,11 +127,11 @@ def test_lerobots_videos_frame_by_frame(out: Path) -> None:
 @no_file_is_left_open
 def test_a_video_need_not_be_read_to_its_end() -> None:
     video = next((LEROBOT / "videos").rglob("*.mp4"))
-    frames = _frames(video, 0.0, 20, 10.0, (16, 32))
+    frames = _frames(video, "demo_0", 0.0, 20, 10.0, (16, 32))
     assert next(frames).shape == (16, 32, 3)
     frames.close()
     with pytest.raises(DemonstrationsError, match="has 26 frames from second 0 on, and 99 are needed"):
-        list(_frames(video, 0.0, 99, 10.0, (16, 32)))
+        list(_frames(video, "demo_0", 0.0, 99, 10.0, (16, 32)))
     gc.collect()
 
 
@@ -193,9 +193,9 @@ def no_json(dataset: Path) -> None:
         (remove_video, r"file-000\.mp4: the video is missing; leave its observation out with --observation"),
         (no_video, r"file-000\.mp4: cannot be decoded: .*Invalid data found"),
         (small_video, r"file-000\.mp4: is \d+ x \d+, and meta/info\.json says 11 x 12"),
-        (older, r"is a LeRobot dataset v2\.1, and v3\.x can be read; convert it with LeRobot's own script first"),
+        (older, r"is a LeRobot dataset v2\.1, and v3\.x can be read; convert it with LeRobot's own script: python -m"),
         (cut, r"demo_0: cannot be read, or is damaged"),
-        (no_rows, r"the rows of episode 0 are missing or not together"),
+        (no_rows, r"demo_0: its rows are missing in .*file-000\.parquet"),
         (no_json, r"info\.json: cannot be read, or is damaged"),
     ],
 )
@@ -274,6 +274,35 @@ def test_minaris_environment_is_never_made(written_by_minari, out: Path) -> None
     path.write_text(json.dumps(metadata | {"env_spec": '{"id": "x-v0", "entry_point": "antigravity:x"}'}))
     with pytest.raises(DemonstrationsError, match=r"metadata\.json does not say its observation and action spaces"):
         import_demonstrations(folder, out)
+
+
+def test_minaris_episodes_are_counted(written_by_minari, out: Path) -> None:
+    """One is gone, one says that it is longer, and one has an observation too many."""
+    folder, _ = written_by_minari(spaces.Box(-1, 1, (2,)))
+    with h5py.File(folder / "data" / "main_data.hdf5", "r+") as file:
+        del file["episode_1"]
+        file["episode_2"].attrs["total_steps"] = 9
+        joints = file["episode_3/observations/arm/joints"][:]
+        del file["episode_3/observations/arm/joints"]
+        file["episode_3/observations/arm/joints"] = np.concatenate([joints, joints[:1]])
+    left_out = import_demonstrations(folder, out, choice=Choice(skip_broken=True)).left_out
+    assert Demonstrations.read(out).names == ("demo_0",)
+    for name, message in {
+        "demo_1": "demo_1 is missing: the metadata counts 4 episodes, and the dataset has 3",
+        "demo_2": "demo_2: total_steps is 9, and there are 7 actions",
+        "demo_3": "demo_3: obs/arm/joints has 10 steps, but actions has 8",
+    }.items():
+        assert message in left_out[name]
+
+
+def test_minaris_paths_stay_in_the_dataset(written_by_minari, out: Path) -> None:
+    folder, _ = written_by_minari(spaces.Box(-1, 1, (2,)))
+    main = folder / "data" / "main_data.hdf5"
+    main.rename(folder.parent / "elsewhere.hdf5")
+    main.symlink_to(folder.parent / "elsewhere.hdf5")
+    for path in (folder, folder / "data", main):
+        with pytest.raises(DemonstrationsError, match=r"main_data\.hdf5 leads out of the dataset"):
+            import_demonstrations(path, out)
 
 
 # --- whole or not at all, and resumed ---------------------------------------------------------------------------------

@@ -22,10 +22,16 @@ class FormatName(StrEnum):
     robomimic = "robomimic"
     minari = "minari"
     lerobot = "lerobot"
+    maniskill = "maniskill"
+    act = "act"
+    d4rl = "d4rl"
 
 
 SourcePath = Annotated[
-    Path, typer.Argument(metavar="FILE", help="An HDF5 file, or the folder of a Minari or LeRobot dataset.")
+    Path,
+    typer.Argument(
+        metavar="FILE", help="An HDF5 file, or the folder of a Minari or LeRobot dataset, or of ACT's episodes."
+    ),
 ]
 FormatOption = Annotated[
     FormatName | None, typer.Option("--format", help="What wrote it; recognised unless given.", show_default=False)

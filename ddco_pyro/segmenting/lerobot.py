@@ -15,6 +15,7 @@ from pyarrow import parquet
 
 from ddco_pyro.data.files import whole_folder, write_text
 from ddco_pyro.data.sources.lerobot import SUBTASK, LeRobot
+from ddco_pyro.data.sources.metadata import inside
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting import Segmented
 from ddco_pyro.segmenting.lerobot_forms import PERSISTENT, Form, subtask_names
@@ -25,20 +26,22 @@ def annotate(source: LeRobot, out: Path, segmented: Segmented, level: str, form:
 
     Videos are linked where the file system can, else copied. A copy that has these very subtasks stays as it is.
 
-    :raises BadInput: ``out`` is something else, or the dataset has subtasks of its own.
+    :raises BadInput: ``out`` is something else, or the dataset has subtasks of its own, or rows of unknown episodes.
     """
     names = subtask_names(level, segmented.counts[level])
     check_target(source, out, names, form)
     options = {demo.name.removeprefix("demo_"): demo.levels[level].options for demo in segmented.segments}
     if out.exists():
-        if not all(_has(source.folder / path, out / path, options, names, form) for path in _data(source)):
+        if not all(_has(source.folder / path, out / path, options, names, form) for path in source.data_files):
             raise _taken(out)
         return
     with whole_folder(out) as temporary:
-        shutil.copytree(source.folder, temporary, dirs_exist_ok=True, copy_function=_link)
-        for path in (Path("meta/info.json"), *_data(source)):
-            (temporary / path).unlink()
-        for path in _data(source):
+        shutil.copytree(
+            source.folder, temporary, dirs_exist_ok=True, copy_function=_link, ignore_dangling_symlinks=True
+        )
+        for path in (Path("meta/info.json"), *source.data_files):
+            inside(temporary, path).unlink()
+        for path in source.data_files:
             _write(source.folder / path, temporary / path, options, names, form)
         for path, table in form.tables(names).items():
             parquet.write_table(table, temporary / path)
@@ -52,6 +55,8 @@ def check_target(source: LeRobot, out: Path, names: list[str], form: Form) -> No
     """
     if {SUBTASK, PERSISTENT} & source.features.keys():
         raise BadInput(f"{source.folder}: has subtasks already; name a dataset without them")
+    if out.resolve().is_relative_to(source.folder.resolve()):
+        raise BadInput(f"{out}: lies in the dataset itself; choose another --lerobot")
     info = out / "meta" / "info.json"
     if out.exists() and not (
         (info.is_file() and info.read_text(encoding="utf-8") == _info(source, form))
@@ -73,14 +78,10 @@ def _info(source: LeRobot, form: Form) -> str:
     return json.dumps({**source.info, "features": {**source.features, **form.features}}, indent=4) + "\n"
 
 
-def _data(source: LeRobot) -> list[Path]:
-    """The files of the dataset that hold steps."""
-    data = source.folder / "data"
-    return sorted(path.relative_to(source.folder) for path in source.files if path.is_relative_to(data))
-
-
 def _link(source: str, target: str) -> None:
-    if Path(source).suffix == ".mp4":
+    """Copy a file; of a link in the dataset, the file that it leads to."""
+    source = os.path.realpath(source)
+    if Path(target).suffix == ".mp4":
         try:
             os.link(source, target)
             return
@@ -118,9 +119,17 @@ def _has(source: Path, target: Path, options: Mapping[str, np.ndarray], names: l
 def _episodes(
     table: pyarrow.Table, options: Mapping[str, np.ndarray], names: list[str], form: Form
 ) -> Iterator[tuple[pyarrow.Table, dict[str, pyarrow.Array]]]:
-    """The rows of each episode in a data file, and the columns that go with them."""
+    """The rows of each episode in a data file, and the columns that go with them.
+
+    :raises BadInput: it has rows of an episode that the dataset does not name, or no times.
+    """
+    if "timestamp" not in table.column_names:
+        raise BadInput("the data files have no column timestamp; subtasks begin at times of frames")
     index = table["episode_index"].to_numpy()
     bounds = [0, *(np.flatnonzero(np.diff(index)) + 1).tolist(), len(index)]
     for start, stop in pairwise(bounds):
         rows = table.slice(start, stop - start)
-        yield rows, form.columns(rows, options[str(index[start])], names)
+        known = options.get(str(index[start]))
+        if known is None or len(known) != len(rows):
+            raise BadInput(f"the data files have rows of episode {index[start]} that meta/episodes does not name")
+        yield rows, form.columns(rows, known, names)

@@ -1,19 +1,22 @@
 """Demonstrations as other libraries store them, each behind the same face: names, masks, and recordings read in blocks.
 
-``robomimic`` HDF5 files (this project's own layout too), ``minari`` datasets and ``lerobot`` v3 datasets.
+``robomimic`` HDF5 files (this project's own layout too), ``minari`` datasets and ``lerobot`` v3 datasets; HDF5 files of
+``maniskill``, ``act`` and ``d4rl``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
+from ddco_pyro.data.hdf5 import Attribute
+from ddco_pyro.data.sources.layouts import format_of
 from ddco_pyro.data.sources.recording import Column, Format, Recording
 
-__all__ = ["Column", "Format", "Recording", "Source", "open_source"]
+__all__ = ["Column", "Format", "Recording", "Source", "format_of", "open_source"]
 
 
 class Source(Protocol):
@@ -47,27 +50,6 @@ class Source(Protocol):
         """One of them; its arrays can be read while the source is open."""
 
 
-def format_of(path: Path) -> Format:
-    """Which library wrote this.
-
-    :raises DemonstrationsError: there is nothing, or nothing known.
-    """
-    if (path / "meta" / "info.json").is_file():
-        return "lerobot"
-    if (path / "data" / "metadata.json").is_file() or (path / "metadata.json").is_file():
-        return "minari"
-    if path.name == "main_data.hdf5" and path.with_name("metadata.json").is_file():
-        return "minari"
-    if path.is_file():
-        return "robomimic"
-    if not path.exists():
-        raise DemonstrationsError(f"{path}: there is no such file or folder; check the path")
-    raise DemonstrationsError(
-        f"{path}: is a folder of no known format; name an HDF5 file, a Minari dataset's folder (with "
-        "data/metadata.json), or a LeRobot dataset's folder (with meta/info.json)"
-    )
-
-
 @contextmanager
 def open_source(path: str | Path, form: Format | None = None) -> Iterator[Source]:
     """Open a file or folder; the format is recognised unless it is given.
@@ -90,6 +72,10 @@ def _opener(form: Format) -> Callable[[Path], AbstractContextManager[Source]]:
         from ddco_pyro.data.sources.minari import open_minari
 
         return open_minari
+    if form in ("maniskill", "act", "d4rl"):
+        from ddco_pyro.data.sources.hdf5_layouts import open_layout
+
+        return partial(open_layout, form=form)
     from ddco_pyro.data.sources.lerobot import open_lerobot
 
     return open_lerobot

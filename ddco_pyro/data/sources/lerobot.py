@@ -6,9 +6,11 @@ Read with pyarrow, without LeRobot itself; what is not used (videos, unless aske
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,14 @@ import cv2
 import numpy as np
 
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
+from ddco_pyro.data.memory import refuse_too_much
+from ddco_pyro.data.sources.metadata import check_keys, check_links, filled, first_missing, inside
 from ddco_pyro.data.sources.recording import Column, Format, Recording, damaged, of_array
 from ddco_pyro.data.sources.video import video_column
 
 try:
     import pyarrow
+    import pyarrow.compute as compute
     import pyarrow.parquet as parquet
 except ImportError:  # pragma: no cover (the tests' environment has it)
     raise DemonstrationsError(
@@ -28,9 +33,15 @@ except ImportError:  # pragma: no cover (the tests' environment has it)
     ) from None
 
 VERSION = "v3."
+_CONVERT = (
+    "convert it with LeRobot's own script: python -m lerobot.scripts.convert_dataset_v21_to_v30 (in LeRobot 0.4: "
+    "lerobot.datasets.v30.convert_dataset_v21_to_v30)"
+)
 OBSERVATION = "observation."
 SUBTASK = "subtask_index"
 IMAGES_AT_ONCE = 32
+_LONGEST = 1e9
+"""Seconds: no video is longer."""
 _DAMAGE = (pyarrow.ArrowException, OSError, KeyError, ValueError, TypeError, IndexError)
 
 
@@ -45,38 +56,76 @@ class LeRobot:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        check_links(folder)
         self.info: dict[str, Any] = _json(folder / "meta" / "info.json")
         version = str(self.info.get("codebase_version", "of no version"))
         if not version.startswith(VERSION):
             raise DemonstrationsError(
-                f"{folder}: is a LeRobot dataset {version}, and {VERSION}x can be read; convert it with "
-                "LeRobot's own script first"
+                f"{folder}: is a LeRobot dataset {version}, and {VERSION}x can be read; {_CONVERT}"
             )
         self.features: dict[str, Any] = self.info["features"]
-        self._episodes = _episodes(folder)
+        check_keys(folder, (_key(key) for key in self.features if key.startswith(OBSERVATION)))
+        self._episodes, self._twice = _episodes(folder)
         if not self._episodes:
             raise DemonstrationsError(f"{folder}: meta/episodes holds no episodes; at least one is needed")
-        self.names = tuple(f"demo_{index}" for index in self._episodes)
+        self._missing = first_missing(folder, self.info.get("total_episodes"), self._episodes, "meta/episodes")
+        self.names = tuple(f"demo_{index}" for index in (*self._episodes, *self._missing))
         fps = self.info.get("fps")
-        self.frequency = float(fps) if isinstance(fps, int | float) and fps > 0 else None
+        self.frequency = float(fps) if isinstance(fps, int | float) and 0 < fps < math.inf else None
         self.masks = self._masks()
         robot = self.info.get("robot_type")
         self.attributes: Mapping[str, Attribute] = {"robot_type": robot} if isinstance(robot, str) else {}
-        data = sorted({self.data_file(index) for index in self._episodes})
-        self.files = (folder / "meta" / "info.json", *sorted((folder / "meta").rglob("*.parquet")), *data)
+        self.data_files = self._data_files()
+        self._check_frames()
+        meta = sorted((folder / "meta").rglob("*.parquet"))
+        data = (folder / path for path in self.data_files)
+        self.files = (folder / "meta" / "info.json", *meta, *(path for path in data if path.is_file()))
+
+    def _data_files(self) -> tuple[Path, ...]:
+        """The files that hold the episodes' rows, relative to the folder; some may be missing.
+
+        :raises DemonstrationsError: the metadata names one outside it.
+        """
+        named = {self.data_file(index) for index in self._episodes}
+        return tuple(sorted(path.relative_to(self.folder) for path in named))
+
+    def _check_frames(self) -> None:
+        """See that all rows, or all the episodes' lengths, add up to the number of frames in ``meta/info.json``.
+
+        Where only one of the two does, the episode that differs says so itself.
+
+        :raises DemonstrationsError: neither does.
+        """
+        total, files = self.info.get("total_frames"), [self.folder / path for path in self.data_files]
+        lengths = [length for row in self._episodes.values() if isinstance(length := row.get("length"), int)]
+        whole = len(lengths) == len(self.names) and all(path.is_file() for path in files)
+        if whole and isinstance(total, int) and total != sum(lengths):
+            rows = sum(_count(file) for file in files)
+            if total != rows:
+                raise DemonstrationsError(
+                    f"{self.folder}: meta/info.json counts {total} frames, and {rows} are there; correct total_frames"
+                )
 
     def data_file(self, index: int) -> Path:
-        """The parquet file that holds an episode's rows."""
-        return self.folder / self._path("data_path", self._episodes[index], "data")
+        """The parquet file that holds an episode's rows.
 
-    def _path(self, template: str, episode: Mapping[str, Any], prefix: str, **more: str) -> str:
-        numbers = {name: int(episode[f"{prefix}/{name}"]) for name in ("chunk_index", "file_index")}
-        return str(self.info[template]).format(**numbers, **more)
+        :raises DemonstrationsError: it lies outside the dataset's folder.
+        """
+        return self._path("data_path", index, "data")
+
+    def _path(self, template: str, index: int, prefix: str, **more: str) -> Path:
+        try:
+            numbers = {name: int(self._episodes[index][f"{prefix}/{name}"]) for name in ("chunk_index", "file_index")}
+            path = filled(self.folder, str(self.info[template]), {**numbers, "episode_index": index, **more})
+        except _DAMAGE as error:
+            raise damaged(self.folder, f"demo_{index}: {template}", error) from error
+        return inside(self.folder, path)
 
     def _masks(self) -> dict[str, tuple[str, ...]]:
         """The splits, such as ``train: "0:40"``, that are not simply all of it."""
-        masks = {}
-        for name, span in (self.info.get("splits") or {}).items():
+        masks: dict[str, tuple[str, ...]] = {}
+        splits = self.info.get("splits")
+        for name, span in splits.items() if isinstance(splits, dict) else ():
             start, _, stop = str(span).partition(":")
             if start.isdecimal() and stop.isdecimal():
                 members = [f"demo_{index}" for index in self._episodes if int(start) <= index < int(stop)]
@@ -87,11 +136,19 @@ class LeRobot:
     def recording(self, name: str) -> Recording:
         """One episode.
 
-        :raises DemonstrationsError: its rows are missing or damaged.
+        :raises DemonstrationsError: its rows are missing, out of order or damaged, or fewer or more than are named.
         """
         index = int(name.removeprefix("demo_"))
+        if index in self._missing:
+            raise DemonstrationsError(f"{name} {self._missing[index]}")
+        if index in self._twice:
+            raise DemonstrationsError(f"{name}: meta/episodes names it twice; remove one of the two")
+        path = self.data_file(index)
+        if not path.is_file():
+            raise DemonstrationsError(f"{name}: {path} is missing; fetch the dataset again")
         try:
-            rows = _Rows(self.data_file(index), index, name)
+            rows = _Rows(path, index, name)
+            self._check(rows, index)
             keys = [key for key in self.features if key.startswith(OBSERVATION)]
             observations = {_key(key): self._column(rows, key, index) for key in keys}
             labels = {"subtask": rows.vectors(SUBTASK, ())} if SUBTASK in rows.present else {}
@@ -99,6 +156,27 @@ class LeRobot:
         except _DAMAGE as error:
             raise damaged(self.folder, name, error) from error
         return Recording(name, observations, actions, labels, self._facts(index))
+
+    def _check(self, rows: _Rows, index: int) -> None:
+        """See that an episode has as many rows as it is said to have, in the order in which they were recorded.
+
+        :raises DemonstrationsError: it has not.
+        """
+        said, there = self._episodes[index], len(rows)
+        start, stop = said.get("dataset_from_index"), said.get("dataset_to_index")
+        spanned = None if start is None or stop is None else stop - start
+        for what, length in (("length", said.get("length")), ("dataset_to_index - dataset_from_index", spanned)):
+            if length is not None and length != there:
+                raise DemonstrationsError(
+                    f"{rows.name}: {what} in meta/episodes is {length}, and {rows.path} has {there} rows of it"
+                )
+        steps = np.arange(there)
+        if "frame_index" in rows.present:
+            frames = rows.vectors("frame_index", ()).array()
+            _refuse_where(frames != steps, rows, "frame_index", frames, steps)
+        if "timestamp" in rows.present and self.frequency:
+            times, expected = rows.vectors("timestamp", ()).array(), steps / self.frequency
+            _refuse_where(~(np.abs(times - expected) < 0.5 / self.frequency), rows, "timestamp", times, expected)
 
     def _facts(self, index: int) -> dict[str, Attribute]:
         tasks = self._episodes[index].get("tasks")
@@ -110,10 +188,11 @@ class LeRobot:
         if kind == "image":
             return rows.images(key, self._size(key))
         if kind == "video":
-            episode = self._episodes[index]
-            path = self.folder / self._path("video_path", episode, f"videos/{key}", video_key=key)
-            start = float(episode[f"videos/{key}/from_timestamp"])
-            return video_column(path, start, len(rows), self._size(key), self.frequency or 1.0)
+            path = self._path("video_path", index, f"videos/{key}", video_key=key)
+            start = float(self._episodes[index][f"videos/{key}/from_timestamp"])
+            if not 0 <= start < _LONGEST:
+                raise ValueError(f"{key} begins at second {start:g} of its video")
+            return video_column(path, rows.name, start, len(rows), self._size(key), self.frequency or 1.0)
         return rows.vectors(key, self.features[key]["shape"])
 
     def _size(self, key: str) -> tuple[int, int]:
@@ -122,6 +201,16 @@ class LeRobot:
         first = names[:1] in (["channels"], ["channel"]) or (not names and shape[0] in (1, 3))
         height, width = shape[1:] if first else shape[:2]
         return int(height), int(width)
+
+
+def _refuse_where(wrong: np.ndarray, rows: _Rows, what: str, values: np.ndarray, expected: np.ndarray) -> None:
+    """Refuse an episode with a row whose value is not what its place says."""
+    if wrong.any():
+        at = int(wrong.argmax())
+        raise DemonstrationsError(
+            f"{rows.name}: {what} is {values[at]:g} in row {at}, not {expected[at]:g}: frames are missing or out of "
+            f"order in {rows.path}"
+        )
 
 
 def _key(name: str) -> str:
@@ -133,19 +222,22 @@ class _Rows:
 
     def __init__(self, path: Path, episode: int, name: str) -> None:
         self.path, self.name = path, name
-        file, index = _open(path, path.stat().st_mtime_ns)
+        file, spans = _open(path, path.stat().st_mtime_ns)
         self.present = set(file.schema_arrow.names)
-        (rows,) = np.nonzero(index == episode)
-        if not len(rows) or rows[-1] - rows[0] + 1 != len(rows):
-            raise DemonstrationsError(f"{path}: the rows of episode {episode} are missing or not together")
-        self.start, self.stop = int(rows[0]), int(rows[-1]) + 1
+        there = spans.get(episode, [])
+        if len(there) != 1:
+            what = "are not together" if there else "are missing"
+            raise DemonstrationsError(f"{name}: its rows {what} in {path}")
+        ((self.start, self.stop),) = there
 
     def __len__(self) -> int:
         return self.stop - self.start
 
     def vectors(self, key: str, shape: Sequence[int] = (1,)) -> Column:
         """A column of numbers, or of lists of numbers, whose steps have this shape."""
-        parts = [_flat(batch.column(0)).reshape(len(batch), *shape) for batch in self._batches(key, 4096)]
+        size = math.prod(shape)
+        refuse_too_much(8 * size * len(self), f"{self.name}: {key}", "leave it out with --observation")
+        parts = [_flat(batch.column(0), size).reshape(len(batch), *shape) for batch in self._batches(key, 4096)]
         return of_array(np.concatenate(parts))
 
     def images(self, key: str, size: tuple[int, int]) -> Column:
@@ -181,30 +273,66 @@ class _Rows:
                 yield batch.slice(low, high - low)
 
 
-def _flat(values: Any) -> np.ndarray:
+def _flat(values: Any, size: int) -> np.ndarray:
+    """The numbers of a column, each row of which has ``size`` of them.
+
+    :raises ValueError: a row has another number of them.
+    """
+    rows = len(values)
     while pyarrow.types.is_nested(values.type):
+        lengths = compute.list_value_length(values)
+        if lengths.null_count or len(lengths.unique()) > 1:
+            raise ValueError("its rows differ in length, or are missing")
         values = values.flatten()
+    if len(values) != rows * size:
+        raise ValueError(f"its rows have {len(values) // max(rows, 1)} numbers, and meta/info.json says {size}")
     return values.to_numpy(zero_copy_only=False)
 
 
 @lru_cache(maxsize=2)
-def _open(path: Path, changed: int) -> tuple[parquet.ParquetFile, np.ndarray]:
-    """A parquet file and the episode of each of its rows; ``changed`` tells versions of the file apart."""
+def _open(path: Path, changed: int) -> tuple[parquet.ParquetFile, Mapping[int, list[tuple[int, int]]]]:
+    """A parquet file, and for each episode the spans of its rows; ``changed`` tells versions of the file apart."""
     file = parquet.ParquetFile(path)
-    return file, file.read(["episode_index"]).column(0).to_numpy()
+    refuse_too_much(8 * file.metadata.num_rows, f"{path}: its {file.metadata.num_rows} rows", "divide it")
+    index = file.read(["episode_index"]).column(0).to_numpy()
+    bounds = [0, *(np.flatnonzero(np.diff(index)) + 1).tolist(), len(index)]
+    spans: dict[int, list[tuple[int, int]]] = {}
+    for start, stop in pairwise(bounds):
+        spans.setdefault(int(index[start]), []).append((start, stop))
+    return file, spans
 
 
-def _episodes(folder: Path) -> dict[int, dict[str, Any]]:
-    """What ``meta/episodes`` says of each episode, by its number, without the statistics."""
+def _count(path: Path) -> int:
+    """Rows of a parquet file, by its footer."""
+    try:
+        return parquet.read_metadata(path).num_rows
+    except _DAMAGE as error:
+        raise damaged(path, "", error) from error
+
+
+ROW_BYTES = 1000
+"""About what a row of ``meta/episodes`` takes in memory."""
+
+
+def _episodes(folder: Path) -> tuple[dict[int, dict[str, Any]], set[int]]:
+    """What ``meta/episodes`` says of each episode without its statistics, by number; and which episodes it names twice.
+
+    :raises DemonstrationsError: it is damaged.
+    """
     episodes: dict[int, dict[str, Any]] = {}
+    twice: set[int] = set()
     for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
         try:
+            refuse_too_much(ROW_BYTES * _count(path), f"{path}: its rows", "divide the dataset")
             names = parquet.read_schema(path).names
             rows = parquet.read_table(path, columns=[key for key in names if not key.startswith("stats/")]).to_pylist()
-            episodes |= {int(row["episode_index"]): row for row in rows}
+            for row in rows:
+                index = int(row["episode_index"])
+                twice |= {index} & episodes.keys()
+                episodes[index] = row
         except _DAMAGE as error:
             raise damaged(path, "", error) from error
-    return dict(sorted(episodes.items()))
+    return dict(sorted(episodes.items())), twice
 
 
 def _json(path: Path) -> dict[str, Any]:

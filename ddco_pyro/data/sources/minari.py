@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError
+from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError, opened
+from ddco_pyro.data.sources.metadata import check_keys, check_links, first_missing
 from ddco_pyro.data.sources.recording import Column, Format, Recording, damaged, of_array
 
 BARE = "observation"
@@ -28,8 +29,10 @@ class Minari:
 
     def __init__(self, folder: Path, storage: Any) -> None:
         self.folder, self._storage = folder, storage
-        self.names = tuple(f"demo_{index}" for index in range(int(storage.total_episodes)))
-        if not self.names:
+        stored = _stored(folder)
+        self._missing = first_missing(folder, storage.total_episodes, stored, "the dataset")
+        self.names = tuple(f"demo_{index}" for index in sorted({*stored, *self._missing}))
+        if not stored:
             raise DemonstrationsError(f"{folder}: holds no episodes; at least one is needed")
         self.attributes: Mapping[str, Attribute] = {"dataset_id": str(storage.metadata.get("dataset_id", ""))}
         self.files = tuple(sorted(path for path in folder.rglob("*") if path.is_file()))
@@ -37,21 +40,29 @@ class Minari:
     def recording(self, name: str) -> Recording:
         """One episode, wholly in memory.
 
-        :raises DemonstrationsError: it is damaged, or its actions are not one array of numbers.
+        :raises DemonstrationsError: it is missing or damaged, or its actions are not one array of numbers.
         """
         index = int(name.removeprefix("demo_"))
+        if index in self._missing:
+            raise DemonstrationsError(f"{self.folder}: {name} {self._missing[index]}")
         try:
             (episode,) = self._storage.get_episodes([index])
             (facts,) = self._storage.get_episode_metadata([index])
         except (*DAMAGE, AssertionError) as error:
             raise damaged(self.folder, name, error) from error
-        actions, steps = episode["actions"], len(episode["rewards"])
+        actions = episode["actions"]
         if not isinstance(actions, np.ndarray) or actions.dtype.kind not in "fiu":
             what = actions.dtype if isinstance(actions, np.ndarray) else "several arrays"
             raise DemonstrationsError(
                 f"{self.folder}: {name}: actions are {what}, they have to be one array of numbers"
             )
-        observations = {key: of_array(array[:steps]) for key, array in _leaves(episode["observations"], "")}
+        steps, said = len(actions), facts.get("total_steps")
+        if said is not None and said != steps:
+            raise DemonstrationsError(f"{self.folder}: {name}: total_steps is {said}, and there are {steps} actions")
+        leaves = list(_leaves(episode["observations"], ""))
+        check_keys(self.folder, (key for key, _ in leaves))
+        # an observation of another number of steps is left as it is, and refused for it
+        observations = {key: of_array(array[:-1] if len(array) == steps + 1 else array) for key, array in leaves}
         seed = facts.get("seed")
         known: dict[str, Attribute] = {"episode_index": index}
         if seed is not None:
@@ -75,6 +86,17 @@ def _leaves(observations: Any, key: str) -> Iterator[tuple[str, np.ndarray]]:
         yield key or BARE, observations if observations.ndim > 1 else observations[:, None]
 
 
+def _stored(folder: Path) -> set[int]:
+    """The numbers of the episodes that a dataset has: groups of an HDF5 file, or folders of Arrow files."""
+    main = folder / "main_data.hdf5"
+    if main.is_file():
+        with opened(main) as file:
+            names = [name.removeprefix("episode_") for name in file]
+    else:
+        names = [path.name for path in folder.iterdir() if path.is_dir()]
+    return {int(name) for name in names if name.isdecimal()}
+
+
 @contextmanager
 def open_minari(path: Path) -> Iterator[Minari]:
     """Open a dataset's folder, its folder ``data``, or the ``main_data.hdf5`` in there.
@@ -88,6 +110,7 @@ def open_minari(path: Path) -> Iterator[Minari]:
             "reading Minari datasets needs minari; install it with: pip install 'ddco-pyro[minari]'"
         ) from None
     folder = path.parent if path.is_file() else path / "data" if (path / "data").is_dir() else path
+    check_links(folder)
     try:
         spaces = MinariStorage.read_raw_metadata(folder).keys() & {"observation_space", "action_space"}
         if len(spaces) < 2:  # Minari would make the environment to ask for them, which runs the data's code

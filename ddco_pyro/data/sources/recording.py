@@ -17,7 +17,7 @@ from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, block_steps
 
-Format = Literal["robomimic", "minari", "lerobot"]
+Format = Literal["robomimic", "minari", "lerobot", "maniskill", "act", "d4rl"]
 
 
 @dataclass(frozen=True)

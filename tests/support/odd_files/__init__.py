@@ -1,4 +1,4 @@
-"""Odd and hostile files, and what the commands say of them."""
+"""Odd and hostile files by name, a module for each kind of file."""
 
 from __future__ import annotations
 

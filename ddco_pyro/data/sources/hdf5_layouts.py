@@ -1,0 +1,220 @@
+"""HDF5 files of ManiSkill, ACT and D4RL: other names and cuts of the same arrays, read in blocks.
+
+A file is opened anew for each array: a folder can have more episodes than files may be open.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from shlex import quote
+
+import cv2
+import h5py
+import numpy as np
+
+from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, dataset_at, datasets, member, natural, opened
+from ddco_pyro.data.pictures import block_steps
+from ddco_pyro.data.sources.layouts import EPISODE, TRAJECTORY
+from ddco_pyro.data.sources.metadata import inside
+from ddco_pyro.data.sources.recording import Column, Format, Recording, of_array, of_dataset
+
+BARE = "state"
+"""Key of observations that are one array without a name."""
+
+
+class _Source(ABC):
+    """Demonstrations that are each a group of a file."""
+
+    format: Format
+    frequency: float | None = None
+    masks: Mapping[str, tuple[str, ...]] = {}
+    attributes: Mapping[str, Attribute] = {}
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._places = self._found()
+        if not self._places:
+            raise DemonstrationsError(f"{path}: holds no demonstrations; at least one is needed")
+        self.names = tuple(self._places)
+        self.files = tuple(dict.fromkeys(file for file, _ in self._places.values()))
+
+    @abstractmethod
+    def _found(self) -> dict[str, tuple[Path, str]]:
+        """The file and the group of each demonstration by name, in order."""
+
+    def recording(self, name: str) -> Recording:
+        """One demonstration.
+
+        :raises DemonstrationsError: a part of it is missing.
+        """
+        path, group = self._places[name]
+        with opened(path) as file:
+            return self._read(name, member(file, group, h5py.Group, ""))
+
+    @abstractmethod
+    def _read(self, name: str, group: h5py.Group) -> Recording:
+        """The demonstration in a group."""
+
+
+class ManiSkill(_Source):
+    """Groups ``traj_0``, ... with ``actions`` [T, A] and ``obs``, one array or a tree of arrays [T + 1, ...].
+
+    The last observation, after which nothing is done, is left out.
+    """
+
+    format: Format = "maniskill"
+
+    def _found(self) -> dict[str, tuple[Path, str]]:
+        with opened(self.path) as file:
+            names = sorted((name for name in file if TRAJECTORY.fullmatch(name)), key=natural)
+            if names and not any(_observed(member(file, name, h5py.Group, ""), name) for name in names):
+                raise DemonstrationsError(
+                    "has no observations; ManiSkill makes them: python -m mani_skill.trajectory.replay_trajectory "
+                    f"--traj-path {quote(str(self.path))} --save-traj -o state"
+                )
+        return {name.replace("traj", "demo"): (self.path, name) for name in names}
+
+    def _read(self, name: str, group: h5py.Group) -> Recording:
+        actions = _column(group, "actions", name)
+        steps = actions.shape[0]
+        observations = {}
+        for key, place in _observed(group, name).items():
+            after = len(dataset_at(group, place, f"{name}: ")) == steps + 1
+            observations[key] = _column(group, place, name, slice(steps) if after else slice(None))
+        return Recording(name, observations, actions)
+
+
+class Act(_Source):
+    """Files ``episode_0.hdf5``, ... with ``action`` [T, A] and ``observations/<key>`` [T, ...].
+
+    The ``base_action`` [T, B] of a mobile base is part of the control. Pictures may be encoded, as bytes [T, longest].
+    """
+
+    format: Format = "act"
+
+    def _found(self) -> dict[str, tuple[Path, str]]:
+        if self.path.is_dir():
+            names = sorted((one.name for one in self.path.iterdir() if EPISODE.fullmatch(one.name)), key=natural)
+            files = [inside(self.path, name) for name in names]
+        else:
+            files = [self.path]
+        found: dict[str, tuple[Path, str]] = {}
+        for file in files:
+            name = f"demo_{_number(file)}"
+            if name in found:
+                raise DemonstrationsError(f"{file}: has the number of {found[name][0].name}; rename one")
+            found[name] = (file, "/")
+        return found
+
+    def _read(self, name: str, group: h5py.Group) -> Recording:
+        actions = _column(group, "action", name)
+        if "base_action" in group:
+            actions = _beside(actions, _column(group, "base_action", name), name)
+        keys = datasets(member(group, "observations", h5py.Group, f"{name}: "))
+        observations = {key: _column(group, f"observations/{key}", name) for key in keys}
+        for key, column in observations.items():
+            if key.startswith("images/") and column.dtype == np.uint8 and len(column.shape) == 2 and column.shape[0]:
+                observations[key] = _decoded(column, f"{name}: observations/{key}")
+        return Recording(name, observations, actions)
+
+
+class D4RL(_Source):
+    """All steps one after another: ``observations`` [N, ...], ``actions`` [N, A], ``terminals`` [N], ``timeouts`` [N].
+
+    A demonstration ends where one of the last two is true, and where the file ends.
+    """
+
+    format: Format = "d4rl"
+
+    def _found(self) -> dict[str, tuple[Path, str]]:
+        with opened(self.path) as file:
+            if "timeouts" not in file:
+                raise DemonstrationsError(
+                    "has no timeouts, so nothing says where demonstrations end that do not end by themselves; take a "
+                    "later version of the dataset"
+                )
+            steps = len(dataset_at(file, "actions", ""))
+            ends = np.zeros(steps, bool)
+            for key in ("terminals", "timeouts"):
+                values = _column(file, key, "").array().reshape(-1) if key in file else ends
+                if len(values) != steps:
+                    raise DemonstrationsError(f"{key} has {len(values)} steps, but actions has {steps}")
+                ends |= values.astype(bool)
+        bounds = [0, *(np.flatnonzero(ends[:-1]) + 1).tolist(), steps]
+        self._spans = {f"demo_{number}": slice(*span) for number, span in enumerate(pairwise(bounds)) if steps}
+        return dict.fromkeys(self._spans, (self.path, "/"))
+
+    def _read(self, name: str, group: h5py.Group) -> Recording:
+        observations, actions = (_column(group, key, name, self._spans[name]) for key in ("observations", "actions"))
+        return Recording(name, {BARE: observations}, actions)
+
+
+def _observed(group: h5py.Group, name: str) -> dict[str, str]:
+    """The observations of one of ManiSkill's trajectories by key, with their places."""
+    if "obs" not in group:
+        return {}
+    obs = member(group, "obs", h5py.HLObject, f"{name}: ")
+    return {BARE: "obs"} if isinstance(obs, h5py.Dataset) else {key: f"obs/{key}" for key in datasets(obs)}
+
+
+def _number(file: Path) -> int:
+    found = EPISODE.fullmatch(file.name)
+    return int(found[1]) if found else 0
+
+
+def _column(group: h5py.Group, key: str, name: str, part: slice = slice(None)) -> Column:
+    """These steps of a dataset, read from the disk when they are wanted; one number a step is a vector of one."""
+    dataset = dataset_at(group, key, f"{name}: " if name else "")
+    known = of_dataset(dataset, f"{name}: {key}")
+    path, place, bare = Path(dataset.file.filename), dataset.name, dataset.ndim == 1
+    start, stop, _ = part.indices(len(dataset))
+    at_once = block_steps(dataset.shape[1:], dataset.dtype)
+
+    def blocks() -> Iterator[np.ndarray]:
+        with opened(path) as file:
+            for at in range(start, stop, at_once):
+                block = file[place][at : min(at + at_once, stop)]
+                yield block[:, None] if bare else block
+
+    return Column((max(stop - start, 0), *((1,) if bare else known.shape[1:])), known.dtype, blocks)
+
+
+def _beside(actions: Column, base: Column, name: str) -> Column:
+    """The control of an arm [T, A] and of its base [T, B] as one [T, A + B]."""
+    steps = actions.shape[0]
+    if len(actions.shape) != 2 or len(base.shape) != 2 or base.shape[0] != steps:
+        raise DemonstrationsError(f"{name}: base_action has shape {base.shape}, and action {actions.shape}")
+    return of_array(np.concatenate([actions.array(), base.array()], 1))
+
+
+def _decoded(column: Column, where: str) -> Column:
+    """Encoded pictures [T, bytes] as uint8 [T, H, W, 3], their channels in the order in which they were encoded."""
+
+    def decode(encoded: np.ndarray, shape: tuple[int, ...] | None = None) -> np.ndarray:
+        picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+        if picture is None or picture.shape != (shape or picture.shape):
+            raise DemonstrationsError(f"{where}: a picture cannot be decoded, or is of another size than the first")
+        return picture
+
+    shape = decode(next(column.blocks())[0]).shape
+    at_once = block_steps(shape, np.dtype(np.uint8))
+
+    def blocks() -> Iterator[np.ndarray]:
+        for block in column.blocks():
+            for at in range(0, len(block), at_once):
+                yield np.stack([decode(encoded, shape) for encoded in block[at : at + at_once]])
+
+    return Column((column.shape[0], *shape), np.dtype(np.uint8), blocks)
+
+
+@contextmanager
+def open_layout(path: Path, form: Format) -> Iterator[ManiSkill | Act | D4RL]:
+    """Open a file of one of these formats, or a folder of ACT's.
+
+    :raises DemonstrationsError: it cannot be read or holds no demonstrations.
+    """
+    yield ManiSkill(path) if form == "maniskill" else Act(path) if form == "act" else D4RL(path)

@@ -1,0 +1,210 @@
+"""Files and folders of other libraries, in their true layouts: some are read, others have to be converted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+
+from odd_files import Row
+
+LENGTHS = 3, 5, 4
+"""Steps of each demonstration."""
+
+
+def control(number: int) -> np.ndarray:
+    """The control of a demonstration [T, 2]; every number tells which."""
+    steps = np.arange(LENGTHS[number], dtype=np.float32)
+    return np.stack([steps, np.full_like(steps, number)], 1) / 10
+
+
+def state(number: int, more: int = 0) -> np.ndarray:
+    """The state before each step [T, 3], and ``more`` states after the last."""
+    steps = np.arange(LENGTHS[number] + more, dtype=np.float32)
+    return np.stack([steps, steps**2, np.full_like(steps, number)], 1)
+
+
+def pictures(number: int) -> np.ndarray:
+    """Pictures of one colour each [T, 16, 24, 3]."""
+    colours = np.arange(LENGTHS[number])[:, None] * [10, 20, 30] + number
+    return np.broadcast_to(colours[:, None, None], (LENGTHS[number], 16, 24, 3)).astype(np.uint8)
+
+
+def maniskill(obs: str) -> Callable[[Path], Path]:
+    """A file as ManiSkill's ``RecordEpisode`` writes it, with observations as one array, as a tree, or without."""
+
+    def make(folder: Path) -> Path:
+        path = folder / "trajectory.h5"
+        with h5py.File(path, "w") as file:
+            for number, steps in enumerate(LENGTHS):
+                group = file.create_group(f"traj_{number}", track_order=True)
+                group["actions"] = control(number)
+                for name in ("terminated", "truncated", "success"):
+                    group[name] = np.arange(steps) == steps - 1
+                group["env_states/actors/cube"] = state(number, 1)
+                if obs == "array":
+                    group["obs"] = state(number, 1)
+                if obs == "tree":
+                    group["obs/agent/qpos"] = state(number, 1)
+                    group["obs/extra/is_grasped"] = np.arange(steps + 1) > 1
+        path.with_suffix(".json").write_text(json.dumps({"env_info": {"env_id": "PickCube-v1"}, "episodes": []}))
+        return path
+
+    return make
+
+
+def act_file(path: Path, number: int, encoded: bool = False, base: bool = False) -> None:
+    """An episode as ACT's and Mobile ALOHA's recording scripts write it."""
+    with h5py.File(path, "w") as file:
+        file.attrs["sim"] = True
+        file["action"] = control(number)
+        file["observations/qpos"] = state(number)
+        if base:
+            file["base_action"] = -control(number)
+        seen = pictures(number)
+        if encoded:
+            file.attrs["compress"] = True
+            packed = [cv2.imencode(".jpg", one, [cv2.IMWRITE_JPEG_QUALITY, 95])[1] for one in seen]
+            longest = max(map(len, packed))
+            seen = np.stack([np.pad(one, (0, longest - len(one))) for one in packed])
+        file["observations/images/top"] = seen
+
+
+def act(encoded: bool = False, base: bool = False) -> Callable[[Path], Path]:
+    """A folder of such episodes."""
+
+    def make(folder: Path) -> Path:
+        dataset = folder / "episodes"
+        dataset.mkdir()
+        for number in range(len(LENGTHS)):
+            act_file(dataset / f"episode_{number}.hdf5", number, encoded, base)
+        return dataset
+
+    return make
+
+
+def act_linked(folder: Path) -> Path:
+    """A folder with an episode that lies elsewhere."""
+    dataset = act()(folder)
+    (dataset / "episode_1.hdf5").rename(folder / "elsewhere.hdf5")
+    (dataset / "episode_1.hdf5").symlink_to(folder / "elsewhere.hdf5")
+    return dataset
+
+
+def act_twice(folder: Path) -> Path:
+    """A folder with two files of the same number."""
+    dataset = act()(folder)
+    act_file(dataset / "episode_01.hdf5", 1)
+    return dataset
+
+
+def d4rl(*without: str) -> Callable[[Path], Path]:
+    """A flat file: the first demonstration reaches its goal, the second runs out of time, the last is cut."""
+
+    def make(folder: Path) -> Path:
+        path = folder / "kitchen.hdf5"
+        ends = np.cumsum(LENGTHS) - 1
+        steps = np.arange(sum(LENGTHS))
+        arrays = {
+            "observations": np.concatenate([state(number) for number in range(len(LENGTHS))]),
+            "actions": np.concatenate([control(number) for number in range(len(LENGTHS))]),
+            "rewards": np.zeros(len(steps), np.float32),
+            "terminals": steps == ends[0],
+            "timeouts": steps == ends[1],
+        }
+        with h5py.File(path, "w") as file:
+            for name in arrays.keys() - set(without):
+                file[name] = arrays[name]
+        return path
+
+    return make
+
+
+def robosuite(prepared: bool) -> Callable[[Path], Path]:
+    """What robosuite records, and what robomimic's ``convert_robosuite`` makes of it: states and controls alone."""
+
+    def make(folder: Path) -> Path:
+        path = folder / "demo.hdf5"
+        with h5py.File(path, "w") as file:
+            data = file.create_group("data")
+            data.attrs["env_args" if prepared else "env_info"] = "{}"
+            for number in range(len(LENGTHS)):
+                demo = data.create_group(f"demo_{number + 1}")
+                demo.attrs["model_file"] = "<mujoco/>"
+                demo["states"], demo["actions"] = state(number), control(number)
+        return path
+
+    return make
+
+
+def zarr(folder: Path) -> Path:
+    """A replay buffer of diffusion policy, as zarr 2 writes it."""
+    store = folder / "pusht.zarr"
+    for group in ("", "data", "meta"):
+        (store / group).mkdir()
+        (store / group / ".zgroup").write_text('{"zarr_format": 2}')
+    (store / "meta" / "episode_ends").mkdir()
+    return store
+
+
+def tfds(folder: Path) -> Path:
+    """A dataset of tensorflow_datasets, named without its version."""
+    version = folder / "toto" / "0.1.0"
+    version.mkdir(parents=True)
+    for name in ("dataset_info.json", "features.json"):
+        (version / name).write_text("{}")
+    (version / "toto-train.tfrecord-00000-of-00001").write_bytes(b"")
+    return version.parent
+
+
+def lerobot_v2(folder: Path) -> Path:
+    """A LeRobot dataset with a file for each episode."""
+    dataset = folder / "pusht"
+    (dataset / "meta").mkdir(parents=True)
+    path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+    said = {"codebase_version": "v2.1", "features": {}, "data_path": path}
+    (dataset / "meta" / "info.json").write_text(json.dumps(said))
+    return dataset
+
+
+def strange(name: str) -> Callable[[Path], Path]:
+    """A folder of nothing known, whose name would do something to a terminal."""
+
+    def make(folder: Path) -> Path:
+        (folder / name).mkdir()
+        return folder / name
+
+    return make
+
+
+IMPORT = "ddco-pyro import"
+"""What ``inspect`` and ``init`` say of a file that can be imported."""
+
+ROWS = {
+    "maniskill array": Row(maniskill("array"), IMPORT),
+    "maniskill tree": Row(maniskill("tree"), IMPORT),
+    "maniskill without observations": Row(
+        maniskill("none"),
+        r"python -m mani_skill\.trajectory\.replay_trajectory --traj-path .* --save-traj -o state",
+    ),
+    "act": Row(act(), None),
+    "act encoded": Row(act(encoded=True), None),
+    "act link": Row(act_linked, "episode_1.hdf5 leads out of the dataset"),
+    "act twice": Row(
+        act_twice, r"episode_1\.hdf5: has the number of episode_01\.hdf5|episode_01\.hdf5: has the number"
+    ),
+    "d4rl": Row(d4rl(), IMPORT),
+    "d4rl without timeouts": Row(d4rl("timeouts"), "has no timeouts, so nothing says where demonstrations end"),
+    "robosuite": Row(
+        robosuite(False), r"conversion\.convert_robosuite --dataset .* && .*dataset_states_to_obs --dataset"
+    ),
+    "robosuite prepared": Row(robosuite(True), r"makes them: python -m robomimic\.scripts\.dataset_states_to_obs"),
+    "zarr": Row(zarr, r"is a zarr store, as diffusion policy writes them; .*docs/own\.md"),
+    "tfds": Row(tfds, r"is a TensorFlow dataset \(RLDS\); .*docs/own\.md"),
+    "lerobot v2": Row(lerobot_v2, r"python -m lerobot\.scripts\.convert_dataset_v21_to_v30"),
+    "strange name": Row(strange("\x1b[2J\nx"), "is a folder of no known format"),
+}

@@ -1,0 +1,243 @@
+"""LeRobot datasets whose metadata lie: paths and links that lead out, and episodes that are not whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow
+import pyarrow.compute as compute
+import pyarrow.parquet as parquet
+
+from odd_files import Row
+
+FIXTURE = Path(__file__).parents[2] / "fixtures" / "lerobot"
+DATA = Path("data/chunk-000/file-000.parquet")
+EPISODES = Path("meta/episodes/chunk-000/file-000.parquet")
+VIDEO = Path("videos/observation.images.top/chunk-000/file-000.mp4")
+
+Change = Callable[[Path], None]
+
+
+def changed(*changes: Change) -> Callable[[Path], Path]:
+    """Makes ``dataset``, a copy of the fixture with these changes."""
+
+    def make(folder: Path) -> Path:
+        dataset = Path(shutil.copytree(FIXTURE, folder / "dataset"))
+        for change in changes:
+            change(dataset)
+        return dataset
+
+    return make
+
+
+def info(**values: object) -> Change:
+    """Sets values of ``meta/info.json``."""
+
+    def change(dataset: Path) -> None:
+        path = dataset / "meta" / "info.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+    return change
+
+
+def feature(name: str, **values: object) -> Change:
+    """Adds a feature, of the type of the state unless told otherwise."""
+
+    def change(dataset: Path) -> None:
+        features = json.loads((dataset / "meta" / "info.json").read_text())["features"]
+        info(features=features | {name: features["observation.state"] | values})(dataset)
+
+    return change
+
+
+def rewritten(place: Path, change: Callable[[pyarrow.Table], pyarrow.Table]) -> Change:
+    """Changes a table."""
+    return lambda dataset: parquet.write_table(change(parquet.read_table(dataset / place)), dataset / place)
+
+
+def episode(index: int, key: str, value: object) -> Change:
+    """Sets what ``meta/episodes`` says of one episode."""
+
+    def change(table: pyarrow.Table) -> pyarrow.Table:
+        values = table[key].to_pylist()
+        values[index] = value
+        at = table.column_names.index(key)
+        return table.set_column(at, table.schema.field(at), pyarrow.array(values, table.schema.field(at).type))
+
+    return rewritten(EPISODES, change)
+
+
+def without_rows(*rows: int) -> Change:
+    """Removes rows of the data file; rows 0 to 4 are episode 0, 5 to 10 episode 1, 11 to 17 episode 2."""
+    return rewritten(DATA, lambda table: table.take([at for at in range(len(table)) if at not in rows]))
+
+
+def reversed_rows(start: int, stop: int) -> Change:
+    """Turns these rows of the data file around."""
+
+    def change(table: pyarrow.Table) -> pyarrow.Table:
+        return table.take([*range(start), *reversed(range(start, stop)), *range(stop, len(table))])
+
+    return rewritten(DATA, change)
+
+
+def renumbered(table: pyarrow.Table) -> pyarrow.Table:
+    """Rows whose frames are counted anew, so that only their times know of frames that are not there."""
+    counts: dict[int, int] = {}
+    frames = []
+    for index in table["episode_index"].to_pylist():
+        frames.append(counts.setdefault(index, 0))
+        counts[index] += 1
+    at = table.column_names.index("frame_index")
+    return table.set_column(at, table.schema.field(at), pyarrow.array(frames))
+
+
+def moved_out(place: Path) -> Change:
+    """Moves a file or folder of the dataset out of it, and leaves a link."""
+
+    def change(dataset: Path) -> None:
+        outside = dataset.parent / "outside" / place.name
+        outside.parent.mkdir()
+        (dataset / place).rename(outside)
+        (dataset / place).symlink_to(outside)
+
+    return change
+
+
+def climbing(dataset: Path) -> None:
+    """Another dataset's data outside, and a path through a folder of this one that leads there."""
+    outside = dataset.parent / "outside.parquet"
+    shutil.copy(dataset / DATA, outside)
+    (dataset / "data" / "l").mkdir()
+    info(data_path="data/l/../../../outside.parquet")(dataset)
+
+
+def absolute(dataset: Path) -> None:
+    outside = dataset.parent / "outside.parquet"
+    shutil.copy(dataset / DATA, outside)
+    info(data_path=str(outside))(dataset)
+
+
+def twice(table: pyarrow.Table) -> pyarrow.Table:
+    """Episode 2 named once more."""
+    return pyarrow.concat_tables([table, table.slice(2, 1)])
+
+
+def second_file(dataset: Path) -> None:
+    """Episodes 2 and 3 lie in file-001, which is not there."""
+    for index in (2, 3):
+        episode(index, "data/file_index", 1)(dataset)
+    without_rows(*range(11, 26))(dataset)
+
+
+def video_of(*times: int) -> Change:
+    """A video with frames at these multiples of 0.1 s alone."""
+
+    def change(dataset: Path) -> None:
+        import av
+        import numpy as np
+
+        with av.open(dataset / VIDEO, "w") as film:
+            stream = film.add_stream("mpeg4", rate=10)
+            stream.width, stream.height = 32, 16
+            for time in times:
+                frame = av.VideoFrame.from_ndarray(np.full((16, 32, 3), 5 * time, np.uint8), format="rgb24")
+                frame.pts = time
+                film.mux(stream.encode(frame))
+            film.mux(stream.encode())
+
+    return change
+
+
+def ragged(table: pyarrow.Table) -> pyarrow.Table:
+    """Controls of one number and of three, which are two on average."""
+    values = table["action"].to_pylist()
+    values[0], values[1] = values[0][:1], [*values[1], 0.0]
+    at = table.column_names.index("action")
+    return table.set_column(at, "action", pyarrow.array(values, pyarrow.list_(pyarrow.float32())))
+
+
+def of_episode(table: pyarrow.Table, index: int) -> pyarrow.Table:
+    return table.filter(compute.equal(table["episode_index"], index))
+
+
+OUT = "leads out of the dataset"
+PATHS = {
+    "lerobot data_path climbs": Row(changed(climbing), OUT),
+    "lerobot data_path absolute": Row(changed(absolute), OUT),
+    "lerobot file linked elsewhere": Row(changed(moved_out(DATA)), OUT),
+    "lerobot data linked elsewhere": Row(changed(moved_out(Path("data"))), OUT),
+    "lerobot videos linked elsewhere": Row(changed(moved_out(Path("videos"))), OUT),
+    "lerobot stray link": Row(changed(lambda dataset: (dataset / "x.mp4").symlink_to("/etc/hostname")), OUT),
+    "lerobot link to a folder": Row(
+        changed(lambda dataset: (dataset / "loop").symlink_to(dataset)), "loop is a link to a folder"
+    ),
+    "lerobot loop of links": Row(
+        changed(lambda dataset: (dataset / "loop").symlink_to("loop")), "'loop' is no path in it"
+    ),
+    "lerobot fifo": Row(changed(lambda dataset: os.mkfifo(dataset / "data" / "x")), "is no regular file"),
+    "lerobot wide number": Row(changed(info(data_path="data/{chunk_index:9999999999d}")), "may have only"),
+    "lerobot wide padding": Row(changed(info(data_path="data/{chunk_index:013d}")), "may have only"),
+    "lerobot nameless field": Row(changed(info(data_path="data/{0}")), "may have only"),
+    "lerobot attribute": Row(changed(info(data_path="data/{chunk_index.__class__}")), "may have only"),
+    "lerobot NUL in a path": Row(changed(info(data_path="data/\0")), "is no path in it"),
+    "lerobot long path": Row(changed(info(data_path="data/" + 5000 * "x")), "is no path in it|is missing"),
+}
+"""Paths and links that are refused before anything is read."""
+
+EPISODES_NOT_WHOLE = {
+    "lerobot dropped frame": (changed(without_rows(7)), "demo_1: length in meta/episodes is 6, and .* has 5 rows"),
+    "lerobot dropped frame, length corrected": (
+        changed(without_rows(7), episode(1, "length", 5), episode(1, "dataset_to_index", 10), info(total_frames=25)),
+        "demo_1: frame_index is 3 in row 2, not 2: frames are missing or out of order",
+    ),
+    "lerobot dropped frame, counted anew": (
+        changed(
+            without_rows(7),
+            rewritten(DATA, renumbered),
+            episode(1, "length", 5),
+            episode(1, "dataset_to_index", 10),
+            info(total_frames=25),
+        ),
+        r"demo_1: timestamp is 0\.3 in row 2, not 0\.2: frames are missing",
+    ),
+    "lerobot reversed": (changed(reversed_rows(5, 11)), "demo_1: frame_index is 5 in row 0, not 0"),
+    "lerobot wrong length": (changed(episode(1, "length", 9)), "demo_1: length in meta/episodes is 9, and .* has 6"),
+    "lerobot wrong span": (
+        changed(episode(1, "dataset_to_index", 12)),
+        "demo_1: dataset_to_index - dataset_from_index in meta/episodes is 7, and .* has 6",
+    ),
+    "lerobot no rows": (changed(without_rows(*range(5, 11))), "demo_1: its rows are missing in"),
+    "lerobot ragged": (changed(rewritten(DATA, ragged)), "demo_0: cannot be read, or is damaged: its rows differ"),
+}
+"""Datasets of which one episode is not whole, and what is said of it."""
+
+ROWS = {
+    **PATHS,
+    **{name: Row(*row) for name, row in EPISODES_NOT_WHOLE.items()},
+    "lerobot missing file": Row(changed(second_file), r"demo_2: .*file-001\.parquet is missing"),
+    "lerobot episode twice": Row(changed(rewritten(EPISODES, twice)), "demo_2: meta/episodes names it twice"),
+    "lerobot episodes missing": Row(
+        changed(rewritten(EPISODES, lambda table: table.slice(0, 3))),
+        "demo_3 is missing: the metadata counts 4 episodes, and meta/episodes has 3",
+    ),
+    "lerobot uncounted episode": Row(changed(info(total_episodes=3)), "counts 3 episodes, and meta/episodes has 4"),
+    "lerobot many episodes counted": Row(changed(info(total_episodes=10**12)), "counts 1000000000000 episodes"),
+    "lerobot uncounted frames": Row(changed(info(total_frames=27)), "counts 27 frames, and 26 are there"),
+    "lerobot without episodes": Row(
+        changed(rewritten(EPISODES, lambda table: table.slice(0, 0)), info(total_episodes=0, total_frames=0)),
+        "meta/episodes holds no episodes",
+    ),
+    "lerobot key with a NUL": Row(changed(feature("observation.a\0b")), "which cannot be stored; rename it"),
+    "lerobot key of nothing": Row(changed(feature("observation.")), "which cannot be stored; rename it"),
+    "lerobot key twice": Row(changed(feature("observation.images/top")), "two observations are called 'images/top'"),
+    "lerobot key below another": Row(
+        changed(feature("observation.state.x")), "observations are called 'state' and 'state/x'"
+    ),
+    "lerobot splits are a list": Row(changed(info(splits=[1])), None),
+    "lerobot endless frequency": Row(changed(info(fps=float("inf"))), None),
+}

@@ -1,0 +1,111 @@
+"""Layouts of other libraries: read where they are a few other names, else named with what converts them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from command_line import call
+from odd_files import layouts as odd
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.hdf5 import DemonstrationsError
+from ddco_pyro.data.importing import import_demonstrations
+from ddco_pyro.data.inspection import inspect
+
+
+def imported(path: Path, tmp_path: Path) -> Demonstrations:
+    out = tmp_path / "demos.hdf5"
+    import_demonstrations(path, out)
+    return Demonstrations.read(out)
+
+
+def same_controls(demos: Demonstrations) -> None:
+    assert demos.names == ("demo_0", "demo_1", "demo_2")
+    for number, demo in enumerate(demos):
+        np.testing.assert_array_equal(demo.actions, odd.control(number))
+
+
+@pytest.mark.parametrize("obs", ["array", "tree"])
+def test_maniskill(obs: str, tmp_path: Path) -> None:
+    path = odd.maniskill(obs)(tmp_path)
+    assert inspect(path).format == "maniskill"
+    demos = imported(path, tmp_path)
+    same_controls(demos)
+    key = {"array": "state", "tree": "agent/qpos"}[obs]
+    for number, demo in enumerate(demos):
+        np.testing.assert_array_equal(demo.observations[key], odd.state(number))
+    if obs == "tree":
+        np.testing.assert_array_equal(demos[1].observations["extra/is_grasped"].ravel(), [0, 0, 1, 1, 1])
+
+
+def test_maniskill_with_two_observations_too_many_is_refused(tmp_path: Path) -> None:
+    path = odd.maniskill("array")(tmp_path)
+    with h5py.File(path, "r+") as file:
+        del file["traj_1/obs"]
+        file["traj_1/obs"] = odd.state(1, 2)
+    with pytest.raises(DemonstrationsError, match="demo_1: obs/state has 7 steps, but actions has 5"):
+        imported(path, tmp_path)
+
+
+@pytest.mark.parametrize("encoded", [False, True])
+def test_act(encoded: bool, tmp_path: Path) -> None:
+    folder = odd.act(encoded)(tmp_path)
+    assert inspect(folder).format == "act"
+    demos = imported(folder, tmp_path)
+    same_controls(demos)
+    for number, demo in enumerate(demos):
+        np.testing.assert_array_equal(demo.observations["qpos"], odd.state(number))
+        seen = np.asarray(demo.observations["images/top"])
+        np.testing.assert_allclose(seen, odd.pictures(number), atol=2 * encoded)  # JPEG
+
+
+def test_one_episode_of_act(tmp_path: Path) -> None:
+    folder = odd.act()(tmp_path)
+    demos = imported(folder / "episode_2.hdf5", tmp_path)
+    assert demos.names == ("demo_2",)
+    np.testing.assert_array_equal(demos[0].actions, odd.control(2))
+
+
+def test_the_base_of_a_mobile_robot_is_part_of_its_control(tmp_path: Path) -> None:
+    demos = imported(odd.act(base=True)(tmp_path), tmp_path)
+    for number, demo in enumerate(demos):
+        np.testing.assert_array_equal(demo.actions, np.hstack([odd.control(number), -odd.control(number)]))
+
+
+def test_d4rl(tmp_path: Path) -> None:
+    path = odd.d4rl()(tmp_path)
+    assert inspect(path).format == "d4rl"
+    demos = imported(path, tmp_path)
+    same_controls(demos)
+    for number, demo in enumerate(demos):
+        np.testing.assert_array_equal(demo.observations["state"], odd.state(number))
+
+
+def test_d4rl_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", 24)  # two steps
+    same_controls(imported(odd.d4rl()(tmp_path), tmp_path))
+
+
+@pytest.mark.parametrize("name", [name for name, row in odd.ROWS.items() if row.says not in (None, odd.IMPORT)])
+def test_what_is_not_read_is_named_with_a_remedy(name: str, tmp_path: Path) -> None:
+    row = odd.ROWS[name]
+    path = row.make(tmp_path)
+    ended = call("import", path, "--out", tmp_path / "demos.hdf5")
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert re.search(row.says, ended.err), ended.err
+    assert not list(tmp_path.glob("*demos*"))
+    assert "\x1b" not in ended.err
+
+
+def test_what_is_to_be_imported_first_is_named(tmp_path: Path) -> None:
+    for name, row in odd.ROWS.items():
+        if row.says == odd.IMPORT:
+            (tmp_path / name).mkdir()
+            path = row.make(tmp_path / name)
+            ended = call("init", path, "--out", tmp_path / "spec.yaml")
+            assert ended.status == 2
+            assert f"first: ddco-pyro import {path} --out demos.hdf5" in ended.err

@@ -1,0 +1,211 @@
+"""LeRobot datasets that lie: nothing outside them is read or written, and nothing that is not there is made up."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from command_line import call
+from odd_files import lerobot as odd
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.hdf5 import DemonstrationsError
+from ddco_pyro.data.importing import Choice, import_demonstrations
+from ddco_pyro.data.inspection import inspect
+from ddco_pyro.data.sources.metadata import check_keys, filled, inside
+from ddco_pyro.fitting.run import fit
+from ddco_pyro.spec import parse_spec
+
+SPEC = """
+demonstrations: {path: PATH, valid_fraction: 0.25}
+observations: [state]
+control: {std: 0.5}
+hierarchy:
+  levels:
+    - {name: skill, count: 2, policy: {network: linear}}
+  meta_policy: {network: linear}
+training: {epochs: 1, batch_size: 3}
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    import_demonstrations(odd.FIXTURE, folder / "demos.hdf5")
+    return fit(parse_spec(yaml.safe_load(SPEC.replace("PATH", str(folder / "demos.hdf5")))), out=folder / "run").folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder, and what links say; sockets and the like by name."""
+    return {
+        str(path.relative_to(folder)): str(path.readlink()).encode() if path.is_symlink() else path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_symlink() or path.is_file()
+    }
+
+
+def refused(ended, message: str) -> None:
+    lines = [line for line in ended.err.splitlines() if not line.startswith(("segmenting: ", "importing: "))]
+    assert (ended.status, len(lines)) == (2, 1), ended
+    assert re.search(message, lines[0]), lines[0]
+
+
+@pytest.mark.parametrize("name", odd.PATHS)
+def test_what_leads_out_is_refused_and_nothing_is_touched(name: str, tmp_path: Path, run: Path) -> None:
+    row = odd.ROWS[name]
+    dataset = row.make(tmp_path)
+    before = contents(tmp_path)
+    for command in (
+        ("inspect", dataset),
+        ("import", dataset, "--out", tmp_path / "demos.hdf5"),
+        ("segment", run, dataset, "--lerobot", tmp_path / "annotated"),
+    ):
+        refused(call(*command), row.says)
+        assert contents(tmp_path) == before
+
+
+def test_videos_that_lead_out_are_refused(tmp_path: Path) -> None:
+    dataset = odd.changed(odd.info(video_path="videos/../../{video_key}.mp4"))(tmp_path)
+    refused(call("import", dataset, "--out", tmp_path / "demos.hdf5"), odd.OUT)
+
+
+def test_the_hubs_cache_is_read_and_copied(tmp_path: Path, run: Path) -> None:
+    """There the files of a dataset are links into the folder ``blobs``."""
+    hub = tmp_path / "datasets--ddco--fixture"
+    (hub / "snapshots").mkdir(parents=True)
+    dataset = odd.changed()(hub / "snapshots")
+    (hub / "blobs").mkdir()
+    for number, path in enumerate(path for path in sorted(dataset.rglob("*")) if path.is_file()):
+        path.rename(hub / "blobs" / str(number))
+        path.symlink_to(hub / "blobs" / str(number))
+    before = contents(tmp_path)
+    assert call("import", dataset, "--out", tmp_path / "demos.hdf5").status == 0
+    assert Demonstrations.read(tmp_path / "demos.hdf5").lengths == (5, 6, 7, 8)
+    out = tmp_path / "annotated"
+    assert call("segment", run, dataset, "--lerobot", out).status == 0
+    assert not any(path.is_symlink() for path in out.rglob("*"))
+    assert (out / odd.VIDEO).read_bytes() == (odd.FIXTURE / odd.VIDEO).read_bytes()
+    assert before.items() <= contents(tmp_path).items()
+
+
+@pytest.mark.parametrize("name", odd.EPISODES_NOT_WHOLE)
+def test_an_episode_that_is_not_whole_is_named_and_can_be_skipped(name: str, tmp_path: Path) -> None:
+    make, message = odd.EPISODES_NOT_WHOLE[name]
+    dataset = make(tmp_path)
+    out = tmp_path / "demos.hdf5"
+    refused(call("import", dataset, "--out", out), message)
+    assert not out.exists()
+    (problem,) = [line for line in inspect(dataset).problems if "cannot be used in" not in line]
+    assert re.search(message, problem), problem
+    ended = call("import", dataset, "--out", out, "--skip-broken")
+    assert (ended.status, ended.err.count("left out")) == (0, 1)
+    assert len(Demonstrations.read(out)) == 3
+
+
+def test_missing_files_and_episodes_are_skipped_by_name(tmp_path: Path) -> None:
+    for number, (name, left) in enumerate(
+        [
+            ("lerobot missing file", ("demo_0", "demo_1")),
+            ("lerobot episode twice", ("demo_0", "demo_1", "demo_3")),
+            ("lerobot episodes missing", ("demo_0", "demo_1", "demo_2")),
+        ]
+    ):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        dataset, out = odd.ROWS[name].make(folder), folder / "demos.hdf5"
+        refused(call("import", dataset, "--out", out), odd.ROWS[name].says)
+        assert import_demonstrations(dataset, out, choice=Choice(skip_broken=True)).names == left
+
+
+@pytest.mark.parametrize(
+    "name",
+    [name for name in odd.ROWS if name not in {*odd.PATHS, *odd.EPISODES_NOT_WHOLE} and "key" in name]
+    + [
+        "lerobot uncounted episode",
+        "lerobot many episodes counted",
+        "lerobot uncounted frames",
+        "lerobot without episodes",
+    ],
+)
+def test_a_dataset_that_contradicts_itself_is_refused(name: str, tmp_path: Path) -> None:
+    dataset = odd.ROWS[name].make(tmp_path)
+    refused(call("import", dataset, "--out", tmp_path / "demos.hdf5"), odd.ROWS[name].says)
+
+
+def test_odd_but_harmless_metadata(tmp_path: Path) -> None:
+    dataset = odd.changed(odd.info(splits=[1], fps=float("inf")))(tmp_path)
+    assert inspect(dataset).frequency is None
+    assert not inspect(dataset).problems
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        (range(12), "demo_2: .* has 1 frames from second 1.1 on, and 7 are needed"),
+        ([*range(7), *range(8, 27)], "demo_1: .* has no frame of step 2: the next one is at second 0.8"),
+    ],
+)
+def test_a_video_without_all_frames(times, message: str, tmp_path: Path) -> None:
+    dataset = odd.changed(odd.video_of(*times))(tmp_path)
+    with pytest.raises(DemonstrationsError, match=message):
+        import_demonstrations(dataset, tmp_path / "demos.hdf5", choice=Choice(("images/top",)))
+
+
+def test_rows_of_an_episode_that_is_not_named_are_not_annotated(tmp_path: Path, run: Path) -> None:
+    dataset = odd.changed(
+        odd.rewritten(odd.EPISODES, lambda table: table.slice(0, 3)), odd.info(total_episodes=3, total_frames=18)
+    )(tmp_path)
+    ended = call("segment", run, dataset, "--lerobot", tmp_path / "annotated")
+    refused(ended, "rows of episode 3 that meta/episodes does not name")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dataset"]
+
+
+def test_a_copy_into_the_dataset_itself_is_refused(tmp_path: Path, run: Path) -> None:
+    dataset = odd.changed()(tmp_path)
+    before = contents(tmp_path)
+    refused(call("segment", run, dataset, "--lerobot", dataset / "data" / "new"), "lies in the dataset itself")
+    assert contents(tmp_path) == before
+
+
+def test_data_need_not_lie_under_data(tmp_path: Path, run: Path) -> None:
+    dataset = odd.changed(odd.info(data_path="steps/{episode_index}-{file_index:03d}.parquet"))(tmp_path)
+    (dataset / "steps").mkdir()
+    table = odd.parquet.read_table(dataset / odd.DATA)
+    for index in range(4):
+        odd.parquet.write_table(odd.of_episode(table, index), dataset / "steps" / f"{index}-000.parquet")
+    out = tmp_path / "annotated"
+    assert call("segment", run, dataset, "--lerobot", out).status == 0
+    columns = odd.parquet.read_table(out / "steps" / "2-000.parquet").column_names
+    assert "language_persistent" in columns
+    assert "language_persistent" in json.loads((out / "meta" / "info.json").read_text())["features"]
+
+
+def test_placeholders() -> None:
+    assert filled(
+        Path("d"),
+        "d/{chunk_index:03d}/{video_key}/{file_index}",
+        {"chunk_index": 7, "file_index": 12, "video_key": "a.b"},
+    ) == ("d/007/a.b/12")
+    assert filled(Path("d"), "{chunk_index:012d}", {"chunk_index": 1}) == "000000000001"
+    for template in ("{chunk_index:3d}", "{chunk_index!r}", "{{x}}", "{video_key:03d}", "{file_index", "{}"):
+        with pytest.raises(DemonstrationsError, match=r"may have only \{chunk_index\}, \{video_key\}, and"):
+            filled(Path("d"), template, {"chunk_index": 1, "video_key": "a"})
+
+
+def test_inside(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    assert inside(tmp_path / "data", "a/./b") == tmp_path / "data" / "a" / "b"
+    (tmp_path / "data" / "link").symlink_to(tmp_path)
+    for relative in ("..", "a/../b", "/etc", "link", "link/x", "a\0b"):
+        with pytest.raises(DemonstrationsError):
+            inside(tmp_path / "data", relative)
+
+
+def test_keys_of_observations() -> None:
+    check_keys(Path("d"), ["a", "b/c", "b/d", "..", "ab"])
+    for keys in (["a//b"], ["/a"], ["."], ["\ud800"], ["a", "a"], ["a/b/c", "a"], [2000 * "x"]):
+        with pytest.raises(DemonstrationsError):
+            check_keys(Path("d"), keys)
