@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -62,6 +63,8 @@ def format_of(path: Path) -> Format:
         return "robomimic"
     if not path.exists():
         raise DemonstrationsError(f"{path}: there is no such file or folder; check the path")
+    if not path.is_dir():
+        raise DemonstrationsError(f"{path}: is neither a regular file nor a folder; name an HDF5 file")
     raise DemonstrationsError(
         f"{path}: is a folder of no known format; name an HDF5 file, a Minari dataset's folder (with "
         "data/metadata.json), or a LeRobot dataset's folder (with meta/info.json)"
@@ -69,27 +72,28 @@ def format_of(path: Path) -> Format:
 
 
 @contextmanager
-def open_source(path: str | Path, form: Format | None = None) -> Iterator[Source]:
+def open_source(path: str | Path, form: Format | None = None, external: bool = False) -> Iterator[Source]:
     """Open a file or folder; the format is recognised unless it is given.
 
+    :param external: whether parts of an HDF5 file may lie in other files.
     :raises DemonstrationsError: it cannot be read, or is not of this format.
     """
     path = Path(path)
     form = form or format_of(path)
-    with _opener(form)(path) as source:
+    with _opener(form, external)(path) as source:
         yield source
 
 
-def _opener(form: Format) -> Callable[[Path], AbstractContextManager[Source]]:
+def _opener(form: Format, external: bool) -> Callable[[Path], AbstractContextManager[Source]]:
     """Each imports what it needs: a library that is not installed is missed only by who needs it."""
     if form == "robomimic":
         from ddco_pyro.data.sources.robomimic import open_robomimic
 
-        return open_robomimic
+        return partial(open_robomimic, external=external)
     if form == "minari":
         from ddco_pyro.data.sources.minari import open_minari
 
-        return open_minari
+        return partial(open_minari, external=external)
     from ddco_pyro.data.sources.lerobot import open_lerobot
 
     return open_lerobot

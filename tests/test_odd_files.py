@@ -1,0 +1,88 @@
+"""Every odd file with every command that takes one: done or refused in a line, within limits, nothing else changed."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import forked
+import pytest
+import yaml
+from odd_files import Row, rows
+
+MEMORY = 500 * 10**6
+ROWS = rows()
+
+
+def digests(folder: Path, out: Path) -> dict[str, str]:
+    """Of every file below a folder, by its kind and contents; what lies in ``out`` aside."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        if path != out and out not in path.parents:
+            regular = path.is_file() and not path.is_symlink()
+            content = hashlib.sha256(path.read_bytes()).hexdigest() if regular else ""
+            target = str(path.readlink()) if path.is_symlink() else ""
+            found[str(path)] = f"{oct(path.lstat().st_mode)} {target} {content}"
+    return found
+
+
+def commands(path: Path, out: Path, run: Path) -> Iterator[tuple[object, ...]]:
+    """Those that take such a file; what they write is named ``written`` in ``out``."""
+    written = out / "written"
+    if path.suffix == ".yaml":
+        yield "check", path
+        yield "fit", path, "--out", written
+        return
+    if (path / "spec.yaml").exists():
+        yield "report", path
+        return
+    yield "inspect", path
+    yield "inspect", path, "--json"
+    if not path.is_dir():  # the others are to be imported first
+        yield "init", path, "--out", written
+        yield "check", spec_of(path, out)
+    yield "import", path, "--out", written
+    yield "segment", run, path, "--csv", written
+
+
+ASIDE = "check", "segment"
+"""What these say of a file may be something else: the spec and the run may be about other observations."""
+
+
+def spec_of(path: Path, out: Path) -> Path:
+    """A spec for such a file, beside what is written."""
+    spec = out / "spec.yaml"
+    network = {"network": "linear"}
+    policy = {"kind": "flat", "policy": network}
+    data = {"demonstrations": {"path": str(path)}, "observations": ["offsets"], "baseline": policy}
+    spec.write_text(yaml.safe_dump(data))
+    return spec
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_an_odd_file(name: str, tmp_path: Path, toy_run) -> None:
+    row: Row = ROWS[name]
+    folder, out = tmp_path / "odd", tmp_path / "out"
+    folder.mkdir()
+    path = row.make(folder)
+    out.mkdir()
+    before = digests(tmp_path, out)
+    refused = []
+    for command in commands(path, out, toy_run.folder):
+        ended = forked.call(*command)
+        shown = f"{' '.join(map(str, command))}\n{ended}"
+        assert ended.status in (0, 2), shown
+        assert (ended.seconds < forked.SECONDS, ended.grown < MEMORY) == (True, True), shown
+        assert ended.err.count("\n") == (1 if ended.status else 0), shown
+        assert "Traceback" not in ended.err, shown
+        assert digests(tmp_path, out) == before, shown
+        assert {one.name for one in out.iterdir()} <= {"written", ".written.parts", "spec.yaml"}, shown
+        for one in out.glob("*"):
+            one.unlink()
+        if command[0] not in ASIDE or path.suffix == ".yaml":
+            refused += [command[0]] if ended.status else []
+            if row.says is not None and (ended.status or command == ("inspect", path)):
+                assert re.search(row.says, ended.err + ended.out), shown
+    assert (row.says is None) == (not refused), refused
