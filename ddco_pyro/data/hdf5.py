@@ -131,7 +131,7 @@ def natural(name: str) -> list[tuple[int, str]]:
 DEEPEST = 32
 """Most groups within groups, links behind links, and virtual datasets of virtual datasets."""
 
-MOST_LINKS = 10_000
+MOST_LINKS = 2_000
 """Most links below a group: where two lead to each of 32 groups there are four thousand million paths."""
 
 PACKED, SMALL = 5_000, 10**9
@@ -152,8 +152,8 @@ def datasets(group: h5py.Group, where: str = "", external: bool = False) -> list
             links += 1
             if depth > DEEPEST or links > MOST_LINKS:
                 raise DemonstrationsError(
-                    f"{where}{prefix[:40]}: its groups go in a circle, are nested more than {DEEPEST} deep, or hold more "
-                    f"than {MOST_LINKS} links; write it again with fewer"
+                    f"{where}{prefix[:40]}: its groups go in a circle, are nested more than {DEEPEST} deep, or hold "
+                    f"more than {MOST_LINKS} links; write it again with fewer"
                 )
             item = _linked(parent, name, f"{where}{prefix}{name}", external)
             if isinstance(item, h5py.Group):

@@ -6,13 +6,14 @@ import os
 import pickle
 import resource
 import signal
-import time
 from pathlib import Path
 from typing import NamedTuple
 
 import command_line
 
 SECONDS = 10
+"""Of computing; one that waits, for a pipe, ends after six times as long, however busy the machine is."""
+
 ADDRESSES = 8 * 10**9
 """Bytes of address space beyond what the parent has: a command that reads without end fails in the child."""
 
@@ -20,7 +21,8 @@ ADDRESSES = 8 * 10**9
 class Ended(NamedTuple):
     """How a command ended.
 
-    :param status: negative where a signal ended it; ``-SIGALRM`` after :data:`SECONDS`.
+    :param status: negative where a signal ended it: SIGXCPU after :data:`SECONDS`, SIGALRM where it hangs.
+    :param seconds: of computing.
     :param grown: bytes of memory that it had at most beyond those of the parent.
     """
 
@@ -33,7 +35,6 @@ class Ended(NamedTuple):
 
 def call(*arguments: object) -> Ended:
     """Run a command in a copy of this process."""
-    began = time.monotonic()
     reader, writer = os.pipe()
     child = os.fork()
     if not child:
@@ -42,8 +43,7 @@ def call(*arguments: object) -> Ended:
     with open(reader, "rb") as pipe:
         told = pipe.read()
     _, ended = os.waitpid(child, 0)
-    status, out, err, grown = pickle.loads(told) if told else (os.waitstatus_to_exitcode(ended), "", "", 0)
-    return Ended(status, out, err, time.monotonic() - began, grown)
+    return Ended(*pickle.loads(told)) if told else Ended(os.waitstatus_to_exitcode(ended), "", "", 0.0, 0)
 
 
 def _child(writer: int, arguments: tuple[object, ...]) -> None:
@@ -52,10 +52,12 @@ def _child(writer: int, arguments: tuple[object, ...]) -> None:
         pages, resident = map(int, Path("/proc/self/statm").read_text().split()[:2])
         resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + ADDRESSES,) * 2)
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.alarm(SECONDS)
+        signal.alarm(6 * SECONDS)
+        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))  # a fork has computed nothing yet
         ended = command_line.call(*arguments)
-        most = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        grown = 1024 * used.ru_maxrss - resident * resource.getpagesize()
         with open(writer, "wb") as pipe:
-            pipe.write(pickle.dumps((*ended, most - resident * resource.getpagesize())))
+            pipe.write(pickle.dumps((*ended, used.ru_utime + used.ru_stime, grown)))
     finally:
         os._exit(1)

@@ -119,6 +119,13 @@ def soft(key: str, target: str) -> Callable[[h5py.Group, Path], None]:
     return lambda group, folder: instead(group.file, key, h5py.SoftLink(target))
 
 
+def soft_and_external(group: h5py.Group, folder: Path) -> None:
+    """A link to what a link to another file leads to."""
+    linked("/data/demo_0/obs", "data/demo_1/obs")(group, folder)
+    group["obs_again"] = h5py.SoftLink("obs")
+    soft("data/demo_0/obs/offsets", "/data/demo_1/obs_again/offsets")(group, folder)
+
+
 def twice(group: h5py.Group, folder: Path) -> None:
     """One array under two names."""
     instead(group, "obs/offsets", group.file["data/demo_0/obs/offsets"])
@@ -156,18 +163,24 @@ def rows_claimed(group: h5py.Group, folder: Path, rows: int = 10**12) -> None:
         dataset.id.write_direct_chunk((0, 0), zlib.compress(bytes(8 * size * chunk)))
 
 
+STORED = {
+    key: zlib.compress(np.tile(np.arange(50.0 * size).reshape(50, size), (2000, 1)).tobytes(), 9)
+    for key, size in (("actions", 2), ("obs/offsets", 4))
+}
+"""Compressed chunks of 100 000 steps that repeat every 50."""
+
+
 def claimed_at_the_end(folder: Path) -> Path:
     """Many demonstrations that unpack to a thousand times their size, and then one of which most is missing."""
     path = folder / "demos.hdf5"
     with h5py.File(path, "w") as file:
         for index in range(10):
             group = file.create_group(f"data/demo_{index}")
-            for key, size in (("actions", 2), ("obs/offsets", 4)):
-                shape = (2 * 10**6, size)
-                stored = zlib.compress(zlib.compress(bytes(8 * size * 10**5), 9), 9)
-                dataset = group.create_dataset(key, shape, "f8", chunks=(10**5, size), compression="gzip")
-                for start in range(0, shape[0] if index < 9 else 10**5, 10**5):
-                    dataset.id.write_direct_chunk((start, 0), zlib.decompress(stored))
+            for key, stored in STORED.items():
+                size = 2 if key == "actions" else 4
+                dataset = group.create_dataset(key, (2 * 10**5, size), "f8", chunks=(10**5, size), compression="gzip")
+                for start in range(0, 2 * 10**5 if index < 9 else 10**5, 10**5):
+                    dataset.id.write_direct_chunk((start, 0), stored)
     return path
 
 
@@ -244,7 +257,7 @@ def data_pipe(folder: Path) -> Path:
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 12)
 )
-ELSEWHERE = r"demo_1.* lies in another file: \S+/{}; where you trust that, .*import \S+ --allow-external"
+ELSEWHERE = r"demo_.* lies in another file: \S+/{}; where you trust that, .*import \S+ --allow-external"
 
 ROWS: dict[str, Row] = {
     "ordinary": Row(changed(lambda group, folder: None), None),
@@ -262,15 +275,7 @@ ROWS: dict[str, Row] = {
         changed(linked("/data/demo_0", "data/demo_1")), ELSEWHERE.format("other.hdf5")
     ),
     "external link to all": Row(changed(linked("/data", "data")), r"data lies in another file: \S+/other.hdf5"),
-    "soft link to an external link": Row(
-        changed(
-            lambda group, folder: (
-                linked("/data/demo_0/obs", "data/demo_2/obs")(group, folder),
-                soft("data/demo_1/obs/offsets", "/data/demo_2/obs/offsets")(group, folder),
-            )
-        ),
-        ELSEWHERE.format("other.hdf5"),
-    ),  # fmt: skip
+    "soft link to an external link": Row(changed(soft_and_external), ELSEWHERE.format("other.hdf5")),
     "external link to a pipe": Row(changed(link_to("pipe.hdf5")), ELSEWHERE.format("pipe.hdf5")),
     "external link to a device": Row(changed(link_to("/dev/zero")), r"demo_1.* lies in another file: /dev/zero"),
     "virtual, of another file": Row(changed(virtual), ELSEWHERE.format("other.hdf5")),
@@ -302,7 +307,7 @@ ROWS: dict[str, Row] = {
         changed(lambda group, folder: rows_claimed(group, folder, 10**6)),
         r"demo_1: actions claims 100 chunks, but the file holds 1; write it again",
     ),
-    "a large file whose last demonstration is not whole": Row(claimed_at_the_end, r"demo_9: actions claims 20 chunks"),
+    "a large file whose last demonstration is not whole": Row(claimed_at_the_end, r"demo_9: actions claims 2 chunks"),
     "a chunk missing": Row(changed(chunk_missing), r"demo_1: obs/offsets claims 4 chunks, but the file holds 2"),
     "chunks": Row(changed(chunks), None),
     "16 bits": Row(changed(half(1.0)), None),
@@ -314,9 +319,9 @@ ROWS: dict[str, Row] = {
     "spec: a pipe": Row(pipe, r"is no file of at most 256 kB"),
     "spec: a device": Row(endless, r"is no file of at most 256 kB"),
     "spec: large": Row(text("a: [" + "1, " * 500_000 + "]"), r"is no file of at most 256 kB"),
-    "spec: many values": Row(text("a: [" + "1, " * 80_000 + "]"), r"holds more than 10000 values"),
+    "spec: many values": Row(text("a: [" + "1, " * 20_000 + "]"), r"holds more than 10000 values"),
     "spec: aliases of aliases": Row(text(BOMB), r"holds more than 10000 values where its aliases are written out"),
-    "spec: nested": Row(text("[" * 100_000), r"nested too deeply"),
+    "spec: nested": Row(text("[" * 5_000), r"nested too deeply"),
     "spec: of a pipe": Row(demonstrations_in("PIPE"), r"is no regular file"),
     "spec: of a device": Row(demonstrations_in("/dev/zero"), r"is no regular file"),
 }
