@@ -44,7 +44,6 @@ def commands(path: Path, out: Path, run: Path) -> Iterator[tuple[object, ...]]:
         yield "report", path
         return
     yield "inspect", path
-    yield "inspect", path, "--json"
     if not path.is_dir():  # the others are to be imported first
         yield "init", path, "--out", written
         yield "check", spec_of(path, out)

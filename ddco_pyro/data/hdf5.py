@@ -230,10 +230,14 @@ def _check_sources(dataset: h5py.Dataset, where: str, external: bool, left: int)
                 there = dataset_at(file, source.dset_name, "", external, left - 1).shape
         except DemonstrationsError as error:
             raise DemonstrationsError(f"{where} is virtual: {error}") from None
-        last = source.src_space.get_select_bounds()[1]
-        if len(last) != len(there) or any(end >= size for end, size in zip(last, there, strict=True)):
+        if source.src_space.get_select_type() == h5py.h5s.SEL_ALL:
+            enough = math.prod(there) == source.vspace.get_select_npoints()
+        else:
+            last = source.src_space.get_select_bounds()[1]
+            enough = len(last) == len(there) and all(end < size for end, size in zip(last, there, strict=True))
+        if not enough:
             raise DemonstrationsError(
-                f"{where} is virtual, and its source {source.file_name}: {source.dset_name} is too small: {there}"
+                f"{where} is virtual, and its source {source.file_name}: {source.dset_name} has another shape: {there}"
             )
 
 
