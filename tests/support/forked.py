@@ -53,7 +53,7 @@ def _child(writer: int, arguments: tuple[object, ...]) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + ADDRESSES,) * 2)
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(6 * SECONDS)
-        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))  # a fork has computed nothing yet
+        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 1))  # a fork has computed nothing yet
         ended = command_line.call(*arguments)
         used = resource.getrusage(resource.RUSAGE_SELF)
         grown = 1024 * used.ru_maxrss - resident * resource.getpagesize()

@@ -296,9 +296,6 @@ ROWS: dict[str, Row] = {
         changed(lambda group, folder: rows_claimed(group, folder, 10**6)),
         r"demo_1: actions claims 100 chunks, but the file holds 1; write it again",
     ),
-    "the last demonstration not whole": Row(
-        last_not_whole, r"demo_65: actions claims 192 bytes, but the file holds 96"
-    ),
     "a chunk missing": Row(changed(chunk_missing), r"demo_1: obs/offsets claims 4 chunks, but the file holds 2"),
     "chunks": Row(changed(chunks), None),
     "16 bits": Row(changed(half(1.0)), None),
