@@ -72,7 +72,7 @@ REFUSED: list[tuple[str, Callable[[h5py.File], None], str]] = [
         "demo_1: actions is missing; there is: labels/phase, obs/camera, obs/pose",
     ),
     ("group for actions", group_for_actions, "demo_1: actions has to be a dataset, not a group"),
-    ("dangling link", dangling_link, "demo_1: actions is missing; there is: labels/phase, obs/camera, obs/pose"),
+    ("dangling link", dangling_link, "demo_1: actions is a link to /nowhere, which leads nowhere"),
     ("no obs", remove("data/demo_1/obs"), "demo_1: obs is missing; there is: actions, labels"),
     ("no such key", remove("data/demo_1/obs/pose"), "demo_1: obs/pose is missing; there is: camera"),
     ("no labels", remove("data/demo_1/labels"), "demo_1: labels is missing; there is: actions, obs"),

@@ -362,11 +362,14 @@ def test_broken_demonstrations_are_refused_or_left_out(tmp_path: Path, out: Path
     demonstrations(5, {"valid": ("demo_1", "demo_2")}).write(source)
     with h5py.File(source, "r+") as file:
         file["data/demo_1/actions"][0, 0] = np.nan
-        del file["data/demo_3/obs/pose"]
     with pytest.raises(
         DemonstrationsError, match=r"demo_1: actions is nan at step 0, index \[0\]; .*; or leave .*--skip"
     ):
         import_demonstrations(source, out)
+    with h5py.File(source, "r+") as file:
+        del file["data/demo_3/obs/pose"]
+    with pytest.raises(DemonstrationsError, match=r"demo_3: obs/pose is missing, .*; or leave .*--skip"):
+        import_demonstrations(source, out)  # headers first
     ended = call("import", source, "--out", out, "--skip-broken")
     assert (ended.status, ended.out) == (0, f"{out}: 3 demonstrations\n")
     assert "left out demo_1: demo_1: actions is nan at step 0, index [0]; repair it" in ended.err

@@ -26,6 +26,12 @@ GIGABYTE = 10**9
 LIMIT = 2 * GIGABYTE
 
 
+@pytest.fixture(autouse=True)
+def two_gigabytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is allowed does not depend on the machine that runs the tests."""
+    monkeypatch.setenv("DDCO_PYRO_MEMORY", "2GB")
+
+
 def large(path: Path, number: int, steps: int, size: int = 1000) -> Path:
     """Demonstrations of as many numbers, all zero, compressed; controls that are not."""
     random = np.random.default_rng(0)

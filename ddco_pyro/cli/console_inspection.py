@@ -22,6 +22,7 @@ def show(facts: Inspection) -> None:
         console = Console(width=WIDTH)
     lines = [f"{facts.path}: {facts.format}, {_lengths(facts)}", f"control frequency: {_frequency(facts)}"]
     lines += [f"mask/{name}: {len(names)} demonstrations" for name, names in facts.masks.items()]
+    lines += [f"names another file as a part of it: {path}" for path in facts.external]
     for line in lines:
         console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
     table = Table("", "a step", "type", "range", "notes", show_edge=False)

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli.options import AllowCode, Overrides, SpecPath
+from ddco_pyro.cli.options import AllowCode, AllowExternal, Overrides, SpecPath
 from ddco_pyro.errors import BadInput
 from ddco_pyro.spec import SpecError, load_spec
 
@@ -119,6 +119,7 @@ def import_(
     skip_broken: Annotated[
         bool, typer.Option("--skip-broken", help="Leave out demonstrations that cannot be used, and say which.")
     ] = False,
+    allow_external: AllowExternal = False,
 ) -> None:
     """Write somebody else's demonstrations into this project's layout; goes on where it was interrupted."""
     from ddco_pyro.cli import console
@@ -126,7 +127,7 @@ def import_(
     from ddco_pyro.events import DemonstrationsDone
 
     size = (image_size, image_size) if image_size else None
-    choice = Choice(tuple(observations), mask, videos, size, skip_broken)
+    choice = Choice(tuple(observations), mask, videos, size, skip_broken, allow_external)
     with console.Progress("importing") as progress:
         imported = import_demonstrations(
             source, out, form.value if form else None, choice, lambda *done: progress(DemonstrationsDone(*done))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli.options import AllowCode, RunPath
+from ddco_pyro.cli.options import AllowCode, AllowExternal, RunPath
 from ddco_pyro.errors import BadInput
 
 if TYPE_CHECKING:
@@ -62,6 +63,7 @@ def segment(
     gripper: Annotated[
         int, typer.Option(help="The control dimension of the gripper for --baselines, from 0; by default the last.")
     ] = -1,
+    allow_external: AllowExternal = False,
     allow_code: AllowCode = False,
 ) -> None:
     """Label every step of demonstrations with a run's options: as a page, a table, labels in HDF5, or subtasks.
@@ -75,6 +77,11 @@ def segment(
             "--baselines measures agreement with labels"
         )
     labelled = _labelled(demos, out, in_place)
+    if labelled and allow_external:  # a copy would not find the other files, and labels could go into those
+        raise BadInput(
+            f"{demos}: labels go into whole files only; first: ddco-pyro import {quote(str(demos))} --allow-external "
+            "--out whole.hdf5"
+        )
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
     from ddco_pyro.drawing.scores import HEAD
@@ -86,7 +93,7 @@ def segment(
     from ddco_pyro.segmenting.tables import write_csv, write_parquet
 
     fit = load(run, allow_code)
-    with open_source(demos) as source, console.Progress("segmenting") as progress:
+    with open_source(demos, external=allow_external) as source, console.Progress("segmenting") as progress:
         if labelled and source.format != "robomimic":
             raise BadInput(f"{demos}: labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot")
         if lerobot:

@@ -13,7 +13,7 @@ from ddco_pyro.data.checks import check, check_alike, check_values, problems_of_
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import PROGRAM, Extent, refuse_too_much
 from ddco_pyro.data.pictures import Observed, Pictures
-from ddco_pyro.data.sources.recording import Recording, of_array
+from ddco_pyro.data.sources.recording import Recording, discrete, of_array
 from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
 
 
@@ -23,7 +23,7 @@ class Demonstration:
 
     :param observations: key to [T, ...]; uint8 (images, HWC) stays as it is, other numbers become float64. Pictures
         of a file are :class:`~ddco_pyro.data.pictures.Pictures`: slices of them are read when they are asked for.
-    :param actions: [T, A], the controls, float64.
+    :param actions: [T, A], the controls, float64; discrete actions, integers [T], become [T, 1].
     :param labels: name to [T], ground-truth segments, int64.
     :param attributes: what is known of the whole demonstration, such as its seed.
     :raises DemonstrationsError: no steps, unequal lengths, anything but numbers, or numbers that are NaN, infinite or
@@ -46,7 +46,7 @@ class Demonstration:
         check_values(recording, f"repair it, or leave {self.name} out (demonstrations.exclude)")
         observations = {key: _numbers(values) for key, values in self.observations.items()}
         labels = {key: _integers(values, f"{self.name}: labels/{key}") for key, values in self.labels.items()}
-        object.__setattr__(self, "actions", np.asarray(self.actions).astype(np.float64))
+        object.__setattr__(self, "actions", recording.actions.array().astype(np.float64))
         object.__setattr__(self, "observations", observations)
         object.__setattr__(self, "labels", labels)
 
@@ -64,7 +64,7 @@ class Demonstration:
         """The same as a recording, to be written."""
         observations = {key: of_array(values) for key, values in self.observations.items()}
         labels = {key: of_array(values) for key, values in self.labels.items()}
-        return Recording(self.name, observations, of_array(self.actions), labels, self.attributes)
+        return Recording(self.name, observations, discrete(of_array(self.actions)), labels, self.attributes)
 
     def __len__(self) -> int:
         return len(self.actions)

@@ -31,7 +31,11 @@ class Damaged(BadInput):
     """A file does not hold what was written into it."""
 
     def __init__(self, path: Path, what: str, remedy: str) -> None:
-        super().__init__(f"{path}: is damaged: {what}; {remedy}")
+        super().__init__(path, what, remedy)
+
+    def __str__(self) -> str:
+        path, what, remedy = self.args
+        return f"{path}: is damaged: {what}; {remedy}"
 
 
 class Busy(BadInput):

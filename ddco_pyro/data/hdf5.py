@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import io
+import math
+import os
 import re
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
+from shlex import quote
 from typing import Any, Literal
 
 import h5py
@@ -38,6 +41,8 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
 
     :raises DemonstrationsError: there is no such file, it is no HDF5, or it is damaged.
     """
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise DemonstrationsError(f"{path}: is no regular file; name an HDF5 file")
     try:
         with h5py.File(path, "r") as file:
             yield file
@@ -123,36 +128,190 @@ def natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-def datasets(group: h5py.Group) -> list[str]:
-    """The names of all datasets below a group; dm_control's own keys have a / in them."""
+DEEPEST = 32
+"""Most groups within groups, links behind links, and virtual datasets of virtual datasets."""
+
+MOST_LINKS = 2_000
+"""Most links below a group: where two lead to each of 32 groups there are four thousand million paths."""
+
+PACKED, SMALL = 5_000, 10**9
+"""A filtered dataset claims at most so many bytes for each stored byte, or this size in all; deflate reaches 1032."""
+
+
+def datasets(group: h5py.Group, where: str = "", external: bool = False) -> list[str]:
+    """The names of all datasets below a group, links to datasets among them; dm_control's own keys have a / in them.
+
+    :param external: whether links to other files are followed.
+    :raises DemonstrationsError: a link leads nowhere or to another file; groups are nested too deeply.
+    """
     names: list[str] = []
-    group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+    groups, links = [("", group, 1)], 0
+    while groups:
+        prefix, parent, depth = groups.pop()
+        for name in parent:
+            links += 1
+            if depth > DEEPEST or links > MOST_LINKS:
+                raise DemonstrationsError(
+                    f"{where}{prefix[:40]}: its groups go in a circle, are nested more than {DEEPEST} deep, or hold "
+                    f"more than {MOST_LINKS} links; write it again with fewer"
+                )
+            item = _linked(parent, name, f"{where}{prefix}{name}", external)
+            if isinstance(item, h5py.Group):
+                groups.append((f"{prefix}{name}/", item, depth + 1))
+            elif isinstance(item, h5py.Dataset):
+                names.append(prefix + name)
     return sorted(names)
 
 
-def dataset_at(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
-    """The dataset at ``key``; nothing of it is read.
+def dataset_at(group: h5py.Group, key: str, where: str, external: bool = False, left: int = DEEPEST) -> h5py.Dataset:
+    """The dataset at ``key``, once every value of it is known to be stored; no value is read.
 
-    :raises DemonstrationsError: it is missing, no array, or claims more than the file holds: HDF5 would fill in zeros.
+    :param external: whether it may lie in other files.
+    :param left: how many virtual datasets may stand between it and what is stored.
+    :raises DemonstrationsError: it is missing, no array, or in another file, or a part is not stored: HDF5 would fill
+        in zeros.
     """
-    dataset = member(group, key, h5py.Dataset, where)
+    dataset = member(group, key, h5py.Dataset, where, external)
+    where = f"{where}{key}"
     if dataset.shape is None or dataset.ndim == 0:
-        raise DemonstrationsError(f"{where}{key} has no steps; it has to be an array")
-    stored = dataset.id.get_storage_size()
-    packed = dataset.is_virtual or (stored and dataset.id.get_create_plist().get_nfilters())
-    if dataset.nbytes > stored and not packed:
-        raise DemonstrationsError(
-            f"{where}{key} claims {dataset.nbytes} bytes, but the file holds {stored}; write it again"
-        )
+        raise DemonstrationsError(f"{where} has no steps; it has to be an array")
+    outside = _outside(dataset)
+    if outside and not external:
+        raise _elsewhere(where, outside, dataset.file)
+    if dataset.is_virtual:
+        _check_sources(dataset, where, external, left)
+    elif dataset.external:
+        _check_external(dataset, where)
+    else:
+        _check_stored(dataset, where)
     return dataset
 
 
-def member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
-    """A group or a dataset below ``group``."""
+def _check_stored(dataset: h5py.Dataset, where: str) -> None:
+    """See that a dataset claims no more than its file holds."""
+    stored = dataset.id.get_storage_size()
+    filtered = stored and dataset.id.get_create_plist().get_nfilters()
+    if dataset.nbytes > (max(PACKED * stored, SMALL) if filtered else stored):
+        raise DemonstrationsError(f"{where} claims {dataset.nbytes} bytes, but the file holds {stored}; write it again")
+    if dataset.chunks:
+        needed = math.prod(-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+        there = dataset.id.get_num_chunks()
+        if there < needed:
+            raise DemonstrationsError(f"{where} claims {needed} chunks, but the file holds {there}; write it again")
+
+
+def _check_external(dataset: h5py.Dataset, where: str) -> None:
+    """See that the raw files of a dataset hold what it claims."""
+    claimed = dataset.nbytes
+    for name, offset, size in dataset.external:
+        path, part = Path(os.path.abspath(name)), min(size, claimed)
+        if not path.is_file() or path.stat().st_size < offset + part:
+            raise DemonstrationsError(f"{where}: {path} has to hold {part} bytes of it, but is missing or too short")
+        claimed -= part
+
+
+def _check_sources(dataset: h5py.Dataset, where: str, external: bool, left: int) -> None:
+    """See that all of a virtual dataset is mapped, and that every source is there."""
+    if not left:
+        raise DemonstrationsError(f"{where} is virtual, and so are its sources, in a circle; write it as an array")
+    sources = dataset.virtual_sources()
+    mapped = h5py.h5s.create_simple(dataset.shape)
+    mapped.select_none()
+    if sum(source.vspace.get_select_npoints() for source in sources) >= dataset.size:
+        for source in sources:
+            for start, stride, count, block in _boxes(source.vspace):
+                mapped.select_hyperslab(start, count, stride, block, h5py.h5s.SELECT_OR)
+    if mapped.get_select_npoints() < dataset.size:
+        raise DemonstrationsError(f"{where} is virtual, and a part of it has no source; write it as an array")
+    for source in sources:
+        try:
+            own = source.file_name == "."
+            with nullcontext(dataset.file) if own else opened(_beside(dataset, source.file_name)) as file:
+                there = dataset_at(file, source.dset_name, "", external, left - 1).shape
+        except DemonstrationsError as error:
+            raise DemonstrationsError(f"{where} is virtual: {error}") from None
+        if source.src_space.get_select_type() == h5py.h5s.SEL_ALL:
+            enough = math.prod(there) == source.vspace.get_select_npoints()
+        else:
+            last = source.src_space.get_select_bounds()[1]
+            enough = len(last) == len(there) and all(end < size for end, size in zip(last, there, strict=True))
+        if not enough:
+            raise DemonstrationsError(
+                f"{where} is virtual, and its source {source.file_name}: {source.dset_name} has another shape: {there}"
+            )
+
+
+def _boxes(space: Any) -> Iterator[tuple[tuple[int, ...], ...]]:
+    """The parts of a selection: start, stride, count and block of each."""
+    if space.get_select_type() == h5py.h5s.SEL_ALL:
+        yield (0,) * len(space.shape), (1,) * len(space.shape), space.shape, (1,) * len(space.shape)
+    elif space.is_regular_hyperslab():
+        yield space.get_regular_hyperslab()
+    else:
+        for first, last in space.get_select_hyper_blocklist():
+            yield tuple(first), (1,) * len(first), tuple(last - first + 1), (1,) * len(first)
+
+
+def _outside(dataset: h5py.Dataset) -> list[str]:
+    """The other files that a dataset's values are in."""
+    if dataset.is_virtual:
+        names = {source.file_name for source in dataset.virtual_sources()} - {"."}
+        return sorted(str(_beside(dataset, name)) for name in names)
+    return sorted({os.path.abspath(name) for name, *_ in dataset.external or ()})
+
+
+def _beside(item: h5py.HLObject, name: str) -> Path:
+    """A file that is named in the file of this object."""
+    return Path(os.path.abspath(item.file.filename)).parent / name
+
+
+def _elsewhere(where: str, files: Sequence[str], file: h5py.File) -> DemonstrationsError:
+    """What is wrong where something lies in other files."""
+    return DemonstrationsError(
+        f"{where} lies in another file: {', '.join(files)}; where you trust that, copy it into one file: "
+        f"ddco-pyro import {quote(file.filename)} --allow-external --out whole.hdf5"
+    )
+
+
+def outside_files(path: Path) -> list[str]:
+    """The other files that an HDF5 file names as parts of it, whether they are there or not.
+
+    They are the targets of external links, external storage, and the sources of virtual datasets.
+
+    :raises DemonstrationsError: the file cannot be read.
+    """
+    found: set[str] = set()
+    with opened(path) as file:
+        groups, known = [(file["/"], 1)], set()
+        while groups:
+            group, depth = groups.pop()
+            for name in group:
+                link = group.get(name, getlink=True)
+                if isinstance(link, h5py.ExternalLink):
+                    found.add(str(_beside(group, link.filename)))
+                item = group[name] if isinstance(link, h5py.HardLink) else None
+                if isinstance(item, h5py.Dataset):
+                    found.update(_outside(item))
+                elif isinstance(item, h5py.Group) and depth <= DEEPEST and item not in known:
+                    known.add(item)
+                    groups.append((item, depth + 1))
+    return sorted(found)
+
+
+def named(group: h5py.Group, key: str) -> bool:
+    """Whether a group has a link of this name, wherever it leads."""
+    return group.get(key, getlink=True) is not None
+
+
+def member(group: h5py.Group, key: str, kind: type, where: str, external: bool = False) -> Any:
+    """A group or a dataset below ``group``.
+
+    :param external: whether links to other files are followed.
+    """
     try:
-        item = group[key]
-    except (KeyError, OSError):
-        known = datasets(group) if kind is h5py.Dataset else list(group)
+        item = _linked(group, key, f"{where}{key}", external)
+    except KeyError:
+        known = datasets(group, where, external) if kind is h5py.Dataset else list(group)
         raise DemonstrationsError(
             f"{where}{key} is missing{nearest(key, known)}; there is: {', '.join(known) or 'nothing'}"
         ) from None
@@ -160,6 +319,40 @@ def member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
         raise DemonstrationsError(
             f"{where}{key} has to be a {kind.__name__.lower()}, not a {type(item).__name__.lower()}"
         )
+    return item
+
+
+def _linked(group: h5py.Group, key: str, where: str, external: bool, left: int = DEEPEST) -> h5py.HLObject:
+    """What a path leads to, link by link, so that none is followed out of the file before that is allowed.
+
+    :param left: soft links that may be followed.
+    :raises KeyError: a group on the way has no link of that name.
+    :raises DemonstrationsError: a link leads nowhere, or to another file, or what it leads to cannot be opened.
+    """
+    item: Any = group
+    for part in filter(None, key.split("/")):
+        link = item.get(part, getlink=True) if isinstance(item, h5py.Group) else None
+        if link is None:
+            raise KeyError(part)
+        try:
+            if isinstance(link, h5py.SoftLink):
+                if not left:
+                    raise KeyError(part)
+                start = item.file if link.path.startswith("/") else item
+                item = _linked(start, link.path, where, external, left - 1)
+                continue
+            if isinstance(link, h5py.ExternalLink):
+                path = _beside(item, link.filename)
+                if not external:
+                    raise _elsewhere(where, [str(path)], item.file)
+                if not path.is_file():
+                    raise KeyError(part)
+            item = item[part]
+        except (KeyError, OSError, RuntimeError) as error:
+            if isinstance(link, h5py.HardLink):
+                raise DemonstrationsError(f"{where} cannot be opened ({error}); the file may be damaged") from error
+            place = f"{link.path} of {link.filename}" if isinstance(link, h5py.ExternalLink) else link.path
+            raise DemonstrationsError(f"{where} is a link to {place}, which leads nowhere") from None
     return item
 
 

@@ -34,6 +34,7 @@ class Choice:
     :param videos: decode the videos too.
     :param image_size: height and width to which pictures are scaled; as they are if None.
     :param skip_broken: leave out demonstrations that cannot be used rather than refuse them.
+    :param allow_external: read the parts of an HDF5 file that lie in other files.
     """
 
     observations: tuple[str, ...] = ()
@@ -41,6 +42,7 @@ class Choice:
     videos: bool = False
     image_size: tuple[int, int] | None = None
     skip_broken: bool = False
+    allow_external: bool = False
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ def import_demonstrations(
     :raises DemonstrationsError: the source cannot be read, or a demonstration cannot be used.
     :raises BadInput: ``out`` is there already and is something else, or another process is writing it.
     """
-    with open_source(source, form) as opened_source:
+    with open_source(source, form, choice.allow_external) as opened_source:
         identity = _identity(opened_source, choice)
         if out.exists():
             discard(out)
@@ -87,6 +89,8 @@ def _keep(source: Source, choice: Choice, parts: Parts, on_recording: OnRecordin
     names = _names(source, choice)
     left_out: dict[str, str] = {}
     first: Recording | None = None
+    if not choice.skip_broken:
+        _check_headers(source, names, choice)
     for number, name in enumerate(names):
         try:
             recording = _chosen(source.recording(name), choice)
@@ -98,11 +102,31 @@ def _keep(source: Source, choice: Choice, parts: Parts, on_recording: OnRecordin
             first = first or recording
         except DemonstrationsError as error:
             if not choice.skip_broken:
-                raise DemonstrationsError(f"{error}; or leave such ones out with --skip-broken") from None
+                raise _refused(error) from None
             left_out[name] = str(error)
         on_recording(number + 1, len(names))
     parts.close()
     return left_out
+
+
+def _check_headers(source: Source, names: Sequence[str], choice: Choice) -> None:
+    """See that demonstrations can be used, as far as headers say, before the first of them is written.
+
+    :raises DemonstrationsError: one cannot.
+    """
+    first: Recording | None = None
+    try:
+        for name in names:
+            recording = _chosen(source.recording(name), choice)
+            check(recording)
+            check_alike(recording, first or recording)
+            first = first or recording
+    except DemonstrationsError as error:
+        raise _refused(error) from None
+
+
+def _refused(error: DemonstrationsError) -> DemonstrationsError:
+    return DemonstrationsError(f"{error}; or leave such ones out with --skip-broken")
 
 
 def _identity(source: Source, choice: Choice) -> str:

@@ -7,12 +7,13 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from ddco_pyro.data.checks import check_shape, check_steps, problems_of_masks
 from ddco_pyro.data.control_dimensions import ControlDimension, ControlStatistics, notes
 from ddco_pyro.data.control_parts import control_parts, described
-from ddco_pyro.data.hdf5 import DemonstrationsError
+from ddco_pyro.data.hdf5 import DemonstrationsError, outside_files
 from ddco_pyro.data.pictures import MOVED
 from ddco_pyro.data.sources import Column, Format, Source, open_source
 from ddco_pyro.data.values import LARGEST, NUMBERS, rounding, usable
@@ -136,6 +137,7 @@ class Inspection:
     :param control: what each dimension of the control does.
     :param excluded: names of demonstrations that were not looked at.
     :param unreadable: names of demonstrations that could not be read.
+    :param external: other files that the HDF5 file names as parts of it; they are not read.
     """
 
     path: Path
@@ -148,6 +150,7 @@ class Inspection:
     control: tuple[ControlDimension, ...] = ()
     excluded: tuple[str, ...] = ()
     unreadable: tuple[str, ...] = ()
+    external: tuple[str, ...] = ()
 
     @property
     def notes(self) -> list[str]:
@@ -200,6 +203,7 @@ class Inspection:
             "masks": {name: list(names) for name, names in self.masks.items()},
             "fields": [_as_json(array) for array in self.fields.values()],
             "control_dimensions": [dimension.as_data() for dimension in self.control],
+            "external": list(self.external),
             "notes": self.notes,
             "problems": self.problems,
         }
@@ -242,9 +246,10 @@ def _inspect(path: Path, source: Source, exclude: tuple[str, ...]) -> Inspection
             unreadable.append(name)
     problems += problems_of_masks(source.masks, source.names)
     masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in source.masks.items()}
+    external = sorted({name for file in source.files if h5py.is_hdf5(file) for name in outside_files(file)})
     inspection = Inspection(
         path, source.format, lengths, fields, masks, source.frequency, problems, control.dimensions(), exclude,
-        tuple(unreadable),
+        tuple(unreadable), tuple(external),
     )  # fmt: skip
     inspection.problems.extend(_problems(inspection))
     return inspection

@@ -1,5 +1,7 @@
 """How much memory a fit may take, and whether what has to be in memory fits into it: said before it is read.
 
+What is free on the machine decides what is refused, and nothing else: bits do not depend on it.
+
 What networks compute, and pictures in a file, take as much as they are given (:func:`share`); vectors, controls and
 what the inference keeps of each step are there as a whole.
 """
@@ -11,6 +13,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -19,8 +22,8 @@ from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.errors import BadInput
 
 VARIABLE = "DDCO_PYRO_MEMORY"
-ALLOWED = "2GB"
-"""What may be taken where ``$DDCO_PYRO_MEMORY`` says nothing else."""
+ORDINARY = 2e9
+"""Bytes that chunks are cut for where ``$DDCO_PYRO_MEMORY`` says nothing: how they are cut decides last digits."""
 
 UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 
@@ -138,11 +141,43 @@ class Extent:
 
 
 def allowed() -> float:
-    """Bytes that may be taken.
+    """Bytes that may be taken: what ``$DDCO_PYRO_MEMORY`` says, or what is free.
 
     :raises BadInput: ``$DDCO_PYRO_MEMORY`` is not a positive number, perhaps with a unit.
     """
-    text = os.environ.get(VARIABLE, ALLOWED)
+    return _said() or _free()
+
+
+def _free(root: Path = Path("/")) -> float:
+    """Bytes that are free on the machine, at most the limit of the control groups that this process is in.
+
+    :param root: the folder that has ``proc`` and ``sys``.
+    """
+    found = [float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))]
+    try:
+        available = re.search(r"^MemAvailable:\s+(\d+) kB$", (root / "proc/meminfo").read_text(), re.MULTILINE)
+        found += [float(available[1]) * 1024] if available else []
+        for line in (root / "proc/self/cgroup").read_text().splitlines():
+            _, controllers, group = line.split(":", 2)
+            if not controllers or "memory" in controllers.split(","):
+                name = "memory.limit_in_bytes" if controllers else "memory.max"
+                top = root / "sys/fs/cgroup" / ("memory" if controllers else "")
+                own = top / group.strip("/")
+                limits = (part / name for part in (own, *own.parents) if part == top or top in part.parents)
+                found += [float(file.read_text()) for file in limits if file.exists() and file.read_text() != "max\n"]
+    except (OSError, ValueError):
+        pass  # another system than Linux
+    return min(found)
+
+
+def _said() -> float | None:
+    """Bytes that ``$DDCO_PYRO_MEMORY`` allows; None where it says nothing.
+
+    :raises BadInput: it is not a positive number, perhaps with a unit.
+    """
+    text = os.environ.get(VARIABLE)
+    if text is None:
+        return None
     said = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([KMGT]?B)?\s*", text, re.IGNORECASE)
     number = float(said[1]) * UNITS[(said[2] or "GB").upper()] if said else 0.0
     if not number > 0:
@@ -159,7 +194,7 @@ PARTS = 4.75
 
 def share() -> float:
     """Bytes that networks may take for the steps that go through them together."""
-    return max(1.0, (allowed() - PROGRAM - MARGIN) / PARTS)
+    return max(1.0, ((_said() or ORDINARY) - PROGRAM - MARGIN) / PARTS)
 
 
 def refuse_too_much(needed: float, what: str, remedy: str) -> None:
@@ -172,6 +207,6 @@ def refuse_too_much(needed: float, what: str, remedy: str) -> None:
     if needed > allowed():
         more = math.ceil(needed / 1e8) / 10
         raise DemonstrationsError(
-            f"{what} takes about {more:g} GB of memory, and {allowed() / 1e9:g} are allowed; {remedy}, "
+            f"{what} takes about {more:g} GB of memory, and {allowed() / 1e9:.4g} are allowed; {remedy}, "
             f"or allow more with {VARIABLE}={more:g}GB"
         )

@@ -17,7 +17,7 @@ def usable(values: np.ndarray) -> np.ndarray:
     """Whether each of these real numbers is finite and at most :data:`LARGEST` in size."""
     if values.dtype.kind != "f":
         return np.ones(values.shape, dtype=bool)
-    return np.abs(values) <= LARGEST  # NaN is not
+    return np.abs(values) <= min(LARGEST, float(np.finfo(values.dtype).max))  # NaN is not
 
 
 RESOLUTION = 1e-9

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import stat
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,9 @@ def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool 
         line for each problem.
     """
     try:
+        about = Path(path).stat()
+        if not stat.S_ISREG(about.st_mode) or about.st_size > MOST_BYTES:
+            raise SpecError(f"{path}: is no file of at most {MOST_BYTES // 1024} kB; a spec is a YAML file")
         content = Path(path).read_bytes()
     except OSError as error:
         raise SpecError(f"{path}: cannot be read: {error.strerror}; check the path") from error
@@ -99,6 +103,9 @@ def read_yaml(content: bytes | str) -> Any:
     except (yaml.YAMLError, ValueError) as error:  # not text, or a date or number that Python cannot hold
         raise SpecError(f"not valid YAML: {' '.join(str(error).split())}") from None
 
+
+MOST_BYTES = 256 * 1024
+"""Of a spec file; an ordinary one has a few thousand. Reading so many takes seconds."""
 
 MOST_VALUES = 10_000
 """Keys and values of a spec where its aliases are written out; an ordinary one has a few hundred."""

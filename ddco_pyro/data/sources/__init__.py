@@ -51,27 +51,28 @@ class Source(Protocol):
 
 
 @contextmanager
-def open_source(path: str | Path, form: Format | None = None) -> Iterator[Source]:
+def open_source(path: str | Path, form: Format | None = None, external: bool = False) -> Iterator[Source]:
     """Open a file or folder; the format is recognised unless it is given.
 
+    :param external: whether parts of an HDF5 file may lie in other files.
     :raises DemonstrationsError: it cannot be read, or is not of this format.
     """
     path = Path(path)
     form = form or format_of(path)
-    with _opener(form)(path) as source:
+    with _opener(form, external)(path) as source:
         yield source
 
 
-def _opener(form: Format) -> Callable[[Path], AbstractContextManager[Source]]:
+def _opener(form: Format, external: bool) -> Callable[[Path], AbstractContextManager[Source]]:
     """Each imports what it needs: a library that is not installed is missed only by who needs it."""
     if form == "robomimic":
         from ddco_pyro.data.sources.robomimic import open_robomimic
 
-        return open_robomimic
+        return partial(open_robomimic, external=external)
     if form == "minari":
         from ddco_pyro.data.sources.minari import open_minari
 
-        return open_minari
+        return partial(open_minari, external=external)
     if form in ("maniskill", "act", "d4rl"):
         from ddco_pyro.data.sources.hdf5_layouts import open_layout
 

@@ -7,9 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
-from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError, opened
+from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError, dataset_at, datasets, member, opened
 from ddco_pyro.data.sources.metadata import check_keys, check_links, first_missing
 from ddco_pyro.data.sources.recording import Column, Format, Recording, damaged, of_array
 
@@ -27,8 +28,8 @@ class Minari:
     frequency: float | None = None
     masks: Mapping[str, tuple[str, ...]] = {}
 
-    def __init__(self, folder: Path, storage: Any) -> None:
-        self.folder, self._storage = folder, storage
+    def __init__(self, folder: Path, storage: Any, external: bool) -> None:
+        self.folder, self._storage, self._external = folder, storage, external
         stored = _stored(folder)
         self._missing = first_missing(folder, storage.total_episodes, stored, "the dataset")
         self.names = tuple(f"demo_{index}" for index in sorted({*stored, *self._missing}))
@@ -40,11 +41,13 @@ class Minari:
     def recording(self, name: str) -> Recording:
         """One episode, wholly in memory.
 
-        :raises DemonstrationsError: it is missing or damaged, or its actions are not one array of numbers.
+        :raises DemonstrationsError: it is missing or damaged, lies in another file, or its actions are not one array of
+            numbers.
         """
         index = int(name.removeprefix("demo_"))
         if index in self._missing:
             raise DemonstrationsError(f"{self.folder}: {name} {self._missing[index]}")
+        self._check_stored(index)
         try:
             (episode,) = self._storage.get_episodes([index])
             (facts,) = self._storage.get_episode_metadata([index])
@@ -68,6 +71,16 @@ class Minari:
         if seed is not None:
             known["seed"] = int(seed)
         return Recording(name, observations, _rows(actions), {}, known)
+
+    def _check_stored(self, index: int) -> None:
+        """See that the arrays of an episode are stored, where Minari keeps them in HDF5."""
+        path = self.folder / "main_data.hdf5"
+        if path.is_file():
+            with opened(path) as file:
+                episode = member(file, f"episode_{index}", h5py.Group, "", self._external)
+                for key in datasets(episode, f"episode_{index}/", self._external):
+                    if member(episode, key, h5py.Dataset, "", self._external).shape:
+                        dataset_at(episode, key, f"episode_{index}/", self._external)
 
 
 def _rows(actions: np.ndarray) -> Column:
@@ -98,9 +111,10 @@ def _stored(folder: Path) -> set[int]:
 
 
 @contextmanager
-def open_minari(path: Path) -> Iterator[Minari]:
+def open_minari(path: Path, external: bool = False) -> Iterator[Minari]:
     """Open a dataset's folder, its folder ``data``, or the ``main_data.hdf5`` in there.
 
+    :param external: whether parts of that may lie in other files.
     :raises DemonstrationsError: Minari is not installed, or cannot read it.
     """
     try:
@@ -118,4 +132,4 @@ def open_minari(path: Path) -> Iterator[Minari]:
         storage = MinariStorage.read(folder)
     except (*DAMAGE, AssertionError, ImportError, AttributeError, RecursionError) as error:
         raise damaged(folder, "", error) from error
-    yield Minari(folder, storage)
+    yield Minari(folder, storage, external)

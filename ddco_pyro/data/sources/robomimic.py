@@ -22,6 +22,7 @@ from ddco_pyro.data.hdf5 import (
     dataset_at,
     datasets,
     member,
+    named,
     natural,
     opened,
     written,
@@ -43,16 +44,15 @@ class Robomimic:
 
     format: Format = "robomimic"
 
-    def __init__(self, path: Path, file: h5py.File) -> None:
-        self._data = member(file, "data", h5py.Group, "")
+    def __init__(self, path: Path, file: h5py.File, external: bool = False) -> None:
+        self._external = external
+        self._data = member(file, "data", h5py.Group, "", external)
         self.files = (path,)
-        self.names = tuple(
-            sorted((name for name in self._data if isinstance(self._data.get(name), h5py.Group)), key=natural)
-        )
+        self.names = tuple(sorted((name for name in self._data if _may_be_group(self._data, name)), key=natural))
         if not self.names:
             raise DemonstrationsError("the group 'data' holds no demonstrations; at least one is needed")
-        masks = member(file, "mask", h5py.Group, "") if "mask" in file else {}
-        self.masks: Mapping[str, tuple[str, ...]] = {name: _names(masks, name) for name in masks}
+        masks = member(file, "mask", h5py.Group, "", external) if named(file, "mask") else {}
+        self.masks: Mapping[str, tuple[str, ...]] = {name: self._mask(masks, name) for name in masks}
         said = attributes_of(self._data) | attributes_of(file)
         self.attributes: Mapping[str, Attribute] = {name: said[name] for name in said if name != ALL_STEPS}
         self.frequency = _frequency(self.attributes)
@@ -63,41 +63,50 @@ class Robomimic:
         """One demonstration.
 
         :param observations: the keys to open; all of them if None. Likewise ``labels``, which need not be there then.
-        :raises DemonstrationsError: something of it is missing, or claims more than the file holds.
+        :raises DemonstrationsError: something of it is missing, lies in another file, or claims more than is stored.
         """
-        group = member(self._data, name, h5py.Group, "")
-        actions = discrete(_column(group, "", "actions", name))
+        group = member(self._data, name, h5py.Group, "", self._external)
+        actions = discrete(self._column(group, "", "actions", name))
         attributes = attributes_of(group)
         claimed = attributes.pop(STEPS, actions.shape[0])
         if claimed != actions.shape[0]:
             raise DemonstrationsError(f"{name}: actions has {actions.shape[0]} steps, but {STEPS} is {claimed}")
-        if labels is None and "labels" not in group:
+        if labels is None and not named(group, "labels"):
             labels = ()
         return Recording(
             name,
-            _columns(group, "obs", observations, name),
+            self._columns(group, "obs", observations, name),
             actions,
-            _columns(group, "labels", labels, name),
+            self._columns(group, "labels", labels, name),
             attributes,
         )
 
+    def _columns(self, group: h5py.Group, folder: str, keys: Sequence[str] | None, name: str) -> dict[str, Column]:
+        """The arrays ``keys`` of a folder of a demonstration; all of them if None."""
+        if keys is not None and not keys:
+            return {}
+        members = member(group, folder, h5py.Group, f"{name}: ", self._external)
+        known = datasets(members, f"{name}: {folder}/", self._external) if keys is None else keys
+        return {key: self._column(members, f"{folder}/", key, name) for key in known}
 
-def _columns(group: h5py.Group, folder: str, keys: Sequence[str] | None, name: str) -> dict[str, Column]:
-    """The arrays ``keys`` of a folder of a demonstration; all of them if None."""
-    if keys is not None and not keys:
-        return {}
-    members = member(group, folder, h5py.Group, f"{name}: ")
-    return {key: _column(members, f"{folder}/", key, name) for key in (datasets(members) if keys is None else keys)}
+    def _column(self, group: h5py.Group, folder: str, key: str, name: str) -> Column:
+        dataset = dataset_at(group, key, f"{name}: {folder}", self._external)
+        return of_dataset(dataset, f"{name}: {folder}{key}")
+
+    def _mask(self, masks: h5py.Group, mask: str) -> tuple[str, ...]:
+        """The names of demonstrations that a mask lists."""
+        dataset = dataset_at(masks, mask, "mask/", self._external)
+        names = of_dataset(dataset, f"mask/{mask}").array().ravel().tolist()
+        return tuple(name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names)
 
 
-def _column(group: h5py.Group, folder: str, key: str, name: str) -> Column:
-    return of_dataset(dataset_at(group, key, f"{name}: {folder}"), f"{name}: {folder}{key}")
-
-
-def _names(masks: h5py.Group, mask: str) -> tuple[str, ...]:
-    """The names of demonstrations that a mask lists."""
-    names = of_dataset(dataset_at(masks, mask, "mask/"), f"mask/{mask}").array().ravel().tolist()
-    return tuple(name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names)
+def _may_be_group(data: h5py.Group, name: str) -> bool:
+    """Whether a name stands for a demonstration; a link that leads nowhere does, and is refused when it is read."""
+    plain = isinstance(data.get(name, getlink=True), h5py.HardLink)
+    try:
+        return not plain or data.get(name, getclass=True) not in (h5py.Dataset, h5py.Datatype)
+    except RuntimeError:
+        return True
 
 
 def _frequency(attributes: Mapping[str, Attribute]) -> float | None:
@@ -112,13 +121,14 @@ def _frequency(attributes: Mapping[str, Attribute]) -> float | None:
 
 
 @contextmanager
-def open_robomimic(path: Path) -> Iterator[Robomimic]:
+def open_robomimic(path: Path, external: bool = False) -> Iterator[Robomimic]:
     """Open such a file.
 
+    :param external: whether parts of it may lie in other files.
     :raises DemonstrationsError: it cannot be read or holds no demonstrations.
     """
     with opened(path) as file:
-        yield Robomimic(path, file)
+        yield Robomimic(path, file, external)
 
 
 @contextmanager

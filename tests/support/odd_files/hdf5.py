@@ -1,0 +1,315 @@
+"""HDF5 files of which parts are elsewhere, missing, or only claimed, and specs that are no small files."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from odd_files import Row
+
+STEPS = 12
+
+
+def demonstrations(path: Path, number: int = 6) -> h5py.File:
+    """An ordinary file of what the toy task observes, open for changes."""
+    random = np.random.default_rng(0)
+    file = h5py.File(path, "w")
+    for index in range(number):
+        group = file.create_group(f"data/demo_{index}")
+        group["obs/offsets"] = random.normal(size=(STEPS, 4))
+        group["obs/visited"] = random.normal(size=(STEPS, 1))
+        group["actions"] = random.normal(size=(STEPS, 2))
+    return file
+
+
+def changed(change: Callable[[h5py.Group, Path], None]) -> Callable[[Path], Path]:
+    """Writes such a file, with something odd about ``demo_1``."""
+
+    def make(folder: Path) -> Path:
+        path = folder / "demos.hdf5"
+        with demonstrations(path) as file:
+            change(file["data/demo_1"], folder)
+        return path
+
+    return make
+
+
+def instead(group: h5py.Group, key: str, item: object) -> None:
+    """Put something in the place of what has this name."""
+    del group[key]
+    group[key] = item
+
+
+# --- parts in other files ---------------------------------------------------------------------------------------------
+
+
+def raw(group: h5py.Group, folder: Path, size: int | None = STEPS * 2 * 8) -> None:
+    """Controls in a raw file of this size; None where it is missing."""
+    del group["actions"]
+    path = folder / "actions.raw"
+    group.create_dataset("actions", (STEPS, 2), "f8", external=[(str(path), 0, STEPS * 2 * 8)])
+    if size is not None:
+        path.write_bytes(bytes(size))
+
+
+def linked(place: str, key: str) -> Callable[[h5py.Group, Path], None]:
+    """A link to another file in the place of something."""
+
+    def change(group: h5py.Group, folder: Path) -> None:
+        with demonstrations(folder / "other.hdf5"):
+            pass
+        instead(group.file, key, h5py.ExternalLink("other.hdf5", place))
+
+    return change
+
+
+def link_to(name: str) -> Callable[[h5py.Group, Path], None]:
+    def change(group: h5py.Group, folder: Path) -> None:
+        os.mkfifo(folder / "pipe.hdf5")
+        instead(group, "obs/offsets", h5py.ExternalLink(name, "/x"))
+
+    return change
+
+
+def virtual(
+    group: h5py.Group, folder: Path, source: str = "other.hdf5", rows: int = STEPS, there: int = STEPS, key: str = "x"
+) -> None:
+    """An observation whose first ``rows`` are those of another file, which has ``there``, and perhaps another key."""
+    layout = h5py.VirtualLayout((STEPS, 4), "f8")
+    layout[:rows] = h5py.VirtualSource(source, "x", (rows, 4))
+    del group["obs/offsets"]
+    group.create_virtual_dataset("obs/offsets", layout)
+    with h5py.File(folder / "other.hdf5", "w") as file:
+        file[key] = np.ones((there, 4))
+
+
+def virtual_here(group: h5py.Group, folder: Path) -> None:
+    """Every other row of one dataset of the same file, the rest of another."""
+    layout = h5py.VirtualLayout((STEPS, 4), "f8")
+    layout[::2] = h5py.VirtualSource(".", "/data/demo_0/obs/offsets", (STEPS, 4))[::2]
+    layout[1::2] = h5py.VirtualSource(".", "/data/demo_2/obs/offsets", (STEPS, 4))[1::2]
+    del group["obs/offsets"]
+    group.create_virtual_dataset("obs/offsets", layout)
+
+
+def virtual_of_itself(group: h5py.Group, folder: Path) -> None:
+    layout = h5py.VirtualLayout((STEPS, 4), "f8")
+    layout[:] = h5py.VirtualSource(".", "/data/demo_1/obs/offsets", (STEPS, 4))
+    del group["obs/offsets"]
+    group.create_virtual_dataset("obs/offsets", layout)
+
+
+def virtual_in_part(group: h5py.Group, folder: Path) -> None:
+    layout = h5py.VirtualLayout((STEPS, 4), "f8")
+    for step in (0, 0, *range(2, STEPS)):  # as many rows as there are, the first twice
+        layout[step] = h5py.VirtualSource(".", "/data/demo_0/obs/offsets", (STEPS, 4))[step]
+    del group["obs/offsets"]
+    group.create_virtual_dataset("obs/offsets", layout)
+
+
+# --- links ------------------------------------------------------------------------------------------------------------
+
+
+def soft(key: str, target: str) -> Callable[[h5py.Group, Path], None]:
+    return lambda group, folder: instead(group.file, key, h5py.SoftLink(target))
+
+
+def soft_and_external(group: h5py.Group, folder: Path) -> None:
+    """A link to what a link to another file leads to."""
+    linked("/data/demo_0/obs", "data/demo_1/obs")(group, folder)
+    group["obs_again"] = h5py.SoftLink("obs")
+    soft("data/demo_0/obs/offsets", "/data/demo_1/obs_again/offsets")(group, folder)
+
+
+def twice(group: h5py.Group, folder: Path) -> None:
+    """One array under two names."""
+    instead(group, "obs/offsets", group.file["data/demo_0/obs/offsets"])
+
+
+def circle(group: h5py.Group, folder: Path) -> None:
+    group["obs/again"] = group["obs"]
+
+
+def diamonds(group: h5py.Group, folder: Path) -> None:
+    """Four thousand million paths to thirty groups."""
+    group = group["obs"]
+    for _ in range(30):
+        below = group.create_group("left")
+        group["right"] = below
+        group = below
+
+
+def nested(group: h5py.Group, folder: Path) -> None:
+    group = group["obs"]
+    for _ in range(3000):
+        group = group.create_group("in")
+    group["x"] = np.zeros((STEPS, 1))
+
+
+# --- what is claimed --------------------------------------------------------------------------------------------------
+
+
+def rows_claimed(group: h5py.Group, folder: Path, rows: int = 10**12) -> None:
+    """Arrays of so many steps of which one chunk is stored."""
+    for key, size in (("actions", 2), ("obs/offsets", 4), ("obs/visited", 1)):
+        del group[key]
+        chunk = min(rows, 10**4)
+        dataset = group.create_dataset(key, (rows, size), "f8", chunks=(chunk, size), compression="gzip")
+        dataset.id.write_direct_chunk((0, 0), zlib.compress(bytes(8 * size * chunk)))
+
+
+def last_not_whole(folder: Path) -> Path:
+    """More demonstrations than an import writes together, and then one of which a part is missing."""
+    path = folder / "demos.hdf5"
+    with demonstrations(path, 66) as file:
+        del file["data/demo_65/actions"]
+        dataset = file.create_dataset("data/demo_65/actions", (STEPS, 2), "f8", chunks=(STEPS // 2, 2))
+        dataset[: STEPS // 2] = 1.0
+    return path
+
+
+def chunk_missing(group: h5py.Group, folder: Path) -> None:
+    """Chunks of which one was never written, though the others, padded, are as large as the array."""
+    del group["obs/offsets"]
+    dataset = group.create_dataset("obs/offsets", (STEPS, 4), "f8", chunks=(STEPS - 1, 3))
+    dataset[: STEPS - 1] = 1.0
+
+
+def chunks(group: h5py.Group, folder: Path) -> None:
+    instead(group, "obs/offsets", group.file["data"].create_dataset("x", data=np.ones((STEPS, 4)), chunks=(5, 3)))
+    del group.file["data/x"]
+
+
+# --- values -----------------------------------------------------------------------------------------------------------
+
+
+def half(value: float) -> Callable[[h5py.Group, Path], None]:
+    """Numbers of 16 bits in all demonstrations; one of ``demo_1`` is this."""
+
+    def change(group: h5py.Group, folder: Path) -> None:
+        for demo in group.file["data"].values():
+            for key in ("obs/offsets", "actions"):
+                instead(demo, key, demo[key][:].astype(np.float16))
+        with np.errstate(over="ignore"):
+            group["obs/offsets"][3, 2] = np.float16(value)
+
+    return change
+
+
+def discrete(group: h5py.Group, folder: Path) -> None:
+    for demo in group.file["data"].values():
+        instead(demo, "actions", np.arange(STEPS) % 3)
+
+
+# --- specs ------------------------------------------------------------------------------------------------------------
+
+
+def pipe(folder: Path) -> Path:
+    os.mkfifo(folder / "spec.yaml")
+    return folder / "spec.yaml"
+
+
+def endless(folder: Path) -> Path:
+    (folder / "spec.yaml").symlink_to("/dev/zero")
+    return folder / "spec.yaml"
+
+
+def text(content: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        (folder / "spec.yaml").write_text(content)
+        return folder / "spec.yaml"
+
+    return make
+
+
+def demonstrations_in(name: str) -> Callable[[Path], Path]:
+    """A spec whose demonstrations are a pipe or a device."""
+
+    def make(folder: Path) -> Path:
+        os.mkfifo(folder / "pipe")
+        path = name.replace("PIPE", str(folder / "pipe"))
+        return text(f"demonstrations: {{path: {path}}}\nobservations: [x]\nbaseline: {{kind: flat}}\n")(folder)
+
+    return make
+
+
+def data_pipe(folder: Path) -> Path:
+    os.mkfifo(folder / "demos.hdf5")
+    return folder / "demos.hdf5"
+
+
+BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 12)
+)
+ELSEWHERE = r"demo_.* lies in another file: \S+/{}; where you trust that, .*import \S+ --allow-external"
+
+ROWS: dict[str, Row] = {
+    "ordinary": Row(changed(lambda group, folder: None), None),
+    "external storage": Row(changed(raw), ELSEWHERE.format("actions.raw")),
+    "external storage that is missing": Row(
+        changed(lambda group, folder: raw(group, folder, None)), ELSEWHERE.format("actions.raw")
+    ),
+    "external link to an array": Row(
+        changed(linked("/data/demo_0/obs/offsets", "data/demo_1/obs/offsets")), ELSEWHERE.format("other.hdf5")
+    ),
+    "external link to a group": Row(
+        changed(linked("/data/demo_0/obs", "data/demo_1/obs")), ELSEWHERE.format("other.hdf5")
+    ),
+    "external link to a demonstration": Row(
+        changed(linked("/data/demo_0", "data/demo_1")), ELSEWHERE.format("other.hdf5")
+    ),
+    "external link to all": Row(changed(linked("/data", "data")), r"data lies in another file: \S+/other.hdf5"),
+    "soft link to an external link": Row(changed(soft_and_external), ELSEWHERE.format("other.hdf5")),
+    "external link to a pipe": Row(changed(link_to("pipe.hdf5")), ELSEWHERE.format("pipe.hdf5")),
+    "external link to a device": Row(changed(link_to("/dev/zero")), r"demo_1.* lies in another file: /dev/zero"),
+    "virtual, of another file": Row(changed(virtual), ELSEWHERE.format("other.hdf5")),
+    "virtual, of this file": Row(changed(virtual_here), None),
+    "virtual, of itself": Row(changed(virtual_of_itself), r"demo_1: obs/offsets is virtual.* in a circle"),
+    "virtual, with a row of no source": Row(
+        changed(virtual_in_part), r"demo_1: obs/offsets is virtual, and a part of it has no source"
+    ),
+    "virtual, of nothing in this file": Row(
+        changed(lambda group, folder: virtual(group, folder, ".")), r"demo_1: obs/offsets is virtual: x is missing"
+    ),
+    "dangling array": Row(
+        changed(soft("data/demo_1/obs/offsets", "/nowhere")),
+        r"demo_1: obs/offsets is a link to /nowhere, which leads nowhere",
+    ),
+    "dangling demonstration": Row(
+        changed(soft("data/demo_1", "demo_9")), r"demo_1 is a link to demo_9, which leads nowhere"
+    ),
+    "soft link to itself": Row(
+        changed(soft("data/demo_1/obs/offsets", "/data/demo_1/obs/offsets")), r"demo_1: obs/offsets is a link to"
+    ),
+    "soft link": Row(changed(soft("data/demo_1/obs/offsets", "/data/demo_0/obs/offsets")), None),
+    "hard link": Row(changed(twice), None),
+    "a group in itself": Row(changed(circle), r"demo_1: obs/again/.*: its groups go in a circle"),
+    "thirty groups of two links": Row(changed(diamonds), r"demo_1: obs/.*: its groups go in a circle"),
+    "3000 groups": Row(changed(nested), r"demo_1: obs/in/in/.* nested more than 32 deep"),
+    "1e12 rows": Row(changed(rows_claimed), r"demo_1: actions claims 16000000000000 bytes, but the file holds \d+"),
+    "a million rows": Row(
+        changed(lambda group, folder: rows_claimed(group, folder, 10**6)),
+        r"demo_1: actions claims 100 chunks, but the file holds 1; write it again",
+    ),
+    "a chunk missing": Row(changed(chunk_missing), r"demo_1: obs/offsets claims 4 chunks, but the file holds 2"),
+    "chunks": Row(changed(chunks), None),
+    "16 bits": Row(changed(half(1.0)), None),
+    "16 bits, infinite": Row(
+        changed(half(1e30)), r"demo_1: obs/offsets is inf at step 3, index \[2\]|the first in demo_1 at step 3"
+    ),
+    "discrete actions": Row(changed(discrete), None),
+    "a pipe": Row(data_pipe, r"is neither a regular file nor a folder"),
+    "spec: a pipe": Row(pipe, r"is no file of at most 256 kB"),
+    "spec: a device": Row(endless, r"is no file of at most 256 kB"),
+    "spec: large": Row(text("a: [" + "1, " * 500_000 + "]"), r"is no file of at most 256 kB"),
+    "spec: many values": Row(text("a: [" + "1, " * 12_000 + "]"), r"holds more than 10000 values"),
+    "spec: aliases of aliases": Row(text(BOMB), r"holds more than 10000 values where its aliases are written out"),
+    "spec: nested": Row(text("[" * 2_000), r"nested too deeply"),
+    "spec: of a pipe": Row(demonstrations_in("PIPE"), r"is no regular file"),
+    "spec: of a device": Row(demonstrations_in("/dev/zero"), r"is no regular file"),
+}

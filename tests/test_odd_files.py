@@ -1,0 +1,109 @@
+"""Every odd file with every command that takes one: done or refused in a line, within limits, nothing else changed."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import forked
+import pytest
+import yaml
+from command_line import call
+from odd_files import Row, rows
+
+MEMORY = 500 * 10**6
+ROWS = rows()
+
+
+PROGRESS = re.compile(r"\w+: \d+/\d+")
+
+
+def digests(folder: Path, out: Path) -> dict[str, str]:
+    """Of every file below a folder, by its kind and contents; what lies in ``out`` aside."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        if path != out and out not in path.parents:
+            regular = path.is_file() and not path.is_symlink()
+            content = hashlib.sha256(path.read_bytes()).hexdigest() if regular else ""
+            target = str(path.readlink()) if path.is_symlink() else ""
+            found[str(path)] = f"{oct(path.lstat().st_mode)} {target} {content}"
+    return found
+
+
+def commands(path: Path, out: Path, run: Path) -> Iterator[tuple[object, ...]]:
+    """Those that take such a file; what they write is named ``written`` in ``out``."""
+    written = out / "written"
+    if path.suffix == ".yaml":
+        yield "check", path
+        yield "fit", path, "--out", written
+        return
+    if (path / "spec.yaml").exists():
+        yield "report", path
+        return
+    yield "inspect", path
+    if not path.is_dir():  # the others are to be imported first
+        yield "init", path, "--out", written
+        yield "check", spec_of(path, out)
+    yield "import", path, "--out", written
+    yield "segment", run, path, "--csv", written
+
+
+ASIDE = "check", "segment"
+"""What these say of a file may be something else: the spec and the run may be about other observations."""
+
+
+def quickly(*arguments: object) -> forked.Ended:
+    """The command line in this process: kernels that run on threads cannot be called in a fork."""
+    began = time.process_time()
+    return forked.Ended(*call(*arguments), time.process_time() - began, 0)
+
+
+def spec_of(path: Path, out: Path) -> Path:
+    """A spec for such a file, beside what is written."""
+    spec = out / "spec.yaml"
+    network = {"network": "linear"}
+    policy = {"kind": "flat", "policy": network}
+    data = {"demonstrations": {"path": str(path)}, "observations": ["offsets"], "baseline": policy}
+    spec.write_text(yaml.safe_dump(data))
+    return spec
+
+
+@pytest.fixture(scope="module")
+def warm(toy_run, tmp_path_factory) -> Path:
+    """The folder of a run, once every command has been called here: what they import and compile is then there."""
+    folder, out = tmp_path_factory.mktemp("warm"), tmp_path_factory.mktemp("out")
+    for row in (ROWS["hdf5: ordinary"], ROWS["hdf5: spec: of a device"]):
+        for command in commands(row.make(folder), out, toy_run.folder):
+            call(*command)
+            (out / "written").unlink(missing_ok=True)
+    return toy_run.folder
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_an_odd_file(name: str, tmp_path: Path, warm: Path) -> None:
+    row: Row = ROWS[name]
+    folder, out = tmp_path / "odd", tmp_path / "out"
+    folder.mkdir()
+    path = row.make(folder)
+    out.mkdir()
+    before = digests(tmp_path, out)
+    refused = []
+    for command in commands(path, out, warm):
+        ended = quickly(*command) if command[0] == "segment" else forked.call(*command)
+        shown = f"{' '.join(map(str, command))}\n{ended}"
+        assert ended.status in (0, 2), shown
+        assert (ended.seconds < forked.SECONDS, ended.grown < MEMORY) == (True, True), shown
+        lines = [line for line in ended.err.splitlines() if not PROGRESS.match(line)]
+        assert [line[:11] for line in lines] == ["ddco-pyro: "] * (ended.status == 2), shown
+        assert digests(tmp_path, out) == before, shown
+        assert {one.name for one in out.iterdir()} <= {"written", ".written.parts", "spec.yaml"}, shown
+        for one in out.glob("*"):
+            one.unlink()
+        if command[0] not in ASIDE or path.suffix == ".yaml":
+            refused += [command[0]] if ended.status else []
+            if row.says is not None and (ended.status or command == ("inspect", path)):
+                assert re.search(row.says, ended.err + ended.out), shown
+    assert (row.says is None) == (not refused), refused
