@@ -14,7 +14,7 @@ from ddco_pyro import inference
 from ddco_pyro.errors import BadInput
 from ddco_pyro.inference.filtering import Filter
 from ddco_pyro.inference.marginal import EliminatedAHMM
-from ddco_pyro.model.tables import NEVER, Tables, complete
+from ddco_pyro.model.tables import NEVER, complete
 
 DOOR = {
     "fused": lambda *given: inference.log_likelihood(*given, engine="fused"),
@@ -37,26 +37,35 @@ LENGTHS = {
     "column": (torch.tensor([[5], [4], [3]]), r"got int64 \[3, 1\]"),
 }
 TABLES = {
-    "short termination": (lambda t: replace(t, termination=_changed(t.termination, 1, t.termination[1][:, :4])),
-                          r"termination\[1\]: expected floating-point numbers \[3, 5, 2, 2\]; got float64 \[3, 4, 2, 2\]"),
-    "one trajectory of controls": (lambda t: replace(t, control=_changed(t.control, 0, t.control[0][:1])), r"control\[0\]"),
-    "callers": (lambda t: replace(t, selection=_changed(t.selection, 0, t.selection[0][:, :, :1])), r"selection\[0\]"),
-    "without callers": (lambda t: replace(t, selection=_changed(t.selection, 1, t.selection[1][:, :, 0])),
-                        r"selection\[1\]: expected \[N, T, callers, 1 \+ options\]"),
-    "integers": (lambda t: replace(t, control=_changed(t.control, 1, t.control[1].clamp(min=0).long())), r"control\[1\]"),
+    "short termination": (
+        lambda t: _changed(t, "termination", 1, t.termination[1][:, :4]),
+        r"termination\[1\]: expected floating-point numbers \[3, 5, 2, 2\]; got float64 \[3, 4, 2, 2\]",
+    ),
+    "controls of one trajectory": (lambda t: _changed(t, "control", 0, t.control[0][:1]), r"control\[0\]"),
+    "a caller": (lambda t: _changed(t, "selection", 0, t.selection[0][:, :, :1]), r"selection\[0\]"),
+    "no callers": (
+        lambda t: _changed(t, "selection", 1, t.selection[1][:, :, 0]),
+        r"selection\[1\]: expected \[N, T, callers, 1 \+ options\]",
+    ),
+    "integers": (lambda t: _changed(t, "control", 1, t.control[1].clamp(min=0).long()), r"control\[1\]"),
     "no control": (lambda t: replace(t, control=()), "control: tables with 2 levels of selections need 3; got 0"),
-    "a level less": (lambda t: replace(t, termination=t.termination[:1]), "termination: .* need 2; got 1"),
-    "evidence of one level": (lambda t: replace(t, evidence=(None,)), "evidence: .* need 2; got 1"),
+    "a level less": (lambda t: replace(t, termination=t.termination[:1]), r"termination: .* need 2; got 1"),
+    "evidence of one level": (lambda t: replace(t, evidence=(None,)), r"evidence: .* need 2; got 1"),
     "evidence of options": (lambda t: replace(t, evidence=(torch.zeros(3, 5, 2), None)), r"evidence\[0\]"),
-    "NaN": (lambda t: replace(t, control=_changed(t.control, 0, _with(t.control[0], (1, 3, 0), torch.nan))),
-            r"control\[0\]: a log-probability of trajectory 1 at step 3 is NaN or \+inf"),
-    "infinite": (lambda t: replace(t, selection=_changed(t.selection, 1, _with(t.selection[1], (2, 0, 0, 1), torch.inf))),
-                 r"selection\[1\]: a log-probability of trajectory 2 at step 0 is NaN or \+inf"),
-}  # fmt: skip
+    "NaN": (
+        lambda t: _changed(t, "control", 0, _with(t.control[0], (1, 3, 0), torch.nan)),
+        r"control\[0\]: a log-probability of trajectory 1 at step 3 is NaN or \+inf",
+    ),
+    "infinite": (
+        lambda t: _changed(t, "selection", 1, _with(t.selection[1], (2, 0, 0, 1), torch.inf)),
+        r"selection\[1\]: a log-probability of trajectory 2 at step 0 is NaN or \+inf",
+    ),
+}
 
 
-def _changed(tables, level, table):
-    return (*tables[:level], table, *tables[level + 1 :])
+def _changed(tables, name, level, table):
+    own = getattr(tables, name)
+    return replace(tables, **{name: (*own[:level], table, *own[level + 1 :])})
 
 
 def _with(table, place, value):
@@ -143,7 +152,7 @@ def test_an_impossible_trajectory_has_a_likelihood_of_zero_and_no_posterior(coun
         assert value[1] == NEVER
         assert float(value[0]) == pytest.approx(possible)
     for function in ("posterior", "most_likely_path", "segment", "sample_paths"):
-        with pytest.raises(BadInput, match="trajectory 1 has probability 0 .* no posterior"):
+        with pytest.raises(BadInput, match=r"trajectory 1 has probability 0 .* no posterior"):
             DOOR[function](tables, lengths)
         DOOR[function](tables, torch.tensor([3, 2, 3]))  # the step is past the end
 

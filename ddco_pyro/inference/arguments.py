@@ -58,11 +58,9 @@ def check_tables(tables: Tables) -> tuple[int, int]:
     """
     depth = tables.depth
     numbers = {"termination": depth, "control": depth + 1, "evidence": depth if tables.evidence else 0}
-    for name, expected in numbers.items():
-        if len(getattr(tables, name)) != expected:
-            raise BadTables(
-                f"{name}: tables with {depth} levels of selections need {expected}; got {len(getattr(tables, name))}"
-            )
+    for name, needed in numbers.items():
+        if (got := len(getattr(tables, name))) != needed:
+            raise BadTables(f"{name}: tables with {depth} levels of selections need {needed}; got {got}")
     for level, table in enumerate(tables.selection):
         if table.dim() != 4 or table.shape[-1] < 2:
             raise BadTables(f"selection[{level}]: expected [N, T, callers, 1 + options]; got {_described(table)}")
@@ -70,10 +68,10 @@ def check_tables(tables: Tables) -> tuple[int, int]:
     if first.dim() != 3 or not len(first):
         raise BadTables(f"control[{depth}]: expected the shape [N, T, 1] with N at least 1; got {_described(first)}")
     number, steps = first.shape[:2]
-    for (name, table), shape in zip(_named(tables), _shapes(tables), strict=True):
-        if table is not None and (not table.is_floating_point() or table.shape != (number, steps, *shape)):
-            expected_shape = ", ".join(map(str, (number, steps, *shape)))
-            raise BadTables(f"{name}: expected floating-point numbers [{expected_shape}]; got {_described(table)}")
+    for (name, given), shape in zip(_named(tables), _shapes(tables), strict=True):
+        if given is not None and (not given.is_floating_point() or given.shape != (number, steps, *shape)):
+            expected = [number, steps, *shape]
+            raise BadTables(f"{name}: expected floating-point numbers {expected}; got {_described(given)}")
     return number, steps
 
 
