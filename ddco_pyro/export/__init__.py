@@ -172,11 +172,14 @@ def _state(program: StepProgram) -> list[dict[str, Any]]:
 
 
 def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
-    """What the runner has to know of a part of the control; σ of each level's callers, lowest first, if it has one."""
+    """What the runner has to know of a part of the control; σ of each level's callers, lowest first, if it has
+    one: callers that emit no control have none.
+    """
     scaling = hierarchy.scaling
     part, places = scaling.parts[number], list(scaling.groups[number])
     first = sum(before.size for before in scaling.parts[:number] if before.continuous)
-    std = [caller.std()[..., first : first + part.size].tolist() for caller in hierarchy.callers()]
+    callers = hierarchy.callers()
+    std = [[] if own.std is None else own.std()[..., first : first + part.size].tolist() for own in callers]
     ends = ([None if math.isinf(end) else end for end in values] for values in (part.low, part.high))
     return {
         "kind": part.kind,
