@@ -29,6 +29,10 @@ class TrainingError(Failed):
     """Training cannot go on: the message names the trajectory or the checkpoint and says what to do."""
 
 
+class Diverged(TrainingError):
+    """A log-likelihood of training demonstrations that is NaN or infinite: this restart has no further epoch."""
+
+
 Known = dict[int, Tensor]
 """By level: the choice of each step that is known, [N, T]; -1 where it is free."""
 
@@ -145,12 +149,12 @@ class Objective:
             return value
         return value + log_duration_prior(tables.termination, batch.lengths, prior) / self.material.train.steps
 
-    def _not_finite(self, tables: Tables, batch: Batch, rows: Tensor) -> TrainingError:
+    def _not_finite(self, tables: Tables, batch: Batch, rows: Tensor) -> Diverged:
         with torch.no_grad():
             values = log_likelihood(tables, batch.lengths)
         bad = [self.material.names[int(row)] for row, ok in zip(rows, torch.isfinite(values), strict=True) if not ok]
         where = ", ".join(bad) or "this minibatch (no trajectory alone)"
-        return TrainingError(
+        return Diverged(
             f"stage {self.stage.name}, epoch {self.progress.epoch + 1}: the log-likelihood of {where} is not "
             "finite; look at these demonstrations, raise control.std, or lower training.optimizer.lr"
         )
