@@ -50,6 +50,14 @@ class RestartStopped:
 
 
 @dataclass(frozen=True)
+class RestartDiverged:
+    """A restart has ended because a log-likelihood became NaN or infinite: ``why`` names the place and the remedy."""
+
+    restart: int
+    why: str
+
+
+@dataclass(frozen=True)
 class TrainingEnded:
     """A model has been trained."""
 
@@ -95,6 +103,7 @@ Event = (
     | EpochEnded
     | UpdatesDone
     | RestartStopped
+    | RestartDiverged
     | TrainingEnded
     | SelectionBegan
     | FoldScored

@@ -171,3 +171,21 @@ def test_looking_at_the_memory_leaves_networks_as_they_were():
     assert all(module.training for module in hierarchy.modules())
     assert all(parameter.grad is None for parameter in hierarchy.parameters())
     assert all(torch.equal(value, before[name]) for name, value in hierarchy.state_dict().items())
+
+
+def test_callers_that_emit_no_control_have_no_sigma():
+    """Neither as parameters, nor where an earlier version's tensors, which have them, are read."""
+    hierarchy = make_hierarchy((2, 2), ("options",), std={"learn": True, "per_option": True})
+    names = [name for name, _ in hierarchy.named_parameters() if ".std." in name]
+    assert names == ["levels.0.policy.std.raw_own"]
+    hybrid = make_hierarchy((2, 2), ("options", "control"), std={"learn": True, "per_option": True})
+    assert sum(".std." in name for name, _ in hybrid.named_parameters()) == 3
+    whole = hierarchy.state_dict()
+    of_before = {f"{place}.std.{name}": torch.zeros(2) for place in ("levels.1.policy", "meta_policy")
+                 for name in ("raw_own",)}  # fmt: skip
+    again = make_hierarchy((2, 2), ("options",), seed=1, std={"learn": True, "per_option": True})
+    again.load_state_dict(whole | of_before)
+    for name, tensor in again.state_dict().items():
+        assert torch.equal(tensor, whole[name])
+    with pytest.raises(RuntimeError, match="Unexpected key"):
+        again.load_state_dict(whole | {"meta_policy.sdt.raw": torch.zeros(2)})

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from command_line import call
 from planted import CONTROL, make_spec, make_truth, plant
@@ -104,6 +106,27 @@ def test_a_level_of_one_option_and_options_with_names_stay(toy_spec):
     held = {"training.labels": {"level": "option", "from": "phase"}}
     with pytest.raises(MergeError, match=r"^training\.labels says which options there are; join two of the labels"):
         merged_spec(with_overrides(toy_spec, held), 0)
+
+
+def test_a_folder_is_of_one_pair_and_one_run(planted, tmp_path):
+    run, _ = planted
+    quick = replace(run, spec=with_overrides(run.spec, {"training.epochs": 2}))
+    first = merge(quick, chosen(quick, options=(2, 3)), out=tmp_path / "merged")
+    again = merge(quick, chosen(quick, options=(3, 2)), out=tmp_path / "merged")
+    assert again.metrics == first.metrics
+    before = {path: path.read_bytes() for path in (tmp_path / "merged").rglob("*") if path.is_file()}
+    with pytest.raises(MergeError, match=r"merged: holds options 2 and 3 of level 'level-1', merged; choose another"):
+        merge(quick, chosen(quick, options=(1, 3)), out=tmp_path / "merged")
+    other = replace(quick, hierarchy=copy.deepcopy(run.hierarchy))
+    with torch.no_grad():
+        other.hierarchy.meta_policy.network.layers[0].bias += 1e-3
+    with pytest.raises(MergeError, match=r"merged: holds options of another run, merged; choose another --out"):
+        merge(other, chosen(quick, options=(2, 3)), out=tmp_path / "merged")
+    demos = Demonstrations.read(tmp_path / "merged" / "demonstrations.hdf5", labels=[LABELS])
+    assert {path: path.read_bytes() for path in before} == before
+    replace(demos, attributes={}).write(tmp_path / "merged" / "demonstrations.hdf5")
+    with pytest.raises(MergeError, match=r"merged: does not say which options it merged; choose another --out"):
+        merge(quick, chosen(quick, options=(2, 3)), out=tmp_path / "merged")
 
 
 def test_the_command_writes_a_run_and_goes_on_where_it_was(toy_run, tmp_path):

@@ -25,7 +25,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from user_networks import Stateful
 
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
-from ddco_pyro.model.networks.conv import POOLED
+from ddco_pyro.model.networks.conv import POOLED, _module
 from ddco_pyro.model.networks.stacked import StackedLinear
 from ddco_pyro.model.networks.state import answer
 from ddco_pyro.spec import Activation, NetworkSpec
@@ -376,3 +376,27 @@ def test_an_output_of_another_shape_is_refused_when_the_network_is_made(how, mes
 def test_a_network_that_cannot_be_built_says_why(shape, settings, message):
     with pytest.raises(ShapeError, match=message):
         make(shape, **settings)
+
+
+@pytest.mark.parametrize("keys", [("cam.rgb", "values"), ("type", "cam%2Ergb"), ("%type", "training"), ("a", "b")])
+@pytest.mark.parametrize("layers", [[], [{"filters": 2, "kernel": 3}] * 2])
+def test_a_picture_may_have_any_name(keys, layers):
+    """A network for two pictures gives what one gives that has the same weights under plain names."""
+    plain, settings = ("one", "two"), {"layers": layers} if layers else {}
+    seen = make_inputs(images=plain)
+
+    def network_of(names):
+        return make(InputShape({}, dict.fromkeys(names, PIXELS)), network="conv", hidden=[4], **settings)
+
+    def given(names):
+        return network_of(names)(Inputs({}, dict(zip(names, seen.images.values(), strict=True)), seen.time))
+
+    assert torch.equal(given(keys), given(plain))
+    own = network_of(keys)
+    network_of(keys).load_state_dict(own.state_dict())
+    assert ("convolutions.a.weight" in own.state_dict()) == (keys[0] == "a")  # as runs have it
+
+
+def test_no_two_names_of_pictures_become_one():
+    names = ["cam.rgb", "%cam.rgb", "%cam%2Ergb", "cam%2Ergb", "%25cam", "%cam", "values", "%values", "."]
+    assert len({_module(name) for name in names}) == len(names)

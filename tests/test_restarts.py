@@ -5,16 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+import user_networks
 from planted import make_spec, make_trainer
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing import words
 from ddco_pyro.errors import BadInput
-from ddco_pyro.events import EpochEnded, RestartStopped
+from ddco_pyro.events import EpochEnded, RestartDiverged, RestartStopped
 from ddco_pyro.fitting import restarts as restarting
 from ddco_pyro.fitting import training
 from ddco_pyro.fitting.checkpoint import Progress, Restart
+from ddco_pyro.fitting.objective import TrainingError
 from ddco_pyro.fitting.run import fit
+from ddco_pyro.spec import parse_spec
 
 QUICK = {"initialize": "random", "layerwise": False, "epochs": 14, "patience": 5, "optimizer": {"lr": 0.05}}
 """Some restarts of it end by patience, others by their budget."""
@@ -218,6 +221,93 @@ def test_what_is_told_of_restarts_adds_up(undisturbed):
     stopped = {event.restart: event.epochs for event in told if isinstance(event, RestartStopped)}
     assert stopped
     assert {n: each["stopped"] for n, each in enumerate(restarts["each"]) if each["stopped"]} == stopped
+
+
+# --- restarts that diverge --------------------------------------------------------------------------------------------
+
+
+def diverging(passes, **training):
+    """Restarts of which those that begin with a positive weight have that many passes before they give NaN."""
+    policy = {"network": "user_networks:Diverging", "options": {"passes": passes}}
+    model = {"hierarchy": None, "baseline": {"kind": "flat", "policy": policy}}
+    return parse_spec(
+        model
+        | {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": ["state"],
+            "control": {"std": 1.0, "scale": "none"},
+            "training": {"restarts": 6, "halving": 3, "epochs": 12, "patience": None, "tune_fraction": 0.2, **training},
+        }
+    )
+
+
+def diverged(trainer):
+    return [number for number, each in enumerate(trainer.summary["restarts"]["each"]) if each.get("diverged")]
+
+
+@pytest.fixture(scope="module", params=[1, 4])
+def with_diverging(request, demos, tmp_path_factory):
+    """As ``undisturbed``; restarts diverge in the first rung, or after it."""
+    told, folder = [], tmp_path_factory.mktemp("diverging")
+    trainer = make_trainer(diverging(request.param), demos, folder, told.append)
+    return trainer, trainer.run().state_dict(), told, checkpoints(folder)
+
+
+def test_a_restart_that_diverges_ends_there_and_is_not_the_best(with_diverging):
+    trainer, model, told, _ = with_diverging
+    ended = diverged(trainer)
+    starts = [trainer.material.hierarchy(number).meta_policy.network.weight[0, 0] > 0 for number in range(6)]
+    passes = int(trainer.spec.baseline.policy.options["passes"])
+    rows = [sum(row["restart"] == number for row in trainer.history) for number in range(6)]
+    assert ended
+    assert all(starts[number] and rows[number] == passes for number in ended)
+    best = trainer.summary["restarts"]["best"]
+    assert best not in ended
+    assert all(value.isfinite().all() for value in model.values())
+    reasons = {event.restart: event.why for event in told if isinstance(event, RestartDiverged)}
+    assert sorted(reasons) == ended
+    assert all(f"epoch {passes + 1}: the log-likelihood of demo_" in why for why in reasons.values())
+    assert f"; diverged: {', '.join(map(str, ended))}" in words.restarts(trainer.summary)
+    made = training.advance(trainer.material, Restart(Progress(best)), None)[0]
+    if passes == 1:  # those that diverge in the first rung are worse than all others there
+        assert ended == [number for number in range(6) if starts[number]]
+    assert all(torch.equal(model[name], value) for name, value in made.states["best"].items())
+
+
+def test_an_interruption_changes_nothing_where_restarts_diverge(with_diverging, demos, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
+    told = []
+    for _ in range(100):
+        trainer, interrupting = None, Interrupting(7)
+        try:
+            trainer = make_trainer(with_diverging[0].spec, demos, tmp_path, interrupting)
+            model = trainer.run().state_dict()
+            break
+        except KeyboardInterrupt:
+            told.append(trainer)
+    assert len(told) > 3
+    assert_same(trainer, model, tmp_path, with_diverging)
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_same_bits_where_restarts_diverge(with_diverging, demos, tmp_path):
+    trainer = make_trainer(with_diverging[0].spec, demos, tmp_path, jobs=2)
+    assert_same(trainer, trainer.run().state_dict(), tmp_path, with_diverging)
+
+
+@pytest.mark.parametrize("restarts", [1, 3])
+def test_where_all_diverge_the_trajectory_is_named(demos, tmp_path, monkeypatch, restarts):
+    monkeypatch.setattr(user_networks.Diverging, "forward", lambda self, inputs: _nan_in_training(self, inputs))
+    for _ in range(2):  # also where all that is kept is read again
+        with pytest.raises(
+            TrainingError, match=r"^stage policy, epoch 1: the log-likelihood of demo_\d+.* is not finite"
+        ):
+            make_trainer(diverging(0, restarts=restarts), demos, tmp_path).run()
+
+
+def _nan_in_training(network, inputs):
+    found = (inputs.vector @ network.weight).unflatten(-1, network.size)
+    return found * torch.nan if network.training else found
 
 
 def test_restarts_in_words(undisturbed):

@@ -18,6 +18,19 @@ def refusal(overrides: dict[str, Any]) -> str:
 
 
 REFUSED: list[tuple[dict[str, Any], str]] = [
+    *(
+        (
+            {"compare_with": ["flat", {"kind": "per_timestep", "policy": {"network": name, **settings}}]},
+            "compare_with.1.policy.network: per_timestep has a perceptron for each step: use one of linear, mlp, "
+            f"got {name!r}, or say kind: flat",
+        )
+        for name, settings in {"lstm": {}, "conv": {}, "branches": {"of": {"pose": {}}}, "module:Net": {}}.items()
+    ),
+    (
+        {"hierarchy": None, "baseline": {"kind": "per_timestep", "policy": {"network": "lstm"}}},
+        "baseline.policy.network: per_timestep has a perceptron for each step: use one of linear, mlp, got 'lstm', or "
+        "say kind: flat",
+    ),
     ({"hierarchy.levels.0.count": 0}, "hierarchy.levels.0.count: must be at least 1, got 0"),
     ({"hierarchy.levels.0.count": "5"}, "hierarchy.levels.0.count: must be a whole number, got '5'"),
     ({"hierarchy.levels.0.count": 5.0}, "hierarchy.levels.0.count: must be a whole number, got 5.0"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Mapping, Sequence
 from types import TracebackType
@@ -24,6 +23,7 @@ from ddco_pyro.events import (
     EpochEnded,
     Event,
     FoldScored,
+    RestartDiverged,
     RestartStopped,
     SelectionBegan,
     TrainingBegan,
@@ -132,6 +132,8 @@ class Progress(_Bar):
                 self.advance(done, f"loss {loss:.2g}")
             case RestartStopped(restart, epochs):
                 self._say(f"restart {restart} stopped after {epochs} epochs of its last stage: others are better")
+            case RestartDiverged(restart, why):
+                self._say(f"restart {restart} diverged: {why}")
             case TrainingEnded():
                 self.end()
             case SelectionBegan(total, kept):
@@ -231,9 +233,9 @@ def merged(pair: Pair, before: Mapping[str, Any], after: Mapping[str, Any]) -> N
     Console().print(Text(text), soft_wrap=True)
 
 
-def _difference(paired: Mapping[str, float]) -> str:
+def _difference(paired: Mapping[str, Any]) -> str:
     error = paired["standard_error"]
-    shown = f"{error:.3f}" if math.isfinite(error) else "unknown (one held out)"
+    shown = "unknown (one held out)" if error is None else f"{error:.3f}"
     return f"{paired['nats_per_step']:+.3f} ± {shown}"
 
 

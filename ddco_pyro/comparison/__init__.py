@@ -6,10 +6,8 @@ the held-out log-likelihood of a trajectory where arviz has the elpd of an obser
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +16,8 @@ from ddco_pyro.comparison.agreement import agreements
 from ddco_pyro.comparison.rollouts import paired_rollouts
 from ddco_pyro.comparison.shared import Held, held_out
 from ddco_pyro.comparison.table import CompareError, Comparison, Row
-from ddco_pyro.data.files import write_text
+from ddco_pyro.data.files import json_text, write_text
+from ddco_pyro.fitting.analysis import paired
 from ddco_pyro.fitting.fit import load
 
 __all__ = ["CompareError", "Comparison", "Row", "compare", "write"]
@@ -55,33 +54,20 @@ def compare(folders: Sequence[Path], allow_code: bool = False) -> Comparison:
 
 
 def _row(rank: int, held: Held, best: np.ndarray) -> Row:
-    difference = best - held.values
+    steps = np.array(held.steps, dtype=float)
+    own, apart = paired(held.values, np.zeros(len(steps)), steps), paired(best, held.values, steps)
     return Row(
         rank, held.run, held.fit.name, int(held.fit.metrics["parameters"]), float(held.values.sum()),
-        _error(held.values), float(difference.sum()), _error(difference), float(held.values.sum() / sum(held.steps)),
-        tuple(held.values.tolist()), held.fit.metrics.get("training"),
+        own["standard_error"] * sum(held.steps), float((best - held.values).sum()),
+        apart["standard_error"] * sum(held.steps), own["nats_per_step"], tuple(held.values.tolist()),
+        held.fit.metrics.get("training"),
     )  # fmt: skip
-
-
-def _error(values: np.ndarray) -> float:
-    """Standard error of a sum of independent values; NaN for a single one."""
-    return float(np.sqrt(len(values) * values.var(ddof=1))) if len(values) > 1 else float("nan")
 
 
 def write(compared: Comparison, folder: Path) -> Path:
     """Write ``compare.json``, ``.md``, ``.html`` and ``.png`` into a folder; the path of the page."""
     picture = plot.write(compared, folder / "compare.png")
-    data = json.dumps(_finite(compared.as_data()), indent=1) + "\n"
-    write_text(folder / "compare.json", data)
+    write_text(folder / "compare.json", json_text(compared.as_data()))
     write_text(folder / "compare.md", page.markdown(compared))
     write_text(folder / "compare.html", page.html(compared, picture, folder))
     return folder / "compare.html"
-
-
-def _finite(data: Any) -> Any:
-    """NaN as null: JSON has no NaN."""
-    if isinstance(data, dict):
-        return {key: _finite(value) for key, value in data.items()}
-    if isinstance(data, list):
-        return [_finite(value) for value in data]
-    return None if isinstance(data, float) and np.isnan(data) else data

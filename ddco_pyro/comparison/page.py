@@ -7,13 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-import numpy as np
-
 from ddco_pyro.comparison.table import Comparison, Row
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.pictures import Picture
 from ddco_pyro.drawing.templates import render
-from ddco_pyro.fitting.analysis import paired
 from ddco_pyro.fitting.convergence import effort
 from ddco_pyro.report.demonstration_list import SHOWN
 from ddco_pyro.segmenting.timeline import anchor
@@ -67,8 +64,10 @@ def rollout_cells(compared: Comparison) -> list[list[str]]:
 def verdict(compared: Comparison) -> str:
     """Which run is the best, by how much, and whether that is more than its error: the report's first sentence."""
     best, *others = compared.rows
-    lengths = np.array(compared.steps, dtype=float)
-    differences = {row.name: paired(np.array(best.each), np.array(row.each), lengths) for row in others}
+    steps = sum(compared.steps)
+    differences = {
+        row.name: {"nats_per_step": row.difference / steps, "standard_error": row.dse / steps} for row in others
+    }
     rising = words.rising(row.name for row in compared.rows if row.training and not row.training["converged"])
     return f"{words.explains(best.name, differences, len(compared.trajectories))}{rising}"
 
@@ -107,7 +106,8 @@ def explanation(compared: Comparison) -> str:
     return (
         f"Held-out log-likelihood of {len(compared.trajectories)} trajectories ({sum(compared.steps)} steps), in nats. "
         "total: sum over trajectories; se: its standard error; diff: the best's total minus this one's, trajectory by "
-        f"trajectory; dse: the standard error of that difference.{more if rising else ''}"
+        f"trajectory; dse: the standard error of that difference. Errors are over trajectories, for one fit of each "
+        f"run; the verdict has the same per step.{more if rising else ''}"
     )
 
 

@@ -17,9 +17,12 @@ class CompareError(BadInput):
 class Row:
     """One run, in nats over all held-out trajectories.
 
-    :param total: Σ log p(ξ_n), and its standard error ``se``, √(N var).
-    :param difference: the best run's total minus this one's (0 for the best), and its standard error ``dse``, √(N var
-        of the differences by trajectory): smaller than what the two ``se`` suggest, as the trajectories are the same.
+    Every error is that of :func:`ddco_pyro.fitting.analysis.paired` times the steps: how much the number per step
+    varies with the demonstrations that happen to be held out, for one fit of each run.
+
+    :param total: Σ log p(ξ_n), and its standard error ``se``.
+    :param difference: the best run's total minus this one's (0 for the best), and its standard error ``dse``: smaller
+        than what the two ``se`` suggest, as the trajectories are the same.
     :param each: log p(ξ_n) of every trajectory.
     """
 

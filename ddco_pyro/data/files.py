@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import fcntl
 import glob
+import json
+import math
 import os
 import platform
 import shutil
@@ -12,6 +14,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from ddco_pyro.errors import BadInput, Failed
 
@@ -160,6 +163,19 @@ def _locked(folder: Path, wait: bool) -> int:
         if folder.exists() and os.path.samestat(os.fstat(handle), folder.stat()):
             return handle
         os.close(handle)  # who held it has removed it meanwhile
+
+
+def json_text(data: Any) -> str:
+    """Plain data as JSON that ends with a new line. NaN, which JSON has not, is null; infinities are a ValueError."""
+    return json.dumps(_without_nan(data), indent=1, allow_nan=False) + "\n"
+
+
+def _without_nan(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {key: _without_nan(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_without_nan(value) for value in data]
+    return None if isinstance(data, float) and math.isnan(data) else data
 
 
 def write_text(path: Path, text: str) -> None:

@@ -20,7 +20,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
     A checksum of both is written with them.
     """
-    checked = {**metadata, CHECKSUM: _digest(tensors, metadata)}
+    checked = {**metadata, CHECKSUM: digest_of(tensors, metadata)}
     content = save({name: value.contiguous() for name, value in tensors.items()}, checked)
     with whole_file(path) as temporary:
         temporary.write_bytes(_metadata_in_order(content))
@@ -39,7 +39,7 @@ def _metadata_in_order(content: bytes) -> bytes:
 CHECKSUM = "sha256"
 
 
-def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+def digest_of(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
     """SHA-256 of names, types, shapes, bytes and metadata."""
     digest = hashlib.sha256(json.dumps(sorted(metadata.items())).encode())
     for name in sorted(tensors):
@@ -62,6 +62,6 @@ def read_tensors(path: Path, remedy: str = "write it again") -> tuple[dict[str, 
     except (SafetensorError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         raise Damaged(path, " ".join(str(error).split()), remedy) from error
     known = metadata.pop(CHECKSUM, None)
-    if known is not None and known != _digest(tensors, metadata):
+    if known is not None and known != digest_of(tensors, metadata):
         raise Damaged(path, "its contents are not what was written", remedy)
     return tensors, metadata

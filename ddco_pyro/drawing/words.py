@@ -127,13 +127,16 @@ def _explained(metrics: Mapping[str, Any]) -> str:
 
 
 def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out: int) -> str:
-    """One sentence on how much better than others a model explains held-out demonstrations.
+    """One sentence on how much better than others a model explains held-out demonstrations. Its ± is over these
+    demonstrations, for the fits at hand: fits from other seeds vary besides.
 
     :param differences: what the others are called to ``nats_per_step`` and ``standard_error`` of the paired difference.
     """
     clauses = [_clause(other, difference, held_out) for other, difference in differences.items()]
     text = f"{name} explains held-out demonstrations {_listed(clauses)}"
-    return f"{text} ({held_out} held-out demonstration{'s' * (held_out != 1)}; ± is one standard error)."
+    if held_out == 1:
+        return f"{text} (1 held-out demonstration, one fit of each model)."
+    return f"{text} (± is one standard error over {held_out} held-out demonstrations, for one fit of each model)."
 
 
 def trainings(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
@@ -151,14 +154,16 @@ def spent(training: Mapping[str, Any]) -> str:
 
 
 def restarts(training: Mapping[str, Any]) -> str:
-    """Which of several restarts was the best, which were stopped early, and what all of them took; nothing where there
-    was a single restart, or in runs of before.
+    """Which of several restarts was the best, which were stopped early or diverged, and what all of them took; nothing
+    where there was a single restart, or in runs of before.
     """
     told = training.get("restarts")
     if told is None or len(told["each"]) == 1:
         return ""
     stopped = [(number, each["stopped"]) for number, each in enumerate(told["each"]) if each["stopped"] is not None]
     early = ", ".join(f"{number} after {epochs}" for number, epochs in stopped) or "none"
+    ended = ", ".join(str(number) for number, each in enumerate(told["each"]) if each.get("diverged"))
+    early += f"; diverged: {ended}" if ended else ""
     return (
         f"restart {told['best']} was the best of {len(told['each'])} (0 to {len(told['each']) - 1}; stopped early, "
         f"with their epochs of the last stage: {early}), which took {told['spent']['epochs']} epochs "
@@ -188,10 +193,10 @@ def _too_short(stage: Mapping[str, Any]) -> str:
     return f"{text} (tuning log-likelihood up by {number(stage['rising'])} nats per step over the last {stage['over']})"
 
 
-def _clause(other: str, difference: Mapping[str, float], held_out: int) -> str:
+def _clause(other: str, difference: Mapping[str, Any], held_out: int) -> str:
     mean, error = difference["nats_per_step"], difference["standard_error"]
     direction = "better" if mean > 0 else "worse"
-    if not math.isfinite(error):
+    if error is None or not math.isfinite(error):
         return f"{number(abs(mean))} nats per step {direction} than {other} (error unknown)"
     if abs(mean) <= error * stats.t.ppf((1 + CONFIDENCE) / 2, held_out - 1):
         return f"with no clear difference from {other} ({signed(mean)} ± {number(error)} nats per step)"

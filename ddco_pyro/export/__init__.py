@@ -172,12 +172,15 @@ def _state(program: StepProgram) -> list[dict[str, Any]]:
 
 
 def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
-    """What the runner has to know of a part of the control; σ of each level's callers, lowest first, if it has one."""
+    """What the runner has to know of a part of the control; σ of each level's callers, lowest first, if it has
+    one: callers that emit no control have none.
+    """
     scaling = hierarchy.scaling
     part, places = scaling.parts[number], list(scaling.groups[number])
-    before = scaling.parts[:number]
+    before, callers = scaling.parts[:number], hierarchy.callers()
     first = sum(len(other.dims) for other in before if other.continuous)
-    std = [caller.std()[..., first : first + len(places)].tolist() for caller in hierarchy.callers()]
+    own = slice(first, first + len(places))
+    std = [[] if caller.std is None else caller.std()[..., own].tolist() for caller in callers]
     decides = [len(scaling.varying) + sum(bool(other.exact) for other in before)] if part.exact else []
     ends = ([None if math.isinf(end) else end for end in values] for values in (part.low, part.high))
     return {

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.fitting.inferred import Inferred
-from ddco_pyro.inference import log_likelihood
+from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.branches import Branches

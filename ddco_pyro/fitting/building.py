@@ -162,10 +162,13 @@ def baselines(spec: Spec, dimensions: Dimensions) -> list[tuple[Spec, Hierarchy]
 
 
 def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
-    """The baselines trained beside, by name: their kind, numbered from the second of one kind on."""
+    """The baselines trained beside, by name: their kind, numbered from the second policy of one kind on. The model
+    itself counts, so that no baseline has its name.
+    """
     names: dict[str, BaselineSpec] = {}
+    own = spec.baseline.kind if spec.baseline else None
     for baseline in spec.compare_with:
-        before = sum(other.kind == baseline.kind for other in names.values())
+        before = (baseline.kind == own) + sum(other.kind == baseline.kind for other in names.values())
         names[f"{baseline.kind}_{before + 1}" if before else baseline.kind] = baseline
     return names
 

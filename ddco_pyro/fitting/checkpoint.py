@@ -24,7 +24,8 @@ class Progress:
     ``start`` is the tuning log-likelihood per step from before this stage, ``best`` that of its best epoch, ``ended``
     has a :class:`ddco_pyro.fitting.convergence.StageEnd` for each stage that has ended, ``history`` a row for each
     epoch. Where all stages have ended (``done``), ``epoch``, ``start`` and ``best`` are still those of the last.
-    ``device`` is the kind of device that its networks were trained on.
+    ``device`` is the kind of device that its networks were trained on. ``diverged`` says where a log-likelihood became
+    NaN or infinite in a further epoch, which ended the restart.
     """
 
     restart: int
@@ -37,6 +38,7 @@ class Progress:
     ended: list[dict[str, Any]] = field(default_factory=list)
     history: list[dict[str, Any]] = field(default_factory=list)
     device: str = "cpu"
+    diverged: str | None = None
 
     @property
     def tune(self) -> Sequence[float]:
@@ -48,7 +50,7 @@ class Progress:
 class Restart:
     """A restart that is being trained: its progress, and the tensors of its ``model``, its ``optimizer``, of the
     ``best`` epoch of this stage, and the ``average`` of weights and the ``constants`` that it takes over, if any. One
-    that is done has the best alone.
+    that is done has the best alone, one that has diverged nothing.
     """
 
     progress: Progress

@@ -6,7 +6,7 @@ whatever their number of stages.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -59,6 +59,7 @@ def summary(
     best: int,
     epochs: Sequence[int],
     stopped: Mapping[int, int],
+    diverged: Collection[int] = (),
 ) -> dict[str, Any]:
     """What ``metrics.json`` says of the training of the best restart, and of what all restarts took.
 
@@ -66,6 +67,7 @@ def summary(
     :param best: the restart that the stages are of.
     :param epochs: of each restart, in all its stages.
     :param stopped: restarts that were stopped early, to their epochs of the last stage.
+    :param diverged: restarts that ended because a log-likelihood became NaN or infinite.
     """
     spent = sum(end.epochs for end in ends)
     return {
@@ -76,7 +78,10 @@ def summary(
         "restarts": {
             "best": best,
             "spent": _effort(sum(epochs), updates),
-            "each": [{"epochs": count, "stopped": stopped.get(number)} for number, count in enumerate(epochs)],
+            "each": [
+                {"epochs": count, "stopped": stopped.get(number)} | ({"diverged": True} if number in diverged else {})
+                for number, count in enumerate(epochs)
+            ],
         },
     }
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,15 +11,17 @@ from typing import Any
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.tensors import digest_of
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import OnEvent, ignore
+from ddco_pyro.fitting.checkpoint import copy_of
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.spec.messages import nearest
 
 LABELS = "merged"
-"""Name of the labels that say which option each step begins with."""
+"""Name of the labels that say which option each step begins with, and of what their file says of the merge."""
 
 
 class MergeError(BadInput):
@@ -42,13 +46,42 @@ class Pair:
 def merge(run: Fit, pair: Pair, out: str | Path | None = None, on_event: OnEvent = ignore, jobs: int = 1) -> Fit:
     """The run's spec with an option less, fitted to its demonstrations from its segments with two options as one.
 
-    The other levels are trained anew. The new run keeps a copy of the demonstrations, with the labels it began from.
+    The other levels are trained anew. The new run keeps a copy of the demonstrations, with the labels it began from,
+    the pair, and the digest of the run's networks.
 
     :param out: its folder; None to write nothing.
-    :raises MergeError: the level would have no option left, or has been trained from labels.
+    :raises MergeError: the level would have no option left, or has been trained from labels; or the folder is of
+        another pair, or of another run.
     """
     changed = merged_spec(run.spec, pair.level)
-    return fit(changed, merged_labels(run, pair), out=out, on_event=on_event, jobs=jobs)
+    level = changed.hierarchy.levels[pair.level].name if changed.hierarchy else ""
+    origin = {"level": level, "options": pair.options, "networks": digest_of(copy_of(run.hierarchy), {})}
+    if out is not None:
+        _check_same(Path(out), json.loads(json.dumps(origin)))
+    demos = merged_labels(run, pair)
+    demos = replace(demos, attributes={**demos.attributes, LABELS: json.dumps(origin)})
+    return fit(changed, demos, out=out, on_event=on_event, jobs=jobs)
+
+
+def _check_same(folder: Path, origin: Mapping[str, Any]) -> None:
+    """See that a folder which holds a merged run, or a part of one, holds this one.
+
+    :raises MergeError: it does not.
+    """
+    path = folder / "demonstrations.hdf5"
+    if not path.exists():
+        return
+    told = json.loads(str(Demonstrations.read(path, []).attributes.get(LABELS, "null")))
+    if told == origin:
+        return
+    if told is None:
+        what = "does not say which options it merged"
+    elif told["networks"] != origin["networks"]:
+        what = "holds options of another run, merged"
+    else:
+        first, second = told["options"]
+        what = f"holds options {first} and {second} of level {told['level']!r}, merged"
+    raise MergeError(f"{folder}: {what}; choose another --out or remove it")
 
 
 def chosen(run: Fit, level: str | None = None, options: tuple[int, int] | None = None) -> Pair:

@@ -18,7 +18,7 @@ from ddco_pyro.fitting.material import Material
 from ddco_pyro.fitting.ranks import ALONE, Ranks
 from ddco_pyro.fitting.stages import Stage
 from ddco_pyro.fitting.upper import Constants, expected, fitted
-from ddco_pyro.inference import log_likelihood, total_log_likelihood
+from ddco_pyro.inference.engines import log_likelihood, total_log_likelihood
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -27,6 +27,10 @@ from ddco_pyro.model.tables import Tables
 
 class TrainingError(Failed):
     """Training cannot go on: the message names the trajectory or the checkpoint and says what to do."""
+
+
+class Diverged(TrainingError):
+    """A log-likelihood of training demonstrations that is NaN or infinite: this restart has no further epoch."""
 
 
 Known = dict[int, Tensor]
@@ -145,12 +149,12 @@ class Objective:
             return value
         return value + log_duration_prior(tables.termination, batch.lengths, prior) / self.material.train.steps
 
-    def _not_finite(self, tables: Tables, batch: Batch, rows: Tensor) -> TrainingError:
+    def _not_finite(self, tables: Tables, batch: Batch, rows: Tensor) -> Diverged:
         with torch.no_grad():
             values = log_likelihood(tables, batch.lengths)
         bad = [self.material.names[int(row)] for row, ok in zip(rows, torch.isfinite(values), strict=True) if not ok]
         where = ", ".join(bad) or "this minibatch (no trajectory alone)"
-        return TrainingError(
+        return Diverged(
             f"stage {self.stage.name}, epoch {self.progress.epoch + 1}: the log-likelihood of {where} is not "
             "finite; look at these demonstrations, raise control.std, or lower training.optimizer.lr"
         )

@@ -80,7 +80,7 @@ def read_metrics(folder: Path, counts: Sequence[int]) -> dict[str, Any]:
     ]
     if levels != [list(range(1 + count)) for count in counts] or {len(values) for values in each_level} - {len(counts)}:
         raise Damaged(path, f"is not about levels with {', '.join(map(str, counts)) or 'no'} options", remedy)
-    data: dict[str, Any] = json.loads(path.read_bytes())
+    data: dict[str, Any] = json.loads(path.read_bytes(), parse_constant=lambda _: None)  # runs of before have NaN
     return data | ({"agreement": as_today(data["agreement"], len(counts))} if "agreement" in data else {})
 
 
@@ -105,10 +105,10 @@ class HeldOut(Record):
 
 
 class Difference(Record):
-    """Paired, in nats per step; the error of a single demonstration is NaN."""
+    """Paired, in nats per step; a single demonstration has no error."""
 
     nats_per_step: Finite
-    standard_error: float
+    standard_error: float | None
 
 
 class BothParts(PerStep):
@@ -143,10 +143,13 @@ class Stage(Record):
 
 
 class Restart(Record):
-    """What a restart took, and after how many epochs of its last stage it was stopped early; None where it was not."""
+    """What a restart took, after how many epochs of its last stage it was stopped early (None where it was not), and
+    whether it diverged.
+    """
 
     epochs: int
     stopped: int | None
+    diverged: bool = False
 
 
 class Restarts(Record):
@@ -282,11 +285,13 @@ class Rollouts(Record):
 
 
 class Unfinished(Record):
-    """Rollouts that were interrupted: the outcome of each seed's episode, for every method that was done."""
+    """Rollouts that were interrupted: the outcome of each seed's episode, for every method that was done; null for a
+    measure that does not apply to an episode.
+    """
 
     models: str
     seeds: list[int]
-    outcomes: dict[str, list[dict[str, float]]]
+    outcomes: dict[str, list[dict[str, float | None]]]
 
     @model_validator(mode="after")
     def _an_outcome_for_each_seed(self) -> Unfinished:

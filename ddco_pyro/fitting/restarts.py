@@ -2,8 +2,9 @@
 
 Successive halving on tuning likelihood: all train until ``training.halving`` epochs of the last stage, the better half
 until twice as many, and so on; the last alone trains until patience or budget end it. Earlier stages are trained whole,
-since what they maximise cannot be compared. Who goes on follows from the histories alone, so that neither the number of
-processes nor an interruption changes it.
+since what they maximise cannot be compared. A restart whose log-likelihood becomes NaN or infinite ends there and is
+the worst of all. Who goes on follows from the histories alone, so that neither the number of processes nor an
+interruption changes it.
 """
 
 from __future__ import annotations
@@ -17,15 +18,17 @@ from typing import Any
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
-from ddco_pyro.events import EpochEnded, OnEvent, RestartStopped, ignore
+from ddco_pyro.events import EpochEnded, OnEvent, RestartDiverged, RestartStopped, ignore
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.checkpoint import Progress, Restart
 from ddco_pyro.fitting.convergence import StageEnd, summary
 from ddco_pyro.fitting.devices import described, device_of
 from ddco_pyro.fitting.labels import Labels
 from ddco_pyro.fitting.material import Material
+from ddco_pyro.fitting.objective import TrainingError
 from ddco_pyro.fitting.processes import pool, results, useful_jobs
 from ddco_pyro.fitting.ranks import ALONE, Ranks
+from ddco_pyro.fitting.stages import plan
 from ddco_pyro.fitting.training import advance
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -85,7 +88,7 @@ class Trainer:
     def run(self) -> Hierarchy:
         """The best restart's hierarchy, in evaluation mode.
 
-        :raises TrainingError: where a log-likelihood is not finite.
+        :raises TrainingError: every restart that was left has diverged.
         """
         self.restarts = [self._begun(number) for number in range(self.spec.training.restarts)]
         self.ranks.share(self.material)
@@ -93,19 +96,25 @@ class Trainer:
         while epochs is not None and len(left) > 1:
             before = len(self.history)
             self._train(left, epochs)
-            better = better_half({number: best_until(self.restarts[number].progress, epochs) for number in left})
+            last = len(plan(self.spec, self.first.depth)) - 1
+            better = better_half({number: best_until(self.restarts[number].progress, epochs, last) for number in left})
             self._stop([number for number in left if number not in better], tell=len(self.history) > before)
             left, epochs = better, 2 * epochs
         self._train(left, None)
         self.ranks.share(None)
+        if (why := self.restarts[self.best].progress.diverged) is not None:
+            self.ranks.share(None)  # that was all
+            raise TrainingError(why)
         model = self.material.hierarchy(self.best)
         model.load_state_dict(self.restarts[self.best].states["best"])
         return model.eval()
 
     @property
     def best(self) -> int:
-        """The restart with the best tuning log-likelihood; the first of equals."""
-        return ranked({restart.progress.restart: restart.progress.best for restart in self._whole})[0]
+        """The restart with the best tuning log-likelihood, the first of equals; one that diverged where all did."""
+        whole = [restart.progress for restart in self._whole]
+        sound = [progress for progress in whole if progress.diverged is None]
+        return ranked({progress.restart: progress.best for progress in sound or whole})[0]
 
     @property
     def history(self) -> list[dict[str, Any]]:
@@ -118,7 +127,8 @@ class Trainer:
         ends = [StageEnd(**end) for end in self.restarts[self.best].progress.ended]
         updates = math.ceil(len(self.material.train) / self.spec.training.batch_size)
         spent = [len(restart.progress.history) for restart in self.restarts]
-        made = summary(self.spec.training, ends, updates, self.best, spent, self.stopped)
+        diverged = [restart.progress.restart for restart in self.restarts if restart.progress.diverged is not None]
+        made = summary(self.spec.training, ends, updates, self.best, spent, self.stopped, diverged)
         return made | {"device": self.restarts[self.best].progress.device}
 
     @property
@@ -178,11 +188,13 @@ class Trainer:
                         left.remove(restart.progress.restart)
 
     def _keep(self, restart: Restart) -> None:
-        number = restart.progress.restart
+        number, why = restart.progress.restart, restart.progress.diverged
         self.restarts[number] = restart
         path = self._path(number)
         if path is not None:
             restart.write(path)
+        if why is not None and len(self.restarts) > 1:
+            self.on_event(RestartDiverged(number, why))
 
 
 def follow(ranks: Ranks) -> None:
@@ -195,8 +207,13 @@ def follow(ranks: Ranks) -> None:
             advance(material, restart, until, ranks=ranks)
 
 
-def best_until(progress: Progress, epochs: int) -> float:
-    """The best tuning log-likelihood per step before and in the first epochs of the last stage."""
+def best_until(progress: Progress, epochs: int, last: int) -> float:
+    """The best tuning log-likelihood per step before and in the first epochs of the last stage, whose number is
+    ``last``; -inf where the restart has diverged by then. What comes later does not count: an interrupted training may
+    have gone further than one that has just arrived there.
+    """
+    if progress.diverged is not None and (progress.stage < last or progress.epoch < epochs):
+        return -math.inf
     return max(progress.tune[: epochs + 1])
 
 

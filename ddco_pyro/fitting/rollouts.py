@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking
-from ddco_pyro.data.files import write_text
+from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit, RunError
 from ddco_pyro.fitting.records import Unfinished, read_record
@@ -120,16 +120,21 @@ class _Unfinished:
         if self._path.exists():
             kept = read_record(self._path, Unfinished, f"remove it and roll out again: ddco-pyro rollout {folder}")
             if (kept.models, kept.seeds) == (self._key["models"], self._key["seeds"]):
-                self.outcomes = kept.outcomes
+                self.outcomes = {name: [_numbers(one) for one in each] for name, each in kept.outcomes.items()}
 
     def keep(self, name: str, outcomes: list[dict[str, float]]) -> None:
         """A method has been rolled out."""
         self.outcomes[name] = outcomes
-        write_text(self._path, json.dumps(self._key | {"outcomes": self.outcomes}))
+        write_text(self._path, json_text(self._key | {"outcomes": self.outcomes}))
 
     def end(self) -> None:
         """All of them have been, and are kept elsewhere."""
         self._path.unlink(missing_ok=True)
+
+
+def _numbers(outcome: Mapping[str, float | None]) -> dict[str, float]:
+    """An outcome read back: NaN for what does not apply."""
+    return {measure: math.nan if value is None else value for measure, value in outcome.items()}
 
 
 def _methods(task: Task, by_method: Outcomes, ours: str) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import torch
 
 from ddco_pyro.data.control_parts import measure
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import leftovers, only_one, write_text
+from ddco_pyro.data.files import json_text, leftovers, only_one, write_text
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
 from ddco_pyro.data.tensors import write_tensors
@@ -194,7 +194,7 @@ def _fit(
     }
     if folder:
         write_metrics(folder, metrics)
-    return replace(fitted, metrics=json.loads(json.dumps(metrics)))  # as they are read back
+    return replace(fitted, metrics=json.loads(json_text(metrics)))  # as they are read back
 
 
 def _baseline(
@@ -211,7 +211,7 @@ def _baseline(
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
     """Write ``metrics.json``."""
-    write_text(folder / "metrics.json", json.dumps(metrics, indent=1) + "\n")
+    write_text(folder / "metrics.json", json_text(metrics))
 
 
 def claim(folder: Path, spec: Spec, resume: bool = True) -> None:

@@ -26,7 +26,7 @@ from ddco_pyro.fitting.checkpoint import Restart, copy_of
 from ddco_pyro.fitting.convergence import StageEnd, share
 from ddco_pyro.fitting.devices import device_of, repeatable
 from ddco_pyro.fitting.material import Material
-from ddco_pyro.fitting.objective import Objective
+from ddco_pyro.fitting.objective import Diverged, Objective
 from ddco_pyro.fitting.ranks import ALONE, Ranks
 from ddco_pyro.fitting.shards import cut
 from ddco_pyro.fitting.stages import Stage, plan
@@ -53,7 +53,6 @@ def advance(
     :param seconds: about how long it may take; an epoch of each stage that it comes to is made in any case.
     :param checkpoint: where it is kept at the end of epochs.
     :param ranks: the processes that do this together, all of them without a limit of time.
-    :raises TrainingError: a log-likelihood is not finite.
     """
     deadline = time.monotonic() + seconds
     device = device_of(material.spec.training)
@@ -74,7 +73,15 @@ class Training:
         self._saved_at = -np.inf  # the first epoch is saved
 
     def run(self, until: int | None, deadline: float) -> bool:
-        """Whether it came as far as it was to, before the deadline."""
+        """Whether it came as far as it was to, or has diverged, before the deadline."""
+        try:
+            return self._run(until, deadline)
+        except Diverged as error:
+            now = self.progress
+            now.done, now.diverged, now.best, self._restart.states = True, str(error), -math.inf, {}
+            return True
+
+    def _run(self, until: int | None, deadline: float) -> bool:
         now, model = self.progress, self._material.hierarchy(self.progress.restart)
         if "model" in self._restart.states:
             model.load_state_dict(self._restart.states["model"])

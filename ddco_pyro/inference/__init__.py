@@ -1,18 +1,18 @@
-"""Exact inference in the AHMM: two engines for one likelihood, and what follows from it."""
+"""Exact inference in the AHMM: two engines for one likelihood, and what follows from it.
+
+Each function refuses tables and lengths that do not go together (:class:`BadTables`, a ``ValueError``).
+"""
 
 from __future__ import annotations
 
-from typing import Literal
-
-import torch
-from torch import Tensor
-
-from ddco_pyro.inference import enumeration, fused
-from ddco_pyro.inference.paths import Path, most_likely_path, sample_paths, segment
-from ddco_pyro.inference.posteriors import Posterior, posterior
-from ddco_pyro.model.tables import Tables
+from ddco_pyro.inference import engines, paths, posteriors
+from ddco_pyro.inference.arguments import BadTables, checked
+from ddco_pyro.inference.engines import Engine
+from ddco_pyro.inference.paths import Path
+from ddco_pyro.inference.posteriors import Posterior
 
 __all__ = [
+    "BadTables",
     "Engine",
     "Path",
     "Posterior",
@@ -24,25 +24,9 @@ __all__ = [
     "total_log_likelihood",
 ]
 
-Engine = Literal["fused", "enumerate"]
-
-
-def log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") -> Tensor:
-    """log p(ξ) in nats of each trajectory, [N] float64, differentiable in the tables.
-
-    :param lengths: steps of each trajectory, [N]; whatever the tables hold beyond is ignored.
-    """
-    if engine == "fused":
-        return fused.log_likelihood(tables, lengths)
-    one_by_one = [
-        enumeration.total_log_likelihood(tables.trajectory(n, int(length)), lengths[n : n + 1])
-        for n, length in enumerate(lengths)
-    ]
-    return torch.stack(one_by_one)
-
-
-def total_log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") -> Tensor:
-    """Σ_n log p(ξ_n), a scalar; with ``engine="enumerate"`` in one elimination for the whole batch."""
-    if engine == "enumerate":
-        return enumeration.total_log_likelihood(tables, lengths)
-    return fused.log_likelihood(tables, lengths).sum()
+log_likelihood = checked(engines.log_likelihood)
+total_log_likelihood = checked(engines.total_log_likelihood)
+posterior = checked(posteriors.posterior)
+most_likely_path = checked(paths.most_likely_path)
+sample_paths = checked(paths.sample_paths)
+segment = checked(paths.segment)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ddco_pyro.inference.arguments import BadTables
 from ddco_pyro.inference.logspace import Arrival, arrive, log_sum
 from ddco_pyro.model.tables import Step
 
@@ -32,7 +33,12 @@ class Filter:
         """log p(a_0..t-1 | s) so far, [N] nats."""
 
     def predict(self, now: Step) -> Belief:
-        """The belief at step t; the control is not known yet."""
+        """The belief at step t; the control is not known yet.
+
+        :raises BadTables: the step is of another number of demonstrations, or of other options, than those before.
+        """
+        if self._before is not None and self._before.shape != (expected := _joint(now)):
+            raise BadTables(f"step: expected joint choices {list(self._before.shape)}; got {list(expected)}")
         arrival = arrive(self._before, now)
         self._now = arrival.message
         return Belief(tuple(_marginals(arrival, level) for level in range(len(now.selection))))
@@ -40,16 +46,24 @@ class Filter:
     def update(self, emission: Tensor) -> None:
         """Take in the control that was applied: its log-density given each joint choice, [N, C_D, ..., C_1].
 
-        :raises ValueError: no step has been predicted, or the control is impossible whatever the choice.
+        :raises ValueError: no step has been predicted, the control is impossible whatever the choice, or the shape is
+            another.
         """
         if self._now is None:
             raise ValueError("update() follows predict(): there is no step to which this control belongs")
+        if emission.shape != self._now.shape:
+            raise BadTables(f"emission: expected {list(self._now.shape)}; got {list(emission.shape)}")
         message = self._now + emission
         total = log_sum(message.flatten(1)) if message.dim() > 1 else message
         if not bool(torch.isfinite(total).all()):
             raise ValueError("the control has probability 0 under every choice; is it in the demonstrations' units?")
         self.log_likelihood = self.log_likelihood + total
         self._before, self._now = message - total.reshape(-1, *(1,) * (message.dim() - 1)), None
+
+
+def _joint(now: Step) -> tuple[int, ...]:
+    """The shape of a message over the joint choices of a step, [N, C_D, ..., C_1]."""
+    return (len(now.alive), *(table.shape[-1] for table in reversed(now.selection)))
 
 
 def _marginals(arrival: Arrival, index: int) -> Tensor:

@@ -68,7 +68,8 @@ class _Eliminate(torch.autograd.Function):
         weight = upstream.to(posteriors[0].dtype)
         gradients = [weight.reshape(-1, *(1,) * (table.dim() - 1)) * table for table in posteriors]
         networks = len(ctx.needs_input_grad) - 2 - len(ctx.evidence)
-        evidence = gradients[networks:] or [None] * len(ctx.evidence)
+        marginals = gradients[networks:] or [None] * len(ctx.evidence)
+        evidence = (own if needed else None for own, needed in zip(marginals, ctx.evidence, strict=True))
         return None, None, *gradients[:networks], *evidence
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from ddco_pyro.inference import log_likelihood
+from ddco_pyro.inference.arguments import BadTables, check_lengths
 from ddco_pyro.model.ahmm import run
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.model.tables import complete
@@ -26,20 +27,24 @@ class EliminatedAHMM(TorchDistribution):
 
     :param outputs: what the networks say about the observations; the batch shape is [N], the event shape [T, A].
     :param lengths: steps of each demonstration, [N]; whatever a value holds beyond is ignored.
+    :raises BadTables: the lengths are no integers [N] from 1 to T, or controls have another shape or no number.
     """
 
     arg_constraints: ClassVar = {}
     support = constraints.independent(constraints.real, 2)
 
     def __init__(self, outputs: Outputs, lengths: Tensor, validate_args: bool | None = None) -> None:
-        self.outputs, self.lengths = outputs, lengths
         lowest = outputs.emissions[0]
         assert lowest is not None  # the lowest level emits the control
         number, steps, _, size = lowest.shape
+        self.outputs, self.lengths = outputs, check_lengths(lengths, number, steps)
         super().__init__(torch.Size([number]), torch.Size([steps, size]), validate_args=validate_args)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """log p(a | s) of controls [N, T, A] in scaled units, [N] nats."""
+        expected = self.batch_shape + self.event_shape
+        if value.shape != expected:
+            raise BadTables(f"controls: expected the shape {list(expected)}; got {list(value.shape)}")
         return log_likelihood(self.outputs.tables(value), self.lengths)
 
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> EliminatedAHMM:

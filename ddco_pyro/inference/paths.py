@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ddco_pyro.inference.arguments import refuse_impossible
 from ddco_pyro.inference.structure import Structure, structure_of
 from ddco_pyro.inference.threads import as_many_threads_as_torch
 from ddco_pyro.inference.trace import trace
@@ -27,20 +28,28 @@ def most_likely_path(tables: Tables, lengths: Tensor) -> Path:
 
     Of equally likely paths it is the one that, followed back from the end, has the lowest last choice (of the highest
     level first), keeps its choices rather than selecting them anew, and comes from the lowest choice before.
+
+    :raises BadTables: a trajectory has probability 0, so none of its paths is likelier than another.
     """
     path = _trace(tables, lengths, best=True, uniforms=np.zeros((1, len(lengths), _steps(tables) + 1, _two(tables))))
     return Path(tuple(h[0] for h in path.choices), tuple(b[0] for b in path.terminations))
 
 
 def sample_paths(tables: Tables, lengths: Tensor, samples: int = 1, seed: int = 0) -> Path:
-    """Independent draws from p(ζ | ξ), [samples, N, T] for every level."""
+    """Independent draws from p(ζ | ξ), [samples, N, T] for every level.
+
+    :raises BadTables: a trajectory has probability 0.
+    """
     generator = np.random.default_rng(seed)
     uniforms = generator.random((samples, len(lengths), _steps(tables) + 1, _two(tables)))
     return _trace(tables, lengths, best=False, uniforms=uniforms)
 
 
 def segment(tables: Tables, lengths: Tensor) -> tuple[Tensor, ...]:
-    """The choices of :func:`most_likely_path`, a [N, T] per level, lowest first; -1 past the length."""
+    """The choices of :func:`most_likely_path`, a [N, T] per level, lowest first; -1 past the length.
+
+    :raises BadTables: a trajectory has probability 0.
+    """
     return most_likely_path(tables, lengths).choices
 
 
@@ -59,14 +68,16 @@ def _trace(tables: Tables, lengths: Tensor, best: bool, uniforms: np.ndarray) ->
     structure = structure_of(tables)
     shape = (*uniforms.shape[:2], _steps(tables))
     joint, terminated = np.empty(shape, dtype=np.int64), np.empty(shape, dtype=np.int64)
+    possible = np.ones(len(lengths), dtype=np.bool_)
     evidence = tables.joint_evidence()
     weight = np.empty((*shape[1:], 0)) if evidence is None else evidence.detach().flatten(2).numpy()
     with as_many_threads_as_torch():
         trace(
             _rows(tables.selection), _rows(tables.termination), _rows(tables.control), weight, lengths.numpy(), best,
-            uniforms, joint, terminated, structure.sizes, structure.starts, structure.selects, structure.ends,
+            uniforms, joint, terminated, possible, structure.sizes, structure.starts, structure.selects, structure.ends,
             structure.actors,
         )  # fmt: skip
+    refuse_impossible(torch.from_numpy(possible))
     return _path(structure, joint, terminated)
 
 

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.inference import fused
-from ddco_pyro.model.tables import Tables
+from ddco_pyro.inference.arguments import refuse_impossible
+from ddco_pyro.model.tables import NEVER, Tables
 
 
 class Posterior(NamedTuple):
@@ -28,10 +29,14 @@ class Posterior(NamedTuple):
 
 
 def posterior(tables: Tables, lengths: Tensor) -> Posterior:
-    """The E-step: u, v and w of every level (§4.1)."""
+    """The E-step: u, v and w of every level (§4.1).
+
+    :raises BadTables: a trajectory has probability 0.
+    """
     if not tables.depth:
         return Posterior((), (), ())
     result = fused.eliminate(tables, lengths, marginals=True)
+    refuse_impossible(result.value > NEVER)
     u = result.marginals
     v = tuple(
         torch.cat([u_d[..., :1], selected.sum(2)[..., 1:]], dim=-1)  # choice 0 lasts one step: it is always selected

@@ -128,10 +128,13 @@ def _before(
 def _back(
     n: int, select: Array, end: Array, messages: Array, spread: Array, best: bool, uniforms: Array, joint: Array,
     terminated: Array, sizes: Choices, starts: Choices, selects: Choices, ends: Choices,
-) -> None:  # fmt: skip
-    """Fill ``joint`` [T] and the number of levels that ``terminated`` [T], from the last step to the first."""
+) -> bool:  # fmt: skip
+    """Fill ``joint`` [T] and the number of levels that ``terminated`` [T], from the last step to the first; whether the
+    path has a probability above 0.
+    """
     depth, steps = len(sizes), len(joint)
     index = _pick(messages[steps, : starts[1]], best, uniforms[steps, 0])
+    possible = messages[steps, index] > -np.inf
     for t in range(steps - 1, -1, -1):
         joint[t] = index
         d = 0
@@ -145,14 +148,18 @@ def _back(
         terminated[t] = d
         if t > 0:
             index = _before(n, t, d - 1, index, messages, end, best, uniforms[t], sizes, starts, ends)
+    return bool(possible)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def trace(
     select: Array, end: Array, emission: Array, weight: Array, lengths: Array, best: bool, uniforms: Array,
-    joint: Array, terminated: Array, sizes: Choices, starts: Choices, selects: Choices, ends: Choices, actors: Array,
+    joint: Array, terminated: Array, possible: Array, sizes: Choices, starts: Choices, selects: Choices, ends: Choices,
+    actors: Array,
 ) -> None:  # fmt: skip
     """Fill the ``joint`` choices [M, N, T] of M paths, and how many levels ``terminated`` there, -1 past the lengths.
+
+    ``possible`` [N] says which trajectories have a probability above 0; the paths of others mean nothing.
 
     :param select: log-probabilities [N, T, Σ callers·C_d]; ``end`` [N, T, Σ 2·k_d]; ``emission`` [N, T, 1 + Σ k_d].
     :param weight: logarithms of factors of the joint choices [N, T, S], or [N, T, 0] where there are none.
@@ -167,7 +174,7 @@ def trace(
             n, select, end, emission, weight, best, messages, spread, sizes, starts, selects, ends, actors
         )  # fmt: skip
         for m in range(len(joint)):
-            _back(
+            possible[n] = _back(
                 n, select, end, messages, spread, best, uniforms[m, n], joint[m, n, : lengths[n]],
                 terminated[m, n, : lengths[n]], sizes, starts, selects, ends,
             )  # fmt: skip

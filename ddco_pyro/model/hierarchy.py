@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -63,12 +63,19 @@ class Caller(nn.Module):
         logits = options + self.emits_control if self.emits_options else 0
         self.sizes = (logits, scaling.numbers if self.emits_control else 0)
         self.network = build(network, shape, sum(self.sizes), copies)
-        self.std = ControlStd(control, scaling, copies)
+        self.std = ControlStd(control, scaling, copies) if self.emits_control else None
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
+        """Models that have a σ also where no control is emitted are read without it."""
+        if self.std is None:
+            for name in [name for name in state_dict if name.startswith(f"{prefix}std.")]:
+                del state_dict[name]
+        super()._load_from_state_dict(state_dict, prefix, *others)
 
     def forward(self, said: Tensor, scaling: ControlScaling) -> CallerOutputs:
         """What the callers say at every step, given what their network says, [N, T, K, outputs]."""
         logits, numbers = said.split(self.sizes, dim=-1) if all(self.sizes) else (said, said)
-        emission = scaling.emission(numbers, self.std()) if self.emits_control else None
+        emission = None if self.std is None else scaling.emission(numbers, self.std())
         return CallerOutputs(self.options, logits if self.emits_options else None, emission)
 
 
@@ -286,7 +293,7 @@ def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
     assert spec.baseline is not None  # a spec has one or the other
     policy = spec.baseline.policy
     if spec.baseline.kind == "per_timestep":
-        kept = {key: getattr(policy, key) for key in ("inputs", "hidden", "dropout", "activation")}
+        kept = {key: getattr(policy, key) for key in ("inputs", "shared", "hidden", "dropout", "activation")}
         policy = NetworkSpec(network="per_timestep", **kept)
     return policy, ("control",)
 

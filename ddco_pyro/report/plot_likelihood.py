@@ -41,7 +41,8 @@ def likelihoods(metrics: Mapping[str, Any], baselines: Mapping[str, Mapping[str,
     for name, other in metrics["comparison"].items():
         values, difference = other["log_likelihood_per_step"], other["difference"]
         each = _each(metrics["valid"], baselines.get(name, {}).get("valid", ()))
-        mean_and_error = (difference["nats_per_step"], difference["standard_error"])
+        error = difference["standard_error"]
+        mean_and_error = (difference["nats_per_step"], np.nan if error is None else error)
         likelihoods.append(Likelihood(name, values["train"], values["valid"], mean_and_error, each, **_effort(other)))
     return likelihoods
 

@@ -5,13 +5,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import only_one, write_text
+from ddco_pyro.data.files import json_text, only_one, write_text
 from ddco_pyro.errors import Failed
 from ddco_pyro.events import CandidateGivenUp, FoldScored, OnEvent, SelectionBegan, ignore
 from ddco_pyro.fitting import prepare
@@ -184,4 +183,4 @@ def _write(folder: Path, spec: Spec, choice: Choice, folds: Folds, stop_early: b
     }
     write_text(folder / "selection.md", table.markdown(choice, data))
     plot.write(choice, folder / "figures" / "selection.png")
-    write_text(folder / "selection.json", json.dumps(data, indent=1) + "\n")
+    write_text(folder / "selection.json", json_text(data))

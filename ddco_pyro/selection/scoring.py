@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from ddco_pyro.data.files import Damaged, write_text
+from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.records import read_record
@@ -83,7 +82,7 @@ def path_of(folder: Path, candidate: int, fold: int) -> Path:
 def keep(folder: Path, score: Score) -> None:
     """Write a score, whole or not at all, unless another attempt could go otherwise."""
     if score.final:
-        write_text(path_of(folder, score.candidate, score.fold), json.dumps(asdict(score)) + "\n")
+        write_text(path_of(folder, score.candidate, score.fold), json_text(asdict(score)))
 
 
 def kept(folder: Path, candidate: int, fold: int) -> Score | None:

@@ -115,7 +115,8 @@ class BaselineSpec(Model):
 
     kind: Kind
     """``flat``: one policy for all times; ``flat_equal``: the same with its hidden layers widened or narrowed, all by
-    one factor, until it has as many parameters as the hierarchy; ``per_timestep``: one policy for each time step."""
+    one factor, until it has as many parameters as the hierarchy; ``per_timestep``: one policy for each time step, a
+    perceptron of the settings in ``policy``."""
     policy: NetworkSpec = NetworkSpec()
     """The policy's network, π."""
     optimizer: OptimizerSpec | None = None
@@ -127,6 +128,13 @@ class BaselineSpec(Model):
         if self.kind == "flat_equal" and not self.policy.hidden:
             text = f"flat_equal widens hidden layers, and network {self.policy.network!r} has none; give it some"
             raise invalid(("policy", f"{text}, such as {{network: mlp, hidden: [64]}}"))
+        return self
+
+    @model_validator(mode="after")
+    def _can_be_repeated(self) -> BaselineSpec:
+        if self.kind == "per_timestep" and self.policy.network not in (*HEADS, "per_timestep"):
+            text = f"per_timestep has a perceptron for each step: use one of {', '.join(HEADS)}"
+            raise invalid(("policy.network", f"{text}, got {self.policy.network!r}, or say kind: flat"))
         return self
 
 

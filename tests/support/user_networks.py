@@ -21,6 +21,21 @@ class Own(nn.Module):
         return (self.gain * inputs.vector.sum(-1))[..., None, None].expand(*inputs.batch, *self.size)
 
 
+class Diverging(Own):
+    """Linear; where its first weight begins positive, NaN after so many training passes, which it counts."""
+
+    def __init__(self, shape, outputs, copies, passes):
+        super().__init__(shape, outputs, copies)
+        self.weight = nn.Parameter(0.1 * torch.randn(shape.vector, copies * outputs))
+        self.register_buffer("left", torch.where(self.weight[0, 0] > 0, passes, 10**6))
+
+    def forward(self, inputs):
+        if self.training:
+            self.left -= 1
+        found = (inputs.vector @ self.weight).unflatten(-1, self.size)
+        return torch.where(self.left < 0, torch.nan, found)
+
+
 class Wrong(Own):
     """A network of one's own that can be made, but whose output is not what it has to be."""
 

@@ -48,14 +48,15 @@ class Conv(nn.Module):
         if not shape.images:
             raise ShapeError("needs an image among the observations, and all of them are vectors: use network: mlp")
         self.reads, self.copies, self.pool, self.pooled = list(shape.vectors), copies, pool, pooled
+        self.pictures = list(shape.images)
         self.activation, self.standardize = ACTIVATIONS[activation](), standardize
         first, *rest = layers or [ConvolutionLayer(filters=filters, kernel=kernel, stride=2, padding=kernel // 2)]
         self.convolutions = nn.ModuleDict(
-            {key: _convolution(first, size[-1], copies) for key, size in shape.images.items()}
+            {_module(key): _convolution(first, size[-1], copies) for key, size in shape.images.items()}
         )
         self.deeper = nn.ModuleDict(
             {
-                key: nn.ModuleList(
+                _module(key): nn.ModuleList(
                     _convolution(layer, copies * before.filters, copies, copies)
                     for before, layer in zip([first, *rest], rest, strict=False)
                 )
@@ -77,7 +78,7 @@ class Conv(nn.Module):
 
     def numpy_form(self) -> NumpyForm:
         """What the numpy runner has to know of it."""
-        pictures = [self._picture_form(key) for key in self.convolutions]
+        pictures = [self._picture_form(key) for key in self.pictures]
         return perceptrons(self.layers, joined([vectors(self.reads, self.copies), *pictures]))
 
     def _picture_form(self, key: str) -> NumpyForm:
@@ -91,12 +92,13 @@ class Conv(nn.Module):
     def strengthen(self, factor: float) -> None:
         """Make the last maps of each picture stronger by a factor."""
         with torch.no_grad():
-            for key in self.convolutions:
+            for key in self.pictures:
                 for parameter in self._layers(key)[-1].parameters():
                     parameter.mul_(factor)
 
     def _layers(self, key: str) -> list[nn.Conv2d]:
-        layers = [self.convolutions[key], *(self.deeper[key].children() if key in self.deeper else ())]
+        name = _module(key)
+        layers = [self.convolutions[name], *(self.deeper[name].children() if name in self.deeper else ())]
         return [layer for layer in layers if isinstance(layer, nn.Conv2d)]
 
     def _map(self, key: str, image: Tensor) -> Tensor:
@@ -126,6 +128,12 @@ class Conv(nn.Module):
                 raise ShapeError(f"{key} of {size[0]} × {size[1]} is too small for its layers: take some out, or pad")
         each = {"mean": self.pooled**2, "flatten": height * width, "spatial_softmax": 2}[self.pool]
         return layer.out_channels // self.copies * each
+
+
+def _module(key: str) -> str:
+    """The name of a picture's layers: the key, escaped where torch takes no module of that name."""
+    plain = "." not in key and not key.startswith("%") and not hasattr(nn.ModuleDict(), key)
+    return key if plain else "%" + key.replace("%", "%25").replace(".", "%2E")
 
 
 def _convolution(layer: ConvolutionLayer, channels: int, copies: int, groups: int = 1) -> nn.Conv2d:

@@ -1,0 +1,183 @@
+"""What the public door of the inference refuses, and what it takes, in both engines alike."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hierarchies import make_batch, make_hierarchy
+from oracle import brute_force, random_tables
+
+from ddco_pyro import inference
+from ddco_pyro.errors import BadInput
+from ddco_pyro.inference.filtering import Filter
+from ddco_pyro.inference.marginal import EliminatedAHMM
+from ddco_pyro.model.tables import NEVER, complete
+
+DOOR = {
+    "fused": lambda *given: inference.log_likelihood(*given, engine="fused"),
+    "enumerate": lambda *given: inference.log_likelihood(*given, engine="enumerate"),
+    "total fused": lambda *given: inference.total_log_likelihood(*given, engine="fused"),
+    "total enumerate": lambda *given: inference.total_log_likelihood(*given, engine="enumerate"),
+    "posterior": inference.posterior,
+    "most_likely_path": inference.most_likely_path,
+    "segment": inference.segment,
+    "sample_paths": inference.sample_paths,
+}
+LENGTHS = {
+    "one for three": (torch.tensor([5]), r"lengths: there are 3 trajectories; got int64 \[1\]"),
+    "longer": (torch.tensor([5, 8, 1]), "lengths: trajectory 1 has 8 steps; the tables hold 1 to 5"),
+    "none": (torch.tensor([5, 0, 1]), "lengths: trajectory 1 has 0 steps"),
+    "negative": (torch.tensor([5, 4, -1]), "lengths: trajectory 2 has -1 steps"),
+    "real": (torch.tensor([5.0, 4.0, 3.0]), "lengths: give a tensor of integers"),
+    "mask": (torch.tensor([True, True, True]), "lengths: give a tensor of integers"),
+    "list": ([5, 4, 3], "lengths: give a tensor of integers, one for each trajectory; got list"),
+    "column": (torch.tensor([[5], [4], [3]]), r"got int64 \[3, 1\]"),
+}
+TABLES = {
+    "short termination": (
+        lambda t: _changed(t, "termination", 1, t.termination[1][:, :4]),
+        r"termination\[1\]: expected floating-point numbers \[3, 5, 2, 2\]; got float64 \[3, 4, 2, 2\]",
+    ),
+    "controls of one trajectory": (lambda t: _changed(t, "control", 0, t.control[0][:1]), r"control\[0\]"),
+    "a caller": (lambda t: _changed(t, "selection", 0, t.selection[0][:, :, :1]), r"selection\[0\]"),
+    "no callers": (
+        lambda t: _changed(t, "selection", 1, t.selection[1][:, :, 0]),
+        r"selection\[1\]: expected \[N, T, callers, 1 \+ options\]",
+    ),
+    "integers": (lambda t: _changed(t, "control", 1, t.control[1].clamp(min=0).long()), r"control\[1\]"),
+    "no control": (lambda t: replace(t, control=()), "control: tables with 2 levels of selections need 3; got 0"),
+    "a level less": (lambda t: replace(t, termination=t.termination[:1]), r"termination: .* need 2; got 1"),
+    "evidence of one level": (lambda t: replace(t, evidence=(None,)), r"evidence: .* need 2; got 1"),
+    "evidence of options": (lambda t: replace(t, evidence=(torch.zeros(3, 5, 2), None)), r"evidence\[0\]"),
+    "NaN": (
+        lambda t: _changed(t, "control", 0, _with(t.control[0], (1, 3, 0), torch.nan)),
+        r"control\[0\]: a log-probability of trajectory 1 at step 3 is NaN or \+inf",
+    ),
+    "infinite": (
+        lambda t: _changed(t, "selection", 1, _with(t.selection[1], (2, 0, 0, 1), torch.inf)),
+        r"selection\[1\]: a log-probability of trajectory 2 at step 0 is NaN or \+inf",
+    ),
+}
+
+
+def _changed(tables, name, level, table):
+    own = getattr(tables, name)
+    return replace(tables, **{name: (*own[:level], table, *own[level + 1 :])})
+
+
+def _with(table, place, value):
+    table = table.clone()
+    table[place] = value
+    return table
+
+
+def _tables(counts=(2, 2), steps=5):
+    return random_tables(counts, (True,) * len(counts), trajectories=3, steps=steps, seed=31)
+
+
+@pytest.mark.parametrize("function", DOOR)
+@pytest.mark.parametrize("case", LENGTHS)
+@pytest.mark.parametrize("counts", [(), (2,), (2, 2)])
+def test_lengths_that_are_none_are_refused(function, case, counts):
+    lengths, says = LENGTHS[case]
+    with pytest.raises(BadInput, match=says):
+        DOOR[function](_tables(counts), lengths)
+
+
+@pytest.mark.parametrize("function", DOOR)
+@pytest.mark.parametrize("case", TABLES)
+def test_tables_that_do_not_go_together_are_refused(function, case):
+    change, says = TABLES[case]
+    with pytest.raises(BadInput, match=says):
+        DOOR[function](change(_tables()), torch.tensor([5, 4, 3]))
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.int32, torch.uint8])
+def test_lengths_of_any_integer_type_and_anything_beyond_them_are_taken(dtype):
+    tables, lengths = _tables(steps=3), torch.tensor([3, 2, 1], dtype=dtype)
+    truth = [brute_force(tables, n, int(length)).log_likelihood for n, length in enumerate(lengths)]
+    past = torch.arange(3) >= lengths[:, None]
+    for leaf in tables.leaves():
+        leaf[past] = torch.nan
+    for engine in ("fused", "enumerate"):
+        np.testing.assert_allclose(inference.log_likelihood(tables, lengths, engine), truth, atol=1e-9)
+    path = inference.most_likely_path(tables, lengths)
+    assert torch.equal(path.choices[0] < 0, past)
+
+
+@pytest.mark.parametrize("counts", [(2,), (2, 2), (1, 2, 1)])
+@pytest.mark.parametrize("levels", ["all", "lowest", "highest"])
+def test_the_gradient_of_the_evidence_is_that_of_differences(counts, levels):
+    """Where evidence of one level alone is known, or of all, in both engines."""
+    tables, lengths = random_tables(counts, (True,) * len(counts), 2, 3, seed=32), torch.tensor([3, 2])
+    known = {"all": range(len(counts)), "lowest": [0], "highest": [len(counts) - 1]}[levels]
+    generator = torch.Generator().manual_seed(33)
+
+    def given(level):
+        return torch.randn(2, 3, 1 + counts[level], generator=generator, dtype=torch.float64).requires_grad_()
+
+    evidence = tuple(given(level) if level in known else None for level in range(len(counts)))
+    leaves = [own for own in evidence if own is not None]
+    gradients = {}
+    for engine in ("fused", "enumerate"):
+        value = inference.total_log_likelihood(replace(tables, evidence=evidence), lengths, engine)
+        gradients[engine] = torch.autograd.grad(value, leaves)
+    step = 1e-5
+    for number, leaf in enumerate(leaves):
+        differences = torch.zeros_like(leaf)
+        for place in np.ndindex(*leaf.shape):
+            sides = []
+            for sign in (1, -1):
+                with torch.no_grad():
+                    leaf[place] += sign * step
+                    sides.append(float(inference.total_log_likelihood(replace(tables, evidence=evidence), lengths)))
+                    leaf[place] -= sign * step
+            differences[place] = (sides[0] - sides[1]) / (2 * step)
+        for engine in gradients:
+            torch.testing.assert_close(gradients[engine][number], differences, atol=1e-8, rtol=0, msg=engine)
+
+
+@pytest.mark.parametrize("counts", [(2,), (2, 2)])
+def test_an_impossible_trajectory_has_a_likelihood_of_zero_and_no_posterior(counts):
+    tables = _tables(counts, steps=3)
+    for table in tables.control:
+        table[1, 2] = NEVER  # no caller can have emitted this control
+    lengths = torch.tensor([3, 3, 3])
+    possible = brute_force(tables, 0, 3).log_likelihood
+    for engine in ("fused", "enumerate"):
+        value = inference.log_likelihood(tables, lengths, engine)
+        assert value[1] == NEVER
+        assert float(value[0]) == pytest.approx(possible)
+    for function in ("posterior", "most_likely_path", "segment", "sample_paths"):
+        with pytest.raises(BadInput, match=r"trajectory 1 has probability 0 .* no posterior"):
+            DOOR[function](tables, lengths)
+        DOOR[function](tables, torch.tensor([3, 2, 3]))  # the step is past the end
+
+
+def test_the_eliminated_model_refuses_lengths_and_controls_of_others():
+    hierarchy, batch = make_hierarchy((3,)), make_batch()
+    with torch.no_grad():
+        outputs = hierarchy(batch.inputs)
+    for wrong in (batch.lengths[:1], batch.lengths + 100, batch.lengths - batch.lengths, batch.lengths.double()):
+        with pytest.raises(BadInput, match="lengths"):
+            EliminatedAHMM(outputs, wrong)
+    distribution = EliminatedAHMM(outputs, batch.lengths)
+    with pytest.raises(BadInput, match="controls: expected the shape"):
+        distribution.log_prob(batch.actions[:1])
+    with pytest.raises(BadInput, match="NaN"):
+        distribution.log_prob(batch.actions * torch.nan)
+
+
+def test_the_filter_refuses_steps_of_other_demonstrations():
+    first, *_ = complete(_tables(), torch.tensor([5, 5, 5])).steps()
+    other, *_ = complete(random_tables((2, 2), (True, True), 1, 2), torch.tensor([2])).steps()
+    filtering = Filter()
+    filtering.predict(first)
+    with pytest.raises(BadInput, match=r"emission: expected \[3, 3, 3\]; got \[1, 3, 3\]"):
+        filtering.update(other.emission)
+    filtering.update(first.emission)
+    with pytest.raises(BadInput, match=r"step: expected joint choices \[3, 3, 3\]; got \[1, 3, 3\]"):
+        filtering.predict(other)

@@ -1,0 +1,97 @@
+"""What ``metrics.json`` says, against sums of the models' own log-likelihoods; and that it is JSON."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import ddco_pyro
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.files import json_text
+from ddco_pyro.drawing import words
+from ddco_pyro.fitting.prepare import parts
+from ddco_pyro.fitting.rollouts import policies
+from ddco_pyro.report import write_report
+from ddco_pyro.spec import parse_spec
+
+POLICY = {"network": "mlp", "hidden": [4]}
+
+
+def demonstrations(number):
+    """Of different lengths; the control bends, which a linear policy cannot follow."""
+    random, each = np.random.default_rng(0), []
+    for n in range(number):
+        seen = random.uniform(-2, 2, size=(6 + n, 1))
+        each.append(Demonstration(f"demo_{n}", {"state": seen}, np.abs(seen) + 0.1 * random.normal(size=seen.shape)))
+    return Demonstrations(tuple(each))
+
+
+def make_spec(valid_fraction, **model):
+    return parse_spec(
+        {
+            "observations": ["state"],
+            "demonstrations": {"path": "unused.hdf5", "valid_fraction": valid_fraction},
+            "training": {"epochs": 30, "optimizer": {"lr": 0.03}, "initialize": "random"},
+            **model,
+        }
+    )
+
+
+def strictly(text):
+    """JSON as it is defined, without NaN and infinities."""
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is no JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_a_baseline_of_the_models_own_kind_has_numbers_of_its_own(tmp_path):
+    """``flat`` with hidden units, and beside it a linear ``flat``, both by their own log-likelihoods."""
+    linear = {"kind": "flat", "policy": {"network": "linear"}}
+    spec = make_spec(0.4, baseline={"kind": "flat", "policy": POLICY}, compare_with=[linear, linear])
+    demos = demonstrations(10)
+    run = ddco_pyro.fit(spec, demos, out=tmp_path / "run")
+    valid = parts(spec, demos)["valid"]
+    steps = sum(valid.lengths)
+    ours = run.log_likelihood(valid)
+    assert list(run.metrics["comparison"]) == list(run.baselines) == ["flat_2", "flat_3"]
+    assert run.metrics["log_likelihood_per_step"]["valid"] == pytest.approx(ours.sum() / steps)
+    for name, beside in run.baselines.items():
+        theirs, said = beside.log_likelihood(valid), run.metrics["comparison"][name]
+        assert abs(ours.sum() - theirs.sum()) / steps > 0.1  # or this could not tell one from the other
+        assert said["log_likelihood_per_step"]["valid"] == pytest.approx(theirs.sum() / steps)
+        assert said["difference"]["nats_per_step"] == pytest.approx((ours.sum() - theirs.sum()) / steps)
+    listed = {row["name"]: row["log_likelihood_per_step"] for row in run.metrics["demonstrations_by_likelihood"]}
+    for name, value, length in zip(valid.names, ours, valid.lengths, strict=True):
+        assert listed[name]["flat"] == pytest.approx(value / length)
+    assert list(ddco_pyro.load(tmp_path / "run").baselines) == ["flat_2", "flat_3"]
+
+
+def test_methods_of_one_kind_are_rolled_out_each_under_its_name(toy_run):
+    spec = toy_run.spec.model_copy(update={"hierarchy": None, "baseline": toy_run.spec.compare_with[0]})
+    own = ddco_pyro.fitting.fit.Fit(spec, toy_run.baselines["flat"].hierarchy, beside={"flat_2": toy_run})
+    assert list(policies(own))[-2:] == ["flat_2", "flat"]
+
+
+def test_a_single_held_out_demonstration_has_no_error_and_every_file_is_json(tmp_path):
+    spec = make_spec(0.1, hierarchy={"levels": [{"count": 2}]}, compare_with=["flat"])
+    run = ddco_pyro.fit(spec, demonstrations(6), out=tmp_path / "run")
+    again = ddco_pyro.load(tmp_path / "run")
+    for metrics in (run.metrics, again.metrics, strictly((tmp_path / "run" / "metrics.json").read_text())):
+        assert metrics["comparison"]["flat"]["difference"]["standard_error"] is None
+    assert "(error unknown) (1 held-out demonstration" in words.verdict(run.metrics)
+    page = write_report(run, run.demonstrations).read_text()
+    assert "± –" in page
+    path = tmp_path / "run" / "metrics.json"
+    path.write_text(path.read_text().replace('"standard_error": null', '"standard_error": NaN'))
+    assert ddco_pyro.load(tmp_path / "run").metrics == again.metrics
+
+
+def test_json_has_null_for_what_is_no_number():
+    data = {"a": [1.5, float("nan"), (2, None)], "b": {"c": float("nan")}}
+    assert strictly(json_text(data)) == {"a": [1.5, None, [2, None]], "b": {"c": None}}
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        json_text([float("inf")])
