@@ -16,6 +16,7 @@ METHODS = {
     "flat": "flat",
     "flat_equal": "flat of equal size",
     "per_timestep": "per-timestep",
+    "mixture": "mixture",
     "open_loop": "open loop",
 }
 
@@ -23,6 +24,7 @@ ABOUT = {
     "ddco": "the hierarchy of options",
     "flat": "one policy without options",
     "per_timestep": "a policy for each time step",
+    "mixture": "the hierarchy’s policies, chosen anew at every step (no memory)",
 }
 
 

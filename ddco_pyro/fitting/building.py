@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import nn
@@ -162,32 +163,40 @@ def baselines(spec: Spec, dimensions: Dimensions) -> list[tuple[Spec, Hierarchy]
 
 
 def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
-    """The baselines trained beside, by name: their kind, numbered from the second of one kind on."""
+    """The baselines trained beside, by name, numbered from the second of one name on."""
     names: dict[str, BaselineSpec] = {}
     for baseline in spec.compare_with:
-        before = sum(other.kind == baseline.kind for other in names.values())
-        names[f"{baseline.kind}_{before + 1}" if before else baseline.kind] = baseline
+        before = sum(other.name == baseline.name for other in names.values())
+        names[f"{baseline.name}_{before + 1}" if before else baseline.name] = baseline
     return names
 
 
 def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) -> Spec:
-    """The spec of a baseline trained beside: the same but for the model, and what it says of the optimiser.
+    """The spec of a baseline trained beside: another model, and the optimiser that the baseline names; nothing else
+    differs. A mixture keeps labels and durations; policies without options have neither.
 
     :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
     """
     grid = spec.selection.model_copy(update={"grid": {}})  # it is about the hierarchy
     own = baseline.optimizer.model_dump(exclude_unset=True) if baseline.optimizer else {}
     optimizer = spec.training.optimizer.model_copy(update=own)
-    training = spec.training.model_copy(update={"optimizer": optimizer, "labels": None, "duration": None})
-    baseline = baseline.model_copy(update={"optimizer": None})
-    model = {"hierarchy": None, "baseline": baseline, "compare_with": ()}
-    alone = spec.model_copy(update={**model, "training": training, "selection": grid})
+    training: dict[str, Any] = {"optimizer": optimizer, "labels": None, "duration": None}
+    model: dict[str, Any] = {"hierarchy": None, "baseline": baseline.model_copy(update={"optimizer": None})}
+    if baseline.kind == "mixture":
+        assert spec.hierarchy is not None  # a mixture beside it is refused otherwise
+        mixture = spec.hierarchy.without_memory(baseline.levels)
+        model = {"hierarchy": mixture, "baseline": None}
+        lasting = spec.training.duration if any(level.lasts for level in mixture.levels) else None
+        training |= {"labels": spec.training.labels, "duration": lasting}
+    own_training = spec.training.model_copy(update=training)
+    alone = spec.model_copy(update={**model, "compare_with": (), "training": own_training, "selection": grid})
     if baseline.kind != "flat_equal":
         return alone
 
     def resized(hidden: tuple[int, ...]) -> Spec:
         policy = baseline.policy.model_copy(update={"hidden": hidden})
-        return alone.model_copy(update={"baseline": baseline.model_copy(update={"policy": policy})})
+        resized = baseline.model_copy(update={"policy": policy, "optimizer": None})
+        return alone.model_copy(update={"baseline": resized})
 
     build_hierarchy(alone, dimensions)  # what is wrong with it is said here
     target = parameters(build_hierarchy(spec, dimensions))
