@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -30,7 +30,7 @@ class LevelActivity:
     path: np.ndarray
     ended: np.ndarray
     termination: np.ndarray
-    lasts: bool = True
+    lasts: bool = field(default=True, kw_only=True)
 
     @property
     def choices(self) -> list[int]:
@@ -53,7 +53,7 @@ def activity(fit: Fit, demos: Demonstrations) -> Activity:
     levels = []
     for number, level in enumerate(fit.spec.hierarchy.levels):
         arrays = (np.concatenate([part[what][number] for part in parts]) for what in range(4))
-        levels.append(LevelActivity(level.name, *arrays, level.lasts))
+        levels.append(LevelActivity(level.name, *arrays, lasts=level.lasts))
     return Activity(tuple(levels), np.array(demos.lengths))
 
 

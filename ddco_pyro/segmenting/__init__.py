@@ -37,7 +37,7 @@ class LevelLabels:
     probability: np.ndarray
 
     @classmethod
-    def of(cls, options: np.ndarray, terminations: np.ndarray, active: np.ndarray, lasts: bool) -> LevelLabels:
+    def of(cls, options: np.ndarray, terminations: np.ndarray, active: np.ndarray, *, lasts: bool) -> LevelLabels:
         """From the most likely path, choices and terminations [T], and the posterior u [T, 1 + k].
 
         :param lasts: whether the level's options can be active for more than one step.
