@@ -206,6 +206,12 @@ def labels(spec: Spec, used: Labels | None) -> None:
     Console().print(Text(text), soft_wrap=True)
 
 
+ONE_FIT = (
+    "± is one standard error over the held-out demonstrations of one fit; other training seeds give other fits: "
+    "repeat them with --seeds 5."
+)
+
+
 def log_likelihoods(metrics: Mapping[str, Any]) -> None:
     """Log-likelihood of the model and of what it is compared with, in training and on what was held out."""
     head = ("model", "training", "validation (held out)", "ours - this, validation", "gradient steps")
@@ -217,6 +223,9 @@ def log_likelihoods(metrics: Mapping[str, Any]) -> None:
         numbers = [_number(values[part]) for part in ("train", "valid")]
         table.add_row(name, *numbers, shown, effort(row.get("training")))
     _show(table)
+    if "worth" in metrics:
+        said = words.worth(metrics["worth"], words.method(metrics["model"]), len(metrics["valid"]))
+        Console().print(Text(f"{said} {ONE_FIT}"), soft_wrap=True)
     for name, training in words.trainings(metrics).items():
         if beside := words.restarts(training):
             Console().print(Text(f"{name}: {beside}"), soft_wrap=True)

@@ -125,7 +125,8 @@ def _explained(metrics: Mapping[str, Any]) -> str:
             f"{name} gives held-out demonstrations {value} nats per step; no other model was trained to compare with."
         )
     differences = {method(other): comparison["difference"] for other, comparison in metrics["comparison"].items()}
-    return explains(name, differences, held_out)
+    said = worth(metrics["worth"], method(metrics["model"]), held_out) if "worth" in metrics else ""
+    return f"{explains(name, differences, held_out)}{' ' * bool(said)}{said}"
 
 
 def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out: int) -> str:
@@ -136,6 +137,46 @@ def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out
     clauses = [_clause(other, difference, held_out) for other, difference in differences.items()]
     text = f"{name} explains held-out demonstrations {_listed(clauses)}"
     return f"{text} ({held_out} held-out demonstration{'s' * (held_out != 1)}; ± is one standard error)."
+
+
+def worth(found: Mapping[str, Any], ours: str, held_out: int) -> str:
+    """What several experts and options that last are worth, and the verdict, which is about the second.
+
+    :param found: what :func:`ddco_pyro.fitting.worth.worth` gives, with ``steps_in_a_row`` where that is known.
+    :param ours: what the hierarchy is called.
+    """
+    memory = found["memory"]
+    lasting = f"{_with_error(memory)} from options that last ({ours} − mixture)"
+    if "flat" in found:
+        flat = method(found["flat"])
+        total = signed(found["total"]["nats_per_step"])
+        experts = f"{_with_error(found['experts'])} come from several experts (mixture − {flat})"
+        parts = f"Of {total} nats per step over {flat}, {experts} and {lasting}."
+    else:
+        parts = f"Held-out nats per step: {lasting}."
+    decided = {
+        1: "So options that last are worth it on these demonstrations.",
+        0: "So this fit does not show that options that last are worth anything.",
+        -1: "So options that last explain these demonstrations worse than the same experts without memory.",
+    }[_direction(memory, held_out)]
+    rows = found.get("steps_in_a_row", ())
+    short = [row for row in rows if row["options"] <= row["mixture"]]
+    if short and len(short) == len(rows):
+        own, mixture = (number(short[0][name], 1) for name in ("options", "mixture"))
+        decided += f" Options stay active no longer ({own} steps) than the mixture keeps to one expert ({mixture})."
+    return f"{parts} {decided}"
+
+
+def _with_error(difference: Mapping[str, float]) -> str:
+    return f"{signed(difference['nats_per_step'])} ± {number(difference['standard_error'])}"
+
+
+def _direction(difference: Mapping[str, float], held_out: int) -> int:
+    """1 or -1 where the 95 % interval of a difference leaves out 0, else 0."""
+    mean, error = difference["nats_per_step"], difference["standard_error"]
+    if not math.isfinite(error) or abs(mean) <= error * stats.t.ppf((1 + CONFIDENCE) / 2, held_out - 1):
+        return 0
+    return 1 if mean > 0 else -1
 
 
 def trainings(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
@@ -195,7 +236,7 @@ def _clause(other: str, difference: Mapping[str, float], held_out: int) -> str:
     direction = "better" if mean > 0 else "worse"
     if not math.isfinite(error):
         return f"{number(abs(mean))} nats per step {direction} than {other} (error unknown)"
-    if abs(mean) <= error * stats.t.ppf((1 + CONFIDENCE) / 2, held_out - 1):
+    if not _direction(difference, held_out):
         return f"with no clear difference from {other} ({signed(mean)} ± {number(error)} nats per step)"
     return f"{number(abs(mean))} ± {number(error)} nats per step {direction} than {other}"
 

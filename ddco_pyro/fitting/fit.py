@@ -150,6 +150,10 @@ def _stacked(parts: Sequence[Tensor], padding: float) -> Tensor:
     return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=padding)
 
 
+HIERARCHY = "ddco"
+"""What a hierarchy whose options last is called in tables."""
+
+
 def model_name(spec: Spec) -> str:
     """``ddco``, or what a baseline of this model is called (:attr:`~ddco_pyro.spec.BaselineSpec.name`)."""
     if spec.hierarchy is None:
@@ -157,7 +161,7 @@ def model_name(spec: Spec) -> str:
         return spec.baseline.name
     memoryless = [level.name for level in spec.hierarchy.levels if not level.lasts]
     if not memoryless:
-        return "ddco"
+        return HIERARCHY
     return "_".join(("mixture", *(memoryless if len(memoryless) < len(spec.hierarchy.levels) else ())))
 
 
