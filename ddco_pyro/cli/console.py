@@ -25,6 +25,7 @@ from ddco_pyro.events import (
     Event,
     FoldScored,
     RestartStopped,
+    SeedFitted,
     SelectionBegan,
     TrainingBegan,
     TrainingEnded,
@@ -144,6 +145,9 @@ class Progress(_Bar):
             case CandidateGivenUp(candidate, folds):
                 self._say(f"{candidate}: stopped early, {folds} folds less")
                 self.advance(self._done + folds)
+            case SeedFitted(total):
+                self._begun("fitting with other training seeds", total)
+                self.advance(self._done + 1)
             case EpisodeEnded(method, total):
                 self._begun("rolling out", total)
                 self.advance(self._done + 1, method)
@@ -225,10 +229,21 @@ def log_likelihoods(metrics: Mapping[str, Any]) -> None:
     _show(table)
     if "worth" in metrics:
         said = words.worth(metrics["worth"], words.method(metrics["model"]), len(metrics["valid"]))
-        Console().print(Text(f"{said} {ONE_FIT}"), soft_wrap=True)
+        Console().print(Text(f"{said} {ONE_FIT if 'seeds' not in metrics else ''}".rstrip()), soft_wrap=True)
     for name, training in words.trainings(metrics).items():
         if beside := words.restarts(training):
             Console().print(Text(f"{name}: {beside}"), soft_wrap=True)
+
+
+def seeds(metrics: Mapping[str, Any]) -> None:
+    """How much the models of a run vary with the training seed; nothing where the fit was not repeated."""
+    if "seeds" not in metrics:
+        return
+    found = metrics["seeds"]
+    rows = [[name, *words.spread(values)] for name, values in found["held_out"].items()]
+    title = f"held-out nats per step over training seeds {words.listed(map(str, found['training_seeds']))}"
+    comparison(("model", "mean", "95 % interval", "range"), rows, title)
+    Console().print(Text(words.over_seeds(found, words.method(metrics["model"]))), soft_wrap=True)
 
 
 def merged(pair: Pair, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
