@@ -29,7 +29,8 @@ from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import always_ends
 from ddco_pyro.segmenting import LevelLabels
-from ddco_pyro.spec import DurationSpec, SpecError, dump_spec, load_spec, parse_spec
+from ddco_pyro.selection.grid import candidates
+from ddco_pyro.spec import DurationSpec, SpecError, dump_spec, load_spec, parse_spec, with_overrides
 from ddco_pyro.spec.reading import read_yaml
 
 SPECS = Path(__file__).parent.parent / "specs"
@@ -154,6 +155,26 @@ def test_a_mixture_that_stands_alone_is_a_hierarchy():
     assert (level.count, level.policy.hidden, level.policy.emits, level.lasts) == (3, (4,), ("control",), False)
     assert spec.baseline is None
     assert model_name(spec) == "mixture"
+
+
+TWO = [{"name": "option", "count": 2}, {"name": "phase", "count": 2}]
+
+
+def test_a_grid_of_models_is_one_line():
+    """Flat, mixture, options and two levels, each valid by itself, with the parameters that it has alone."""
+    spec = spec_of(selection={"grid": {"model": ["flat", "mixture", "options", TWO]}})
+    found = candidates(spec, Dimensions({"offsets": (4,), "visited": (1,)}, 2, 12))
+    assert [one.name for one in found] == ["model = flat", "model = mixture", "model = options", "model = [2, 2]"]
+    assert [model_name(one.spec) for one in found] == ["flat", "mixture", "ddco", "ddco"]
+    _, mixture, options, _ = (one.parameters for one in found)
+    assert options - mixture == 2 * (4 + 1 + 1)  # two linear terminations of five numbers
+    assert found[2].spec.hierarchy == spec.hierarchy
+    assert all(one.spec.compare_with == () for one in found)
+
+
+def test_what_is_no_model_is_refused():
+    with pytest.raises(SpecError, match=r"^model: must be options, a baseline such as flat or mixture, .* got 3$"):
+        with_overrides(spec_of(), {"model": 3})
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from ddco_pyro.model.encoding import Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import ShapeError
 from ddco_pyro.model.seeding import seeded
-from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code
+from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code, with_overrides
 
 
 @dataclass(frozen=True)
@@ -177,27 +177,20 @@ def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) ->
 
     :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
     """
-    grid = spec.selection.model_copy(update={"grid": {}})  # it is about the hierarchy
     own = baseline.optimizer.model_dump(exclude_unset=True) if baseline.optimizer else {}
-    optimizer = spec.training.optimizer.model_copy(update=own)
-    training: dict[str, Any] = {"optimizer": optimizer, "labels": None, "duration": None}
-    model: dict[str, Any] = {"hierarchy": None, "baseline": baseline.model_copy(update={"optimizer": None})}
-    if baseline.kind == "mixture":
-        assert spec.hierarchy is not None  # a mixture beside it is refused otherwise
-        mixture = spec.hierarchy.without_memory(baseline.levels)
-        model = {"hierarchy": mixture, "baseline": None}
-        lasting = spec.training.duration if any(level.lasts for level in mixture.levels) else None
-        training |= {"labels": spec.training.labels, "duration": lasting}
-    own_training = spec.training.model_copy(update=training)
-    alone = spec.model_copy(update={**model, "compare_with": (), "training": own_training, "selection": grid})
+    optimizer = {f"training.optimizer.{key}": value for key, value in own.items()}
+    model = baseline.model_dump(exclude_unset=True, exclude={"optimizer"})
+
+    def alone(**changes: Any) -> Spec:
+        return with_overrides(spec, {"selection.grid": {}, "model": model | changes, **optimizer})
+
     if baseline.kind != "flat_equal":
-        return alone
+        return alone()
 
     def resized(hidden: tuple[int, ...]) -> Spec:
         policy = baseline.policy.model_copy(update={"hidden": hidden})
-        resized = baseline.model_copy(update={"policy": policy, "optimizer": None})
-        return alone.model_copy(update={"baseline": resized})
+        return alone(policy=policy.model_dump(exclude_unset=True))
 
-    build_hierarchy(alone, dimensions)  # what is wrong with it is said here
+    build_hierarchy(resized(baseline.policy.hidden), dimensions)  # what is wrong with it is said here
     target = parameters(build_hierarchy(spec, dimensions))
     return resized(nearest_widths(baseline.policy.hidden, target, lambda hidden: _counted(resized(hidden), dimensions)))

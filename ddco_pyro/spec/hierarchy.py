@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer, model_validator
@@ -92,14 +92,6 @@ class HierarchySpec(Model):
         """Names of the observations that the policies of a level, 1 for the lowest, read; all of them where none is."""
         own = self.levels[level - 1]
         return (self.trunk or own.trunk or own.policy).reads
-
-    def without_memory(self, names: Iterable[str] = ()) -> HierarchySpec:
-        """The same hierarchy in which the options of these levels, of all where none is named, end after every step."""
-        chosen = set(names) or {level.name for level in self.levels}
-        levels = (
-            level.model_copy(update={"termination": ALWAYS}) if level.name in chosen else level for level in self.levels
-        )
-        return self.model_copy(update={"levels": tuple(levels)})
 
     @field_validator("levels")
     @classmethod
