@@ -90,6 +90,13 @@ class CandidateGivenUp:
 
 
 @dataclass(frozen=True)
+class SeedFitted:
+    """The model and its baselines have been fitted with one more of ``total`` other training seeds."""
+
+    total: int
+
+
+@dataclass(frozen=True)
 class EpisodeEnded:
     """One of ``total`` episodes, of the method so named, has ended."""
 
@@ -108,6 +115,7 @@ Event = (
     | SelectionBegan
     | FoldScored
     | CandidateGivenUp
+    | SeedFitted
     | EpisodeEnded
 )
 OnEvent = Callable[[Event], None]

@@ -25,6 +25,7 @@ from ddco_pyro.events import (
     FoldScored,
     RestartDiverged,
     RestartStopped,
+    SeedFitted,
     SelectionBegan,
     TrainingBegan,
     TrainingEnded,
@@ -146,6 +147,9 @@ class Progress(_Bar):
             case CandidateGivenUp(candidate, folds):
                 self._say(f"{candidate}: stopped early, {folds} folds less")
                 self.advance(self._done + folds)
+            case SeedFitted(total):
+                self._begun("fitting with other training seeds", total)
+                self.advance(self._done + 1)
             case EpisodeEnded(method, total):
                 self._begun("rolling out", total)
                 self.advance(self._done + 1, method)
@@ -208,6 +212,12 @@ def labels(spec: Spec, used: Labels | None) -> None:
     Console().print(Text(text), soft_wrap=True)
 
 
+ONE_FIT = (
+    "± is one standard error over the held-out demonstrations of one fit; other training seeds give other fits: "
+    "repeat them with --seeds 5."
+)
+
+
 def log_likelihoods(metrics: Mapping[str, Any]) -> None:
     """Log-likelihood of the model and of what it is compared with, in training and on what was held out."""
     head = ("model", "training", "validation (held out)", "ours - this, validation", "gradient steps")
@@ -219,9 +229,23 @@ def log_likelihoods(metrics: Mapping[str, Any]) -> None:
         numbers = [_number(values[part]) for part in ("train", "valid")]
         table.add_row(name, *numbers, shown, effort(row.get("training")))
     _show(table)
+    if "worth" in metrics:
+        said = words.worth(metrics["worth"], words.method(metrics["model"]), len(metrics["valid"]))
+        Console().print(Text(f"{said} {ONE_FIT if 'seeds' not in metrics else ''}".rstrip()), soft_wrap=True)
     for name, training in words.trainings(metrics).items():
         if beside := words.restarts(training):
             Console().print(Text(f"{name}: {beside}"), soft_wrap=True)
+
+
+def seeds(metrics: Mapping[str, Any]) -> None:
+    """How much the models of a run vary with the training seed; nothing where the fit was not repeated."""
+    if "seeds" not in metrics:
+        return
+    found = metrics["seeds"]
+    rows = [[name, *words.spread(values)] for name, values in found["held_out"].items()]
+    title = f"held-out nats per step over training seeds {words.listed(map(str, found['training_seeds']))}"
+    comparison(("model", "mean", "95 % interval", "range"), rows, title)
+    Console().print(Text(words.over_seeds(found, words.method(metrics["model"]))), soft_wrap=True)
 
 
 def merged(pair: Pair, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:

@@ -69,17 +69,25 @@ def fit(
         int | None,
         typer.Option(help="Processes that share each gradient step, at most training.shards; under torchrun its own."),
     ] = None,
+    seeds: Annotated[
+        int | None,
+        typer.Option(min=2, help="Fit with so many training seeds in all, and say how much they differ."),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Where --out holds this run whole, show it again.")] = False,
     allow_code: AllowCode = False,
 ) -> None:
     """Fit the spec's hierarchy and its baselines; write the run folder with its report.
 
     An unfinished run of this very spec in --out is continued, with any number of processes.
+
+    With --seeds the fit and its baselines are repeated, in --jobs processes, with other training seeds: other first
+    weights, clusters and orders of the same demonstrations. RUN/seeds has a run for each.
     """
     loaded = load_spec(spec, overrides, allow_code)
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.launching import follow_torchrun, requested
     from ddco_pyro.fitting.run import fit_run
+    from ddco_pyro.fitting.seeds import check_seeds, repeat
     from ddco_pyro.report import write_report
 
     ranks = requested(processes)
@@ -88,13 +96,19 @@ def fit(
         return
     if jobs is None:
         jobs = -1 if ranks.size == 1 else 1
+    if seeds is not None:
+        check_seeds(loaded, seeds)
+    again = "" if seeds is None else f" --seeds {seeds}"
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     with (
-        _continued(f"fit {folder / 'spec.yaml'} --out {folder} --resume{_allowed(loaded)}", folder),
+        _continued(f"fit {folder / 'spec.yaml'} --out {folder} --resume{again}{_allowed(loaded)}", folder),
         console.Progress() as progress,
     ):
         fitted = fit_run(loaded, None, folder, progress, jobs, resume, processes=ranks.size)
+        if seeds is not None:
+            fitted = repeat(fitted, seeds, progress, jobs)
     console.log_likelihoods(fitted.metrics)
+    console.seeds(fitted.metrics)
     _warn(fitted)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
     if loaded.hierarchy and loaded.demonstrations.path:

@@ -7,11 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
+import numpy as np
+
 from ddco_pyro.comparison.table import Comparison, Row
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.pictures import Picture
 from ddco_pyro.drawing.templates import render
 from ddco_pyro.fitting.convergence import effort
+from ddco_pyro.fitting.fit import HIERARCHY
+from ddco_pyro.fitting.worth import worth
 from ddco_pyro.report.demonstration_list import SHOWN
 from ddco_pyro.segmenting.timeline import anchor
 
@@ -69,7 +73,16 @@ def verdict(compared: Comparison) -> str:
         row.name: {"nats_per_step": row.difference / steps, "standard_error": row.dse / steps} for row in others
     }
     rising = words.rising(row.name for row in compared.rows if row.training and not row.training["converged"])
-    return f"{words.explains(best.name, differences, len(compared.trajectories))}{rising}"
+    parts = _worth(compared)
+    return f"{words.explains(best.name, differences, len(compared.trajectories))}{' ' * bool(parts)}{parts}{rising}"
+
+
+def _worth(compared: Comparison) -> str:
+    """What several experts and options that last are worth, where one run of each model says so."""
+    models = [row.model for row in compared.rows]
+    alone = {row.model: np.array(row.each) for row in compared.rows if models.count(row.model) == 1}
+    found = worth(HIERARCHY, alone, compared.steps) if HIERARCHY in alone else {}
+    return words.worth(found, words.method(HIERARCHY), len(compared.trajectories)) if found else ""
 
 
 def list_head(compared: Comparison) -> list[str]:

@@ -144,8 +144,9 @@ def _lines(inspection: Inspection, path: str) -> Iterator[str]:
     yield "  meta_policy: {network: linear}"
     yield "training:"
     yield from _training(lengths, PICTURES if pictures else VECTORS)
-    yield "# Is the hierarchy worth it? Policies without options, trained beside it with the same budget."
+    yield "# Is the hierarchy worth it? Other models, trained beside it with the same budget."
     yield "compare_with:"
+    yield "  - mixture                         # the same policies, chosen anew at every step: is lasting worth it?"
     network = "*sight" if pictures else PERCEPTRON
     if not pictures:  # the network that all read is nearly all of the hierarchy
         yield f"  - {{kind: flat, policy: {network}}}"

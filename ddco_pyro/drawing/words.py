@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from scipy import stats
 
 CONFIDENCE = 0.95
@@ -16,6 +17,7 @@ METHODS = {
     "flat": "flat",
     "flat_equal": "flat of equal size",
     "per_timestep": "per-timestep",
+    "mixture": "mixture",
     "open_loop": "open loop",
 }
 
@@ -23,6 +25,7 @@ ABOUT = {
     "ddco": "the hierarchy of options",
     "flat": "one policy without options",
     "per_timestep": "a policy for each time step",
+    "mixture": "the hierarchy’s policies, chosen anew at every step (no memory)",
 }
 
 
@@ -108,8 +111,8 @@ def verdict(metrics: Mapping[str, Any]) -> str:
 
 def rising(names: Iterable[str]) -> str:
     """A sentence, after a space, on those whose training ended while they still rose; nothing where there are none."""
-    listed = list(names)
-    return f" {_capital(_listed(listed))} had not converged: more epochs can change this." if listed else ""
+    rising = list(names)
+    return f" {_capital(listed(rising))} had not converged: more epochs can change this." if rising else ""
 
 
 def _explained(metrics: Mapping[str, Any]) -> str:
@@ -123,7 +126,12 @@ def _explained(metrics: Mapping[str, Any]) -> str:
             f"{name} gives held-out demonstrations {value} nats per step; no other model was trained to compare with."
         )
     differences = {method(other): comparison["difference"] for other, comparison in metrics["comparison"].items()}
-    return explains(name, differences, held_out)
+    said = [explains(name, differences, held_out)]
+    if "worth" in metrics:
+        said.append(worth(metrics["worth"], method(metrics["model"]), held_out))
+    if "seeds" in metrics:
+        said.append(over_seeds(metrics["seeds"], method(metrics["model"])))
+    return " ".join(said)
 
 
 def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out: int) -> str:
@@ -133,10 +141,78 @@ def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out
     :param differences: what the others are called to ``nats_per_step`` and ``standard_error`` of the paired difference.
     """
     clauses = [_clause(other, difference, held_out) for other, difference in differences.items()]
-    text = f"{name} explains held-out demonstrations {_listed(clauses)}"
+    text = f"{name} explains held-out demonstrations {listed(clauses)}"
     if held_out == 1:
         return f"{text} (1 held-out demonstration, one fit of each model)."
     return f"{text} (± is one standard error over {held_out} held-out demonstrations, for one fit of each model)."
+
+
+def worth(found: Mapping[str, Any], ours: str, held_out: int) -> str:
+    """What several experts and options that last are worth, and the verdict, which is about the second.
+
+    :param found: what :func:`ddco_pyro.fitting.worth.worth` gives, with ``steps_in_a_row`` where that is known.
+    :param ours: what the hierarchy is called.
+    """
+    memory = found["memory"]
+    lasting = f"{_with_error(memory)} from options that last ({ours} − mixture)"
+    if "flat" in found:
+        flat = method(found["flat"])
+        total = signed(found["total"]["nats_per_step"])
+        experts = f"{_with_error(found['experts'])} come from several experts (mixture − {flat})"
+        parts = f"Of {total} nats per step over {flat}, {experts} and {lasting}."
+    else:
+        parts = f"Held-out nats per step: {lasting}."
+    decided = {
+        1: "So options that last are worth it on these demonstrations.",
+        0: "So this fit does not show that options that last are worth anything.",
+        -1: "So options that last explain these demonstrations worse than the same experts without memory.",
+    }[_direction(memory, held_out)]
+    rows = found.get("steps_in_a_row", ())
+    short = [row for row in rows if row["options"] <= row["mixture"]]
+    if short and len(short) == len(rows):
+        own, mixture = (number(short[0][name], 1) for name in ("options", "mixture"))
+        decided += f" Options stay active no longer ({own} steps) than the mixture keeps to one expert ({mixture})."
+    return f"{parts} {decided}"
+
+
+def over_seeds(found: Mapping[str, Any], ours: str) -> str:
+    """What the parts of the worth are over training seeds, each with a 95 % t interval.
+
+    :param found: what :func:`ddco_pyro.fitting.seeds.over_seeds` gives.
+    :param ours: what the hierarchy is called.
+    """
+    names = {"memory": f"{ours} − mixture", "experts": "mixture − flat"}
+    parts = [
+        f"{names[part]} {signed(float(np.mean(values)))} [{spread(values)[1]}]"
+        for part, values in found["worth"].items()
+        if part in names
+    ]
+    count = len(found["training_seeds"])
+    said = f": {listed(parts)} nats per step" if parts else ""
+    return f"Over {count} training seeds, with the same demonstrations held out{said}."
+
+
+def spread(values: Sequence[float]) -> tuple[str, str, str]:
+    """Mean, 95 % t interval of the mean, and range of a few values."""
+    mean, count = float(np.mean(values)), len(values)
+    half = float(np.std(values, ddof=1) * stats.t.ppf((1 + CONFIDENCE) / 2, count - 1) / math.sqrt(count))
+    return number(mean), interval([mean - half, mean + half]), interval([min(values), max(values)])
+
+
+def _with_error(difference: Mapping[str, Any]) -> str:
+    return f"{signed(difference['nats_per_step'])} ± {number(difference['standard_error'])}"
+
+
+def _direction(difference: Mapping[str, Any], held_out: int) -> int:
+    """1 or -1 where the 95 % interval of a difference leaves out 0, else 0."""
+    mean, error = difference["nats_per_step"], difference["standard_error"]
+    if (
+        error is None
+        or not math.isfinite(error)
+        or abs(mean) <= error * stats.t.ppf((1 + CONFIDENCE) / 2, held_out - 1)
+    ):
+        return 0
+    return 1 if mean > 0 else -1
 
 
 def trainings(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
@@ -182,7 +258,7 @@ def unconverged(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
         if stages:
             who = method(name)
             verdict = f"Earlier stages of {who} had" if training["converged"] else f"{_capital(who)} has"
-            verdicts.append((f"{verdict} not converged: the budget ended {_listed(stages)}.", RAISE))
+            verdicts.append((f"{verdict} not converged: the budget ended {listed(stages)}.", RAISE))
     return verdicts
 
 
@@ -198,12 +274,14 @@ def _clause(other: str, difference: Mapping[str, Any], held_out: int) -> str:
     direction = "better" if mean > 0 else "worse"
     if error is None or not math.isfinite(error):
         return f"{number(abs(mean))} nats per step {direction} than {other} (error unknown)"
-    if abs(mean) <= error * stats.t.ppf((1 + CONFIDENCE) / 2, held_out - 1):
+    if not _direction(difference, held_out):
         return f"with no clear difference from {other} ({signed(mean)} ± {number(error)} nats per step)"
     return f"{number(abs(mean))} ± {number(error)} nats per step {direction} than {other}"
 
 
-def _listed(items: list[str]) -> str:
+def listed(items: Iterable[str]) -> str:
+    """``a, b and c``."""
+    items = list(items)
     return items[0] if len(items) == 1 else ", ".join(items[:-1]) + " and " + items[-1]
 
 
@@ -217,4 +295,4 @@ def success(metrics: Mapping[str, Any]) -> str:
         return ""
     others = [f"{method(name)} in {rate(summary)}" for name, summary in rates.items() if name != ours]
     text = f"In rollouts {method(ours)} succeeds in {rate(rates[ours], 'episodes')}"
-    return f"{text}{'; ' if others else ''}{_listed(others) if others else ''}."
+    return f"{text}{'; ' if others else ''}{listed(others) if others else ''}."

@@ -61,10 +61,17 @@ class NumpyNetworks:
             if mean.shape[1]:
                 outputs[f"control_{level}"] = mean
             if level < depth:
-                raw = self._evaluate(self._about["terminations"][level], f"end_{level}")[:, 0]
-                bound = np.float32(self._about["termination_bound"])
-                outputs[f"termination_{level}"] = 1 / (1 + np.exp(-(bound * np.tanh(raw / bound)).astype(np.float64)))
+                outputs[f"termination_{level}"] = self._termination(level, len(out))
         return outputs, self._after
+
+    def _termination(self, level: int, options: int) -> np.ndarray:
+        """ψ [k] of a level, whose options end after every step where no network says when."""
+        network, bound = self._about["terminations"][level], np.float32(self._about["termination_bound"])
+        if network is None:
+            return np.ones(options)
+        raw = self._evaluate(network, f"end_{level}")[:, 0]
+        psi: np.ndarray = 1 / (1 + np.exp(-(bound * np.tanh(raw / bound)).astype(np.float64)))
+        return psi
 
     def _evaluate(self, node: Mapping[str, Any], name: str) -> np.ndarray:
         """What a part of a network gives for each of K copies, [K, features]; ``name`` begins those of its arrays."""

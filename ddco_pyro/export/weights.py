@@ -23,7 +23,7 @@ def weights_and_networks(hierarchy: Hierarchy) -> tuple[Arrays, dict[str, Any]]:
         arrays |= {name: array.numpy() for name, array in ends.items()}
     levels = hierarchy.option_levels()
     networks = {f"caller_{number}": caller.network for number, caller in enumerate(hierarchy.callers())}
-    networks |= {f"end_{number}": level.termination for number, level in enumerate(levels)}
+    networks |= {f"end_{n}": level.termination for n, level in enumerate(levels) if level.termination is not None}
     networks |= {f"trunk_{number}": level.trunk for number, level in enumerate(levels) if level.trunk is not None}
     networks |= {} if hierarchy.trunk is None else {"trunk": hierarchy.trunk}
     forms = {name: form for name, network in networks.items() if (form := numpy_form(network)) is not None}

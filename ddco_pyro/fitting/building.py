@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import nn
@@ -18,7 +19,7 @@ from ddco_pyro.model.encoding import Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import ShapeError
 from ddco_pyro.model.seeding import seeded
-from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code
+from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code, with_overrides
 
 
 @dataclass(frozen=True)
@@ -162,36 +163,35 @@ def baselines(spec: Spec, dimensions: Dimensions) -> list[tuple[Spec, Hierarchy]
 
 
 def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
-    """The baselines trained beside, by name: their kind, numbered from the second policy of one kind on. The model
-    itself counts, so that no baseline has its name.
-    """
+    """The baselines trained beside, by name, numbered from the second model of one name on: the spec's own counts."""
     names: dict[str, BaselineSpec] = {}
-    own = spec.baseline.kind if spec.baseline else None
+    own = spec.baseline.name if spec.baseline else None
     for baseline in spec.compare_with:
-        before = (baseline.kind == own) + sum(other.kind == baseline.kind for other in names.values())
-        names[f"{baseline.kind}_{before + 1}" if before else baseline.kind] = baseline
+        before = (baseline.name == own) + sum(other.name == baseline.name for other in names.values())
+        names[f"{baseline.name}_{before + 1}" if before else baseline.name] = baseline
     return names
 
 
 def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) -> Spec:
-    """The spec of a baseline trained beside: the same but for the model, and what it says of the optimiser.
+    """The spec of a baseline trained beside: another model, and the optimiser that the baseline names; nothing else
+    differs. A mixture keeps labels and durations; policies without options have neither.
 
     :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
     """
-    grid = spec.selection.model_copy(update={"grid": {}})  # it is about the hierarchy
     own = baseline.optimizer.model_dump(exclude_unset=True) if baseline.optimizer else {}
-    optimizer = spec.training.optimizer.model_copy(update=own)
-    training = spec.training.model_copy(update={"optimizer": optimizer, "labels": None, "duration": None})
-    baseline = baseline.model_copy(update={"optimizer": None})
-    model = {"hierarchy": None, "baseline": baseline, "compare_with": ()}
-    alone = spec.model_copy(update={**model, "training": training, "selection": grid})
+    optimizer = {f"training.optimizer.{key}": value for key, value in own.items()}
+    model = baseline.model_dump(exclude_unset=True, exclude={"optimizer"})
+
+    def alone(**changes: Any) -> Spec:
+        return with_overrides(spec, {"selection.grid": {}, "model": model | changes, **optimizer})
+
     if baseline.kind != "flat_equal":
-        return alone
+        return alone()
 
     def resized(hidden: tuple[int, ...]) -> Spec:
         policy = baseline.policy.model_copy(update={"hidden": hidden})
-        return alone.model_copy(update={"baseline": baseline.model_copy(update={"policy": policy})})
+        return alone(policy=policy.model_dump(exclude_unset=True))
 
-    build_hierarchy(alone, dimensions)  # what is wrong with it is said here
+    build_hierarchy(resized(baseline.policy.hidden), dimensions)  # what is wrong with it is said here
     target = parameters(build_hierarchy(spec, dimensions))
     return resized(nearest_widths(baseline.policy.hidden, target, lambda hidden: _counted(resized(hidden), dimensions)))

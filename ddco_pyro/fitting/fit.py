@@ -150,9 +150,19 @@ def _stacked(parts: Sequence[Tensor], padding: float) -> Tensor:
     return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=padding)
 
 
+HIERARCHY = "ddco"
+"""What a hierarchy whose options last is called in tables."""
+
+
 def model_name(spec: Spec) -> str:
-    """``ddco``, or the kind of the baseline."""
-    return spec.baseline.kind if spec.baseline else "ddco"
+    """``ddco``, or what a baseline of this model is called (:attr:`~ddco_pyro.spec.BaselineSpec.name`)."""
+    if spec.hierarchy is None:
+        assert spec.baseline is not None  # a spec has one or the other
+        return spec.baseline.name
+    memoryless = [level.name for level in spec.hierarchy.levels if not level.lasts]
+    if not memoryless:
+        return HIERARCHY
+    return "_".join(("mixture", *(memoryless if len(memoryless) < len(spec.hierarchy.levels) else ())))
 
 
 def load(folder: str | Path, allow_code: bool = False) -> Fit:

@@ -57,4 +57,5 @@ class Material:
 
     def seed(self, *where: int) -> int:
         """A seed for a restart, one of its stages, an epoch of a stage, or a shard of one of its minibatches."""
-        return int(np.random.SeedSequence([self.spec.seed, *where]).generate_state(1)[0])
+        own, training = self.spec.seed, self.spec.training.seed
+        return int(np.random.SeedSequence([own if training is None else training, *where]).generate_state(1)[0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from ddco_pyro.fitting.agreement import agreement, confusion
 from ddco_pyro.fitting.branch_use import branch_use
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.inferred import Inferred
+from ddco_pyro.fitting.worth import MIXTURE, mean_run, worth
 from ddco_pyro.inference import Posterior
 from ddco_pyro.inference.decomposition import Decomposition
 from ddco_pyro.model.outputs import Outputs
@@ -98,6 +99,8 @@ def evaluate(fitted: Fit, parts: dict[str, Demonstrations], demos: Demonstration
             for name, fit in fitted.baselines.items()
         },
     }
+    if "valid" in parts:
+        metrics |= _worth(fitted, by_method, ours["valid"], parts["valid"])
     if uses := branch_use(fitted.hierarchy, fitted.infer(parts.get("valid", demos))):
         metrics["branches"] = uses
     if fitted.hierarchy.depth:
@@ -105,6 +108,22 @@ def evaluate(fitted: Fit, parts: dict[str, Demonstrations], demos: Demonstration
         if names := fitted.spec.demonstrations.labels_by_level(fitted.hierarchy.depth):
             metrics["agreement"] = _agreement(names, ours, parts)
     return metrics
+
+
+def _worth(
+    fit: Fit, by_method: Mapping[str, dict[str, np.ndarray]], ours: _Part, valid: Demonstrations
+) -> dict[str, Any]:
+    """What several experts and options that last are worth on held-out demonstrations; nothing without a mixture.
+
+    ``steps_in_a_row`` compares, level by level, how long options stay active with how long the mixture keeps to one
+    expert.
+    """
+    found = worth(fit.name, {name: values["valid"] for name, values in by_method.items()}, valid.lengths)
+    if not found:
+        return {}
+    pairs = zip(ours.segments, _Part.of(fit.baselines[MIXTURE], valid).segments, strict=True)
+    rows = [{"options": mean_run(own), MIXTURE: mean_run(mixture)} for own, mixture in pairs]
+    return {"worth": found | {"steps_in_a_row": rows}}
 
 
 def _options(fit: Fit, demos: Demonstrations) -> dict[str, Any]:

@@ -178,6 +178,31 @@ class Compared(Record):
     training: Annotated[Training | None, NOT_NULL] = None
 
 
+class InARow(Record):
+    """Mean steps for which a level of the hierarchy, and of the mixture, keeps to one choice."""
+
+    options: Finite
+    mixture: Finite
+
+
+class Worth(Record):
+    """What the hierarchy is worth (:func:`ddco_pyro.fitting.worth.worth`)."""
+
+    memory: Difference
+    experts: Annotated[Difference | None, NOT_NULL] = None
+    total: Annotated[Difference | None, NOT_NULL] = None
+    flat: Annotated[str | None, NOT_NULL] = None
+    steps_in_a_row: Annotated[list[InARow], Field(min_length=1)]
+
+
+class Seeds(Record):
+    """What a fit and its repetitions say, in the order of their training seeds."""
+
+    training_seeds: Annotated[list[int], Field(min_length=2)]
+    held_out: dict[str, list[Finite]]
+    worth: dict[str, list[Finite]]
+
+
 class Dimensions(Record):
     """Log-likelihood per step that each control dimension adds, None for constant ones, and choosing options."""
 
@@ -328,6 +353,8 @@ class Metrics(Record):
     valid: list[HeldOut]
     demonstrations_by_likelihood: list[Listed] = Field(default_factory=list)
     comparison: dict[str, Compared]
+    worth: Annotated[Worth | None, NOT_NULL] = None
+    seeds: Annotated[Seeds | None, NOT_NULL] = None
     options: list[list[Use]] = Field(default_factory=list)
     divergences: list[list[Alike]] = Field(default_factory=list)
     agreement: Annotated[Agreement | None, NOT_NULL] = None

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ddco_pyro.inference import fused
-from ddco_pyro.model.tables import NEVER, Tables
+from ddco_pyro.model.tables import NEVER, Tables, always_ends
 
 STARTS = 16
 """Random ones; of them the likelier half goes on, and so on. On planted levels about one in three reaches the best."""
@@ -55,7 +55,10 @@ class Constants:
         """Random ones for a hierarchy with such tables."""
         sizes = [table.shape[2:] for table in tables.selection]
         selection = (random.dirichlet(np.ones(choices - 1), size=callers) for callers, choices in sizes)
-        termination = (random.uniform(0.05, 0.5, table.shape[2]) for table in tables.termination[1:])
+        termination = (
+            np.ones(table.shape[2]) if always_ends(table) else random.uniform(0.05, 0.5, table.shape[2])
+            for table in tables.termination[1:]
+        )
         return cls(tuple(map(torch.as_tensor, selection)), tuple(map(torch.as_tensor, termination)))
 
     @classmethod
@@ -116,7 +119,7 @@ def improved(pieces: Sequence[Piece], constants: Constants) -> tuple[float, Cons
     """An iteration of EM: the log-likelihood of the constants, and those that the expected counts make of them."""
     value = 0.0
     selected = [torch.full_like(table, PSEUDO) for table in constants.selection]
-    ended = [torch.full((*table.shape, 2), PSEUDO, dtype=table.dtype) for table in constants.termination]
+    ended = [torch.stack([PSEUDO * (psi < 1), torch.full_like(psi, PSEUDO)], -1) for psi in constants.termination]
     for tables, lengths in pieces:
         found = fused.eliminate(constants.within(tables), lengths)
         value += float(found.value.sum())

@@ -37,7 +37,8 @@ PART_OF_A_GPU = 0.1
 Emits = Literal["options", "control"]
 
 Answers = Sequence[Tensor]
-"""The outputs of networks [N, T, K, F]: policy and termination of each level, lowest first, and the meta-policy's."""
+"""The outputs of networks [N, T, K, F]: policy and, where it has one, termination of each level, lowest first, and the
+meta-policy's."""
 
 
 class Caller(nn.Module):
@@ -83,6 +84,8 @@ class Level(nn.Module):
     """The k options of one level: their policies π (or, above the lowest level, η) and terminations ψ, which read the
     observations, or the features of a trunk that they share.
 
+    ``termination`` is None where every option ends after every step (ψ = 1).
+
     :param shape: of the observations, or the hierarchy's trunk.
     """
 
@@ -104,8 +107,10 @@ class Level(nn.Module):
         self.trunk = seen.network if isinstance(seen, Trunk) and seen is not shape else None
         with named(f"{place}.policy"):
             self.policy = Caller(spec.policy, spec.policy.emits, options_below, seen, control, scaling, spec.count)
-        with named(f"{place}.termination"):
-            self.termination = build(spec.termination, seen, 1, spec.count)
+        self.termination: nn.Module | None = None
+        if isinstance(spec.termination, NetworkSpec):
+            with named(f"{place}.termination"):
+                self.termination = build(spec.termination, seen, 1, spec.count)
 
 
 class Hierarchy(nn.Module):
@@ -180,7 +185,8 @@ class Hierarchy(nn.Module):
             if level.trunk is not None:
                 each[f"levels.{number}.trunk"] = level.trunk
             each[f"levels.{number}.policy"] = level.policy.network
-            each[f"levels.{number}.termination"] = level.termination
+            if level.termination is not None:
+                each[f"levels.{number}.termination"] = level.termination
         return each | {"meta_policy": self.meta_policy.network}
 
     def named_networks(self) -> Iterator[tuple[str, nn.Module]]:
@@ -191,7 +197,8 @@ class Hierarchy(nn.Module):
             if level.trunk is not None:
                 yield f"hierarchy.levels.{number}.trunk", level.trunk
             yield f"hierarchy.levels.{number}.policy", level.policy
-            yield f"hierarchy.levels.{number}.termination", level.termination
+            if level.termination is not None:
+                yield f"hierarchy.levels.{number}.termination", level.termination
         yield "hierarchy.meta_policy" if self.depth else "baseline.policy", self.meta_policy
 
     @cached_property
@@ -254,7 +261,8 @@ class Hierarchy(nn.Module):
                 place, trunk = f"levels.{number}", level.trunk
                 seen = given if trunk is None else carried.answer(f"{place}.trunk", trunk, given)
                 answers.append(carried.answer(f"{place}.policy", level.policy.network, seen))
-                answers.append(carried.answer(f"{place}.termination", level.termination, seen))
+                if level.termination is not None:
+                    answers.append(carried.answer(f"{place}.termination", level.termination, seen))
             if not discovering:
                 answers.append(carried.answer("meta_policy", self.meta_policy.network, given))
         if reduced or self.device != HOST:
@@ -263,9 +271,11 @@ class Hierarchy(nn.Module):
 
     def _outputs(self, answers: Answers, discovering: int | None) -> Outputs:
         """What the networks' outputs stand for."""
-        levels = self.option_levels()[:discovering]
-        callers = [level.policy(said, self.scaling) for level, said in zip(levels, answers[::2], strict=False)]
-        endings = [said.squeeze(-1) for _, said in zip(levels, answers[1::2], strict=False)]
+        levels, said = self.option_levels()[:discovering], iter(answers)
+        callers, endings = [], []
+        for level in levels:
+            callers.append(level.policy(next(said), self.scaling))
+            endings.append(None if level.termination is None else next(said).squeeze(-1))
         top = answers[-1]
         last = _uniform(top, levels[-1].count) if discovering else self.meta_policy(top, self.scaling)
         return Outputs((*callers, last), tuple(endings))

@@ -29,14 +29,21 @@ class CallerOutputs:
     emission: Emission | None
 
     @property
+    def shape(self) -> torch.Size:
+        """[N, T, K]."""
+        if self.emission is not None:
+            return self.emission.shape[:-1]
+        assert self.logits is not None  # a caller emits something
+        return self.logits.shape[:-1]
+
+    @property
     def selection(self) -> Tensor | None:
         """log η [N, T, K, 1 + k]; None where there is nothing to select."""
         if not self.options:
             return None
         if self.logits is not None:
             return log_selection(self.logits, 1 + self.options - self.logits.shape[-1])
-        assert self.emission is not None  # a caller emits something
-        return pad(torch.zeros(*self.emission.shape[:-1], 1), (0, self.options), value=NEVER)
+        return pad(torch.zeros(*self.shape, 1), (0, self.options), value=NEVER)
 
     def log_density(self, actions: Tensor) -> Tensor:
         """log π(a | s) of each caller, [N, T, K]; -inf where it emits no control."""
@@ -51,11 +58,12 @@ class Outputs:
     """What all networks say about a batch, before any control is known.
 
     :param callers: each level's, lowest first, the meta-policy's last.
-    :param termination_logits: of each level's options [N, T, k], before they are bounded.
+    :param termination_logits: of each level's options [N, T, k], before they are bounded; None for a level whose
+        options end after every step.
     """
 
     callers: tuple[CallerOutputs, ...]
-    termination_logits: tuple[Tensor, ...]
+    termination_logits: tuple[Tensor | None, ...]
 
     @property
     def emissions(self) -> tuple[Emission | None, ...]:
@@ -65,7 +73,8 @@ class Outputs:
     @property
     def termination(self) -> tuple[Tensor, ...]:
         """(log(1 - ψ), log ψ) of each level, [N, T, k, 2]."""
-        return tuple(log_termination(logit) for logit in self.termination_logits)
+        levels = zip(self.callers, self.termination_logits, strict=False)  # the meta-policy has none
+        return tuple(_always(level.shape) if logit is None else log_termination(logit) for level, logit in levels)
 
     def tables(self, actions: Tensor | None = None) -> Tables:
         """The tables for controls [N, T, A] in scaled units; without them, of selections and terminations alone."""
@@ -77,7 +86,7 @@ class Outputs:
         """Everything that the networks say, each [N, T, ...]."""
         logits = [caller.logits for caller in self.callers if caller.logits is not None]
         numbers = [emission.numbers for emission in self.emissions if emission is not None]
-        return [*logits, *numbers, *self.termination_logits]
+        return [*logits, *numbers, *(logit for logit in self.termination_logits if logit is not None)]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Outputs:
         """The same of changed tensors."""
@@ -89,4 +98,10 @@ class Outputs:
             )
             for caller in self.callers
         )
-        return Outputs(tuple(callers), tuple(change(logit) for logit in self.termination_logits))
+        endings = (None if logit is None else change(logit) for logit in self.termination_logits)
+        return Outputs(tuple(callers), tuple(endings))
+
+
+def _always(shape: torch.Size) -> Tensor:
+    """The termination table of options that end after every step, [N, T, k, 2]."""
+    return torch.tensor([NEVER, 0.0]).expand(*shape, 2)

@@ -99,6 +99,13 @@ class Tables:
         return Tables(cut(self.selection), cut(self.termination), cut(self.control), cut(self.evidence))
 
 
+def always_ends(termination: Tensor) -> bool:
+    """Whether the options of a level, whose table [N, T, k, 2] this is, end after every step; ψ of a network is less
+    than 1.
+    """
+    return bool(termination[0, 0, 0, 0] == NEVER)
+
+
 @dataclass(frozen=True)
 class Chain:
     """The Markov chain over joint choices that :class:`Tables` describe, complete: what an engine eliminates.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,6 +22,7 @@ class LevelActivity:
     :param ended: whether that path terminates a choice before this step, to select one anew: 1, 0, or -1 past the end
         [N, T].
     :param termination: ψ_h(s_t) of the k options [N, T, k].
+    :param lasts: whether options can be active for more than one step.
     """
 
     name: str
@@ -29,6 +30,7 @@ class LevelActivity:
     path: np.ndarray
     ended: np.ndarray
     termination: np.ndarray
+    lasts: bool = field(default=True, kw_only=True)
 
     @property
     def choices(self) -> list[int]:
@@ -51,7 +53,7 @@ def activity(fit: Fit, demos: Demonstrations) -> Activity:
     levels = []
     for number, level in enumerate(fit.spec.hierarchy.levels):
         arrays = (np.concatenate([part[what][number] for part in parts]) for what in range(4))
-        levels.append(LevelActivity(level.name, *arrays))
+        levels.append(LevelActivity(level.name, *arrays, lasts=level.lasts))
     return Activity(tuple(levels), np.array(demos.lengths))
 
 

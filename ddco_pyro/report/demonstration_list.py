@@ -76,7 +76,9 @@ def timelines(fit: Fit, demos: Demonstrations, activity: Activity, metrics: Mapp
 def _segments(fit: Fit, demos: Demonstrations, row: int, activity: Activity, listed: Mapping[str, Any]) -> Segments:
     demo = demos[row]
     levels = {
-        level.name: LevelLabels.of(*(array[row, : len(demo)] for array in (level.path, level.ended, level.active)))
+        level.name: LevelLabels.of(
+            *(array[row, : len(demo)] for array in (level.path, level.ended, level.active)), lasts=level.lasts
+        )
         for level in activity.levels
     }
     labels = {name: demo.labels[name] for name in fit.spec.demonstrations.label_names}

@@ -227,9 +227,13 @@ def degeneracies(spec: Spec, metrics: Mapping[str, Any]) -> list[tuple[str, str]
     """Signs of a degenerate solution in ``metrics.json``, each in words with its number, and what usually helps."""
     if spec.hierarchy is None:
         return []
-    names = [level.name for level in spec.hierarchy.levels]
+    levels = spec.hierarchy.levels
     findings = diagnose(metrics["options"], metrics.get("divergences", ()))  # runs of before have no divergences
-    return [(warning(finding, names[finding.level - 1]), finding.advice) for finding in findings]
+    return [
+        (warning(finding, levels[finding.level - 1].name), finding.advice)
+        for finding in findings
+        if finding.kind != "never_persisting" or levels[finding.level - 1].lasts
+    ]
 
 
 def films(fit: Fit) -> Films | None:

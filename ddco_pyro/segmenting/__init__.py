@@ -17,6 +17,7 @@ from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.inferred import Inferred
 from ddco_pyro.fitting.labels import option_labels
+from ddco_pyro.spec import LevelSpec
 
 __all__ = ["LevelLabels", "Segmented", "Segments", "demonstrations", "segments"]
 
@@ -26,7 +27,8 @@ class LevelLabels:
     """One level over one demonstration of T steps.
 
     :param options: choices of the most likely path [T]: 1 to k, 0 where the caller emits the control itself.
-    :param boundaries: whether a choice is made anew at this step [T], be it the same again; true at the first.
+    :param boundaries: whether a choice is made anew at this step [T], be it the same again; true at the first. At a
+        level whose options end after every step: whether another one is active than before.
     :param probability: of that choice at that step, given the whole demonstration [T].
     """
 
@@ -35,9 +37,12 @@ class LevelLabels:
     probability: np.ndarray
 
     @classmethod
-    def of(cls, options: np.ndarray, terminations: np.ndarray, active: np.ndarray) -> LevelLabels:
-        """From the most likely path, choices and terminations [T], and the posterior u [T, 1 + k]."""
-        boundaries = terminations == 1
+    def of(cls, options: np.ndarray, terminations: np.ndarray, active: np.ndarray, *, lasts: bool) -> LevelLabels:
+        """From the most likely path, choices and terminations [T], and the posterior u [T, 1 + k].
+
+        :param lasts: whether the level's options can be active for more than one step.
+        """
+        boundaries = terminations == 1 if lasts else np.diff(options, prepend=-1) != 0
         boundaries[0] = True
         probability = np.minimum(active[np.arange(len(options)), options], 1.0)  # rounding can exceed it
         return cls(options, boundaries, probability)
@@ -96,7 +101,7 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
     labels: dict[str, dict[str, np.ndarray]] = {}
     segmented: list[Segments] = []
     for piece in fit.infer(_demonstrations(source, chosen, fit, labels)):
-        segmented += _segments(fit, piece, tuple(counts), labels)
+        segmented += _segments(fit, piece, hierarchy.levels, labels)
         on_event(DemonstrationsDone(len(segmented), len(chosen)))
     names = fit.spec.demonstrations.labels_by_level(len(counts))
     truth = dict(zip(counts, names, strict=bool(names)))
@@ -175,11 +180,11 @@ def _check_shape(where: str, shape: tuple[int, ...], fitted: tuple[int, ...]) ->
 
 
 def _segments(
-    fit: Fit, piece: Inferred, levels: tuple[str, ...], labels: dict[str, dict[str, np.ndarray]]
+    fit: Fit, piece: Inferred, levels: Sequence[LevelSpec], labels: dict[str, dict[str, np.ndarray]]
 ) -> Iterator[Segments]:
     for row, (name, steps) in enumerate(zip(piece.names, piece.lengths, strict=True)):
         each = {
-            level: LevelLabels.of(*(array[row, :steps].numpy() for array in arrays))
+            level.name: LevelLabels.of(*(array[row, :steps].numpy() for array in arrays), lasts=level.lasts)
             for level, *arrays in zip(levels, *piece.path, piece.posterior.u, strict=True)
         }
         value = float(piece.log_likelihood[row])

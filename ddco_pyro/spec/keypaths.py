@@ -9,6 +9,12 @@ from ddco_pyro.spec.messages import SpecError, show
 from ddco_pyro.spec.networks import foreign_keys
 
 _GRID = "selection.grid."
+MODEL = "model"
+"""As a key path it stands for the whole model, see :func:`_set_model`."""
+
+OPTIONS = "options"
+"""As a value of it: the hierarchy as it is."""
+
 _BARE = {"observations": "key", "baseline": "kind", "compare_with": "kind"}
 
 
@@ -17,14 +23,49 @@ def edited(data: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]
 
     Another ``network`` drops the settings beside it that do not apply to it, unless ``values`` has them too.
 
+    The key path ``model`` puts another model in the place of the whole: a baseline as in ``compare_with``, a list of
+    levels, or a hierarchy; ``options`` stands for the hierarchy as it is.
+
     :raises SpecError: a key path leads nowhere.
     """
     copy: dict[str, Any] = plain(data)
     for path, value in values.items():
+        if path == MODEL:
+            _set_model(copy, plain(value))
+            continue
         _set(copy, path, value)
         if path.endswith(".network"):
             _drop_foreign_keys(copy, path, keep=values)
     return copy
+
+
+def _set_model(data: dict[str, Any], value: Any) -> None:
+    """Another model in plain data; labels and durations stay where the model has options that they can be about."""
+    if value == OPTIONS:
+        return
+    hierarchy = data.get("hierarchy") or {}
+    if isinstance(value, list):
+        data["hierarchy"] = {**hierarchy, "levels": value}
+    elif isinstance(value, dict) and "kind" not in value:
+        data["hierarchy"] = value
+    elif not isinstance(value, str | dict):
+        what = "options, a baseline such as flat or mixture, a list of levels, or a hierarchy"
+        raise SpecError(f"{MODEL}: must be {what}, got {show(value)}")
+    else:
+        baseline = {"kind": value} if isinstance(value, str) else value
+        data["compare_with"] = []
+        levels = hierarchy.get("levels") or []
+        if baseline["kind"] == "mixture" and levels and "count" not in baseline:
+            named = baseline.get("levels") or [level.get("name", "option") for level in levels]
+            for level in levels:
+                if level.get("name", "option") in named:
+                    level["termination"] = "always"
+            gone = ["duration"] if all(level.get("termination") == "always" for level in levels) else []
+        else:
+            data |= {"hierarchy": None, "baseline": baseline}
+            gone = ["duration", "labels"]
+        for key in gone:
+            (data.get("training") or {}).pop(key, None)
 
 
 def plain(data: Any) -> Any:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import ConfigDict, Field, TypeAdapter, model_validator
 
 from ddco_pyro.spec.messages import invalid
-from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Share, Text, nested
+from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Seed, Share, Text, nested
 
 
 class OptimizerSpec(Model):
@@ -99,6 +99,9 @@ class TrainingSpec(Model):
     halving: Count | None = 50
     """With more restarts: epochs of the last stage after which the worse half of them, on the tuning demonstrations, is
     stopped; of those that are left again after twice as many, and so on. Null: all are trained to the end."""
+    seed: Seed | None = None
+    """Seed of what is random in training: first weights, clusters, the order of demonstrations, dropout; null: that of
+    the spec. What is held out or tuned on does not depend on it."""
     tune_fraction: Fraction = 0.1
     """Part of the training demonstrations set aside for tuning: to stop early and to choose among restarts."""
     tune_by: Literal["mean", "median"] = "mean"

@@ -77,9 +77,22 @@ class Spec(Model):
         return {f"obs/{observation.key}": observation.seen for observation in self.observations}
 
     @model_validator(mode="after")
+    def _mixture_alone(self) -> Spec:
+        """A mixture that stands alone becomes the hierarchy that it is."""
+        alone = self.baseline
+        if alone is None or alone.kind != "mixture" or self.hierarchy is not None:
+            return self
+        if alone.count is None:
+            raise invalid(("baseline.count", "missing; say how many experts the mixture has"))
+        if alone.levels:
+            raise invalid(("baseline.levels", "is for a mixture in compare_with; leave it out"))
+        return self.model_copy(update={"hierarchy": alone.as_hierarchy, "baseline": None})
+
+    @model_validator(mode="after")
     def _consistent(self) -> Spec:
         problems = [
             *self._choices(),
+            *self._mixtures_beside(),
             *self._repeated_observations(),
             *self._nothing_observed(),
             *self._unknown_trajectory(),
@@ -108,6 +121,24 @@ class Spec(Model):
         alone = self.baseline
         if alone and alone.kind == "flat_equal" and "hidden" not in alone.policy.model_fields_set:
             yield "baseline", "flat_equal takes its size from a hierarchy; list it in compare_with there, or say flat"
+
+    def _mixtures_beside(self) -> Iterator[tuple[str, str]]:
+        known = [level.name for level in self._levels]
+        for number, baseline in enumerate(self.compare_with):
+            if baseline.kind != "mixture":
+                continue
+            place = f"compare_with.{number}"
+            if not known:
+                yield place, "mixture takes its experts from a hierarchy; declare one, or leave it out"
+            elif not any(level.lasts for level in self._levels):
+                yield place, "mixture is what the hierarchy is already: none of its options lasts; leave it out"
+            for key in ("policy", "count", "meta_policy"):
+                if key in baseline.model_fields_set:
+                    yield f"{place}.{key}", "a mixture in compare_with has the networks of the hierarchy; leave it out"
+            for name in baseline.levels:
+                if known and name not in known:
+                    there = ", ".join(known)
+                    yield f"{place}.levels", f"there is no level {name!r}{nearest(name, known)}; there is: {there}"
 
     def _nothing_held_out(self) -> Iterator[tuple[str, str]]:
         if self.compare_with and self.demonstrations.valid_fraction == 0:
@@ -144,8 +175,8 @@ class Spec(Model):
         duration, levels = self.training.duration, len(self._levels)
         if duration is None:
             return
-        if not levels:
-            yield "training.duration", "a baseline has no options that last; leave it out"
+        if not any(level.lasts for level in self._levels):
+            yield "training.duration", "there are no options that last; leave it out"
         elif isinstance(duration.mean, tuple) and len(duration.mean) != levels:
             yield "training.duration.mean", f"has {len(duration.mean)} numbers, but the number of levels is {levels}"
 

@@ -1,0 +1,81 @@
+"""A fit repeated with other training seeds: how much the models, and their differences, vary with the seed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ddco_pyro.data.files import only_one
+from ddco_pyro.errors import BadInput
+from ddco_pyro.events import OnEvent, SeedFitted, ignore
+from ddco_pyro.fitting.fit import Fit, is_finished, load
+from ddco_pyro.fitting.processes import pool, results, useful_jobs
+from ddco_pyro.fitting.run import fit_run, write_metrics
+from ddco_pyro.spec import Spec, user_code, with_overrides
+
+DEAD = "a process that repeated the fit was ended from outside (too little memory?); the same command goes on"
+
+
+def check_seeds(spec: Spec, seeds: int) -> None:
+    """See that a fit can be repeated with so many training seeds.
+
+    :raises BadInput: nothing is held out to compare them on, or the last seed is too large.
+    """
+    if spec.demonstrations.valid_fraction == 0:
+        raise BadInput("--seeds compares on held-out demonstrations; raise demonstrations.valid_fraction")
+    with_overrides(spec, {"training.seed": training_seeds(spec, seeds)[-1]})
+
+
+def training_seeds(spec: Spec, seeds: int) -> list[int]:
+    """The training seeds of a fit and of its repetitions: the spec's own, and those that follow it."""
+    first = spec.seed if spec.training.seed is None else spec.training.seed
+    return list(range(first, first + seeds))
+
+
+def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) -> Fit:
+    """Repeat a fit and its baselines until there is one for each of ``seeds`` training seeds; nothing else differs.
+
+    Each repetition is a run in ``seeds/SEED`` of the run folder. One that is finished is not done again.
+
+    :param jobs: processes that fit side by side; -1 is one for each core. The result is the same for any number.
+    :returns: the fit, whose ``metrics["seeds"]``, and ``metrics.json``, have what comes of all of them.
+    :raises Failed: a process died.
+    """
+    folder = first.run_folder
+    numbers = training_seeds(first.spec, seeds)
+    allow_code = bool(user_code(first.spec))
+    with only_one(folder):
+        places = {seed: folder / "seeds" / str(seed) for seed in numbers[1:]}
+        left = {seed: place for seed, place in places.items() if not is_finished(place)}
+        for _ in range(len(places) - len(left)):
+            on_event(SeedFitted(len(places)))
+        calls = [partial(_again, first.spec, seed, place) for seed, place in left.items()]
+        with pool(useful_jobs(jobs, max(1, len(calls)))) as parallel:
+            for _ in results(parallel, calls, DEAD):
+                on_event(SeedFitted(len(places)))
+        every = [first, *(load(place, allow_code) for place in places.values())]
+        first.metrics["seeds"] = over_seeds(numbers, [fit.metrics for fit in every])
+        write_metrics(folder, first.metrics)
+    return first
+
+
+def _again(spec: Spec, seed: int, folder: Path) -> None:
+    """The fit with another training seed, in a folder of its own."""
+    fit_run(with_overrides(spec, {"training.seed": seed}), None, folder)
+
+
+def over_seeds(seeds: Sequence[int], each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What fits with these training seeds say, from the ``metrics`` of each.
+
+    :returns: the ``training_seeds``; by model its ``held_out`` log-likelihoods per step; and the parts of ``worth``
+        (:mod:`ddco_pyro.fitting.worth`), nats per step: all in the order of the seeds.
+    """
+    model = each[0]["model"]
+    held_out = {model: [metrics["log_likelihood_per_step"]["valid"] for metrics in each]}
+    for name in each[0]["comparison"]:
+        held_out[name] = [metrics["comparison"][name]["log_likelihood_per_step"]["valid"] for metrics in each]
+    parts = [part for part in ("memory", "experts", "total") if part in each[0].get("worth", {})]
+    worth = {part: [metrics["worth"][part]["nats_per_step"] for metrics in each] for part in parts}
+    return {"training_seeds": list(seeds), "held_out": held_out, "worth": worth}
