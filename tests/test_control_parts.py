@@ -108,7 +108,10 @@ def test_parts_by_name_come_first_and_the_rest_follows():
             {"parts": [{"name": "a", "dims": [1], "kind": "clipped", "bounds": [-1, 1]}]},
             "control.parts.0.bounds: control dimension 1 goes from -2 to 2",
         ),
-        ({"parts": [{"name": "a", "dims": [0, 2], "kind": "categorical"}]}, "control dimension 0 is not 0 or 1"),
+        (
+            {"parts": [{"name": "a", "dims": [0, 2], "kind": "categorical"}]},
+            "control dimension 0 is not of whole numbers",
+        ),
     ],
 )
 def test_what_does_not_fit_the_demonstrations_is_refused(control, message):

@@ -21,6 +21,7 @@ class ControlDimension:
     :param at_minimum: the number of steps exactly there; ``at_maximum`` likewise.
     :param steps: the number of all steps.
     :param distinct: its values in order, where they are at most :data:`MOST_DISTINCT`; else empty.
+    :param integer: whether it is of an integer type.
     """
 
     number: int
@@ -30,6 +31,7 @@ class ControlDimension:
     at_maximum: int
     steps: int
     distinct: tuple[float, ...] = ()
+    integer: bool = False
 
     @property
     def whole(self) -> bool:
@@ -72,13 +74,18 @@ class ControlDimension:
         return ""
 
     def as_data(self) -> dict[str, Any]:
-        """The same as plain data, without the distinct values."""
-        return {key: value for key, value in asdict(self).items() if key != "distinct"}
+        """The same as plain data, without its type and distinct values."""
+        return {key: value for key, value in asdict(self).items() if key not in ("distinct", "integer")}
 
 
 def number(value: float) -> str:
-    """A value of a control in a few digits, never as minus zero."""
-    return f"{value + 0.0:.6g}"
+    """A value with as few digits as tell it from any other of its type, single or double; never as minus zero."""
+    value = float(value) + 0.0
+    if value.is_integer() and abs(value) < 1e16:
+        return str(int(value))
+    with np.errstate(over="ignore"):
+        single = np.float32(value)
+    return str(single) if float(single) == value else str(value)
 
 
 MOST_DISTINCT = 64
@@ -91,9 +98,11 @@ class ControlStatistics:
     def __init__(self) -> None:
         self._columns: list[np.ndarray] = []  # minimum, maximum, steps there, steps: each [A]
         self._distinct: list[np.ndarray] = []
+        self._integer = True
 
     def add(self, controls: np.ndarray) -> None:
         """Take in some steps [T, A]."""
+        self._integer &= controls.dtype.kind in "iu"
         values = np.asarray(controls, dtype=np.float64).reshape(len(controls), -1)
         finite = np.isfinite(values)
         if not len(values):
@@ -111,7 +120,7 @@ class ControlStatistics:
         columns = [column.tolist() for column in self._columns]
         few = [tuple(values.tolist()) if len(values) <= MOST_DISTINCT else () for values in self._distinct]
         return tuple(
-            ControlDimension(index, low, high, at_low, at_high, steps, distinct)
+            ControlDimension(index, low, high, at_low, at_high, steps, distinct, self._integer)
             for index, (low, high, at_low, at_high, steps, distinct) in enumerate(zip(*columns, few, strict=True))
             if steps
         )
