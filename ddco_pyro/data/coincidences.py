@@ -155,11 +155,7 @@ class Coincidences:
             for shift, when in SHIFTS.items():
                 own, controls = self._controls(place, shift, varying)
                 if own:
-                    effect = (
-                        "policies that see it tend to repeat it"
-                        if shift < 0
-                        else "policies see what they have to predict"
-                    )
+                    effect = "tend to repeat it" if shift < 0 else "see what they have to predict"
                     yield (
                         f"{place}: {listed(own)} = control {listed(controls)} {when}, in all {len(self._seen)} "
                         f"demonstrations, the first {self._seen[0].name}: policies {effect}"

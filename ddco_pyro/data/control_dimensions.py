@@ -39,6 +39,11 @@ class ControlDimension:
         return bool(self.distinct) and self.minimum >= 0 and all(value.is_integer() for value in self.distinct)
 
     @property
+    def discrete(self) -> bool:
+        """Whether it is of an integer type and takes few values."""
+        return self.integer and bool(self.distinct)
+
+    @property
     def constant(self) -> bool:
         """Whether it has the same value in every step."""
         return self.minimum == self.maximum
@@ -54,11 +59,12 @@ class ControlDimension:
     def extremes(self) -> tuple[tuple[str, float, float], ...]:
         """(``minimum`` or ``maximum``, its value, share of the steps exactly there) where it often sits on it.
 
-        Empty where it takes one or two values only, and for a value that it takes once: every extreme is.
+        Empty where it takes one or two values only, or is discrete. A value that it takes once does not count: every
+        extreme is taken once.
         """
         ends = (("minimum", self.minimum, self.at_minimum), ("maximum", self.maximum, self.at_maximum))
         often = [(name, value, at / self.steps) for name, value, at in ends if at > max(1, OFTEN * self.steps)]
-        return () if self.values else tuple(often)
+        return () if self.values or self.discrete else tuple(often)
 
     @property
     def note(self) -> str:

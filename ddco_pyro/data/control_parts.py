@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from ddco_pyro.data.control_dimensions import MOST_DISTINCT, ControlDimension, number
@@ -154,7 +154,7 @@ def _parts(
         own = [dim for dim in dimensions if decided[dim.number][0] == each]
         name = each if spec is None else spec.name if len(kinds) == 1 else f"{spec.name} {each}"
         if each == "categorical":
-            yield from _actions(own, place, name)
+            yield from (replace(part, why=decided[part.dims[0]][1]) for part in _actions(own, place, name))
         else:
             ends = [_ends(dim, each, place, spec) for dim in own]
             low, high = zip(*ends, strict=True) if each in ("clipped", "binary") else ((), ())
@@ -169,7 +169,7 @@ def _decided(dimension: ControlDimension, alone: bool) -> tuple[str, str]:
     """
     if dimension.values:
         return "binary", f"takes two values, {number(dimension.minimum)} and {number(dimension.maximum)}"
-    if dimension.integer and dimension.distinct:
+    if dimension.discrete:
         return "categorical", f"takes {len(dimension.distinct)} values of an integer type"
     if alone and dimension.whole:
         return "categorical", f"takes {len(dimension.distinct)} whole numbers and is the only dimension"

@@ -12,7 +12,7 @@ import numpy as np
 
 from ddco_pyro.data.checks import LEAST, check_division
 from ddco_pyro.data.control_dimensions import all_constant
-from ddco_pyro.data.hdf5 import DemonstrationsError, natural
+from ddco_pyro.data.hdf5 import DemonstrationsError, natural, printable
 from ddco_pyro.data.inspection import Field, Inspection, inspect
 from ddco_pyro.data.starting_pictures import seen, sight
 from ddco_pyro.spec import parse_spec
@@ -130,7 +130,7 @@ def _lines(inspection: Inspection, path: str) -> Iterator[str]:
     yield from _observations(inspection)
     yield "control:"
     yield "  kind: auto                        # decided from the demonstrations; so it is:"
-    yield from (f"  # {note}" for note in inspection.notes)
+    yield from (f"  # {printable(note)}" for note in inspection.notes)
     yield "  std: {learn: true, floor: 0.01, per_option: true}   # in units of each dimension's own spread"
     pictures = [_text(field.key) for field in _images(inspection)] if _only_images(inspection) else []
     yield "hierarchy:"

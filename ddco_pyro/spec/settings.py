@@ -204,6 +204,13 @@ class ControlSpec(Model):
                     where = f"control dimension {dimension} is in {dimensions[dimension]!r} already"
                     raise invalid((f"parts.{number}.dims", where))
                 dimensions[dimension] = part.name
+            if isinstance(part.scale, tuple) and len(part.scale) != len(part.dims):
+                raise invalid(
+                    (f"parts.{number}.scale", f"has {len(part.scale)} numbers for {len(part.dims)} dimensions")
+                )
+            for setting in ("scale", "std"):
+                if part.kind in ("binary", "categorical") and getattr(part, setting) is not None:
+                    raise invalid((f"parts.{number}.{setting}", f"is of no use to kind: {part.kind}; leave it out"))
             if part.bounds is not None and (part.kind != "clipped" or part.bounds[0] >= part.bounds[1]):
                 problem = "are for kind: clipped" if part.kind != "clipped" else "must be a lower and a higher number"
                 raise invalid((f"parts.{number}.bounds", problem))
