@@ -72,7 +72,6 @@ def test_what_a_fit_would_refuse_is_said(path: Path) -> None:
         "demo_3: obs/goal has 2 steps, but actions has 6",
         "demo_4: actions is missing; there is: labels/phase, obs/camera, obs/fixed, obs/goal, obs/pose",
         "mask/valid: there is no demonstration 'demo_9' (did you mean 'demo_4'?)",
-        "obs/goal cannot be used in 1 of 4 demonstrations",
         "obs/pose has 1 NaN and 1 infinite values, the first in demo_1 at step 2; 2 of 4 demonstrations are affected",
     ]
 

@@ -148,7 +148,8 @@ class Coincidences:
         if not self._compared[place][at]:
             return [], []
         equal = self._equal[place][at][:, list(varying)]
-        return np.flatnonzero(equal.any(1)).tolist(), [varying[column] for column in np.flatnonzero(equal.any(0))]
+        own, controls = np.flatnonzero(equal.any(1)).tolist(), np.flatnonzero(equal.any(0)).tolist()
+        return own, [varying[column] for column in controls]
 
     def _observed(self, varying: Sequence[int]) -> Iterator[str]:
         for place in self._equal:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -252,6 +252,7 @@ def _inspect(path: Path, source: Source, exclude: tuple[str, ...]) -> Inspection
     fields: dict[str, Field] = {}
     problems = _Problems()
     unreadable: list[str] = []
+    places: dict[str, Collection[str]] = {}
     control, coincidences = ControlStatistics(), Coincidences()
     names = [name for name in source.names if name not in exclude]
     for name in names:
@@ -263,11 +264,13 @@ def _inspect(path: Path, source: Source, exclude: tuple[str, ...]) -> Inspection
                 watched = coincidences.watched(place, column)
                 watched = _watched(watched, control) if place == "actions" else watched
                 _add(fields, place, watched, name, lengths[name], problems)
-            for place in fields.keys() - dict(recording.columns()).keys():
-                problems.add("missing", f"{name}: {place} is missing", place)
+            places[name] = {place for place, _ in recording.columns()}
         except DemonstrationsError as error:
             problems.add("unreadable", str(error), re.sub(r"\d+", "", str(error).removeprefix(name)))
             unreadable.append(name)
+    for name, there in places.items():
+        for place in (place for place in fields if place not in there):
+            problems.add("missing", f"{name}: {place} is missing", place)
     masks = {mask: tuple(name for name in members if name not in exclude) for mask, members in source.masks.items()}
     dimensions = control.dimensions()
     varying = [dimension.number for dimension in dimensions if not dimension.constant]

@@ -234,7 +234,5 @@ def refuse_impossible(demonstrations: Demonstrations, scaling: ControlScaling, f
     """
     for demonstration in demonstrations:
         if problem := scaling.impossible(demonstration):
-            remedy = (
-                f"repair it, or leave {demonstration.name} out" if fitted else "declare another kind in control.parts"
-            )
-            raise DemonstrationsError(f"{problem}; {remedy}")
+            declare, repair = "declare another kind in control.parts", f"repair it, or leave {demonstration.name} out"
+            raise DemonstrationsError(f"{problem}; {repair if fitted else declare}")

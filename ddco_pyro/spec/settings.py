@@ -205,9 +205,8 @@ class ControlSpec(Model):
                     raise invalid((f"parts.{number}.dims", where))
                 dimensions[dimension] = part.name
             if isinstance(part.scale, tuple) and len(part.scale) != len(part.dims):
-                raise invalid(
-                    (f"parts.{number}.scale", f"has {len(part.scale)} numbers for {len(part.dims)} dimensions")
-                )
+                problem = f"has {len(part.scale)} numbers, but the part has {len(part.dims)} dimensions"
+                raise invalid((f"parts.{number}.scale", problem))
             for setting in ("scale", "std"):
                 if part.kind in ("binary", "categorical") and getattr(part, setting) is not None:
                     raise invalid((f"parts.{number}.{setting}", f"is of no use to kind: {part.kind}; leave it out"))
