@@ -233,6 +233,24 @@ def test_copies_are_noted_where_the_masks_part_them(tmp_path: Path) -> None:
     assert not noted(valid=[b"demo_0", b"demo_4"])
 
 
+def test_demonstrations_that_cannot_be_read_equal_nothing(tmp_path: Path) -> None:
+    path = write(tmp_path / "demos.hdf5")
+    with h5py.File(path, "r+") as file:
+        for name in ("demo_1", "demo_2"):
+            actions = file[f"data/{name}/actions"][()]
+            del file[f"data/{name}/actions"]
+            file.create_dataset(f"data/{name}/actions", data=actions, fletcher32=True, chunks=actions.shape)
+    with h5py.File(path) as file:
+        places = [file[f"data/{name}/actions"].id.get_chunk_info(0).byte_offset for name in ("demo_1", "demo_2")]
+    content = bytearray(path.read_bytes())
+    for place in places:
+        content[place + 8] ^= 1
+    path.write_bytes(content)
+    found = inspect(path)
+    assert found.unreadable == ("demo_1", "demo_2")
+    assert not any("equal another one" in note for note in found.notes)
+
+
 def test_a_kind_of_problem_is_one_line_with_its_number(tmp_path: Path) -> None:
     def change(made: dict[str, np.ndarray], number: int) -> None:
         if number == 0:

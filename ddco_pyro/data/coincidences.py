@@ -81,6 +81,10 @@ class Coincidences:
         """Another demonstration; its controls are read first."""
         self._seen.append(_Demonstration(name, steps))
 
+    def forget(self, name: str) -> None:
+        """A demonstration that could not be read to its end."""
+        self._seen = [demo for demo in self._seen if demo.name != name]
+
     def watched(self, place: str, column: Column) -> Column:
         """The same column, whose values are gathered when they are read."""
         if place.startswith("labels/"):

@@ -268,6 +268,7 @@ def _inspect(path: Path, source: Source, exclude: tuple[str, ...]) -> Inspection
         except DemonstrationsError as error:
             problems.add("unreadable", str(error), re.sub(r"\d+", "", str(error).removeprefix(name)))
             unreadable.append(name)
+            coincidences.forget(name)
     for name, there in places.items():
         for place in (place for place in fields if place not in there):
             problems.add("missing", f"{name}: {place} is missing", place)
