@@ -103,7 +103,7 @@ class Coincidences:
                     digest.update(np.ascontiguousarray(rows).tobytes())
                     if place == "actions":
                         demo.take(rows, first)
-                    elif not first and not column.image and rows.shape[1] <= WIDEST:
+                    elif len(demo.commands) and not first and not column.image and rows.shape[1] <= WIDEST:
                         self._compare(place, rows[: len(demo.commands)], demo.commands)
                 first += len(rows)
                 yield block
@@ -117,7 +117,8 @@ class Coincidences:
         commands = commands[: len(rows)]
         floats = [array.dtype for array in (rows, commands) if array.dtype.kind == "f"]
         coarser = min(floats, key=lambda dtype: dtype.itemsize, default=np.dtype(np.float64))
-        rows, commands = rows.astype(coarser), commands.astype(coarser)
+        with np.errstate(over="ignore"):
+            rows, commands = rows.astype(coarser), commands.astype(coarser)
         shape = (len(SHIFTS), rows.shape[1], commands.shape[1])
         equal = self._equal.setdefault(place, np.ones(shape, dtype=bool))
         compared = self._compared.setdefault(place, np.zeros(len(SHIFTS), dtype=int))

@@ -106,6 +106,16 @@ def _half(steps: int) -> np.ndarray:
     return np.arange(steps) < steps // 2
 
 
+def _another_size(made: Arrays, number: int) -> None:
+    leaked(made, number)
+    made["actions"] = made["actions"][:, : 2 - (number == 2)]
+
+
+def _huge(made: Arrays, number: int) -> None:
+    made["actions"] = made["actions"].astype(np.float32)
+    made["obs/huge"] = np.full((len(made["actions"]), 1), 1e39 + number)
+
+
 def one_step(made: Arrays, number: int) -> None:
     for place, values in made.items():
         made[place] = values[:1]
@@ -187,6 +197,11 @@ CONTROL_ROWS: dict[str, Row] = {
     "two conventions of a switch": _row(
         with_switch(lambda steps, number: np.where(_half(steps), -1 if number < 3 else 0, 1))
     ),
+    "controls of another size in one": _row(
+        _another_size,
+        says="actions is in 4 of 5 demonstrations",
+    ),
+    "a number that single precision does not hold": _row(_huge),
     "no control that moves": _row(
         put("actions", lambda steps, number: np.ones((steps, 2))), says="every dimension is constant"
     ),
