@@ -94,6 +94,43 @@ def test_whole_numbers_alone_are_discrete_actions():
     assert "categorical" not in kinds(both).values()
 
 
+def whole(seed, columns=2):
+    """[T, 2] of an integer type: -1, 0 or 1, and 0, 1 or 2."""
+    return np.random.default_rng(seed).integers(-1, 2, (20, columns)) + np.arange(columns)
+
+
+def test_of_an_integer_type_every_column_is_discrete_whatever_its_sign():
+    parts = control_parts(ControlSpec(), control_dimensions([whole(0)]))
+    assert [(part.dims, part.kind, part.values) for part in parts] == [
+        ((0,), "categorical", (-1.0, 0.0, 1.0)),
+        ((1,), "categorical", (0.0, 1.0, 2.0)),
+    ]
+    assert parts == control_parts(ControlSpec(), control_dimensions([whole(1), whole(0)]))
+    assert kinds(whole(0).astype(float)) == {0: "clipped", 1: "clipped"}
+    assert kinds(whole(0).astype(float), kind="categorical") == {0: "categorical", 1: "categorical"}
+    many = np.arange(100).reshape(-1, 1)
+    assert kinds(many) == {0: "gaussian"}
+    assert kinds(np.where(many < 50, -1, 1)) == {0: "binary"}
+
+
+def test_two_discrete_columns_are_a_distribution_and_act_in_exports_as_in_the_run(tmp_path):
+    """The probabilities of all nine actions sum to 1; nothing else is emitted."""
+    made = []
+    for n in range(6):
+        noise = np.random.default_rng(n).normal(0, 0.1, (20, 2))
+        made.append(Demonstration(f"demo_{n}", {"state": whole(n) + noise}, whole(n)))
+    fit = ddco_pyro.fit(spec_of(), Demonstrations(tuple(made)))
+    actions = np.stack(np.meshgrid([-1, 0, 1], [0, 1, 2]), axis=-1).reshape(-1, 2)
+    each = [Demonstration(f"demo_{n}", {"state": np.zeros((1, 2))}, action[None]) for n, action in enumerate(actions)]
+    np.testing.assert_allclose(np.exp(fit.log_likelihood(Demonstrations(tuple(each)))).sum(), 1.0, rtol=1e-6)
+    controller = Controller(fit.hierarchy, "sample")
+    controller.reset(0)
+    emitted = {tuple(controller.act({"state": np.zeros(2)})) for _ in range(60)}
+    assert len(emitted) > 3
+    assert emitted <= set(map(tuple, actions.astype(float)))
+    assert all(d < TOLERANCE for d, _ in export(fit, tmp_path / "out").values())
+
+
 def test_parts_by_name_come_first_and_the_rest_follows():
     parts = [{"name": "arm", "dims": [1, 0], "kind": "gaussian"}, {"name": "jaw", "dims": [2, 4]}]
     assert kinds(mixed(), parts=parts) == {0: "gaussian", 1: "gaussian", 2: "binary", 3: "clipped"}
@@ -108,7 +145,10 @@ def test_parts_by_name_come_first_and_the_rest_follows():
             {"parts": [{"name": "a", "dims": [1], "kind": "clipped", "bounds": [-1, 1]}]},
             "control.parts.0.bounds: control dimension 1 goes from -2 to 2",
         ),
-        ({"parts": [{"name": "a", "dims": [0, 2], "kind": "categorical"}]}, "control dimension 0 is not 0 or 1"),
+        (
+            {"parts": [{"name": "a", "dims": [0, 2], "kind": "categorical"}]},
+            "control dimension 0 is not of whole numbers",
+        ),
     ],
 )
 def test_what_does_not_fit_the_demonstrations_is_refused(control, message):
@@ -123,6 +163,11 @@ def test_what_does_not_fit_the_demonstrations_is_refused(control, message):
         [{"name": "a", "dims": [0]}, {"name": "a", "dims": [1]}],
         [{"name": "a", "dims": [0], "bounds": [0, 1]}],
         [{"name": "a", "dims": [0], "kind": "clipped", "bounds": [1, 0]}],
+        [{"name": "a", "dims": [0, 1], "scale": [1.0]}],
+        [{"name": "a", "dims": [0], "scale": [1.0, 2.0]}],
+        [{"name": "a", "dims": [2], "kind": "binary", "scale": [1.0]}],
+        [{"name": "a", "dims": [2], "kind": "binary", "std": 0.1}],
+        [{"name": "a", "dims": [2], "kind": "categorical", "scale": "none"}],
     ],
 )
 def test_contradictions_in_parts_are_refused(parts):
@@ -212,7 +257,7 @@ def in_file(spec, path, **changes):
 def test_a_value_that_a_switch_does_not_have_is_one_line():
     broken = demonstrations(lambda n: np.where(np.arange(5) == 2, 0.5, mixed(n)), number=1)
     fit = ddco_pyro.fit(spec_of(), demonstrations())
-    with pytest.raises(DemonstrationsError, match=r"demo_0: control dimension 2 is 0\.5 at step 0"):
+    with pytest.raises(DemonstrationsError, match=r"2 is 0\.5 at step 0, .*; repair it, or leave demo_0 out$"):
         fit.log_likelihood(broken)
 
 

@@ -71,7 +71,7 @@ def test_only_what_is_asked_for_is_read(path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file["data/demo_3/obs/camera"][...] = 0
         del file["data/demo_4/obs/camera"]
-    read = Demonstrations.read(path, ["pose"])
+    read = Demonstrations.read(path, ["pose"], ())
     assert read.observation_shapes == {"pose": (3,)}
     assert read[0].labels == {}
     assert Demonstrations.read(path, []).observation_shapes == {}

@@ -103,12 +103,13 @@ REFUSED: list[tuple[str, Callable[[h5py.File], None], str]] = [
     (
         "flat actions",
         replace("data/demo_1/actions", np.ones(4)),
-        "demo_1: actions has shape (4,), it has to be [steps, dimensions]",
+        "demo_1: actions is float64 of shape [steps]; store discrete actions as integers (astype(int)), and anything "
+        "else as [steps, 1] (actions[:, None])",
     ),
     (
         "float labels",
         replace("data/demo_1/labels/phase", np.ones(4)),
-        "demo_1: labels/phase is float64 of shape (4,), it has to be integers of shape [steps]",
+        "demo_1: labels/phase is float64 of shape [steps], it has to be integers of shape [steps]",
     ),
     (
         "other obs shape",

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from command_line import call
+from odd_files.kinds import ROWS, twins, write
 from random_demonstrations import demonstrations
 
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
@@ -72,7 +73,6 @@ def test_what_a_fit_would_refuse_is_said(path: Path) -> None:
         "demo_3: obs/goal has 2 steps, but actions has 6",
         "demo_4: actions is missing; there is: labels/phase, obs/camera, obs/fixed, obs/goal, obs/pose",
         "mask/valid: there is no demonstration 'demo_9' (did you mean 'demo_4'?)",
-        "obs/goal cannot be used in 1 of 4 demonstrations",
         "obs/pose has 1 NaN and 1 infinite values, the first in demo_1 at step 2; 2 of 4 demonstrations are affected",
     ]
 
@@ -155,3 +155,114 @@ def test_markup_in_names_is_shown_as_it_is(path: Path) -> None:
         for group in file["data"].values():
             group["obs/[red]x[/red]"] = np.ones((len(group["actions"]), 1))
     assert "obs/[red]x[/red]" in call("inspect", path).out
+
+
+def notes_of(name: str, folder: Path) -> list[str]:
+    """What is noted of a row of odd files, kinds of controls aside."""
+    return [note for note in inspect(ROWS[name].make(folder)).notes if "by control.kind" not in note]
+
+
+NOTES: dict[str, list[str]] = {
+    "equal tails": [
+        "the last steps are the same in 5 of 5 demonstrations, the first demo_0 from step 5 on: cut them off if they "
+        "are padding"
+    ],
+    "a demonstration twice": [
+        "1 of 5 demonstrations equal another one, the first demo_4, which equals demo_0: one of two that are the same "
+        "may be trained on and the other held out"
+    ],
+    "an observation that is the control": [
+        "obs/command: dimensions 0-1 = control dimensions 0-1 at the same step, in all 5 demonstrations, the first "
+        "demo_0: policies see what they have to predict"
+    ],
+    "a switch padded by zeros": [
+        "control dimension 2: exactly at its minimum -1 in 47.1 % of the steps, at its maximum 1 in 23.5 % of the "
+        "steps",
+        "control dimension 2: -1 or 1, and 0 at the end of 5 of 5 demonstrations, the first demo_0 from step 4 on: cut "
+        "the ends off if they are padding, and it is a switch",
+    ],
+    "two conventions of a switch": [
+        "control dimension 2: exactly at its minimum -1 in 29.4 % of the steps, at its maximum 1 in 52.9 % of the "
+        "steps",
+        "control dimension 2: -1 or 1 in 3 demonstrations, the first demo_0, and 0 or 1 in 2, the first demo_3: write "
+        "all of them in one way, and it is a switch",
+    ],
+    "integers -1, 0, 1": [],
+    "demonstrations of one step": [],
+    "channels first": [],
+}
+
+
+@pytest.mark.parametrize(("name", "notes"), NOTES.items(), ids=NOTES)
+def test_what_coincides_is_noted_once(
+    name: str, notes: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert notes_of(name, tmp_path) == notes
+    monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", 1)
+    assert notes_of(name, tmp_path) == notes
+
+
+@pytest.mark.parametrize(("shift", "left_out"), [(-1, False), (0, True), (1, True)])
+def test_a_control_among_other_numbers_is_noted_and_alone_left_out(shift: int, left_out: bool, tmp_path: Path) -> None:
+    """It is that of the step before, of the same one, or of the next; beside it is a number of its own."""
+
+    def change(made: dict[str, np.ndarray], number: int) -> None:
+        control = np.roll(made["actions"][:, 1], -shift)
+        made["obs/alone"] = control[:, None]
+        made["obs/both"] = np.column_stack([made["obs/pose"], control])
+        for key in ("alone", "both"):  # what is not there for want of a step is anything
+            made[f"obs/{key}"][[0, -1], -1] += {-1: (7, 0), 0: (0, 0), 1: (0, 7)}[shift]
+
+    found = inspect(write(tmp_path / "demos.hdf5", change))
+    when = {-1: "of the step before", 0: "at the same step", 1: "of the next step"}[shift]
+    for place, dimension in (("obs/alone", 0), ("obs/both", 3)):
+        said = (
+            f"{place}: dimension {dimension} = control dimension 1 {when}, in all 5 demonstrations, the first demo_0: "
+        )
+        assert sum(note.startswith(said) for note in found.notes) == 1
+    assert found.leaks == (("obs/alone",) if left_out else ())
+
+
+def test_copies_are_noted_where_the_masks_part_them(tmp_path: Path) -> None:
+    def noted(**masks: list[bytes]) -> bool:
+        return any("equal another one" in note for note in inspect(write(tmp_path / "d.hdf5", twins, masks)).notes)
+
+    assert noted(valid=[b"demo_0"])
+    assert noted(train=[b"demo_0", b"demo_1"], valid=[b"demo_4"])
+    assert not noted(valid=[b"demo_1"])
+    assert not noted(valid=[b"demo_0", b"demo_4"])
+
+
+def test_demonstrations_that_cannot_be_read_equal_nothing(tmp_path: Path) -> None:
+    path = write(tmp_path / "demos.hdf5")
+    with h5py.File(path, "r+") as file:
+        for name in ("demo_1", "demo_2"):
+            actions = file[f"data/{name}/actions"][()]
+            del file[f"data/{name}/actions"]
+            file.create_dataset(f"data/{name}/actions", data=actions, fletcher32=True, chunks=actions.shape)
+    with h5py.File(path) as file:
+        places = [file[f"data/{name}/actions"].id.get_chunk_info(0).byte_offset for name in ("demo_1", "demo_2")]
+    content = bytearray(path.read_bytes())
+    for place in places:
+        content[place + 8] ^= 1
+    path.write_bytes(content)
+    found = inspect(path)
+    assert found.unreadable == ("demo_1", "demo_2")
+    assert not any("equal another one" in note for note in found.notes)
+
+
+def test_a_kind_of_problem_is_one_line_with_its_number(tmp_path: Path) -> None:
+    def change(made: dict[str, np.ndarray], number: int) -> None:
+        if number == 0:
+            return
+        for key in range(8):
+            made[f"obs/{key}"] = np.zeros((2 + number % 3, 1))
+        made["obs/pose"] = made["obs/pose"][:, :2]
+
+    found = inspect(write(tmp_path / "demos.hdf5", change, number=30))
+    assert len(found.problems) == 9
+    assert found.problems[0] == "demo_1: obs/0 has 3 steps, but actions has 7; the first of 29 such"
+    assert (
+        "demo_1: obs/pose has shape (2,) at each step, but (3,) in the first; all demonstrations need the same; "
+        in (found.problems[8])
+    )

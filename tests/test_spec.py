@@ -282,3 +282,30 @@ def test_a_grid_over_networks_survives_writing() -> None:
     grid = {"hierarchy.levels.0.policy.network": ["linear", "mlp", "conv"]}
     spec = parse_spec(SMALL, {"selection.grid": grid})
     assert parse_spec(yaml.safe_load(dump_spec(spec))) == spec
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("010", 10),  # YAML 1.1 has eight
+        ("09", 9),
+        ("1:30", "1:30"),  # and ninety
+        ("1:30.5", "1:30.5"),
+        ("1_000", 1000),
+        ("-0x1f", -31),
+        ("0o10", "0o10"),
+        ("1e-3", 0.001),
+        ("+.5e2", 50.0),
+        ("1.", 1.0),
+        ("-.inf", float("-inf")),
+    ],
+)
+def test_a_number_is_what_its_decimal_text_says(text: str, value: object) -> None:
+    found = read_yaml(f"seed: {text}")["seed"]
+    assert (found, type(found)) == (value, type(value))
+
+
+@pytest.mark.parametrize("name", ["010", "09", "1:30", "0o10", "1e3", "1_0", "0x1F", "1.", "yes"])
+def test_a_name_that_looks_like_a_number_stays_a_name(name: str) -> None:
+    text = dump_spec(parse_spec({**SMALL, "observations": [name]}))
+    assert parse_spec(read_yaml(text)).observed == [name]

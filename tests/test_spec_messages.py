@@ -87,6 +87,18 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"hierarchy.meta_policy": {"network": "mlp", "options": {"a": 1}}},
         "hierarchy.meta_policy.options: does not apply to network 'mlp'; leave it out",
     ),
+    (
+        {"control.parts": [{"name": "arm", "dims": [0, 1], "scale": [1.0]}]},
+        "control.parts.0.scale: has 1 numbers, but the part has 2 dimensions",
+    ),
+    (
+        {"control.parts": [{"name": "jaw", "dims": [0], "kind": "binary", "scale": [1.0]}]},
+        "control.parts.0.scale: is of no use to kind: binary; leave it out",
+    ),
+    (
+        {"training.optimizer": {"name": "adam", "momentum": 0.5}},
+        "training.optimizer.momentum: is for name: momentum, and adam would not use it; leave it out",
+    ),
     ({"observations": ["step"]}, "observations: step alone says nothing of the state; name an observation beside it"),
     (
         {"observations": ["state", {"key": "step", "differences": True}]},

@@ -44,11 +44,13 @@ def check(
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.building import baselines, check_networks
     from ddco_pyro.fitting.labels import used
-    from ddco_pyro.fitting.prepare import dimensions, in_file, outline
+    from ddco_pyro.fitting.prepare import dimensions, in_file, outline, refuse_unfit
 
     demos = outline(loaded) if in_file(loaded) else None
     size = dimensions(loaded, demos)
     hierarchy = check_networks(loaded, size)
+    if demos is not None:
+        refuse_unfit(loaded, demos)
     labels = used(loaded, demos) if demos else None
     print(dump_spec(loaded), end="")
     console.dimensions(loaded, size, hierarchy, baselines(loaded, size))

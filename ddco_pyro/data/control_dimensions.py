@@ -33,6 +33,7 @@ class ControlDimension:
     :param inside: the commonest of the values between its extremes; None where it takes none of them often.
     :param at_inside: the number of steps exactly there.
     :param together: the other dimensions that are at their ``inside`` in the same steps (:data:`TOGETHER`).
+    :param integer: whether it is of an integer type.
     """
 
     number: int
@@ -45,11 +46,17 @@ class ControlDimension:
     inside: float | None = None
     at_inside: int = 0
     together: tuple[int, ...] = ()
+    integer: bool = False
 
     @property
     def whole(self) -> bool:
         """Whether it takes few values, and whole numbers from 0 on."""
         return bool(self.distinct) and self.minimum >= 0 and all(value.is_integer() for value in self.distinct)
+
+    @property
+    def discrete(self) -> bool:
+        """Whether it is of an integer type and takes few values."""
+        return self.integer and bool(self.distinct)
 
     @property
     def constant(self) -> bool:
@@ -67,11 +74,12 @@ class ControlDimension:
     def extremes(self) -> tuple[tuple[str, float, float], ...]:
         """(``minimum`` or ``maximum``, its value, share of the steps exactly there) where it often sits on it.
 
-        Empty where it takes one or two values only, and for a value that it takes once: every extreme is.
+        Empty where it takes one or two values only, or is discrete. A value that it takes once does not count: every
+        extreme is taken once.
         """
         ends = (("minimum", self.minimum, self.at_minimum), ("maximum", self.maximum, self.at_maximum))
         often = [(name, value, at / self.steps) for name, value, at in ends if at > max(1, OFTEN * self.steps)]
-        return () if self.values else tuple(often)
+        return () if self.values or self.discrete else tuple(often)
 
     @property
     def atom(self) -> str:
@@ -93,17 +101,27 @@ class ControlDimension:
         return "; ".join(filter(None, (self.atom, ends and f"exactly at its {ends}")))
 
     def as_data(self) -> dict[str, Any]:
-        """The same as plain data, without the distinct values and the other dimensions."""
-        return {key: value for key, value in asdict(self).items() if key not in ("distinct", "together")}
+        """The same as plain data, without its type, its distinct values and the other dimensions."""
+        left_out = ("distinct", "together", "integer")
+        return {key: value for key, value in asdict(self).items() if key not in left_out}
 
 
 def number(value: float) -> str:
-    """A value of a control in a few digits, never as minus zero."""
-    return f"{value + 0.0:.6g}"
+    """A value with as few digits as tell it from any other of its type, single or double; never as minus zero."""
+    value = float(value) + 0.0
+    if value.is_integer() and abs(value) < 1e16:
+        return str(int(value))
+    with np.errstate(over="ignore"):
+        single = np.float32(value)
+    return str(single) if float(single) == value else str(value)
 
 
 MOST_DISTINCT = 64
 """Distinct values of a dimension that are kept."""
+
+
+NOWHERE: tuple[float | None, int, tuple[int, ...]] = (None, 0, ())
+"""What is said of a dimension that takes no value inside its range often."""
 
 
 class ControlStatistics:
@@ -113,9 +131,11 @@ class ControlStatistics:
         self._columns: list[np.ndarray] = []  # minimum, maximum, steps there, steps: each [A]
         self._distinct: list[np.ndarray] = []
         self._often = _Often()
+        self._integer = True
 
     def add(self, controls: np.ndarray) -> None:
         """Take in some steps [T, A]."""
+        self._integer &= controls.dtype.kind in "iu"
         values = np.asarray(controls, dtype=np.float64).reshape(len(controls), -1)
         finite = np.isfinite(values)
         if not len(values):
@@ -135,7 +155,9 @@ class ControlStatistics:
         few = [tuple(values.tolist()) if len(values) <= MOST_DISTINCT else () for values in self._distinct]
         inside = self._often.inside(*self._columns[:2]) if columns else {}
         return tuple(
-            ControlDimension(index, low, high, at_low, at_high, steps, distinct, *inside.get(index, ()))
+            ControlDimension(
+                index, low, high, at_low, at_high, steps, distinct, *inside.get(index, NOWHERE), integer=self._integer
+            )
             for index, (low, high, at_low, at_high, steps, distinct) in enumerate(zip(*columns, few, strict=True))
             if steps
         )

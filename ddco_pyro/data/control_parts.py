@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -67,10 +67,10 @@ class ControlPart:
 
 def described(parts: Sequence[ControlPart]) -> list[str]:
     """A line for each part: its dimensions, its kind, and why."""
-    return [f"control {_listed(part.dims)}: {part.kind}" + (f" ({part.why})" if part.why else "") for part in parts]
+    return [f"control {listed(part.dims)}: {part.kind}" + (f" ({part.why})" if part.why else "") for part in parts]
 
 
-def _listed(dims: Sequence[int]) -> str:
+def listed(dims: Sequence[int]) -> str:
     """``dimension 3``, or ``dimensions 0-2, 5``."""
     runs: list[list[int]] = []
     for dimension in sorted(dims):
@@ -114,7 +114,7 @@ def _told(measured: Sequence[Any] | None) -> str:
     kind, *about = measured
     ends = " and ".join("none" if end is None else number(end) for end in about[:2])
     told = f"{kind} with bounds {ends}" if kind in ("clipped", "hurdle") else str(kind)
-    return f"{told} at {number(about[2])}, of {_listed(about[3])}" if kind == "hurdle" else told
+    return f"{told} at {number(about[2])}, of {listed(about[3])}" if kind == "hurdle" else told
 
 
 def all_gaussian(varying: Sequence[int]) -> tuple[ControlPart, ...]:
@@ -155,7 +155,11 @@ def _parts(
 ) -> Iterator[ControlPart]:
     """One part for each kind among the dimensions."""
     if kind == "categorical" and dimensions:
-        yield _categorical(dimensions, place, spec.name if spec else kind)
+        name, rows = spec.name if spec else kind, all(dim.values == (0.0, 1.0) for dim in dimensions)
+        if rows and len(dimensions) > 1:
+            yield _rows(dimensions, name)
+        else:
+            yield from _actions(dimensions, place, name)
         return
     alone = len(dimensions) == 1
     decided = {dim.number: _decided(dim, alone) if kind == "auto" else _declared(dim, kind) for dim in dimensions}
@@ -164,7 +168,7 @@ def _parts(
         alike = [dim for dim in dimensions if decided[dim.number][0] == each]
         name = each if spec is None else spec.name if len(kinds) == 1 else f"{spec.name} {each}"
         if each == "categorical":
-            yield _categorical(alike, place, name)
+            yield from (replace(part, why=decided[part.dims[0]][1]) for part in _actions(alike, place, name))
             continue
         exact = {dim.number: _exact(dim, place, spec) for dim in alike if each == "hurdle"}
         for own in _at_once(alike, exact) if exact else [alike]:
@@ -216,6 +220,8 @@ def _decided(dimension: ControlDimension, alone: bool) -> tuple[str, str]:
     """
     if dimension.values:
         return "binary", f"takes two values, {number(dimension.minimum)} and {number(dimension.maximum)}"
+    if dimension.discrete:
+        return "categorical", f"takes {len(dimension.distinct)} values of an integer type"
     if alone and dimension.whole:
         return "categorical", f"takes {len(dimension.distinct)} whole numbers and is the only dimension"
     if dimension.atom:
@@ -253,17 +259,22 @@ def _ends(
     return often.get("minimum", -math.inf), often.get("maximum", math.inf)
 
 
-def _categorical(dimensions: Sequence[ControlDimension], place: str, name: str) -> ControlPart:
+def _actions(dimensions: Sequence[ControlDimension], place: str, name: str) -> Iterator[ControlPart]:
+    """A part for each of these dimensions, whose values are the actions."""
+    for dim in dimensions:
+        if not dim.distinct:
+            raise SpecError(f"{place}.kind: control dimension {dim.number} takes more than {MOST_DISTINCT} values")
+        if len(dimensions) > 1 and not all(value.is_integer() for value in dim.distinct):
+            raise SpecError(
+                f"{place}.kind: control dimension {dim.number} is not of whole numbers: discrete actions are such "
+                "dimensions, or rows with a single 1"
+            )
+        own = name if len(dimensions) == 1 else f"{name} {dim.number}"
+        why = f"{len(dim.distinct)} discrete actions"
+        yield ControlPart(own, (dim.number,), "categorical", values=dim.distinct, why=why)
+
+
+def _rows(dimensions: Sequence[ControlDimension], name: str) -> ControlPart:
+    """One part, whose actions are rows with a single 1."""
     dims = tuple(dim.number for dim in dimensions)
-    if len(dims) == 1:
-        values = dimensions[0].distinct
-        if not values:
-            raise SpecError(f"{place}.kind: control dimension {dims[0]} takes more than {MOST_DISTINCT} values")
-        return ControlPart(name, dims, "categorical", values=values, why=f"{len(values)} discrete actions")
-    wrong = [dim.number for dim in dimensions if dim.values != (0.0, 1.0)]
-    if wrong:
-        raise SpecError(
-            f"{place}.kind: control dimension {wrong[0]} is not 0 or 1: discrete actions are one dimension, or rows "
-            "with a single 1"
-        )
     return ControlPart(name, dims, "categorical", why=f"{len(dims)} discrete actions, as rows")

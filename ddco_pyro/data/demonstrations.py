@@ -9,11 +9,19 @@ from typing import Any, overload
 
 import numpy as np
 
-from ddco_pyro.data.checks import check, check_alike, check_values, problems_of_masks, unknown
+from ddco_pyro.data.checks import (
+    check,
+    check_alike,
+    check_values,
+    divided,
+    problem_of_labels,
+    problems_of_masks,
+    unknown,
+)
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import PROGRAM, Extent, refuse_too_much
 from ddco_pyro.data.pictures import Observed, Pictures
-from ddco_pyro.data.sources.recording import Recording, discrete, of_array
+from ddco_pyro.data.sources.recording import Recording, of_array
 from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
 
 
@@ -21,10 +29,11 @@ from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimi
 class Demonstration:
     """One demonstration of T steps, s_0 a_0 ... s_{T-1} a_{T-1}.
 
-    :param observations: key to [T, ...]; uint8 (images, HWC) stays as it is, other numbers become float64. Pictures
-        of a file are :class:`~ddco_pyro.data.pictures.Pictures`: slices of them are read when they are asked for.
-    :param actions: [T, A], the controls, float64; discrete actions, integers [T], become [T, 1].
-    :param labels: name to [T], ground-truth segments, int64.
+    :param observations: key to [T, ...]; uint8 stays as it is, other numbers become float64. Pictures uint8
+        [T, C, H, W] or [T, H, W] become [T, H, W, C]. Pictures of a file are
+        :class:`~ddco_pyro.data.pictures.Pictures`: slices of them are read when they are asked for.
+    :param actions: the controls [T, A], float64; whole numbers, of which [T] is enough, become int64.
+    :param labels: ground-truth segments by name, [T] or [T, 1], int64.
     :param attributes: what is known of the whole demonstration, such as its seed.
     :raises DemonstrationsError: no steps, unequal lengths, anything but numbers, or numbers that are NaN, infinite or
         beyond :data:`ddco_pyro.data.values.LARGEST`.
@@ -44,9 +53,14 @@ class Demonstration:
         recording = self.recording()
         check(recording)
         check_values(recording, f"repair it, or leave {self.name} out (demonstrations.exclude)")
-        observations = {key: _numbers(values) for key, values in self.observations.items()}
-        labels = {key: _integers(values, f"{self.name}: labels/{key}") for key, values in self.labels.items()}
-        object.__setattr__(self, "actions", recording.actions.array().astype(np.float64))
+        observations = {key: _numbers(column.observed()) for key, column in recording.observations.items()}
+        labels = {}
+        for key, column in recording.labels.items():
+            if problem := problem_of_labels(column.shape[1:], column.dtype):
+                raise DemonstrationsError(f"{self.name}: labels/{key} {problem}")
+            labels[key] = column.array().astype(np.int64)
+        whole = recording.actions.dtype.kind in "iu"
+        object.__setattr__(self, "actions", recording.actions.array().astype(np.int64 if whole else np.float64))
         object.__setattr__(self, "observations", observations)
         object.__setattr__(self, "labels", labels)
 
@@ -64,7 +78,7 @@ class Demonstration:
         """The same as a recording, to be written."""
         observations = {key: of_array(values) for key, values in self.observations.items()}
         labels = {key: of_array(values) for key, values in self.labels.items()}
-        return Recording(self.name, observations, discrete(of_array(self.actions)), labels, self.attributes)
+        return Recording(self.name, observations, of_array(self.actions), labels, self.attributes)
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -76,15 +90,6 @@ def _numbers(values: Any) -> Observed:
         return values
     array = np.asarray(values)
     return array if array.dtype == np.uint8 else array.astype(np.float64)
-
-
-def _integers(array: Any, where: str) -> np.ndarray:
-    array = np.asarray(array)
-    if array.dtype.kind not in "iub" or array.ndim != 1:
-        raise DemonstrationsError(
-            f"{where} is {array.dtype} of shape {array.shape}, it has to be integers of shape [steps]"
-        )
-    return array.astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,13 +129,13 @@ class Demonstrations(Sequence[Demonstration]):
         cls,
         path: str | Path,
         observations: Sequence[str] | None = None,
-        labels: Sequence[str] = (),
+        labels: Sequence[str] | None = None,
         exclude: Sequence[str] = (),
     ) -> Demonstrations:
         """The demonstrations in an HDF5 file, ``demo_2`` before ``demo_10``.
 
-        :param observations: the keys to read; all of them if None.
-        :param labels: names of the ground-truth labels to read.
+        :param observations: the keys to read; all of them if None, which is not none of them, ``()``.
+        :param labels: names of the ground-truth labels to read; likewise.
         :param exclude: names of demonstrations that are left out, of masks too; nothing of them is read.
         :raises DemonstrationsError: the file cannot be read, does not hold what was asked for, or holds more than fits
             into memory.
@@ -201,22 +206,9 @@ class Demonstrations(Sequence[Demonstration]):
 
         :raises DemonstrationsError: there is only one, a mask leaves nothing, or the masks overlap.
         """
-        train, valid = self.masks.get("train"), self.masks.get("valid")
-        if train is None and valid is None:
-            valid = self._draw(valid_fraction, seed)
-        train = self._without(valid or ()) if train is None else train
-        valid = self._without(train) if valid is None else valid
-        if not train or not valid:
-            purpose = "validate" if train else "train"
-            raise DemonstrationsError(f"no demonstration is left to {purpose} with; add some or change the masks")
-        both = set(train) & set(valid)
-        if both:
-            raise DemonstrationsError(f"{min(both)} is in mask/train and in mask/valid; remove it from one")
+        drawn = {} if self.masks.keys() & {"train", "valid"} else {"valid": self._draw(valid_fraction, seed)}
+        train, valid = divided(self.names, {**self.masks, **drawn})
         return self.select(train), self.select(valid)
-
-    def _without(self, names: Iterable[str]) -> tuple[str, ...]:
-        left_out = set(names)
-        return tuple(name for name in self.names if name not in left_out)
 
     def _draw(self, fraction: float, seed: int) -> tuple[str, ...]:
         number = min(max(round(fraction * len(self)), 1), len(self) - 1)
@@ -234,13 +226,13 @@ def extent(path: str | Path, observations: Sequence[str], exclude: Sequence[str]
 
 
 def _extent(
-    source: Robomimic, observations: Sequence[str] | None, labels: Sequence[str], exclude: Sequence[str]
+    source: Robomimic, observations: Sequence[str] | None, labels: Sequence[str] | None, exclude: Sequence[str]
 ) -> Extent:
     return Extent.of(dict(recording.columns()) for recording in _recordings(source, observations, labels, exclude))
 
 
 def _recordings(
-    source: Robomimic, observations: Sequence[str] | None, labels: Sequence[str], exclude: Sequence[str]
+    source: Robomimic, observations: Sequence[str] | None, labels: Sequence[str] | None, exclude: Sequence[str]
 ) -> Iterator[Recording]:
     """The demonstrations of a file, in order, without those that are left out."""
     for name in exclude:

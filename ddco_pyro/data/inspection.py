@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,16 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ddco_pyro.data.checks import check_shape, check_steps, problems_of_masks
+from ddco_pyro.data.checks import (
+    check_division,
+    check_shape,
+    check_steps,
+    problem_of_controls,
+    problem_of_labels,
+    problem_of_pictures,
+    problems_of_masks,
+)
+from ddco_pyro.data.coincidences import Coincidences
 from ddco_pyro.data.control_dimensions import ControlDimension, ControlStatistics, notes
 from ddco_pyro.data.control_parts import control_parts, described
 from ddco_pyro.data.hdf5 import DemonstrationsError, outside_files
@@ -66,6 +76,14 @@ class Field:
     def numeric(self) -> bool:
         """Whether it holds real numbers."""
         return np.dtype(self.dtype).kind in NUMBERS
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with its shape or type; nothing where nothing is."""
+        if self.place == "actions":
+            return problem_of_controls(self.shape, np.dtype(self.dtype))
+        ask = problem_of_labels if self.place.startswith("labels/") else problem_of_pictures
+        return ask(self.shape, np.dtype(self.dtype))
 
     @property
     def constant(self) -> list[int]:
@@ -135,6 +153,8 @@ class Inspection:
     :param problems: what a fit would refuse, one line each.
     :param frequency: control steps in a second, Hz, where the file says it.
     :param control: what each dimension of the control does.
+    :param coincidences: what is the same where it should not be, one line for each kind.
+    :param leaks: the observations, ``obs/<key>``, that hold nothing but the controls that a policy has to predict.
     :param excluded: names of demonstrations that were not looked at.
     :param unreadable: names of demonstrations that could not be read.
     :param external: other files that the HDF5 file names as parts of it; they are not read.
@@ -148,15 +168,18 @@ class Inspection:
     frequency: float | None
     problems: list[str] = field(default_factory=list)
     control: tuple[ControlDimension, ...] = ()
+    coincidences: tuple[str, ...] = ()
+    leaks: tuple[str, ...] = ()
     excluded: tuple[str, ...] = ()
     unreadable: tuple[str, ...] = ()
     external: tuple[str, ...] = ()
 
     @property
     def notes(self) -> list[str]:
-        """What is odd about dimensions of the control, one line each."""
+        """What is odd about the control and about what coincides, one line each."""
         auto = control_parts(ControlSpec(), self.control) if self.control else ()
-        return [*notes(self.control), *(f"{line}, by control.kind: auto" for line in described(auto))]
+        kinds = (f"{line}, by control.kind: auto" for line in described(auto))
+        return [*notes(self.control), *self.coincidences, *kinds]
 
     @property
     def affected(self) -> list[str]:
@@ -231,28 +254,65 @@ def inspect(path: str | Path, form: Format | None = None, exclude: Sequence[str]
 def _inspect(path: Path, source: Source, exclude: tuple[str, ...]) -> Inspection:
     lengths: dict[str, int] = {}
     fields: dict[str, Field] = {}
-    problems: list[str] = []
+    problems = _Problems()
     unreadable: list[str] = []
-    control = ControlStatistics()
-    for name in (name for name in source.names if name not in exclude):
+    places: dict[str, Collection[str]] = {}
+    control, coincidences = ControlStatistics(), Coincidences()
+    names = [name for name in source.names if name not in exclude]
+    for name in names:
         try:
             recording = source.recording(name)
             lengths[name] = recording.actions.shape[0] if recording.actions.shape else 0
+            coincidences.begin(name, lengths[name])
             for place, column in recording.columns():
-                watched = _watched(column, control) if place == "actions" else column
-                problems += _add(fields, place, watched, name, lengths[name])
+                watched = coincidences.watched(place, column)
+                watched = _watched(watched, control) if place == "actions" else watched
+                _add(fields, place, watched, name, lengths[name], problems)
+            places[name] = {place for place, _ in recording.columns()}
         except DemonstrationsError as error:
-            problems.append(str(error))
+            problems.add("unreadable", str(error), re.sub(r"\d+", "", str(error).removeprefix(name)))
             unreadable.append(name)
-    problems += problems_of_masks(source.masks, source.names)
-    masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in source.masks.items()}
+            coincidences.forget(name)
+    for name, there in places.items():
+        for place in (place for place in fields if place not in there):
+            problems.add("missing", f"{name}: {place} is missing", place)
+    masks = {mask: tuple(name for name in members if name not in exclude) for mask, members in source.masks.items()}
     external = sorted({name for file in source.files if h5py.is_hdf5(file) for name in outside_files(file)})
-    inspection = Inspection(
-        path, source.format, lengths, fields, masks, source.frequency, problems, control.dimensions(), exclude,
-        tuple(unreadable), tuple(external),
-    )  # fmt: skip
-    inspection.problems.extend(_problems(inspection))
-    return inspection
+    dimensions = control.dimensions()
+    varying = [dimension.number for dimension in dimensions if not dimension.constant]
+    return Inspection(
+        path,
+        source.format,
+        lengths,
+        fields,
+        masks,
+        source.frequency,
+        [*problems.lines(), *_problems_of_division(source, names, masks), *_problems(fields, lengths)],
+        dimensions,
+        tuple(coincidences.notes(masks, varying)),
+        tuple(place for place, array in fields.items() if coincidences.leaks(place, varying, array.constant)),
+        exclude,
+        tuple(unreadable),
+        tuple(external),
+    )
+
+
+class _Problems:
+    """Problems of demonstrations, of which each kind is told once."""
+
+    def __init__(self) -> None:
+        self._first: dict[tuple[str, str], str] = {}
+        self._number: dict[tuple[str, str], int] = {}
+
+    def add(self, kind: str, message: str, about: str) -> None:
+        """A problem of a kind about something, such as a place in the file."""
+        self._first.setdefault((kind, about), message)
+        self._number[kind, about] = self._number.get((kind, about), 0) + 1
+
+    def lines(self) -> list[str]:
+        """The first problem of each kind, with the number of all."""
+        numbers = ((message, self._number[key]) for key, message in self._first.items())
+        return [message if number == 1 else f"{message}; the first of {number} such" for message, number in numbers]
 
 
 def _watched(column: Column, control: ControlStatistics) -> Column:
@@ -267,24 +327,38 @@ def _watched(column: Column, control: ControlStatistics) -> Column:
     return replace(column, blocks=blocks)
 
 
-def _add(fields: dict[str, Field], place: str, column: Column, name: str, steps: int) -> list[str]:
-    """Take in an array of a demonstration; what is wrong with its shape, so that it could not be."""
+def _add(fields: dict[str, Field], place: str, column: Column, name: str, steps: int, problems: _Problems) -> None:
+    """Take in an array of a demonstration, unless its shape is wrong."""
     none, shape = np.zeros(0), tuple(column.shape[1:])
     try:
         check_steps(name, place, column, steps)
         known = fields.setdefault(place, Field(place, shape, str(column.dtype), none, none))
         check_shape(f"{name}: {place}", column, known.shape, "the first")
     except DemonstrationsError as error:
-        return [str(error)]
-    known.add(column, name)
-    return []
+        problems.add("shape", str(error), place)
+    else:
+        known.add(column, name)
 
 
-def _problems(inspection: Inspection) -> list[str]:
+def _problems_of_division(source: Source, names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """What keeps demonstrations from being divided into those to train with and those to validate with."""
+    strangers = list(problems_of_masks(source.masks, source.names))
+    yield from strangers
+    if not strangers:
+        try:
+            check_division(names, masks)
+        except DemonstrationsError as error:
+            yield str(error)
+
+
+def _problems(fields: Mapping[str, Field], lengths: Mapping[str, int]) -> list[str]:
+    """What is wrong with arrays, of whatever demonstration."""
     problems = []
-    for array in inspection.fields.values():
+    for array in fields.values():
         if not array.numeric:
             problems.append(f"{array.place} holds {array.dtype}, not numbers")
+        elif problem := array.problem:
+            problems.append(f"{array.place} {problem}")
         if array.first is not None:
             name, step = array.first
             number = len(array.affected)
@@ -292,12 +366,7 @@ def _problems(inspection: Inspection) -> list[str]:
                 f"{array.place} has {array.unusable}, the first in {name} at step {step}; "
                 f"{number} of {array.demonstrations} demonstrations {'is' if number == 1 else 'are'} affected"
             )
-        if not inspection.everywhere(array):
-            missing = len(inspection.lengths) - array.demonstrations
-            problems.append(f"{array.place} cannot be used in {missing} of {len(inspection.lengths)} demonstrations")
-    empty = [name for name, steps in inspection.lengths.items() if steps == 0]
+    empty = [name for name, steps in lengths.items() if steps == 0]
     if empty:
         problems.append(f"{', '.join(empty[:3])}{' ...' if len(empty) > 3 else ''}: no steps")
-    if inspection.actions is not None and len(inspection.actions.shape) != 1:
-        problems.append(f"actions has shape {list(inspection.actions.shape)} at each step, it has to be [dimensions]")
     return problems

@@ -19,6 +19,9 @@ PICTURE_DIMENSIONS = 3
 """A step of pictures is [H, W, C]."""
 
 
+CHANNELS = (1, 3, 4)
+"""Grey; red, green and blue; those with transparency or depth."""
+
 MOVED = "_moved"
 """What the key of features of pictures that were moved ends with, behind that of the features themselves."""
 
@@ -27,19 +30,49 @@ class TransformError(BadInput):
     """Pictures cannot be cut or scaled as asked."""
 
 
+def channels_last(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...]:
+    """The shape [T, H, W, C] of pictures that are stored as [T, C, H, W] or [T, H, W]; any other shape as it is.
+
+    Arrays of 8 or 16 bits without a sign are pictures: the first has 1, 3 or 4 channels before sides that are longer,
+    the second is grey. A side of a picture is longer than its channels are many.
+    """
+    sides, most = shape[-2:], max(CHANNELS)
+    if dtype not in (np.uint8, np.uint16) or min(sides, default=0) <= most:
+        return shape
+    if len(shape) == PICTURE_DIMENSIONS:
+        return (*shape, 1)
+    if len(shape) == 1 + PICTURE_DIMENSIONS and shape[1] in CHANNELS:
+        return (shape[0], *sides, shape[1])
+    return shape
+
+
+def turned(array: np.ndarray) -> np.ndarray:
+    """Pictures with their channels last, :func:`channels_last`; any other array as it is."""
+    shape = channels_last(array.shape, array.dtype)
+    if shape == array.shape:
+        return array
+    return array[..., None] if array.ndim == PICTURE_DIMENSIONS else np.ascontiguousarray(np.moveaxis(array, 1, -1))
+
+
 @dataclass(frozen=True)
 class Pictures:
-    """An array uint8 [T, H, W, C] in an HDF5 file: a slice of steps is read when it is asked for.
+    """Pictures uint8 [T, H, W, C] in an HDF5 file: a slice of steps is read when it is asked for.
 
     :param path: the file, which is opened for each slice, in whatever process asks for it.
     :param place: of the array in it.
     :param where: what errors call it, such as ``demo_0: obs/camera``.
+    :param stored: the shape of the array in the file, which may have its channels first or none.
     """
 
     path: str
     place: str
     where: str
-    shape: tuple[int, ...]
+    stored: tuple[int, ...]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """[T, H, W, C]."""
+        return channels_last(self.stored, self.dtype)
 
     @property
     def dtype(self) -> np.dtype[np.uint8]:
@@ -62,10 +95,10 @@ class Pictures:
         first, last, stride = steps.indices(len(self))
         with opened(self.path) as file:
             dataset = file.get(self.place)
-            if getattr(dataset, "shape", None) != self.shape or dataset.dtype != self.dtype:
+            if getattr(dataset, "shape", None) != self.stored or dataset.dtype != self.dtype:
                 raise DemonstrationsError(f"{self.where} has changed since it was looked at; do the same again")
             try:
-                return np.asarray(dataset[first:last:stride])
+                return turned(np.asarray(dataset[first:last:stride]))
             except DAMAGE as error:
                 raise DemonstrationsError(f"{self.where} cannot be read ({error}); the file may be damaged") from error
 

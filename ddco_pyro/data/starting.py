@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ddco_pyro.data.checks import LEAST, check_division
 from ddco_pyro.data.control_dimensions import all_constant
-from ddco_pyro.data.hdf5 import DemonstrationsError, natural
+from ddco_pyro.data.hdf5 import DemonstrationsError, natural, printable
 from ddco_pyro.data.inspection import Field, Inspection, inspect
 from ddco_pyro.data.starting_pictures import seen, sight
 from ddco_pyro.spec import parse_spec
@@ -19,9 +20,6 @@ from ddco_pyro.spec.reading import read_yaml
 
 MANY = 100
 """Of so many demonstrations a tenth is held out, of fewer a fifth."""
-
-LEAST = 3
-"""Demonstrations that a fit needs: to train, to stop early, and to validate."""
 
 MOST_EPOCHS = 2000
 """Of a model."""
@@ -81,11 +79,10 @@ def starting_spec(inspection: Inspection, path: str | Path) -> str:
     excluded = sorted({*inspection.unreadable, *_few_affected(inspection)}, key=natural)
     if excluded:
         inspection = inspect(inspection.path, exclude=excluded)
-    if len(inspection.lengths) < LEAST:
-        raise DemonstrationsError(
-            f"{inspection.path}: holds {len(inspection.lengths)} demonstrations that can be read, and a fit "
-            f"needs {LEAST}: to train, to stop early, and to validate; add some"
-        )
+    try:
+        check_division(tuple(inspection.lengths), inspection.masks)
+    except DemonstrationsError as error:
+        raise DemonstrationsError(f"{inspection.path}: {error}") from None
     actions = inspection.actions
     wrong = _unusable(inspection, actions) if actions else "is missing"
     if actions is None or wrong:
@@ -110,9 +107,12 @@ def _few_affected(inspection: Inspection) -> list[str]:
     most = MOST_EXCLUDED * len(inspection.lengths)
     keys = [field for field in (inspection.actions, *inspection.observations) if field and inspection.everywhere(field)]
     names = {name for field in keys if len(field.affected) <= most for name in field.affected}
-    left = [set(inspection.masks[mask]) - names for mask in ("train", "valid") if mask in inspection.masks]
-    few = len(names) <= most and len(inspection.lengths) - len(names) >= LEAST and all(left)
-    return [name for name in inspection.lengths if name in names] if few else []
+    masks = {mask: [name for name in members if name not in names] for mask, members in inspection.masks.items()}
+    try:
+        check_division([name for name in inspection.lengths if name not in names], masks)
+    except DemonstrationsError:
+        return []
+    return [name for name in inspection.lengths if name in names] if len(names) <= most else []
 
 
 def _lines(inspection: Inspection, path: str) -> Iterator[str]:
@@ -130,7 +130,7 @@ def _lines(inspection: Inspection, path: str) -> Iterator[str]:
     yield from _observations(inspection)
     yield "control:"
     yield "  kind: auto                        # decided from the demonstrations; so it is:"
-    yield from (f"  # {note}" for note in inspection.notes)
+    yield from (f"  # {printable(note)}" for note in inspection.notes)
     yield "  std: {learn: true, floor: 0.01, per_option: true}   # in units of each dimension's own spread"
     pictures = [_text(field.key) for field in _images(inspection)] if _only_images(inspection) else []
     yield "hierarchy:"
@@ -195,12 +195,11 @@ def _validation(inspection: Inspection) -> Iterator[str]:
 
 
 def _labels(inspection: Inspection) -> Iterator[str]:
-    usable = [
-        field for field in inspection.labels if np.dtype(field.dtype).kind in "iub" and inspection.everywhere(field)
-    ]
-    for number, field in enumerate(usable):
+    reasons = {field.key: _unusable(inspection, field) for field in inspection.labels}
+    for number, key in enumerate(key for key, reason in reasons.items() if not reason):
         comment = "# compared with the options that are found, never trained on"
-        yield f"  {'# ' if number else ''}labels: {_text(field.key)}                  {comment}"
+        yield f"  {'# ' if number else ''}labels: {_text(key)}                  {comment}"
+    yield from (f"  # labels: {_text(key)}   # {reason}" for key, reason in reasons.items() if reason)
 
 
 def _observations(inspection: Inspection) -> Iterator[str]:
@@ -208,7 +207,7 @@ def _observations(inspection: Inspection) -> Iterator[str]:
     for field in inspection.observations:
         if field.key in versions.values():
             continue
-        reason = _unusable(inspection, field) or _constant(field)
+        reason = _left_out(inspection, field)
         if reason:
             left_out.append((field, reason))
         elif not field.image:
@@ -236,7 +235,7 @@ def _observations(inspection: Inspection) -> Iterator[str]:
 
 def _unusable(inspection: Inspection, field: Field) -> str:
     """Why an array cannot be used; nothing where it can."""
-    if not field.numeric:
+    if not field.numeric and not field.place.startswith("labels/"):
         return f"holds {field.dtype}, not numbers"
     if field.unusable:
         return f"has {field.unusable}"
@@ -244,13 +243,13 @@ def _unusable(inspection: Inspection, field: Field) -> str:
         return f"is in {field.demonstrations} of {len(inspection.lengths)} demonstrations"
     if 0 in inspection.lengths.values():
         return "has no steps in some demonstration"
-    if field.place == "actions" and (len(field.shape) != 1 or not field.shape[0]):
-        return f"has shape {list(field.shape)} at each step, not [dimensions]"
-    if len(field.shape) == 3 and not field.image:
-        return f"is {field.dtype} of shape {list(field.shape)}: an image has to be uint8"
-    if 0 in field.shape:
-        return "has no dimensions"
-    return ""
+    return field.problem or ("has no dimensions" if 0 in field.shape else "")
+
+
+def _left_out(inspection: Inspection, field: Field) -> str:
+    """Why an observation is left out; nothing where it is not."""
+    leak = "is the control that a policy has to predict" if field.place in inspection.leaks else ""
+    return _unusable(inspection, field) or _constant(field) or leak
 
 
 def _constant(field: Field) -> str:
@@ -261,8 +260,8 @@ def _constant(field: Field) -> str:
 
 
 def _images(inspection: Inspection) -> list[Field]:
-    return [field for field in inspection.observations if field.image and not _unusable(inspection, field)]
+    return [field for field in inspection.observations if field.image and not _left_out(inspection, field)]
 
 
 def _only_images(inspection: Inspection) -> bool:
-    return all(field.image or _constant(field) for field in inspection.observations if not _unusable(inspection, field))
+    return all(field.image for field in inspection.observations if not _left_out(inspection, field))

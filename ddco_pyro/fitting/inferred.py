@@ -86,7 +86,7 @@ def infer(hierarchy: Hierarchy, demonstrations: Iterable[Demonstration]) -> Iter
     """
     for group in _groups(demonstrations, hierarchy.steps_at_once):
         demos = Demonstrations(tuple(group))
-        yield Inferred(demos.names, encode(demos, hierarchy.encoder, hierarchy.scaling), hierarchy)
+        yield Inferred(demos.names, encode(demos, hierarchy.encoder, hierarchy.scaling, fitted=True), hierarchy)
 
 
 def _groups(demonstrations: Iterable[Demonstration], steps: int) -> Iterator[list[Demonstration]]:

@@ -5,18 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import torch
 
+from ddco_pyro.data.checks import check, check_trained, problem_of_pictures
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, extent
-from ddco_pyro.data.hdf5 import dataset_at, member, opened
 from ddco_pyro.data.memory import Work, refuse_too_much
 from ddco_pyro.data.pictures import blocks
+from ddco_pyro.data.sources.recording import Recording
+from ddco_pyro.data.sources.robomimic import open_robomimic
 from ddco_pyro.errors import nearest
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.building import Dimensions, baselines, build_hierarchy
@@ -55,7 +56,7 @@ def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
     collected = Path(own.path) if own.path else cache_path(task, spec.demonstrated_task, own, spec.observed)
     if not collected.exists():
         return size
-    known = Dimensions.of(Demonstrations.read(collected, [], exclude=own.exclude))
+    known = Dimensions.of(Demonstrations.read(collected, (), (), own.exclude))
     return replace(size, constant=known.constant, control=known.control)
 
 
@@ -65,6 +66,18 @@ def parts(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
         return {"train": demos}
     train, valid = demos.split(spec.demonstrations.valid_fraction, spec.seed)
     return {"train": train, "valid": valid}
+
+
+def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:
+    """See that networks take the observations, and that the spec's division leaves enough demonstrations for each part.
+
+    :raises DemonstrationsError: they do not, or it does not.
+    """
+    for key in spec.observed:
+        observed = demos[0].observations[key]
+        if problem := problem_of_pictures(observed.shape[1:], observed.dtype):
+            raise DemonstrationsError(f"obs/{key} {problem}")
+    check_trained(parts(spec, demos)["train"].names)
 
 
 def in_file(spec: Spec) -> bool:
@@ -102,20 +115,20 @@ def outline(spec: Spec) -> Demonstrations:
     """
     path = Path(str(spec.demonstrations.path))
     _refuse_what_cannot_be_read(spec, path)
-    controls = Demonstrations.read(path, [], _labels(spec), spec.demonstrations.exclude)
-    keys = spec.trained_with
-    with opened(path) as file:
-        return replace(
-            controls, demonstrations=tuple(_outlined(file[f"data/{demo.name}"], demo, keys) for demo in controls)
-        )
+    controls = Demonstrations.read(path, (), _labels(spec), spec.demonstrations.exclude)
+    with open_robomimic(path) as source:
+        outlined = (_outlined(source.recording(demo.name, spec.trained_with, ()), demo) for demo in controls)
+        return replace(controls, demonstrations=tuple(outlined))
 
 
-def _outlined(group: h5py.Group, demo: Demonstration, keys: Sequence[str]) -> Demonstration:
-    members = member(group, "obs", h5py.Group, f"{demo.name}: ")
-    headers = {key: dataset_at(members, key, f"{demo.name}: obs/") for key in keys}
-    kinds = {key: np.uint8 if header.dtype.kind in "fiub" else header.dtype for key, header in headers.items()}
-    zeros = {key: np.broadcast_to(np.zeros((), kinds[key]), header.shape) for key, header in headers.items()}
-    return replace(demo, observations=zeros)  # uint8 zeros are taken as they are: they need no memory
+def _outlined(recording: Recording, demo: Demonstration) -> Demonstration:
+    check(recording)
+    kinds = {key: np.uint8 if column.image else np.float64 for key, column in recording.observations.items()}
+    shapes = {key: column.shape for key, column in recording.observations.items()}
+    outlined = copy(demo)  # zeros are not looked at, and need no memory
+    zeros = {key: np.broadcast_to(np.zeros((), kinds[key]), shape) for key, shape in shapes.items()}
+    object.__setattr__(outlined, "observations", zeros)
+    return outlined
 
 
 def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:

@@ -31,7 +31,7 @@ from ddco_pyro.fitting.launching import check_processes, together
 from ddco_pyro.fitting.metrics import evaluate, supervisor
 from ddco_pyro.fitting.objective import TrainingError
 from ddco_pyro.fitting.prepare import demonstrations as read_demonstrations
-from ddco_pyro.fitting.prepare import digest, dimensions, known_demonstrations, parts, seen
+from ddco_pyro.fitting.prepare import digest, dimensions, known_demonstrations, parts, refuse_unfit, seen
 from ddco_pyro.fitting.processes import check_jobs
 from ddco_pyro.fitting.ranks import ALONE, Ranks
 from ddco_pyro.fitting.restarts import Trainer
@@ -125,6 +125,7 @@ def fit_run(
         demos = known_demonstrations(spec) if demos is None else demos
         check_networks(spec, dimensions(spec, demos))
         if demos is not None:
+            refuse_unfit(spec, demos)
             labels.used(spec, demos)
     if folder is None:
         demos = demos or read_demonstrations(spec, on_event)

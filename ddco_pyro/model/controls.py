@@ -117,7 +117,7 @@ class ControlScaling(nn.Module):
                     value = demonstration.actions[step, part.dims[place]]
                     return (
                         f"{demonstration.name}: control dimension {part.dims[place]} is {number(value)} at step "
-                        f"{step}, which {part.name} ({part.kind}) cannot be; declare another kind in control.parts"
+                        f"{step}, which {part.name} ({part.kind}) cannot be"
                     )
         return ""
 
@@ -233,11 +233,13 @@ def _std_of(spec: ControlSpec, dimension: int) -> float | LearnedStd:
     return spec.std if named is None or named.std is None else named.std
 
 
-def refuse_impossible(demonstrations: Demonstrations, scaling: ControlScaling) -> None:
+def refuse_impossible(demonstrations: Demonstrations, scaling: ControlScaling, fitted: bool = False) -> None:
     """See that every control of these demonstrations can be emitted.
 
+    :param fitted: whether the model is fitted, so that its kinds of controls stand.
     :raises DemonstrationsError: a switch or a discrete action has a value that it does not have in the model.
     """
     for demonstration in demonstrations:
         if problem := scaling.impossible(demonstration):
-            raise DemonstrationsError(problem)
+            declare, repair = "declare another kind in control.parts", f"repair it, or leave {demonstration.name} out"
+            raise DemonstrationsError(f"{problem}; {repair if fitted else declare}")

@@ -289,24 +289,29 @@ LARGEST_SCALED = 1e12
 divided by that of a small σ, and ends at 3e38."""
 
 
-def encode(demonstrations: Demonstrations, encoder: ObservationEncoder, scaling: ControlScaling) -> Batch:
+def encode(
+    demonstrations: Demonstrations, encoder: ObservationEncoder, scaling: ControlScaling, fitted: bool = False
+) -> Batch:
     """All demonstrations as one padded batch.
 
+    :param fitted: whether the model is fitted already, so that nothing can be declared any more.
     :raises DemonstrationsError: a number is too large for networks.
     """
-    refuse_unusable(demonstrations, encoder, scaling)
+    refuse_unusable(demonstrations, encoder, scaling, fitted)
     inputs = encoder.inputs(demo.observations for demo in demonstrations)
     actions = _pad([scaling.scaled(demo.actions) for demo in demonstrations]).float()
     return Batch(inputs, actions, torch.tensor([len(demo) for demo in demonstrations]))
 
 
-def refuse_unusable(demonstrations: Demonstrations, encoder: ObservationEncoder, scaling: ControlScaling) -> None:
+def refuse_unusable(
+    demonstrations: Demonstrations, encoder: ObservationEncoder, scaling: ControlScaling, fitted: bool = False
+) -> None:
     """See that networks can take every feature, and the emissions every control.
 
     :raises DemonstrationsError: a number is larger than :data:`LARGEST_SCALED` once it is scaled, or a control has a
         value that it cannot have.
     """
-    refuse_impossible(demonstrations, scaling)
+    refuse_impossible(demonstrations, scaling, fitted)
     places = np.repeat([f"obs/{spec.key}" for spec in encoder.specs], encoder.sizes)
     for demo in demonstrations:
         features = encoder.scaled(encoder.features(demo.observations))

@@ -16,8 +16,8 @@ from ddco_pyro.report.strips import colour_image, label_image, legend
 def order(activity: Activity) -> np.ndarray:
     """Rows by length, then by when the option of the lowest level first changes."""
     path = activity.levels[0].path
-    changed = np.diff(path, axis=1) != 0
-    first = np.where(changed.any(1), changed.argmax(1), path.shape[1])
+    changed = np.diff(path, axis=1, append=-1) != 0  # at the end at the latest
+    first = np.where(changed[:, :-1].any(1), changed.argmax(1), path.shape[1])
     return np.lexsort((first, activity.lengths))
 
 

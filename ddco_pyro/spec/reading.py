@@ -17,7 +17,7 @@ from ddco_pyro.spec.whole import Spec, parse_spec
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads ``1e-3`` as a number, as YAML 1.2 does, and refuses a key given twice."""
+    """Reads numbers as YAML 1.2 does, ``1e-3``, ``010`` (ten) and ``1:30`` (text), and refuses a key given twice."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -35,9 +35,28 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-_NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$|[-+]?\.[0-9]+$")
+_INT, _FLOAT = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
+_WHOLE = re.compile(r"[-+]?(?:0x[0-9a-fA-F]+|[0-9][0-9_]*)$")
+_NUMBER = re.compile(
+    r"[-+]?(?:[0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?$|[-+]?[0-9][0-9_]*[eE][-+]?[0-9]+$"
+    r"|[-+]?\.(?:inf|Inf|INF)$|\.(?:nan|NaN|NAN)$"
+)
 for _yaml in (_Loader, _Dumper):
-    _yaml.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.0123456789"))
+    _yaml.yaml_implicit_resolvers = {  # YAML 1.1 has 010 for eight, and 1:30 for ninety
+        first: [(tag, pattern) for tag, pattern in known if tag not in (_INT, _FLOAT)]
+        for first, known in _yaml.yaml_implicit_resolvers.items()
+    }
+    _yaml.add_implicit_resolver(_INT, _WHOLE, list("-+0123456789"))
+    _yaml.add_implicit_resolver(_FLOAT, _NUMBER, list("-+.0123456789"))
+
+
+def _whole(loader: _Loader, node: yaml.ScalarNode) -> int:
+    """The whole number that a text says, in decimal digits or, after 0x, in hexadecimal ones."""
+    text = loader.construct_scalar(node)
+    return int(text, 16 if "x" in text else 10)
+
+
+_Loader.add_constructor(_INT, _whole)
 
 
 def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool = False) -> Spec:

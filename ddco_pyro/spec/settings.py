@@ -208,6 +208,12 @@ class ControlSpec(Model):
                     where = f"control dimension {dimension} is in {dimensions[dimension]!r} already"
                     raise invalid((f"parts.{number}.dims", where))
                 dimensions[dimension] = part.name
+            if isinstance(part.scale, tuple) and len(part.scale) != len(part.dims):
+                problem = f"has {len(part.scale)} numbers, but the part has {len(part.dims)} dimensions"
+                raise invalid((f"parts.{number}.scale", problem))
+            for setting in ("scale", "std"):
+                if part.kind in ("binary", "categorical") and getattr(part, setting) is not None:
+                    raise invalid((f"parts.{number}.{setting}", f"is of no use to kind: {part.kind}; leave it out"))
             if part.bounds is not None and part.kind not in ("clipped", "hurdle"):
                 raise invalid((f"parts.{number}.bounds", "are for kind: clipped or hurdle"))
             if part.bounds is not None and part.bounds[0] >= part.bounds[1]:

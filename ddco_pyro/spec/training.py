@@ -27,6 +27,12 @@ class OptimizerSpec(Model):
     weight_decay: float = Field(default=0.0, ge=0)
     """L2 penalty; of ``adamw`` by which part, times the learning rate, every weight shrinks in a step."""
 
+    @model_validator(mode="after")
+    def _momentum_has_its_optimizer(self) -> OptimizerSpec:
+        if self.name != "momentum" and self.momentum != type(self).model_fields["momentum"].default:
+            raise invalid(("momentum", f"is for name: momentum, and {self.name} would not use it; leave it out"))
+        return self
+
 
 class LabelsSpec(Model):
     """Labels of demonstrations that say which option of a level is active; at steps where a label is -1 it is free."""

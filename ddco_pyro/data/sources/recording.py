@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
-from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, block_steps
+from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, block_steps, channels_last, turned
 
 Format = Literal["robomimic", "minari", "lerobot", "maniskill", "act", "d4rl"]
 
@@ -58,8 +58,8 @@ class Recording:
     """One episode of T steps, under the names of the HDF5 layout.
 
     :param observations: key to [T, ...].
-    :param actions: [T, A].
-    :param labels: name to [T].
+    :param actions: [T, A]; discrete actions, integers [T], become [T, 1].
+    :param labels: name to [T]; a column [T, 1] becomes that.
     :param attributes: what is known of the whole episode.
     """
 
@@ -68,6 +68,10 @@ class Recording:
     actions: Column
     labels: Mapping[str, Column] = field(default_factory=dict)
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "actions", _discrete(self.actions))
+        object.__setattr__(self, "labels", {name: _flat(column) for name, column in self.labels.items()})
 
     def columns(self) -> Iterator[tuple[str, Column]]:
         """Every array with its place: ``actions``, ``obs/<key>``, ``labels/<name>``."""
@@ -82,29 +86,37 @@ def is_image(shape: tuple[int, ...], dtype: np.dtype) -> bool:
 
 
 def of_array(values: ArrayLike | Pictures) -> Column:
-    """A column that is in memory already, or of pictures in their file."""
+    """A column that is in memory already, or of pictures in their file; pictures have their channels last."""
     if isinstance(values, Pictures):
         return Column(values.shape, values.dtype, values.blocks, kept=values)
-    array = np.asarray(values)
+    array = turned(np.asarray(values))
     return Column(array.shape, array.dtype, lambda: iter([array]))
 
 
-def discrete(actions: Column) -> Column:
+def _discrete(actions: Column) -> Column:
     """Discrete actions, integers [T], as [T, 1]; other actions as they are."""
     if len(actions.shape) != 1 or actions.dtype.kind not in "iu":
         return actions
     return Column((*actions.shape, 1), actions.dtype, lambda: (block[:, None] for block in actions.blocks()))
 
 
+def _flat(labels: Column) -> Column:
+    """Labels [T, 1] as [T]; others as they are."""
+    if labels.shape[1:] != (1,):
+        return labels
+    return Column(labels.shape[:1], labels.dtype, lambda: (block[:, 0] for block in labels.blocks()))
+
+
 def of_dataset(dataset: h5py.Dataset, where: str) -> Column:
-    """A dataset of an open file; reading it raises :class:`DemonstrationsError` where the file is damaged.
+    """A dataset of an open file, pictures with their channels last; reading it raises :class:`DemonstrationsError`
+    where the file is damaged.
 
     :raises DemonstrationsError: a step of it, or a chunk, which HDF5 reads whole, takes more memory than is allowed.
     """
     length, at_once = len(dataset), block_steps(dataset.shape[1:], dataset.dtype)
-    image = is_image(dataset.shape, dataset.dtype)
+    shape = channels_last(dataset.shape, dataset.dtype)
     path = os.path.abspath(dataset.file.filename)  # it may be read by a process that runs elsewhere
-    kept = Pictures(path, dataset.name, where, dataset.shape) if image else None
+    kept = Pictures(path, dataset.name, where, dataset.shape) if is_image(shape, dataset.dtype) else None
     least = dataset.dtype.itemsize * max(math.prod(dataset.shape[1:]), math.prod(dataset.chunks or ()))
     refuse_too_much(least, f"{where}: to read one step", "store it in smaller steps or chunks")
 
@@ -114,9 +126,9 @@ def of_dataset(dataset: h5py.Dataset, where: str) -> Column:
                 block = np.asarray(dataset[start : start + at_once])
             except DAMAGE as error:
                 raise DemonstrationsError(f"{where} cannot be read ({error}); the file may be damaged") from error
-            yield block
+            yield turned(block)
 
-    return Column(dataset.shape, dataset.dtype, read, kept=kept)
+    return Column(shape, dataset.dtype, read, kept=kept)
 
 
 def damaged(path: Path, where: str, error: BaseException) -> DemonstrationsError:

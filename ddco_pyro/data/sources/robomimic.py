@@ -27,7 +27,7 @@ from ddco_pyro.data.hdf5 import (
     opened,
     written,
 )
-from ddco_pyro.data.sources.recording import Column, Format, Recording, discrete, of_dataset
+from ddco_pyro.data.sources.recording import Column, Format, Recording, of_dataset
 
 FREQUENCY = "control_frequency"
 """Attribute of a file: control steps in a second, Hz."""
@@ -66,7 +66,7 @@ class Robomimic:
         :raises DemonstrationsError: something of it is missing, lies in another file, or claims more than is stored.
         """
         group = member(self._data, name, h5py.Group, "", self._external)
-        actions = discrete(self._column(group, "", "actions", name))
+        actions = self._column(group, "", "actions", name)
         attributes = attributes_of(group)
         claimed = attributes.pop(STEPS, actions.shape[0])
         if claimed != actions.shape[0]:
