@@ -106,7 +106,7 @@ def test_of_an_integer_type_every_column_is_discrete_whatever_its_sign():
         ((1,), "categorical", (0.0, 1.0, 2.0)),
     ]
     assert parts == control_parts(ControlSpec(), control_dimensions([whole(1), whole(0)]))
-    assert kinds(whole(0).astype(float)) == {0: "clipped", 1: "clipped"}
+    assert kinds(whole(0).astype(float)) == {0: "hurdle", 1: "hurdle"}
     assert kinds(whole(0).astype(float), kind="categorical") == {0: "categorical", 1: "categorical"}
     many = np.arange(100).reshape(-1, 1)
     assert kinds(many) == {0: "gaussian"}

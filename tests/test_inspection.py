@@ -176,14 +176,14 @@ NOTES: dict[str, list[str]] = {
         "demo_0: policies see what they have to predict"
     ],
     "a switch padded by zeros": [
-        "control dimension 2: exactly at its minimum -1 in 47.1 % of the steps, at its maximum 1 in 23.5 % of the "
-        "steps",
+        "control dimension 2: exactly 0 in 29.4 % of the steps; exactly at its minimum -1 in 47.1 % of the steps, at "
+        "its maximum 1 in 23.5 % of the steps",
         "control dimension 2: -1 or 1, and 0 at the end of 5 of 5 demonstrations, the first demo_0 from step 4 on: cut "
         "the ends off if they are padding, and it is a switch",
     ],
     "two conventions of a switch": [
-        "control dimension 2: exactly at its minimum -1 in 29.4 % of the steps, at its maximum 1 in 52.9 % of the "
-        "steps",
+        "control dimension 2: exactly 0 in 17.6 % of the steps; exactly at its minimum -1 in 29.4 % of the steps, at "
+        "its maximum 1 in 52.9 % of the steps",
         "control dimension 2: -1 or 1 in 3 demonstrations, the first demo_0, and 0 or 1 in 2, the first demo_3: write "
         "all of them in one way, and it is a switch",
     ],

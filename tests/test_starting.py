@@ -204,7 +204,7 @@ def test_pictures_alone_are_seen_by_one_network(tmp_path: Path) -> None:
     assert set(spec.hierarchy.trunk.of) == set(CAMERAS)
     ended = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--set", "training.epochs=2")
     assert ended.status == 0, ended.err
-    assert list(ddco_pyro.load(tmp_path / "run").baselines) == ["flat_equal"]
+    assert list(ddco_pyro.load(tmp_path / "run").baselines) == ["mixture", "flat_equal"]
 
 
 CAMERAS = {"eye": (40, 80), "2nd eye": (12, 16)}

@@ -178,8 +178,11 @@ def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Se
 
 
 def _baseline(spec: Spec) -> str:
-    """A baseline's kind and the sizes of its hidden layers."""
-    assert spec.baseline is not None
+    """A baseline's name and, of a policy without options, the sizes of its hidden layers."""
+    from ddco_pyro.fitting.fit import model_name
+
+    if spec.baseline is None:
+        return model_name(spec)
     hidden = list(spec.baseline.policy.hidden)
     return f"{spec.baseline.kind}, {f'hidden: {hidden}' if hidden else spec.baseline.policy.network}"
 

@@ -14,8 +14,8 @@ OFTEN = 0.01
 ATOM = 0.05
 """A dimension is said to rest on a value inside its range where it is exactly there in this share of the steps."""
 
-FEWEST = 3
-"""Steps in which a value is taken often, at least: numbers that were rounded are equal now and then."""
+FEWEST = 6
+"""Steps in which a value is taken often, at least: rounded numbers, and the end of one padded demonstration, are equal."""
 
 TOGETHER = 0.9
 """Two dimensions are said to rest at once where this share of the steps in which either does is the same steps."""
@@ -84,7 +84,7 @@ class ControlDimension:
     @property
     def atom(self) -> str:
         """Where it rests on a value inside its range, and how often, in words; empty where it does not."""
-        if self.inside is None or self.at_inside < max(FEWEST, ATOM * self.steps):
+        if self.inside is None or self.discrete or self.at_inside < max(FEWEST, ATOM * self.steps):
             return ""
         return f"exactly {number(self.inside)} in {100 * self.at_inside / self.steps:.1f} % of the steps"
 
