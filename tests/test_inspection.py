@@ -164,8 +164,10 @@ def notes_of(name: str, folder: Path) -> list[str]:
 
 NOTES: dict[str, list[str]] = {
     "equal tails": [
+        "control dimension 0: exactly -0.30100668315876145 in 9.3 % of the steps",
+        "control dimension 1: exactly -0.38171402837921675 in 9.3 % of the steps",
         "the last steps are the same in 5 of 5 demonstrations, the first demo_0 from step 5 on: cut them off if they "
-        "are padding"
+        "are padding",
     ],
     "a demonstration twice": [
         "1 of 5 demonstrations equal another one, the first demo_4, which equals demo_0: one of two that are the same "

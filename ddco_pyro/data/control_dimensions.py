@@ -14,8 +14,8 @@ OFTEN = 0.01
 ATOM = 0.05
 """A dimension is said to rest on a value inside its range where it is exactly there in this share of the steps."""
 
-FEWEST = 6
-"""Steps in which a value is taken often, at least: rounded numbers, and the end of one padded demonstration, are equal."""
+FEWEST = 3
+"""Steps in which a value is taken often, at least: numbers that were rounded are equal now and then."""
 
 TOGETHER = 0.9
 """Two dimensions are said to rest at once where this share of the steps in which either does is the same steps."""
