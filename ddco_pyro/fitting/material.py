@@ -59,7 +59,7 @@ class Material:
         """A seed for a restart, one of its stages, an epoch of a stage, or a shard of one of its minibatches.
 
         numpy pads with zeros: a stage has the seed of its first epoch, and the first stage that of its restart. They
-        draw different things: weights, clusters, the order of minibatches. No two restarts, no two stages of one, and no
-        two epochs or shards have the same seed.
+        draw different things: weights, clusters, the order of minibatches. No two restarts, no two stages of one, and
+        no two epochs or shards have the same seed.
         """
         return int(np.random.SeedSequence([self.spec.seed, *where]).generate_state(1)[0])
