@@ -245,11 +245,11 @@ def diverged(trainer):
     return [number for number, each in enumerate(trainer.summary["restarts"]["each"]) if each.get("diverged")]
 
 
-@pytest.fixture(scope="module", params=[1, 4])
+@pytest.fixture(scope="module", params=[(1, 3), (4, 3), (10, 2)])
 def with_diverging(request, demos, tmp_path_factory):
-    """As ``undisturbed``; restarts diverge in the first rung, or after it."""
+    """As ``undisturbed``; restarts diverge in the first rung, after it, or when all others have been stopped."""
     told, folder = [], tmp_path_factory.mktemp("diverging")
-    trainer = make_trainer(diverging(request.param), demos, folder, told.append)
+    trainer = make_trainer(diverging(request.param[0], halving=request.param[1]), demos, folder, told.append)
     return trainer, trainer.run().state_dict(), told, checkpoints(folder)
 
 
@@ -271,6 +271,9 @@ def test_a_restart_that_diverges_ends_there_and_is_not_the_best(with_diverging):
     made = training.advance(trainer.material, Restart(Progress(best)), None)[0]
     if passes == 1:  # those that diverge in the first rung are worse than all others there
         assert ended == [number for number in range(6) if starts[number]]
+    if passes == 10:  # the last one that was left: another goes on, which had been stopped
+        assert best in {event.restart for event in told if isinstance(event, RestartStopped)}
+        assert trainer.summary["restarts"]["each"][best] == {"epochs": 12, "stopped": None}
     assert all(torch.equal(model[name], value) for name, value in made.states["best"].items())
 
 

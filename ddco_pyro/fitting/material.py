@@ -56,6 +56,11 @@ class Material:
         return replace(self, train=self.train.held(device), tune=self.tune.held(device))
 
     def seed(self, *where: int) -> int:
-        """A seed for a restart, one of its stages, an epoch of a stage, or a shard of one of its minibatches."""
+        """A seed for a restart, one of its stages, an epoch of a stage, or a shard of one of its minibatches.
+
+        numpy pads with zeros: a stage has the seed of its first epoch, and the first stage that of its restart. They
+        draw different things: weights, clusters, the order of minibatches. No two restarts, no two stages of one, and
+        no two epochs or shards have the same seed.
+        """
         own, training = self.spec.seed, self.spec.training.seed
         return int(np.random.SeedSequence([own if training is None else training, *where]).generate_state(1)[0])

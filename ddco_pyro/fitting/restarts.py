@@ -88,19 +88,27 @@ class Trainer:
     def run(self) -> Hierarchy:
         """The best restart's hierarchy, in evaluation mode.
 
-        :raises TrainingError: every restart that was left has diverged.
+        Where all that were left have diverged, the best of those that were stopped is trained to the end instead.
+
+        :raises TrainingError: every restart has diverged.
         """
         self.restarts = [self._begun(number) for number in range(self.spec.training.restarts)]
         self.ranks.share(self.material)
         left, epochs = list(range(len(self.restarts))), self.spec.training.halving
+        worse: list[int] = []  # the best first
         while epochs is not None and len(left) > 1:
             before = len(self.history)
             self._train(left, epochs)
             last = len(plan(self.spec, self.first.depth)) - 1
-            better = better_half({number: best_until(self.restarts[number].progress, epochs, last) for number in left})
-            self._stop([number for number in left if number not in better], tell=len(self.history) > before)
-            left, epochs = better, 2 * epochs
+            order = ranked({number: best_until(self.restarts[number].progress, epochs, last) for number in left})
+            better, behind = sorted(order[: (len(order) + 1) // 2]), order[(len(order) + 1) // 2 :]
+            self._stop(sorted(behind), tell=len(self.history) > before)
+            left, worse, epochs = better, behind + worse, 2 * epochs
         self._train(left, None)
+        while self.restarts[self.best].progress.diverged is not None and self.stopped:
+            again = next(number for number in worse if number in self.stopped)
+            del self.stopped[again]
+            self._train([again], None)
         self.ranks.share(None)
         if (why := self.restarts[self.best].progress.diverged) is not None:
             self.ranks.share(None)  # that was all
@@ -220,8 +228,3 @@ def best_until(progress: Progress, epochs: int, last: int) -> float:
 def ranked(values: Mapping[int, float]) -> list[int]:
     """Restarts, the best first; what is not a number is worst, and the first of equals is the better."""
     return sorted(values, key=lambda number: (-values[number] if values[number] > -math.inf else math.inf, number))
-
-
-def better_half(values: Mapping[int, float]) -> list[int]:
-    """The restarts that go on, in order; of an odd number the larger part."""
-    return sorted(ranked(values)[: (len(values) + 1) // 2])
