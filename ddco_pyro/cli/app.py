@@ -6,7 +6,9 @@ do; ``--debug`` shows the traceback. A file for each group of commands; they imp
 
 from __future__ import annotations
 
+import io
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable
@@ -65,11 +67,19 @@ for command, example in EXAMPLES.items():
 
 def main() -> None:
     """Run the command line; ends the process with 0, 1 or 2."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a scheduler that preempts it means what Ctrl-C means
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a name may have what the terminal's encoding lacks
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     if "--allow-code" in arguments:
         sys.path.append(os.getcwd())  # where a user's module:name lies
     try:
         status = app(arguments or ["--help"], prog_name="ddco-pyro", standalone_mode=False)
+        sys.stdout.flush()
+    except BrokenPipeError:  # who read it, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = 1
     except Exception as error:
         status, lines = _explain(error)
         if "--debug" in sys.argv:
