@@ -1,4 +1,6 @@
-"""Commands that were killed (SIGKILL) or terminated (SIGTERM) go on when they are called again, and end as if nothing had happened.
+"""Commands that were killed (SIGKILL) or terminated (SIGTERM) go on when they are called again.
+
+They end as if nothing had happened.
 
 The files they were to write are equal to those of an undisturbed run; what is there is always whole.
 """
@@ -188,7 +190,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory, toy_run) -> dict[str, Case]:
             (Path(toy_task.__file__), folder / "elsewhere" / "run"),
         ),
         "rollout": Case(
-            ("rollout", "run", "--episodes", "300", "--jobs", "2", "--allow-code"),
+            ("rollout", "run", "--episodes", "40", "--jobs", "2", "--allow-code"),
             "run",
             same_rollouts,
             rolled,

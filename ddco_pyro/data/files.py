@@ -86,6 +86,8 @@ def check_outputs(outputs: Sequence[Output], inputs: Sequence[Path] = ()) -> Non
                 raise output.refused("is what this command reads")
             if path.is_dir() and Path(os.path.realpath(path)) in output.place.parents:
                 raise output.refused(f"lies in {path}, which this command reads")
+        if output.kind == "stream" and _is_hdf5(output.path):
+            raise output.refused("is an HDF5 file, which this would replace", "choose another place or remove it first")
         for other in outputs[:number]:
             if _same(output.path, other.path):
                 raise output.refused(f"is also where {other.option} is written")
@@ -125,13 +127,13 @@ def _check_kind(output: Output) -> None:
         raise output.refused("is a folder", "name a file")
     elif not (stat.S_ISREG(mode) or (stat.S_ISCHR(mode) and output.kind == "stream")):
         raise output.refused("is no regular file")
-    elif output.kind == "stream" and stat.S_ISREG(mode) and _begins_with(output.path, _HDF5):
-        raise output.refused("is an HDF5 file, which this would replace", "choose another place or remove it first")
 
 
-def _begins_with(path: Path, signature: bytes) -> bool:
+def _is_hdf5(path: Path) -> bool:
+    if not path.is_file():
+        return False
     with path.open("rb") as file:
-        return file.read(len(signature)) == signature
+        return file.read(len(_HDF5)) == _HDF5
 
 
 def _check_writable(output: Output) -> None:
