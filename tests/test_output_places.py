@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import shlex
 import shutil
 import stat
 from collections.abc import Callable
@@ -273,3 +274,35 @@ def test_demonstrations_that_no_option_explains_are_refused(toy_run, file: Path,
         "ddco-pyro inspect, and repair it or leave it out"
     )
     assert not (tmp_path / "a.csv").exists()
+
+
+# --- what is said and what is asked for -------------------------------------------------------------------------------
+
+
+def test_a_rollout_asks_for_what_its_report_needs_first(toy_run, tmp_path: Path, monkeypatch) -> None:
+    """Demonstrations that were moved are named before any episode is played; so is a report that cannot be written."""
+    run, gone = shutil.copytree(toy_run.folder, tmp_path / "run"), tmp_path / "gone.hdf5"
+    played: list[object] = []
+    monkeypatch.setattr("ddco_pyro.fitting.rollouts.run_episodes", lambda *how: played.append(how))
+    spec = (run / "spec.yaml").read_text()
+    (run / "report.html").unlink()
+    (run / "report.html").mkdir()
+    refused(call("rollout", run, "--episodes", 2), f"RUN {run}/report.html: is a folder; name a file")
+    (run / "report.html").rmdir()
+    (run / "spec.yaml").write_text(spec.replace("task: toy\n", "", 1).replace("path: null", f"path: {gone}"))
+    refused(call("rollout", run, "--episodes", 2), f"{gone}: there is no such file; check the path")
+    assert not played
+
+
+def test_commands_are_printed_as_a_shell_takes_them(tmp_path: Path, monkeypatch) -> None:
+    """Each is called again as it was printed, from a folder with an odd name."""
+    folder = tmp_path / "it's $(odd)"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    demonstrations(6).write(folder / "a b.hdf5")
+    said = call("inspect", "a b.hdf5").out.splitlines()[-1].partition("next: ")[2]
+    assert shlex.split(said) == ["ddco-pyro", "init", "a b.hdf5", "--out", "a b.yaml"]
+    said = call(*shlex.split(said)[1:]).out.partition("fit it with: ")[2]
+    assert shlex.split(said) == ["ddco-pyro", "fit", "a b.yaml", "--out", "runs/a b"]
+    assert "# Fit it:              ddco-pyro fit 'a b.yaml' --out runs/first\n" in Path("a b.yaml").read_text()
+    assert call("check", "a b.yaml").status == 0

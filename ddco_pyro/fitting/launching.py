@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
+from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
 
 from torch import distributed
@@ -111,6 +112,7 @@ def _started(size: int) -> Iterator[Ranks]:
     store = distributed.TCPStore(HERE, 0, size, is_master=True, wait_for_workers=False)
     context = multiprocessing.get_context("spawn")
     others = [context.Process(target=_follow, args=(Ranks(rank, size), store.port)) for rank in range(1, size)]
+    resource_tracker.ensure_running()  # it would be started with the first of them, and unblock the signals
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ANSWERED_HERE)  # they inherit it
     try:
         for other in others:
