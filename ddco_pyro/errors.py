@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import shlex
 from collections.abc import Iterable
 from typing import Any
 
@@ -13,6 +14,11 @@ class BadInput(ValueError):
 
 class Failed(RuntimeError):
     """What was asked for cannot be done, though the input is in order: one line as above (exit status 1)."""
+
+
+def command(*words: object) -> str:
+    """A command of this program as a user types it, quoted for the shell."""
+    return shlex.join(["ddco-pyro", *map(str, words)])
 
 
 def nearest(given: Any, names: Iterable[str]) -> str:

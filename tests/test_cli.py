@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
+import time
 import tomllib
 from pathlib import Path
 from unittest import mock
@@ -17,7 +20,7 @@ import pytest
 import toy_task
 import typer
 import yaml
-from command_line import HERE, call, start, with_set
+from command_line import COMMAND, HERE, call, start, with_set
 from killing import HANGS, struck
 
 import ddco_pyro
@@ -307,6 +310,29 @@ def test_what_fails_otherwise_has_one_line_too(monkeypatch, spec, error, message
     assert call("check", spec) == (1, "", f"ddco-pyro: {message}\n")
 
 
+def test_a_scheduler_that_preempts_means_ctrl_c(monkeypatch, spec):
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr("ddco_pyro.fitting.prepare.dimensions", lambda *_: signal.raise_signal(signal.SIGTERM))
+    assert call("check", spec) == (1, "", "ddco-pyro: interrupted\n")
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_an_interrupt_within_a_finalizer_is_not_lost(monkeypatch, spec, number):
+    """Python prints what is raised there and goes on."""
+
+    class Interrupted:
+        def __del__(self):
+            signal.raise_signal(number)
+
+    def work(*_):
+        Interrupted()
+        time.sleep(HANGS)
+
+    monkeypatch.setattr("ddco_pyro.fitting.prepare.dimensions", work)
+    assert call("check", spec) == (1, "", "ddco-pyro: interrupted\n")
+
+
 def test_debug_shows_the_traceback():
     for arguments in (["--debug", "check", "nowhere.yaml"], ["check", "nowhere.yaml", "--debug"]):
         ended = call(*arguments)
@@ -330,11 +356,33 @@ def test_a_command_ends_with_its_status_and_finds_tasks_beside_it(spec):
     assert (process.returncode, out, err.count("\n")) == (2, "", 1)
 
 
+def test_a_pipe_that_is_closed_ends_it_quietly():
+    """As in ``ddco-pyro check --schema | head -1``, be what is printed short or long."""
+    for arguments in (["check", "--schema"], ["--version"]):
+        reading, writing = os.pipe()
+        process = subprocess.Popen([COMMAND, *arguments], stdout=writing, stderr=subprocess.PIPE, text=True)
+        os.close(writing)
+        os.close(reading)
+        assert process.communicate(timeout=HANGS)[1] == ""
+        assert process.returncode == 1
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+def test_a_name_that_the_terminal_cannot_print_is_printed_all_the_same(encoding):
+    name = os.fsdecode(b"gone \xc3\xa9\xff.yaml")
+    environment = {**os.environ, "PYTHONIOENCODING": encoding, "LC_ALL": "C"}
+    ended = subprocess.run([COMMAND, "init", name], capture_output=True, env=environment)
+    shown = name.encode(encoding, "backslashreplace").decode(encoding)
+    assert ended.returncode == 2
+    assert ended.stderr.decode(encoding) == f"ddco-pyro: {shown}: there is no such file or folder; check the path\n"
+
+
 @pytest.mark.slow
-def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path):
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path, number):
     longer = with_set("compare_with=[]", "training.epochs=60", "training.patience=null")
-    folder = tmp_path / "cut"
-    interrupt = "os.kill(os.getpid(), signal.SIGINT)"
+    folder = tmp_path / "cut it"
+    interrupt = f"os.kill(os.getpid(), signal.{number})"
     status, err = struck(["fit", spec, "--out", folder, *longer], HERE, "EpochEnded", 25, interrupt)
     assert status == 1
     assert not (folder / "model.safetensors").exists()

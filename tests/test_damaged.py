@@ -93,6 +93,18 @@ def test_damaged_metrics(run: Path, monkeypatch: pytest.MonkeyPatch, command: tu
     refused(run, command, path, what)
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("model", [".", "baselines/flat"])
+def test_weights_that_are_not_finite(run: Path, monkeypatch: pytest.MonkeyPatch, model: str, value: float) -> None:
+    monkeypatch.chdir(run.parent)
+    path = run / model / "model.safetensors"
+    tensors, metadata = read_tensors(path)
+    name = next(name for name, tensor in sorted(tensors.items()) if tensor.is_floating_point() and tensor.numel() > 1)
+    tensors[name].view(-1)[1] = value
+    write_tensors(path, tensors, metadata)
+    refused(run, COMMANDS["compare"], path, f"{name} has numbers that are NaN or infinite")
+
+
 @pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"[" * 100_000, b'{"model": NaN}', b"\x00" * 100])
 def test_metrics_that_are_no_text(run: Path, content: bytes) -> None:
     (run / "metrics.json").write_bytes(content)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from ddco_pyro.data.files import NotWritable, whole_file, whole_folder, write_text
+from ddco_pyro.data.files import NoSpace, NotWritable, whole_file, whole_folder, write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 
 
@@ -85,6 +86,87 @@ def test_what_a_killed_process_left_of_a_folder_is_removed(tmp_path):
     assert [path.name.startswith(".folder-") for path in tmp_path.iterdir()] == [True]
     write_folder(tmp_path / "folder", "whole")
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+
+
+class Killed(BaseException):
+    """Where a process was killed: nothing of it runs after that."""
+
+
+@pytest.mark.parametrize("step", ["before the first", "between the two", "after the second"])
+def test_a_folder_is_there_whole_wherever_its_writer_was_killed(tmp_path, monkeypatch, step):
+    """Killed before or after each of the two renames, the folder is the old or the new one once it is written again."""
+    path, rename = tmp_path / "folder", Path.rename
+    write_folder(path, "old")
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    renamed = []
+
+    def killed(self, target):
+        done = {"before the first": 0, "between the two": 1, "after the second": 2}[step]
+        if len(renamed) < done:
+            renamed.append(rename(self, target))
+        if len(renamed) == done:
+            raise Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr("os.getpid", lambda: dead.pid)
+        patched.setattr(Path, "rename", killed)
+        patched.setattr("shutil.rmtree", lambda *_, **__: None)
+        patched.setattr("ddco_pyro.data.files._put_back", lambda *_: None)
+        with pytest.raises(Killed):
+            write_folder(path, "new")
+    assert path.exists() == (step != "between the two")
+    with whole_folder(tmp_path / "folder"):  # the next writer
+        assert contents(path)["deeper/file"] == ("new" if step == "after the second" else "old")
+    assert [one.name for one in tmp_path.iterdir()] == ["folder"]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+def test_a_folder_comes_back_where_the_new_one_cannot_take_its_place(tmp_path, monkeypatch, error):
+    path, rename, seen = tmp_path / "folder", Path.rename, []
+    write_folder(path, "old")
+
+    def fails(self, target):
+        seen.append(target)
+        if len(seen) == 2:
+            raise error
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", fails)
+    with pytest.raises(error):
+        write_folder(path, "new")
+    assert contents(tmp_path) == {"folder": False, "folder/deeper": False, "folder/deeper/file": "old"}
+
+
+def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path):
+    (tmp_path / "there").mkdir()
+    link, folder = tmp_path / "link", tmp_path / "folder"
+    link.symlink_to(tmp_path / "there" / "file")
+    write_text(link, "first")  # it led nowhere
+    write_text(link, "second")
+    write_folder(tmp_path / "there" / "folder", "old")
+    folder.symlink_to(tmp_path / "there" / "folder")
+    write_folder(folder, "new")
+    assert link.is_symlink()
+    assert folder.is_symlink()
+    assert (tmp_path / "there" / "file").read_text() == "second"
+    assert (tmp_path / "there" / "folder" / "deeper" / "file").read_text() == "new"
+    assert {path.name for path in (tmp_path / "there").iterdir()} == {"file", "folder"}
+
+
+def test_a_device_is_written_into_and_never_replaced(tmp_path):
+    """A terminal, so that what arrives can be read."""
+    ours, theirs = os.openpty()
+    terminal = Path(os.ttyname(theirs))
+    write_text(terminal, "hello")
+    assert os.read(ours, 100) == b"hello"
+    assert terminal.is_char_device()
+    with pytest.raises(NoSpace):
+        write_text(Path("/dev/full"), "x")
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(NotWritable, match="pipe: is no regular file; choose another place"):
+        write_text(tmp_path / "pipe", "x")
+    assert (tmp_path / "pipe").is_fifo()
 
 
 def test_a_folder_that_cannot_be_replaced_is_said(tmp_path, monkeypatch):

@@ -1,4 +1,6 @@
-"""Commands that were killed (SIGKILL) go on when they are called again, and end as if nothing had happened.
+"""Commands that were killed (SIGKILL) or terminated (SIGTERM) go on when they are called again.
+
+They end as if nothing had happened.
 
 The files they were to write are equal to those of an undisturbed run; what is there is always whole.
 """
@@ -7,6 +9,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,6 +58,19 @@ def same_run(one: Path, other: Path) -> None:
     metrics = [json.loads((folder / "metrics.json").read_text()) for folder in (one, other)]
     aside = {"seconds": ...}
     assert metrics[0] | aside == metrics[1] | aside
+
+
+def same_rollouts(one: Path, other: Path) -> None:
+    """Equal outcomes of every episode, and what is said of them."""
+    assert (one / "rollouts.csv").read_bytes() == (other / "rollouts.csv").read_bytes()
+    metrics = [json.loads((folder / "metrics.json").read_text()) for folder in (one, other)]
+    assert metrics[0] == metrics[1]
+
+
+def rolled(folder: Path) -> set[object] | None:
+    """The methods that need not be rolled out again."""
+    path = folder / "run" / "rollouts.unfinished.json"
+    return set(json.loads(path.read_text())["outcomes"]) if path.exists() else None
 
 
 def same_selection(one: Path, other: Path) -> None:
@@ -119,6 +135,9 @@ def cases(tmp_path_factory: pytest.TempPathFactory, toy_run) -> dict[str, Case]:
     data["selection"] = data["selection"] | {"folds": 3}
     (folder / "grid.yaml").write_text(yaml.safe_dump(data))
     tables = ("--csv", "a.csv", "--html", "a.html")
+    shutil.copytree(toy_run.folder, folder / "elsewhere" / "run")
+    for path in (folder / "elsewhere").rglob("spec.yaml"):  # the task is found where the command is called
+        path.write_text(path.read_text().replace("task: toy", "task: toy_task:task"))
     return {
         "collect": Case(
             ("collect", folder / "toy.yaml", "--out", "demos.hdf5", "--set", "demonstrations.count=40", "--allow-code"),
@@ -163,6 +182,20 @@ def cases(tmp_path_factory: pytest.TempPathFactory, toy_run) -> dict[str, Case]:
             lambda folder: None,
             (folder / "toy.hdf5",),
         ),
+        "merge": Case(
+            ("merge", "run", "--out", "merged", "--jobs", "2", "--allow-code"),
+            "merged",
+            same_run,
+            epochs,
+            (Path(toy_task.__file__), folder / "elsewhere" / "run"),
+        ),
+        "rollout": Case(
+            ("rollout", "run", "--episodes", "40", "--jobs", "2", "--allow-code"),
+            "run",
+            same_rollouts,
+            rolled,
+            (Path(toy_task.__file__), folder / "elsewhere" / "run"),
+        ),
     }
 
 
@@ -195,15 +228,15 @@ def _toy_demonstrations(folder: Path) -> Path:
     return path
 
 
-def check(case: Case, tmp_path: Path, kills: int, seed: int) -> Killed:
+def check(case: Case, tmp_path: Path, kills: int, seed: int, by: signal.Signals = signal.SIGKILL) -> Killed:
     """Undisturbed and killed again and again, each in a folder and with a cache of its own."""
     folders = [tmp_path / name for name in ("whole", "killed")]
     for folder in folders:
         folder.mkdir()
         for path in case.inputs:
-            shutil.copy(path, folder)
+            shutil.copytree(path, folder / path.name) if path.is_dir() else shutil.copy(path, folder)
     seconds = whole(case.arguments, folders[0], tmp_path / "cache-whole")
-    killed = until_done(case.arguments, folders[1], tmp_path / "cache-killed", kills, seconds, seed, case.kept)
+    killed = until_done(case.arguments, folders[1], tmp_path / "cache-killed", kills, seconds, seed, case.kept, by)
     case.same(folders[0] / case.result, folders[1] / case.result)
     assert not [path for path in folders[1].rglob("*") if path.name.endswith((".tmp", ".parts"))]
     return killed
@@ -214,13 +247,21 @@ def test_killed_and_called_again(cases: dict[str, Case], tmp_path: Path) -> None
     check(cases["import"], tmp_path, kills=2, seed=7)
 
 
+ALL = ["collect", "import", "fit", "fit to pictures", "select", "segment", "segment in place", "merge", "rollout"]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["collect", "import", "fit", "fit to pictures", "select", "segment", "segment in place"]
-)
+@pytest.mark.parametrize("name", ["collect", "fit", "fit to pictures", "select", "merge", "rollout"])
+def test_terminated_and_called_again(cases: dict[str, Case], tmp_path: Path, name: str) -> None:
+    """A scheduler's preemption, five times: each ends with a line, without helpers left behind, and goes on."""
+    assert check(cases[name], tmp_path, kills=5, seed=11, by=signal.SIGTERM).total > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ALL)
 def test_killed_at_very_many_moments(cases: dict[str, Case], tmp_path: Path, name: str) -> None:
     found: list[Killed] = []
-    while sum(one.total for one in found) < 10:  # sixty in all; a moment that comes after the end kills nothing
+    while sum(one.total for one in found) < 10:  # ninety in all; a moment that comes after the end kills nothing
         folder = tmp_path / str(len(found))
         folder.mkdir()
         found.append(check(cases[name], folder, kills=5, seed=len(found)))

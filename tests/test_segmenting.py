@@ -77,7 +77,7 @@ NOTHING = (
         ([], NOTHING),
         (["--level", "option"], NOTHING),
         (["--in-place", "--out", "copy.hdf5"], "ddco-pyro: --out and --in-place exclude each other; keep one\n"),
-        (["--out", "FILE"], "ddco-pyro: --out FILE: is the file itself; to write labels into it, say --in-place\n"),
+        (["--out", "FILE"], "ddco-pyro: --out FILE: is what this command reads; choose another place\n"),
         (["--lerobot", "folder"], "ddco-pyro: FILE: is no LeRobot dataset; --lerobot annotates a copy of one\n"),
     ],
 )

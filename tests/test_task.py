@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
@@ -35,6 +36,13 @@ def test_a_registered_task_is_found_by_its_name(monkeypatch):
         UnknownTask, match=r"^no task is registered as 'toi' \(registered: toy\); module:name works too$"
     ):
         find_task("toi")
+
+
+def test_a_registered_task_whose_packages_are_missing_is_one_line(monkeypatch):
+    point = EntryPoint("needs", "no_such_package.of_mine:task", TASKS)
+    monkeypatch.setattr("ddco_pyro.simulation.task.entry_points", lambda group: [point])
+    with pytest.raises(UnknownTask, match=r"^task 'needs' cannot be loaded: No module named 'no_such_package'$"):
+        find_task("needs")
 
 
 @pytest.mark.parametrize(

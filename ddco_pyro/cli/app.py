@@ -6,10 +6,15 @@ do; ``--debug`` shows the traceback. A file for each group of commands; they imp
 
 from __future__ import annotations
 
+import _thread
+import io
 import os
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from typing import Annotated, Any
 
@@ -65,11 +70,45 @@ for command, example in EXAMPLES.items():
 
 def main() -> None:
     """Run the command line; ends the process with 0, 1 or 2."""
+    with _interruptible():
+        status = _run()
+    sys.exit(status)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM, by which schedulers preempt, does what Ctrl-C does, and neither is lost."""
+    before, hook = signal.signal(signal.SIGTERM, signal.default_int_handler), sys.unraisablehook
+
+    def again(ignored: Any) -> None:
+        """Python ignores what is raised in a finalizer: a moment later it is raised elsewhere."""
+        if isinstance(ignored.exc_value, KeyboardInterrupt):
+            threading.Timer(0.01, _thread.interrupt_main, [signal.SIGTERM]).start()
+        else:
+            hook(ignored)
+
+    sys.unraisablehook = again
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        signal.signal(signal.SIGTERM, before)
+
+
+def _run() -> int:
+    """The exit status of the command line."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a name may have what the terminal's encoding lacks
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     if "--allow-code" in arguments:
         sys.path.append(os.getcwd())  # where a user's module:name lies
     try:
         status = app(arguments or ["--help"], prog_name="ddco-pyro", standalone_mode=False)
+        sys.stdout.flush()
+    except BrokenPipeError:  # who read it, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = 1
     except Exception as error:
         status, lines = _explain(error)
         if "--debug" in sys.argv:
@@ -79,7 +118,7 @@ def main() -> None:
     if status == INTERRUPTED:
         print("ddco-pyro: interrupted", file=sys.stderr)
         status = 1
-    sys.exit(status or 0)
+    return status or 0
 
 
 INTERRUPTED = 130

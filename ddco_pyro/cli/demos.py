@@ -11,8 +11,8 @@ from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli.options import AllowCode, AllowExternal, Overrides, SpecPath
-from ddco_pyro.errors import BadInput
+from ddco_pyro.cli.options import AllowCode, AllowExternal, Overrides, SpecPath, out_file, written
+from ddco_pyro.errors import BadInput, command
 from ddco_pyro.spec import SpecError, load_spec
 
 
@@ -40,7 +40,7 @@ FormatOption = Annotated[
 
 def collect(
     spec: SpecPath,
-    out: Annotated[Path | None, typer.Option(help="The HDF5 file; by default in the cache, by content.")] = None,
+    out: Annotated[Path | None, written(out_file, "The HDF5 file; by default in the cache, by content.")] = None,
     overrides: Overrides = [],  # noqa: B006
     allow_code: AllowCode = False,
 ) -> None:
@@ -49,11 +49,13 @@ def collect(
     if loaded.demonstrated_task is None:
         raise SpecError(f"{spec}: names no task, so there is no supervisor to record")
     from ddco_pyro.cli import console
+    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.simulation.collect import collect as record
 
     own = loaded.demonstrations.path
+    kept = out or (Path(own) if own else None)
+    check_outputs([Output("--out", kept, "file")] if kept else [], [spec])
     with console.Progress() as progress:
-        kept = out or (Path(own) if own else None)
         path = record(loaded.demonstrated_task, loaded.demonstrations, kept, progress, loaded.observed)
     print(path)
 
@@ -76,37 +78,38 @@ def inspect(
 
     show(facts)
     if facts.format != "robomimic":
-        print(f"\nto fit to it, import it first: ddco-pyro import {file} --out demos.hdf5")
+        print(f"\nto fit to it, import it first: {command('import', file, '--out', 'demos.hdf5')}")
         return
     try:
-        print(f"\n{starting_spec(facts, file)}\nnext: ddco-pyro init {quote(str(file))} --out {quote(file.stem)}.yaml")
+        print(f"\n{starting_spec(facts, file)}\nnext: {command('init', file, '--out', f'{file.stem}.yaml')}")
     except DemonstrationsError as error:
         print(f"\nno spec to start with: {str(error).removeprefix(f'{file}: ')}")
 
 
 def init(
     file: SourcePath,
-    out: Annotated[Path, typer.Option(help="Where to write the spec.")] = Path("spec.yaml"),
+    out: Annotated[Path, written(out_file, "Where to write the spec.")] = Path("spec.yaml"),
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
 ) -> None:
     """Write a commented spec for a file of demonstrations that fits as it is."""
-    from ddco_pyro.data.files import write_text
+    from ddco_pyro.data.files import Output, check_outputs, write_text
     from ddco_pyro.data.inspection import inspect as look
     from ddco_pyro.data.starting import starting_spec
 
+    check_outputs([Output("--out", out)], [file])
     if out.exists() and not force:
         raise BadInput(f"{out}: is there already; choose another --out, or replace it with --force")
     facts = look(file)
     if facts.format != "robomimic":
-        raise BadInput(f"{file}: is a {facts.format} dataset; first: ddco-pyro import {file} --out demos.hdf5")
-    text = starting_spec(facts, file).replace("THIS_FILE", str(out))
+        raise BadInput(f"{file}: is a {facts.format} dataset; first: {command('import', file, '--out', 'demos.hdf5')}")
+    text = starting_spec(facts, file).replace("THIS_FILE", quote(str(out)))
     write_text(out, text)
-    print(f"{out}: fit it with: ddco-pyro fit {out} --out runs/{out.stem}")
+    print(f"{out}: fit it with: {command('fit', out, '--out', f'runs/{out.stem}')}")
 
 
 def import_(
     source: SourcePath,
-    out: Annotated[Path, typer.Option(help="The HDF5 file to write.", show_default=False)],
+    out: Annotated[Path, written(out_file, "The HDF5 file to write.", show_default=False)],
     form: FormatOption = None,
     observations: Annotated[
         list[str], typer.Option("--observation", metavar="KEY", help="Import only this one; repeatable.")
@@ -123,9 +126,11 @@ def import_(
 ) -> None:
     """Write somebody else's demonstrations into this project's layout; goes on where it was interrupted."""
     from ddco_pyro.cli import console
+    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.data.importing import Choice, import_demonstrations
     from ddco_pyro.events import DemonstrationsDone
 
+    check_outputs([Output("--out", out, "file")], [source])
     size = (image_size, image_size) if image_size else None
     choice = Choice(tuple(observations), mask, videos, size, skip_broken, allow_external)
     with console.Progress("importing") as progress:
@@ -140,7 +145,7 @@ def import_(
 def encode(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="An HDF5 file of demonstrations.")],
     observation: Annotated[str, typer.Option(metavar="KEY", help="The pictures to encode.", show_default=False)],
-    out: Annotated[Path, typer.Option(help="The HDF5 file to write.", show_default=False)],
+    out: Annotated[Path, written(out_file, "The HDF5 file to write.", show_default=False)],
     encoder: Annotated[
         str, typer.Option(metavar="NAME", help="random_conv, autoencoder, the folder of a fit, or module:Class.")
     ] = "random_conv",
@@ -171,9 +176,13 @@ def encode(
     The encoder is written beside, in OUT.encoder: ddco_pyro.encoding.load reads it for acting.
     """
     from ddco_pyro.cli import console
+    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.encoding import Encoding
     from ddco_pyro.encoding import encode as write
+    from ddco_pyro.encoding.writing import encoder_folder
 
+    places = [Output("--out", out, "file"), Output("--out", encoder_folder(out), "folder")]
+    check_outputs(places, [file, *([Path(encoder)] if Path(encoder).exists() else [])])
     encoding = Encoding(observation, encoder, size, seed, name, updates, moved, shift)
     with console.Progress("encoding") as progress:
         encoded = write(file, out, encoding, progress, allow_code)

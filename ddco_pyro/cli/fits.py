@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import sys
 import time
 from collections.abc import Iterator
@@ -14,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli.options import AllowCode, Overrides, RunPath, SpecPath
+from ddco_pyro.cli.options import AllowCode, Overrides, RunPath, SpecPath, out_folder, written
+from ddco_pyro.errors import command
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def check(
 
 def fit(
     spec: SpecPath,
-    out: Annotated[Path | None, typer.Option(help="The run folder; by default runs/SPEC-TIME.")] = None,
+    out: Annotated[Path | None, written(out_folder, "The run folder; by default runs/SPEC-TIME.")] = None,
     overrides: Overrides = [],  # noqa: B006
     jobs: Annotated[
         int | None,
@@ -100,12 +100,11 @@ def fit(
         jobs = -1 if ranks.size == 1 else 1
     if seeds is not None:
         check_seeds(loaded, seeds)
-    again = "" if seeds is None else f" --seeds {seeds}"
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
-    with (
-        _continued(f"fit {folder / 'spec.yaml'} --out {folder} --resume{again}{_allowed(loaded)}", folder),
-        console.Progress() as progress,
-    ):
+    _check_folder(folder, spec, loaded)
+    repeated = () if seeds is None else ("--seeds", str(seeds))
+    again = command("fit", folder / "spec.yaml", "--out", folder, "--resume", *repeated, *_allowed(loaded))
+    with _continued(again, folder), console.Progress() as progress:
         fitted = fit_run(loaded, None, folder, progress, jobs, resume, processes=ranks.size)
         if seeds is not None:
             fitted = repeat(fitted, seeds, progress, jobs)
@@ -114,13 +113,13 @@ def fit(
     _warn(fitted)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
     if loaded.hierarchy and loaded.demonstrations.path:
-        file = shlex.quote(loaded.demonstrations.path)
-        print(f"next: ddco-pyro segment {shlex.quote(str(folder))} {file} --html segments.html{_allowed(loaded)}")
+        file = loaded.demonstrations.path
+        print(f"next: {command('segment', folder, file, '--html', 'segments.html', *_allowed(loaded))}")
 
 
 def select(
     spec: SpecPath,
-    out: Annotated[Path | None, typer.Option(help="The folder; by default runs/SPEC-select-TIME.")] = None,
+    out: Annotated[Path | None, written(out_folder, "The folder; by default runs/SPEC-select-TIME.")] = None,
     overrides: Overrides = [],  # noqa: B006
     folds: Annotated[int | None, typer.Option(help="Number of folds; by default the spec's selection.folds.")] = None,
     jobs: Annotated[int, typer.Option(help="Processes that train folds; -1 is one for each core.")] = -1,
@@ -147,12 +146,13 @@ def select(
     from ddco_pyro.selection.table import HEAD, cells
 
     workers = selection.Workers(jobs, scheduler)
+    folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"
+    _check_folder(folder, spec, loaded)
     demos = selection.known_demonstrations(loaded)
     selection.check(loaded, workers, demos)  # before anything is collected, trained or written
-    folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"
     claim(folder, loaded, resume)
-    early = " --stop-early" * stop_early
-    again = f"select {folder / 'spec.yaml'} --out {folder} --resume{early}{_allowed(loaded)}"
+    early = ["--stop-early"] if stop_early else []
+    again = command("select", folder / "spec.yaml", "--out", folder, "--resume", *early, *_allowed(loaded))
     with _continued(again, folder), console.Progress() as progress:
         made = selection.select(loaded, folder, progress, workers, stop_early, demos)
         progress.end()
@@ -172,7 +172,7 @@ def merge(
         typer.Option(help="Numbers of the two options; by default those that act most alike.", show_default=False),
     ] = None,
     level: Annotated[str | None, typer.Option(help="Name of their level; by default the lowest.")] = None,
-    out: Annotated[Path | None, typer.Option(help="The run folder; by default RUN-merged.")] = None,
+    out: Annotated[Path | None, written(out_folder, "The run folder; by default RUN-merged.")] = None,
     jobs: Annotated[int, typer.Option(help="Processes that train restarts; -1 is one for each core.")] = -1,
     allow_code: AllowCode = False,
 ) -> None:
@@ -181,31 +181,42 @@ def merge(
     Called again, an unfinished one is continued.
     """
     from ddco_pyro.cli import console
+    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.fitting import merging
     from ddco_pyro.fitting.fit import load
     from ddco_pyro.report import write_report
 
+    named = run if run.name else run.resolve()
+    folder = out or named.with_name(f"{named.name}-merged")
+    check_outputs([Output("--out", folder, "folder")], [run])
     before = load(run, allow_code)
     pair = merging.chosen(before, level, options)
-    folder = out or run.with_name(f"{run.name}-merged")
     with console.Progress() as progress:
         fitted = merging.merge(before, pair, folder, progress, jobs)
     console.log_likelihoods(fitted.metrics)
     console.merged(pair, before.metrics, fitted.metrics)
     _warn(fitted)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
-    print(f"next: ddco-pyro compare {shlex.quote(str(run))} {shlex.quote(str(folder))}{_allowed(fitted.spec)}")
+    print(f"next: {command('compare', run, folder, *_allowed(fitted.spec))}")
+
+
+def _check_folder(folder: Path, spec: Path, loaded: Spec) -> None:
+    """See that the folder of a fit or a selection may be written."""
+    from ddco_pyro.data.files import Output, check_outputs
+
+    own = loaded.demonstrations.path
+    check_outputs([Output("--out", folder, "folder")], [spec, *([Path(own)] if own else [])])
 
 
 @contextmanager
-def _continued(command: str, folder: Path) -> Iterator[None]:
+def _continued(again: str, folder: Path) -> Iterator[None]:
     """Ctrl-C ends with 1 and the command that continues, where there is something to continue."""
     try:
         yield
     except KeyboardInterrupt:
         if not (folder / "spec.yaml").exists():
             raise
-        print(f"interrupted; continue with: ddco-pyro {command}", file=sys.stderr)
+        print(f"interrupted; continue with: {again}", file=sys.stderr)
         raise typer.Exit(1) from None
 
 
@@ -217,6 +228,6 @@ def _warn(fitted: Fit) -> None:
     console.warnings([*unconverged(fitted.metrics), *degeneracies(fitted.spec, fitted.metrics)])
 
 
-def _allowed(spec: Spec) -> str:
-    """What has to be said again so that the user code of this spec is imported again."""
-    return " --allow-code" if user_code(spec) else ""
+def _allowed(spec: Spec) -> list[str]:
+    """The option that lets the user code of this spec be imported again."""
+    return ["--allow-code"] if user_code(spec) else []

@@ -2,10 +2,38 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+
+def out_file(text: str | os.PathLike[str]) -> Path:
+    """The name of a file to write.
+
+    :raises typer.BadParameter: it is empty, or that of a folder.
+    """
+    name = os.fspath(text)
+    if name.endswith(os.sep) or (name and not Path(name).name):
+        raise typer.BadParameter(f"{name} names a folder; name a file")
+    return out_folder(name)
+
+
+def out_folder(text: str | os.PathLike[str]) -> Path:
+    """The name of a folder to write.
+
+    :raises typer.BadParameter: it is empty.
+    """
+    if not os.fspath(text):
+        raise typer.BadParameter("the name is empty; name a place")
+    return Path(text)
+
+
+def written(parser: Any, text: str, **how: Any) -> Any:
+    """An option that names a place to write, :func:`out_file` or :func:`out_folder`."""
+    return typer.Option(help=text, parser=parser, metavar="PATH", **how)
+
 
 SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="The spec, a YAML file.", show_default=False)]
 Overrides = Annotated[

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
 from enum import StrEnum
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli.options import AllowCode, AllowExternal, RunPath
-from ddco_pyro.errors import BadInput
+from ddco_pyro.cli.options import AllowCode, AllowExternal, RunPath, out_file, out_folder, written
+from ddco_pyro.errors import BadInput, command
 
 if TYPE_CHECKING:
     from ddco_pyro.data.sources import Source
@@ -33,17 +33,20 @@ def segment(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="A copy of the HDF5 file with labels for each step.", show_default=False),
+        written(out_file, "A copy of the HDF5 file with labels for each step.", show_default=False),
     ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Let --out replace a file that is no labelled copy of DEMOS.")
+    ] = False,
     in_place: Annotated[bool, typer.Option("--in-place", help="Write the labels into the HDF5 file itself.")] = False,
-    csv: Annotated[Path | None, typer.Option(help="A table with a row for each step.", show_default=False)] = None,
-    parquet: Annotated[Path | None, typer.Option(help="The same table as Parquet.", show_default=False)] = None,
+    csv: Annotated[Path | None, written(out_file, "A table with a row for each step.", show_default=False)] = None,
+    parquet: Annotated[Path | None, written(out_file, "The same table as Parquet.", show_default=False)] = None,
     html: Annotated[
-        Path | None, typer.Option(help="A page with the timeline of every demonstration.", show_default=False)
+        Path | None, written(out_file, "A page with the timeline of every demonstration.", show_default=False)
     ] = None,
     lerobot: Annotated[
         Path | None,
-        typer.Option(help="A copy of the LeRobot dataset with options as subtasks.", show_default=False),
+        written(out_folder, "A copy of the LeRobot dataset with options as subtasks.", show_default=False),
     ] = None,
     lerobot_format: Annotated[
         LeRobotFormat,
@@ -76,26 +79,37 @@ def segment(
             "copy) or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset; "
             "--baselines measures agreement with labels"
         )
-    labelled = _labelled(demos, out, in_place)
+    if out and in_place:
+        raise BadInput("--out and --in-place exclude each other; keep one")
+    labelled = demos if in_place else out
     if labelled and allow_external:  # a copy would not find the other files, and labels could go into those
-        raise BadInput(
-            f"{demos}: labels go into whole files only; first: ddco-pyro import {quote(str(demos))} --allow-external "
-            "--out whole.hdf5"
-        )
+        again = command("import", demos, "--allow-external", "--out", "whole.hdf5")
+        raise BadInput(f"{demos}: labels go into whole files only; first: {again}")
     from ddco_pyro.cli import console
+    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.data.sources import open_source
     from ddco_pyro.drawing.scores import HEAD
     from ddco_pyro.fitting.fit import load
-    from ddco_pyro.segmenting import segments
-    from ddco_pyro.segmenting.hdf5 import write_labels
+    from ddco_pyro.segmenting import chosen_names, segments
+    from ddco_pyro.segmenting.hdf5 import check_copy, check_labels, write_labels
     from ddco_pyro.segmenting.page import write_page
     from ddco_pyro.segmenting.scores import baseline_scores, level_scores
     from ddco_pyro.segmenting.tables import write_csv, write_parquet
 
+    tables = {"--csv": csv, "--parquet": parquet, "--html": html}
+    files = [Output(option, path) for option, path in tables.items() if path]
+    labels = [Output("--in-place" if in_place else "--out", labelled, "file")] if labelled else []
+    copies = [Output("--lerobot", lerobot, "folder")] if lerobot else []
+    check_outputs([*labels, *files, *copies], [run] if in_place else [run, demos])
+    if out and not overwrite:
+        check_copy(demos, out)
     fit = load(run, allow_code)
     with open_source(demos, external=allow_external) as source, console.Progress("segmenting") as progress:
         if labelled and source.format != "robomimic":
             raise BadInput(f"{demos}: labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot")
+        if labelled and fit.spec.hierarchy:
+            levels = [level.name for level in fit.spec.hierarchy.levels]
+            check_labels(demos, levels, chosen_names(source, fit))
         if lerobot:
             segmented = _annotate(fit, source, lerobot, (level, lerobot_format.value), progress)
         else:
@@ -116,18 +130,6 @@ def segment(
     if labelled:
         write_labels(demos, labelled, segmented)
         print(f"{labelled}: labels/{', labels/'.join(segmented.counts)}")
-
-
-def _labelled(demos: Path, out: Path | None, in_place: bool) -> Path | None:
-    """The HDF5 file that is to have the labels, if any.
-
-    :raises BadInput: it is said in two ways, or the copy is the file itself.
-    """
-    if out and in_place:
-        raise BadInput("--out and --in-place exclude each other; keep one")
-    if out and out.resolve() == demos.resolve():
-        raise BadInput(f"--out {out}: is the file itself; to write labels into it, say --in-place")
-    return demos if in_place else out
 
 
 def _annotate(fit: Fit, source: Source, out: Path, how: tuple[str | None, str], on_event: OnEvent) -> Segmented:
@@ -158,7 +160,7 @@ def _annotate(fit: Fit, source: Source, out: Path, how: tuple[str | None, str], 
 
 def export(
     run: RunPath,
-    out: Annotated[Path, typer.Option(help="The folder to write.", show_default=False)],
+    out: Annotated[Path, written(out_folder, "The folder to write.", show_default=False)],
     onnx: Annotated[bool, typer.Option("--onnx", help="Write ONNX too (pip install 'ddco-pyro\\[export]').")] = False,
     allow_code: AllowCode = False,
 ) -> None:
@@ -172,11 +174,14 @@ def export(
     run's own networks where that is more; else nothing is written and what
     was there stays.
     """
+    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.export import export as write
     from ddco_pyro.fitting.fit import load
 
+    check_outputs([Output("--out", out, "folder")], [run])
     exported = write(load(run, allow_code), out, onnx)
     for form, (difference, seconds) in exported.items():
         print(f"{form}: largest difference {difference:.1e}, a step takes {1e3 * seconds:.3f} ms")
     form = next(iter(exported))
-    print(f"{out}: try it with: python {out / 'runner.py'} {out}{'' if form == 'numpy' else f' {form}'}")
+    again = shlex.join(["python", str(out / "runner.py"), str(out), *([] if form == "numpy" else [form])])
+    print(f"{out}: try it with: {again}")

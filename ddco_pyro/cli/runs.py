@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli.options import AllowCode, RunPath
+from ddco_pyro.cli.options import AllowCode, RunPath, out_folder, written
 
 FILMED = 3
 """Episodes of each method that ``rollout --video`` films."""
@@ -20,14 +20,17 @@ def compare(
     runs: Annotated[
         list[Path], typer.Argument(metavar="RUN RUN...", help="Run folders; a run's baselines are some too.")
     ],
-    out: Annotated[Path | None, typer.Option(help="The folder to write to; by default runs/compare-TIME.")] = None,
+    out: Annotated[Path | None, written(out_folder, "The folder to write to; by default runs/compare-TIME.")] = None,
     allow_code: AllowCode = False,
 ) -> None:
     """Compare runs on the demonstrations that all of them held out, and on rollouts from the same initial states."""
     from ddco_pyro import comparison
     from ddco_pyro.cli import console
     from ddco_pyro.comparison import page
+    from ddco_pyro.data.files import Output, check_outputs
 
+    folder = out or Path("runs") / time.strftime("compare-%Y%m%d-%H%M%S")
+    check_outputs([Output("--out", folder / name) for name in comparison.FILES], runs)
     compared = comparison.compare(runs, allow_code)
     console.comparison(page.HEAD, [page.cells(row) for row in compared.rows])
     if compared.agreement:
@@ -35,7 +38,7 @@ def compare(
     if compared.rollouts:
         console.comparison(page.ROLLOUT_HEAD, page.rollout_cells(compared))
     print(page.verdict(compared))
-    print(f"comparison: {comparison.write(compared, out or Path('runs') / time.strftime('compare-%Y%m%d-%H%M%S'))}")
+    print(f"comparison: {comparison.write(compared, folder)}")
 
 
 def rollout(
@@ -59,10 +62,12 @@ def rollout(
 
     fitted = load(run, allow_code)
     number = episodes or fitted.spec.rollout.episodes
+    _check_run(run, "rollouts.csv", "metrics.json")
+    demos = fitted.demonstrations  # the report needs them: asked for before any episode
     with console.Progress() as progress:
         results = roll_out(fitted, number, FILMED if video else 0, progress, jobs, resume)
     console.successes(results)
-    print(f"report: {write_report(fitted, fitted.demonstrations)}")
+    print(f"report: {write_report(fitted, demos)}")
 
 
 def report(run: RunPath, allow_code: AllowCode = False) -> None:
@@ -71,4 +76,13 @@ def report(run: RunPath, allow_code: AllowCode = False) -> None:
     from ddco_pyro.report import write_report
 
     fitted = load(run, allow_code)
+    _check_run(run)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
+
+
+def _check_run(run: Path, *names: str) -> None:
+    """See that the report of a run, and these files of it, may be written."""
+    from ddco_pyro.data.files import Output, check_outputs
+
+    files = [Output("RUN", run / name, "file") for name in ("report.html", *names)]
+    check_outputs([*files, Output("RUN", run / "figures", "folder")])

@@ -20,7 +20,10 @@ from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.fitting.analysis import paired
 from ddco_pyro.fitting.fit import load
 
-__all__ = ["CompareError", "Comparison", "Row", "compare", "write"]
+__all__ = ["FILES", "CompareError", "Comparison", "Row", "compare", "write"]
+
+FILES = ("compare.png", "compare.json", "compare.md", "compare.html")
+"""What a comparison is written as."""
 
 
 def compare(folders: Sequence[Path], allow_code: bool = False) -> Comparison:

@@ -15,6 +15,7 @@ from ddco_pyro.data.control_dimensions import all_constant
 from ddco_pyro.data.hdf5 import DemonstrationsError, natural, printable
 from ddco_pyro.data.inspection import Field, Inspection, inspect
 from ddco_pyro.data.starting_pictures import seen, sight
+from ddco_pyro.errors import command
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.spec.reading import read_yaml
 
@@ -87,7 +88,7 @@ def starting_spec(inspection: Inspection, path: str | Path) -> str:
     wrong = _unusable(inspection, actions) if actions else "is missing"
     if actions is None or wrong:
         raise DemonstrationsError(
-            f"{inspection.path}: actions {wrong}; repair them first (ddco-pyro inspect {inspection.path})"
+            f"{inspection.path}: actions {wrong}; repair them first ({command('inspect', inspection.path)})"
         )
     if all(dimension.constant for dimension in inspection.control):
         raise DemonstrationsError(f"{inspection.path}: {all_constant(inspection.control)}")
@@ -216,7 +217,7 @@ def _observations(inspection: Inspection) -> Iterator[str]:
     if not vectors and not images:
         raise DemonstrationsError(
             f"{inspection.path}: no observation can be used; see what is wrong with: "
-            f"ddco-pyro inspect {inspection.path}"
+            f"{command('inspect', inspection.path)}"
         )
     yield "observations:                       # standardised; differences: appends x_t - x_(t-1), a velocity"
     for field in vectors:

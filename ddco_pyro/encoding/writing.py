@@ -30,7 +30,7 @@ from ddco_pyro.encoding.kinds import Kind, kind_of
 from ddco_pyro.encoding.pictures import Pictures, batches
 from ddco_pyro.encoding.projection import Projection, principal_components
 from ddco_pyro.encoding.training import UPDATES
-from ddco_pyro.errors import BadInput
+from ddco_pyro.errors import BadInput, command
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.inference.threads import one_thread
 
@@ -103,6 +103,11 @@ class Encoded:
     demonstrations: int
 
 
+def encoder_folder(out: Path) -> Path:
+    """The folder of the encoder that belongs to a file of features."""
+    return out.with_name(f"{out.name}.encoder")
+
+
 def encode(
     path: str | Path, out: str | Path, encoding: Encoding, on_event: OnEvent = ignore, allow_code: bool = False
 ) -> Encoded:
@@ -121,7 +126,7 @@ def encode(
     if out.exists() and not out.is_file():
         raise BadInput(f"{out}: is there already and is no file; choose another --out")
     if (form := format_of(path)) != "robomimic":
-        raise BadInput(f"{path}: is a {form} dataset; first: ddco-pyro import {path} --out demos.hdf5")
+        raise BadInput(f"{path}: is a {form} dataset; first: {command('import', path, '--out', 'demos.hdf5')}")
     with open_robomimic(path) as source, one_thread() if kind.ours else nullcontext():
         job = _Job(source, path, out, encoding, on_event, allow_code)
         return job.already() or job.run()
@@ -145,7 +150,7 @@ class _Job:
         self.kind = kind.made(encoding.encoder, self.pictures, encoding.seed, allow_code)
         self.about = _about(encoding, self.pictures, self.kind)
         self.identity = _identity(path, encoding, self.kind)
-        self.beside, self.folder = out.with_name(f"{out.name}.encoder"), out.with_name(f".{out.name}.encoding")
+        self.beside, self.folder = encoder_folder(out), out.with_name(f".{out.name}.encoding")
 
     def already(self) -> Encoded | None:
         """What an earlier call has written; None where there is nothing.

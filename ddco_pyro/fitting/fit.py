@@ -17,6 +17,7 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor
 from ddco_pyro.data.control_parts import ControlPart
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.files import Damaged
 from ddco_pyro.data.tensors import read_tensors
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy, named_baselines
@@ -198,6 +199,9 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
 
 def _read_model(spec: Spec, path: Path) -> Hierarchy:
     tensors, metadata = read_tensors(path, refit(path.parent))
+    wrong = [name for name, tensor in tensors.items() if not bool(torch.isfinite(tensor).all())]
+    if wrong:
+        raise Damaged(path, f"{wrong[0]} has numbers that are NaN or infinite", refit(path.parent))
     shapes = {key: tuple(shape) for key, shape in json.loads(metadata["shapes"]).items()}
     size = int(metadata["control_size"])
     whole = {"scaling.varying": torch.arange(size), "scaling.constant": torch.empty(0, dtype=torch.float64)}

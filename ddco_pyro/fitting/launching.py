@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
+from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
 
 from torch import distributed
@@ -101,13 +102,18 @@ def _joined(store: distributed.Store | None, ranks: Ranks) -> Iterator[Ranks]:
         distributed.destroy_process_group()
 
 
+ANSWERED_HERE = {signal.SIGINT, signal.SIGTERM}
+"""Signals that the first process answers; it ends the others."""
+
+
 @contextmanager
 def _started(size: int) -> Iterator[Ranks]:
     """Connected with processes that are started, and ended, here."""
     store = distributed.TCPStore(HERE, 0, size, is_master=True, wait_for_workers=False)
     context = multiprocessing.get_context("spawn")
     others = [context.Process(target=_follow, args=(Ranks(rank, size), store.port)) for rank in range(1, size)]
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # they inherit it: Ctrl-C is answered here
+    resource_tracker.ensure_running()  # it would be started with the first of them, and unblock the signals
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ANSWERED_HERE)  # they inherit it
     try:
         for other in others:
             other.start()

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from ddco_pyro.data.files import Damaged
+from ddco_pyro.errors import command
 from ddco_pyro.fitting.agreement_record import Agreement, as_today, each_level_of
 from ddco_pyro.fitting.record_types import NOT_NULL, AtLeastOne, Finite, Record
 from ddco_pyro.spec.messages import invalid, lines
@@ -57,7 +58,7 @@ def read_successes(folder: Path) -> dict[tuple[str, int], float]:
     path = folder / "rollouts.csv"
     if not path.exists():
         return {}
-    rows = read_table(path, _success, f"remove it and roll out again: ddco-pyro rollout {folder}")
+    rows = read_table(path, _success, f"remove it and roll out again: {command('rollout', folder)}")
     return {(method, seed): value for method, seed, value in rows if value is not None}
 
 
@@ -86,7 +87,7 @@ def read_metrics(folder: Path, counts: Sequence[int]) -> dict[str, Any]:
 
 def refit(folder: Path, remove: str = "it") -> str:
     """What to do about a damaged file of a run: what its checkpoint holds need not be trained again."""
-    return f"remove {remove} and fit again: ddco-pyro fit {folder / 'spec.yaml'} --out {folder} --resume"
+    return f"remove {remove} and fit again: {command('fit', folder / 'spec.yaml', '--out', folder, '--resume')}"
 
 
 class PerStep(Record):

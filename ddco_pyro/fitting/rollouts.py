@@ -14,6 +14,7 @@ from typing import Any
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking
 from ddco_pyro.data.files import json_text, write_text
+from ddco_pyro.errors import command
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit, RunError
 from ddco_pyro.fitting.records import Unfinished, read_record
@@ -118,7 +119,7 @@ class _Unfinished:
         self._key = {"models": hashlib.sha256(models).hexdigest(), "seeds": list(seeds)}
         self.outcomes: Outcomes = {}
         if self._path.exists():
-            kept = read_record(self._path, Unfinished, f"remove it and roll out again: ddco-pyro rollout {folder}")
+            kept = read_record(self._path, Unfinished, f"remove it and roll out again: {command('rollout', folder)}")
             if (kept.models, kept.seeds) == (self._key["models"], self._key["seeds"]):
                 self.outcomes = {name: [_numbers(one) for one in each] for name, each in kept.outcomes.items()}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -97,7 +98,7 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
     if hierarchy is None:
         raise BadInput(f"{fit}: is a {fit.name} policy without options; name a run with a hierarchy")
     counts = {level.name: level.count for level in hierarchy.levels}
-    chosen = _names(source, fit)
+    chosen = chosen_names(source, fit)
     labels: dict[str, dict[str, np.ndarray]] = {}
     segmented: list[Segments] = []
     for piece in fit.infer(_demonstrations(source, chosen, fit, labels)):
@@ -113,7 +114,7 @@ def demonstrations(source: Source, names: Iterable[str], fit: Fit) -> Demonstrat
     return Demonstrations(tuple(_demonstration(source.recording(name), fit) for name in names))
 
 
-def _names(source: Source, fit: Fit) -> list[str]:
+def chosen_names(source: Source, fit: Fit) -> list[str]:
     """The demonstrations to segment: those that a spec excludes may hold anything."""
     known = fit.spec.demonstrations
     same = known.path is not None and Path(known.path).resolve() == source.files[0].resolve()
@@ -188,4 +189,9 @@ def _segments(
             for level, *arrays in zip(levels, *piece.path, piece.posterior.u, strict=True)
         }
         value = float(piece.log_likelihood[row])
+        if not math.isfinite(value):
+            raise DemonstrationsError(
+                f"{name}: its log-likelihood is {value}, so no options explain it; see its controls with ddco-pyro "
+                "inspect, and repair it or leave it out"
+            )
         yield Segments(name, each, value / steps, fit.was_held_out(name, value), labels[name])

@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting import Segmented
+
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""How a text begins that a spreadsheet takes for a formula, and may execute."""
+
+
+def cell(value: Any) -> Any:
+    """A value as CSV has it: a text that a spreadsheet would execute begins with an apostrophe."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
 
 
 def columns(segmented: Segmented) -> list[str]:
@@ -29,11 +38,11 @@ def rows(segmented: Segmented) -> Iterator[list[Any]]:
 
 
 def write_csv(path: Path, segmented: Segmented) -> None:
-    """Write the table as CSV, whole or not at all."""
+    """Write the table as CSV, whole or not at all; texts as :func:`cell` has them."""
     with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns(segmented))
-        writer.writerows(rows(segmented))
+        for row in chain([columns(segmented)], rows(segmented)):
+            writer.writerow(map(cell, row))
 
 
 def write_parquet(path: Path, segmented: Segmented) -> None:

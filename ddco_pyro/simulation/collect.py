@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from ddco_pyro.data.demonstrations import DemonstrationsError
+from ddco_pyro.data.hdf5 import opened
 from ddco_pyro.data.resumable import Parts, parts_of
+from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.simulation.episodes import run_episodes, summarize
 from ddco_pyro.simulation.task import Task, find_task
@@ -60,11 +62,14 @@ def collect(
 
     :param observed: the spec's observations: of the task's cameras those among them are recorded.
     :raises DemonstrationsError: the task has no such scripted policy.
+    :raises BadInput: the file is there already and holds other demonstrations.
     """
     task = find_task(task_name)
     if spec.supervisor not in task.policies:
         known = ", ".join(sorted(task.policies))
         raise DemonstrationsError(f"task {task.name!r} has no policy {spec.supervisor!r} to record (it has: {known})")
+    if path is not None and path.exists():
+        _refuse_others(path, task, spec)
     path = path or cache_path(task, task_name, spec, observed)
     if path.exists():
         return path
@@ -80,6 +85,17 @@ def collect(
         attributes = {"task": task.name, "policy": spec.supervisor, "supervisor": json.dumps(_summary(task, parts))}
         parts.finish(attributes, {})
     return path
+
+
+def _refuse_others(path: Path, task: Task, spec: DemonstrationsSpec) -> None:
+    """:raises BadInput: a file holds other demonstrations than these."""
+    names = {f"demo_{seed}" for seed in range(spec.seed, spec.seed + spec.count)}
+    with opened(path) as file:
+        about = (file.attrs.get("task"), file.attrs.get("policy"))
+        if about != (task.name, spec.supervisor) or {*file.get("data", ())} != names:
+            raise BadInput(
+                f"{path}: is there already and does not hold these demonstrations; choose another --out or remove it"
+            )
 
 
 def _slices(seeds: Sequence[int], size: int) -> Iterator[Sequence[int]]:

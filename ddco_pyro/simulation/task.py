@@ -127,17 +127,17 @@ def find_task(name: str) -> Task:
     :raises UnknownTask: names what is registered.
     """
     registered = {point.name: point for point in entry_points(group=TASKS)}
-    if name in registered:
-        task: Any = registered[name].load()
-    elif ":" in name:
-        module, _, attribute = name.partition(":")
-        try:
-            task = getattr(importlib.import_module(module), attribute)
-        except Exception as error:  # whatever the user's code raises
-            raise UnknownTask(f"task {name!r} cannot be loaded: {error}") from error
-    else:
+    if name not in registered and ":" not in name:
         known = ", ".join(sorted(registered)) or "none"
         raise UnknownTask(f"no task is registered as {name!r} (registered: {known}); module:name works too")
+    try:
+        if name in registered:
+            task: Any = registered[name].load()
+        else:
+            module, _, attribute = name.partition(":")
+            task = getattr(importlib.import_module(module), attribute)
+    except Exception as error:  # whatever the task's code raises
+        raise UnknownTask(f"task {name!r} cannot be loaded: {' '.join(str(error).split())}") from error
     if not isinstance(task, Task):
         raise UnknownTask(f"task {name!r} leads to a {type(task).__name__}, not to a ddco_pyro.simulation.task.Task")
     return task

@@ -1,10 +1,11 @@
-"""Commands that are killed at random moments until they come to their end."""
+"""Commands that are killed or terminated at random moments until they come to their end."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -113,13 +114,15 @@ def until_done(
     seconds: float,
     seed: int,
     kept: Kept = lambda folder: None,
+    by: signal.Signals = signal.SIGKILL,
 ) -> Killed:
-    """Run a command again and again, killing it (SIGKILL) at random moments, ``kills`` times at most.
+    """Run a command again and again, killing it at random moments, ``kills`` times at most.
 
-    Half of the time all its processes die, as when a machine loses power; else it alone, and its helpers are orphans.
-    Nothing that is kept is lost or made again.
+    Half of the time all its processes get the signal, as when a machine loses power; else it alone, and its helpers are
+    orphans. Nothing that is kept is lost or made again.
 
     :param seconds: how long it takes undisturbed: moments lie within.
+    :param by: SIGKILL; or SIGTERM, after which it says one line and leaves no process behind.
     """
     choose, killed, safe = random.Random(seed), Counter[bool](), set[object]()
     groups = []
@@ -143,8 +146,11 @@ def until_done(
                     assert killed.total() < kills, "it hangs"
                     alone = choose.random() < 0.5
                     killed[alone] += 1
-                    process.kill() if alone else os.killpg(process.pid, signal.SIGKILL)
-                    process.wait()
+                    process.send_signal(by) if alone else os.killpg(process.pid, by)
+                    process.wait(timeout=HANGS)
+                    err.seek(0)
+                    _answered(process, err.read(), by)
+                    running = by is signal.SIGKILL or process.returncode != 0  # or it had just come to its end
                 now = kept(folder)
                 assert now is None or safe <= now, f"lost or made again: {safe - now}"
                 safe = now or set()
@@ -156,3 +162,23 @@ def until_done(
         for group in groups:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(group, signal.SIGKILL)
+
+
+INTERRUPTED = re.compile(r"(ddco-pyro: )?interrupted(; continue with: .*)?|ddco-pyro: .* was ended from outside .*")
+"""What a command says last that was terminated; where its helpers are first to go, that."""
+
+
+def _answered(process: subprocess.Popen[bytes], err: str, by: signal.Signals) -> None:
+    """See that a terminated command has said so in a line, and left no process behind."""
+    if by is signal.SIGKILL or process.returncode in (0, -by):  # killed, at its end, or not yet begun
+        return
+    assert process.returncode == 1, err
+    assert INTERRUPTED.fullmatch(err.splitlines()[-1]), err
+    assert "Traceback" not in err
+    for _ in range(100):
+        try:
+            os.killpg(process.pid, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    raise AssertionError("a process is left behind")

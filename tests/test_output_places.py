@@ -1,0 +1,308 @@
+"""Outputs are places: what may be written is asked for all outputs of a command before it does anything."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shlex
+import shutil
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import h5py
+import numpy as np
+import pytest
+import toy_task
+from command_line import Ended, call
+from random_demonstrations import demonstrations
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.files import NotWritable, Output, check_outputs
+from ddco_pyro.fitting.prepare import demonstrations as of
+
+
+def digest(folder: Path) -> dict[str, object]:
+    """All that there is in a folder: kinds, times and contents."""
+    found: dict[str, object] = {}
+    for path in sorted(folder.rglob("*")):
+        about = path.lstat()
+        content = hashlib.sha256(path.read_bytes()).hexdigest() if stat.S_ISREG(about.st_mode) else None
+        found[str(path.relative_to(folder))] = (about.st_mode, about.st_mtime_ns, content)
+    return found
+
+
+def refused(ended: Ended, says: str) -> None:
+    """One line, status 2."""
+    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1), ended
+    assert ended.err.startswith("ddco-pyro: ")
+    assert re.search(says, ended.err), ended.err
+
+
+@pytest.fixture(scope="module")
+def inputs(toy_run, tmp_path_factory) -> Path:
+    """What commands read, and odd places beside it."""
+    folder = tmp_path_factory.mktemp("inputs")
+    demonstrations(6).write(folder / "demos.hdf5")
+    shutil.copytree(toy_run.folder, folder / "run")
+    (folder / "toy.yaml").write_text(toy_task.SPEC.replace("task: toy", "task: toy\nseed: 1"))
+    (folder / "folder").mkdir()
+    (folder / "file").write_text("x")
+    os.mkfifo(folder / "pipe")
+    for name in ("demos.hdf5", "toy.yaml"):
+        (folder / f"link-{name}").symlink_to(folder / name)
+        (folder / f"hard-{name}").hardlink_to(folder / name)
+    (folder / "link-run").symlink_to(folder / "run")
+    (folder / "loop").symlink_to(folder / "loop")
+    return folder
+
+
+class Command(NamedTuple):
+    """A command that writes: its arguments before the place, the input that a place must not be, and the kind of what
+    it writes.
+    """
+
+    arguments: str
+    read: str
+    folder: bool = False
+
+
+COMMANDS = {
+    "segment --csv": Command("segment run demos.hdf5 --csv", "demos.hdf5"),
+    "segment --parquet": Command("segment run demos.hdf5 --parquet", "demos.hdf5"),
+    "segment --html": Command("segment run demos.hdf5 --html", "demos.hdf5"),
+    "segment --out": Command("segment run demos.hdf5 --overwrite --out", "demos.hdf5"),
+    "segment --lerobot": Command("segment run demos.hdf5 --lerobot", "run", folder=True),
+    "export": Command("export run --out", "run", folder=True),
+    "merge": Command("merge run --out", "run", folder=True),
+    "compare": Command("compare run run/baselines/flat --out", "run", folder=True),
+    "fit": Command("fit toy.yaml --out", "toy.yaml", folder=True),
+    "select": Command("select toy.yaml --set selection.grid.seed=[1,2] --out", "toy.yaml", folder=True),
+    "collect": Command("collect toy.yaml --out", "toy.yaml"),
+    "init": Command("init demos.hdf5 --force --out", "demos.hdf5"),
+    "import": Command("import demos.hdf5 --out", "demos.hdf5"),
+    "encode": Command("encode demos.hdf5 --observation camera --out", "demos.hdf5"),
+}
+
+READ = "is what this command reads"
+LONG = "x" * 300
+NOWHERE = {
+    "": "the name is empty; name a place",
+    "a\0b": "is no name for a file",
+    "a\nb": "is no name for a file",
+    LONG: "File name too long",
+    f"new/{LONG}": "File name too long",
+    "file/below": "Not a directory",
+    "loop": "Too many levels of symbolic links",
+    "/proc/new": "cannot be written",
+}
+NO_FILE = {
+    "folder": "is a folder; name a file",
+    "folder/": "names a folder; name a file",
+    "pipe": "is no regular file",
+    ".": "names a folder; name a file",
+    "x" * 240: "File name too long",  # that of the temporary file is
+}
+NO_FOLDER = {"file": "is a file; name a folder", "pipe": "is a file; name a folder"}
+
+
+def places(command: Command) -> dict[str, str]:
+    """Bad places for its output, and what is said of each."""
+    if command.read == "run":
+        return NOWHERE | NO_FOLDER | dict.fromkeys(["run/new", "link-run/new"], "lies in run, which this command reads")
+    read = dict.fromkeys((command.read, f"link-{command.read}", f"hard-{command.read}"), READ)
+    return NOWHERE | (NO_FOLDER if command.folder else NO_FILE | read)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_bad_place_is_refused_before_anything_is_done(inputs: Path, monkeypatch, name: str) -> None:
+    monkeypatch.chdir(inputs)
+    before = digest(inputs)
+    for place, says in places(COMMANDS[name]).items():
+        if name == "compare":  # its files are named, in a folder
+            says = says.replace("is a file; name a folder", "Not a directory")
+        refused(call(*COMMANDS[name].arguments.split(), place), says)
+    assert digest(inputs) == before
+
+
+@pytest.mark.parametrize("name", ["segment --csv", "segment --html", "segment --parquet", "segment --out"])
+def test_a_file_of_the_run_is_no_output(inputs: Path, monkeypatch, name: str) -> None:
+    monkeypatch.chdir(inputs)
+    before = digest(inputs)
+    for place in ("run/metrics.json", "run/model.safetensors", "run/new", "link-run/spec.yaml"):
+        refused(call(*COMMANDS[name].arguments.split(), place), "lies in run, which this command reads")
+    assert digest(inputs) == before
+
+
+@pytest.mark.parametrize("second", ["a", "./a", "link"])
+def test_two_outputs_of_one_name_are_refused(inputs: Path, tmp_path: Path, monkeypatch, second: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("link").symlink_to("a")
+    ended = call("segment", inputs / "run", inputs / "demos.hdf5", "--csv", "a", "--html", second)
+    refused(ended, f"--html {Path(second)}: is also where --csv is written; choose another place")
+    ended = call("segment", inputs / "run", inputs / "demos.hdf5", "--csv", "new/a", "--lerobot", "new")
+    refused(ended, "--lerobot new: and --csv new/a lie in one another")
+    assert [path.name for path in tmp_path.iterdir()] == ["link"]
+
+
+def test_an_output_does_not_lie_in_a_data_set(inputs: Path, monkeypatch) -> None:
+    """Whose folder is what is read."""
+    monkeypatch.chdir(inputs)
+    before = digest(inputs)
+    for more in (["--out", "folder/new.hdf5"], ["--out", "folder/new.yaml"]):
+        command = "import" if more[1].endswith("hdf5") else "init"
+        refused(call(command, "folder", *more), "lies in folder, which this command reads")
+    assert digest(inputs) == before
+
+
+def test_a_place_that_is_read_only(tmp_path: Path, monkeypatch) -> None:
+    """These tests may be run by root, to whom all is permitted: what the system says is made up."""
+
+    def read_only(**_: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", read_only)
+    for kind in ("file", "stream", "folder"):
+        with pytest.raises(NotWritable, match="new: cannot be written: Read-only file system; choose another place or"):
+            check_outputs([Output("--out", tmp_path / "new", kind)])
+
+
+# --- what is there already --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def file(toy_spec, tmp_path: Path) -> Path:
+    path = tmp_path / "demos.hdf5"
+    of(toy_spec).write(path)
+    return path
+
+
+def test_devices_stay_and_a_link_is_kept(toy_run, file: Path, tmp_path: Path) -> None:
+    (tmp_path / "link.csv").symlink_to(tmp_path / "there.csv")
+    ended = call("segment", toy_run.folder, file, "--csv", "/dev/null", "--html", tmp_path / "link.csv")
+    assert (ended.status, ended.out) == (0, f"/dev/null\n{tmp_path / 'link.csv'}\n")
+    assert Path("/dev/null").is_char_device()
+    assert (tmp_path / "link.csv").is_symlink()
+    assert (tmp_path / "there.csv").read_text().startswith("<!doctype html>")
+
+
+def segment(run: Path, file: Path, out: Path, *more: str) -> Ended:
+    return call("segment", run, file, "--out", out, *more)
+
+
+def test_another_file_is_replaced_only_where_that_is_said(toy_run, file: Path, tmp_path: Path) -> None:
+    """A file of somebody else, and a labelled copy of other demonstrations."""
+    other, copy = tmp_path / "other.hdf5", tmp_path / "copy.hdf5"
+    Demonstrations(Demonstrations.read(file, labels=["phase"]).demonstrations[:9]).write(other)
+    assert segment(toy_run.folder, other, copy).status == 0
+    for there in (other, copy):
+        before = there.read_bytes()
+        says = f"--out {there}: is there already and is not a labelled copy of {file}; choose another --out, or replace"
+        refused(segment(toy_run.folder, file, there), says)
+        assert there.read_bytes() == before
+        ended = segment(toy_run.folder, file, there, "--overwrite")
+        assert ended.status == 0, ended.err
+        assert len(Demonstrations.read(there, labels=["option"])) == 12
+
+
+def test_a_copy_is_renewed_where_its_file_has_changed(toy_run, file: Path, tmp_path: Path) -> None:
+    """Even where no label is another, and the copy is larger than the file."""
+    copy = tmp_path / "copy.hdf5"
+    assert segment(toy_run.folder, file, copy).status == 0
+    before = copy.stat().st_ino, copy.stat().st_mtime_ns
+    assert segment(toy_run.folder, file, copy).status == 0
+    assert (copy.stat().st_ino, copy.stat().st_mtime_ns) == before  # nothing has changed
+    with h5py.File(file, "r+") as opened:
+        opened["data/demo_0"].attrs["note"] = "seen"
+    assert segment(toy_run.folder, file, copy).status == 0
+    with h5py.File(copy) as opened:
+        assert opened["data/demo_0"].attrs["note"] == "seen"
+
+
+def test_a_page_or_table_does_not_replace_demonstrations(toy_run, file: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.hdf5"
+    shutil.copy(file, other)
+    for option in ("--html", "--csv", "--parquet"):
+        refused(call("segment", toy_run.folder, file, option, other), f"{option} {other}: is an HDF5 file")
+    refused(call("init", file, "--force", "--out", other), "is an HDF5 file, which this would replace")
+    assert other.read_bytes() == file.read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["other demonstrations", "another number of them", "no HDF5"])
+def test_collect_takes_only_its_own_file_for_done(tmp_path: Path, cache, kind: str) -> None:
+    spec, out = tmp_path / "toy.yaml", tmp_path / "demos.hdf5"
+    spec.write_text(toy_task.SPEC)
+    collect: Callable[..., Ended] = lambda *more: call("collect", spec, "--out", out, *more)  # noqa: E731
+    if kind == "another number of them":
+        assert collect("--set", "demonstrations.count=3").status == 0
+        assert collect("--set", "demonstrations.count=3").status == 0
+    elif kind == "other demonstrations":
+        demonstrations(12).write(out)
+    else:
+        out.write_text("notes")
+    before = out.read_bytes()
+    says = "cannot be read as HDF5" if kind == "no HDF5" else "is there already and does not hold these demonstrations"
+    refused(collect(), says)
+    assert out.read_bytes() == before
+
+
+# --- what is written --------------------------------------------------------------------------------------------------
+
+
+def test_a_name_that_is_a_formula_is_quoted_in_csv(toy_run, file: Path, tmp_path: Path) -> None:
+    names = ["=cmd|' /C calc'!A0", "+1", "-2", "@SUM(A1)", "plain"]
+    with h5py.File(file, "r+") as opened:
+        for old, new in zip([*opened["data"]], names, strict=False):
+            opened.move(f"data/{old}", f"data/{new.replace('/', '%')}")
+    table = tmp_path / "a.csv"
+    assert call("segment", toy_run.folder, file, "--csv", table).status == 0
+    first = {line.split(",")[0] for line in table.read_text().splitlines()}
+    assert {"'+1", "'-2", "'@SUM(A1)", "plain", "'=cmd|' %C calc'!A0"} <= first
+    assert not [cell for cell in first if cell.startswith(("=", "+", "-", "@"))]
+
+
+def test_demonstrations_that_no_option_explains_are_refused(toy_run, file: Path, tmp_path: Path, monkeypatch) -> None:
+    from ddco_pyro.fitting.inferred import Inferred
+
+    monkeypatch.setattr(Inferred, "log_likelihood", np.full(12, -np.inf))
+    ended = call("segment", toy_run.folder, file, "--csv", tmp_path / "a.csv")
+    assert ended.status == 2
+    assert ended.err.splitlines()[-1] == (
+        f"ddco-pyro: {file}: demo_0: its log-likelihood is -inf, so no options explain it; see its controls with "
+        "ddco-pyro inspect, and repair it or leave it out"
+    )
+    assert not (tmp_path / "a.csv").exists()
+
+
+# --- what is said and what is asked for -------------------------------------------------------------------------------
+
+
+def test_a_rollout_asks_for_what_its_report_needs_first(toy_run, tmp_path: Path, monkeypatch) -> None:
+    """Demonstrations that were moved are named before any episode is played; so is a report that cannot be written."""
+    run, gone = shutil.copytree(toy_run.folder, tmp_path / "run"), tmp_path / "gone.hdf5"
+    played: list[object] = []
+    monkeypatch.setattr("ddco_pyro.fitting.rollouts.run_episodes", lambda *how: played.append(how))
+    spec = (run / "spec.yaml").read_text()
+    (run / "report.html").unlink()
+    (run / "report.html").mkdir()
+    refused(call("rollout", run, "--episodes", 2), f"RUN {run}/report.html: is a folder; name a file")
+    (run / "report.html").rmdir()
+    (run / "spec.yaml").write_text(spec.replace("task: toy\n", "", 1).replace("path: null", f"path: {gone}"))
+    refused(call("rollout", run, "--episodes", 2), f"{gone}: there is no such file; check the path")
+    assert not played
+
+
+def test_commands_are_printed_as_a_shell_takes_them(tmp_path: Path, monkeypatch) -> None:
+    """Each is called again as it was printed, from a folder with an odd name."""
+    folder = tmp_path / "it's $(odd)"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    demonstrations(6).write(folder / "a b.hdf5")
+    said = call("inspect", "a b.hdf5").out.splitlines()[-1].partition("next: ")[2]
+    assert shlex.split(said) == ["ddco-pyro", "init", "a b.hdf5", "--out", "a b.yaml"]
+    said = call(*shlex.split(said)[1:]).out.partition("fit it with: ")[2]
+    assert shlex.split(said) == ["ddco-pyro", "fit", "a b.yaml", "--out", "runs/a b"]
+    assert "# Fit it:              ddco-pyro fit 'a b.yaml' --out runs/first\n" in Path("a b.yaml").read_text()
+    assert call("check", "a b.yaml").status == 0
