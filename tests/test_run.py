@@ -22,7 +22,7 @@ from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan, Trai
 from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.fitting.fit import RunError
 from ddco_pyro.fitting.prepare import demonstrations
-from ddco_pyro.fitting.run import claim, fit, train
+from ddco_pyro.fitting.run import claim, claimed, fit, train
 from ddco_pyro.spec import dump_spec, load_spec, with_overrides
 
 
@@ -56,7 +56,14 @@ class Interrupting:
 
 # --- contents ---------------------------------------------------------------------------------------------------------
 
-FILES = {"spec.yaml", "model.safetensors", "metrics.json", "history.csv", "checkpoints/restart-0.safetensors"}
+FILES = {
+    "spec.yaml",
+    "demonstrations.json",
+    "model.safetensors",
+    "metrics.json",
+    "history.csv",
+    "checkpoints/restart-0.safetensors",
+}
 
 
 def test_the_folder_holds_what_it_promises(toy_run):
@@ -304,8 +311,8 @@ def test_claiming_a_folder(tmp_path, toy_spec):
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match=r": is not empty and not a run; choose another --out$"):
         claim(tmp_path, toy_spec)
-    with pytest.raises(RunError, match=r"file: is a file; choose another --out$"):
-        claim(tmp_path / "file", toy_spec)
+    with pytest.raises(RunError, match=r"file: is a file; choose another --out$"), claimed(tmp_path / "file", toy_spec):
+        pass
 
 
 @pytest.mark.parametrize(

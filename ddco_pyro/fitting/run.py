@@ -27,11 +27,12 @@ from ddco_pyro.fitting.building import Dimensions, baseline_spec, check_networks
 from ddco_pyro.fitting.checkpoint import copy_of
 from ddco_pyro.fitting.devices import repeatable
 from ddco_pyro.fitting.fit import Fit, RunError, is_finished, load, model_name
+from ddco_pyro.fitting.fitted_to import record, recorded
 from ddco_pyro.fitting.launching import check_processes, together
 from ddco_pyro.fitting.metrics import evaluate, supervisor
 from ddco_pyro.fitting.objective import TrainingError
 from ddco_pyro.fitting.prepare import demonstrations as read_demonstrations
-from ddco_pyro.fitting.prepare import digest, dimensions, known_demonstrations, parts, seen
+from ddco_pyro.fitting.prepare import dimensions, known_demonstrations, parts, seen
 from ddco_pyro.fitting.processes import check_jobs
 from ddco_pyro.fitting.ranks import ALONE, Ranks
 from ddco_pyro.fitting.restarts import Trainer
@@ -81,6 +82,7 @@ def fit(
     :raises SpecError: something in the spec does not fit the demonstrations.
     :raises DemonstrationsError: they cannot be used.
     :raises RunError: the folder holds something else.
+    :raises OtherDemonstrations: the folder is a run of other demonstrations.
     :raises TrainingError: training stopped; nothing that was written before is lost.
     """
     spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else Path(out)
@@ -130,27 +132,23 @@ def fit_run(
         demos = demos or read_demonstrations(spec, on_event)
         with together(processes) as ranks:
             return _fit(spec, demos, None, on_event, jobs, ranks, clock)
-    claim(folder, spec, resume)
-    with only_one(folder):
-        if keep is not None:
-            _keep(keep, Path(str(spec.demonstrations.path)))
-        if is_finished(folder):
+    with claimed(folder, spec, resume):
+        finished = is_finished(folder)
+        with clock("demonstrations"):
+            if demos is None and not finished:
+                demos = read_demonstrations(spec, on_event)
+            if demos is not None:
+                record(folder, demos)
+        if keep is not None and not (kept := Path(str(spec.demonstrations.path))).exists():
+            keep.write(kept)
+        if finished:
             return replace(load(folder, allow_code=True), given=demos)  # it is this very spec, which the caller has
+        assert demos is not None
         for part in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
             for old in leftovers(part):
                 old.unlink()
-        with clock("demonstrations"):
-            demos = demos or read_demonstrations(spec, on_event)
         with together(processes) as ranks:
             return _fit(spec, demos, folder, on_event, jobs, ranks, clock)
-
-
-def _keep(demos: Demonstrations, path: Path) -> None:
-    """:raises RunError: other demonstrations are kept there."""
-    if not path.exists():
-        demos.write(path)
-    elif digest(Demonstrations.read(path)) != digest(demos):
-        raise RunError(f"{path.parent}: holds a run of other demonstrations; choose another folder or remove it")
 
 
 def _fit(
@@ -202,8 +200,9 @@ def _baseline(
 ) -> Fit:
     """A baseline trained beside, in a folder of its own where the run has one; nothing where it was done before."""
     folder = run / "baselines" / name if run else None
-    if folder:
+    if run and folder:
         claim(folder, spec)
+        record(folder, demos, recorded(run))
         if is_finished(folder):
             return load(folder, allow_code=True)
     return _fit(spec, demos, folder, on_event, jobs, ranks, _Clock(), name)
@@ -212,6 +211,21 @@ def _baseline(
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
     """Write ``metrics.json``."""
     write_text(folder / "metrics.json", json.dumps(metrics, indent=1) + "\n")
+
+
+@contextmanager
+def claimed(folder: Path, spec: Spec, resume: bool = True) -> Iterator[None]:
+    """The folder is this spec's run, and no other process works on it, while the block lasts.
+
+    :param resume: as of :func:`claim`.
+    :raises RunError: it is a file, or as :func:`claim`.
+    :raises Busy: another process is at work on it.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise RunError(f"{folder}: is a file; choose another --out")
+    with only_one(folder):
+        claim(folder, spec, resume)
+        yield
 
 
 def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
@@ -223,8 +237,6 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     :raises RunError: it holds something else, or all of it and may not.
     """
     text, path = dump_spec(spec), folder / "spec.yaml"
-    if folder.exists() and not folder.is_dir():
-        raise RunError(f"{folder}: is a file; choose another --out")
     if path.exists():
         if path.read_bytes() != text.encode():
             raise RunError(f"{folder}: holds a run of another spec; choose another --out or remove it")
