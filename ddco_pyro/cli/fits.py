@@ -76,24 +76,29 @@ def fit(
 
     An unfinished run of this very spec in --out is continued, with any number of processes.
     """
-    loaded = load_spec(spec, overrides, allow_code)
+    from ddco_pyro.fitting.launching import follow_torchrun, launched, leading, requested
+
+    ranks = launched()
+    if ranks and ranks.rank > 0:
+        follow_torchrun(ranks)
+        return
+    with leading(ranks):
+        _fit(load_spec(spec, overrides, allow_code), spec.stem, out, jobs, requested(processes, ranks), resume)
+
+
+def _fit(loaded: Spec, name: str, out: Path | None, jobs: int | None, processes: int, resume: bool) -> None:
     from ddco_pyro.cli import console
-    from ddco_pyro.fitting.launching import follow_torchrun, requested
     from ddco_pyro.fitting.run import fit_run
     from ddco_pyro.report import write_report
 
-    ranks = requested(processes)
-    if ranks.rank > 0:
-        follow_torchrun(ranks)
-        return
     if jobs is None:
-        jobs = -1 if ranks.size == 1 else 1
-    folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
+        jobs = -1 if processes == 1 else 1
+    folder = out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
     with (
         _continued(f"fit {folder / 'spec.yaml'} --out {folder} --resume{_allowed(loaded)}", folder),
         console.Progress() as progress,
     ):
-        fitted = fit_run(loaded, None, folder, progress, jobs, resume, processes=ranks.size)
+        fitted = fit_run(loaded, None, folder, progress, jobs, resume, processes=processes)
     console.log_likelihoods(fitted.metrics)
     _warn(fitted)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
