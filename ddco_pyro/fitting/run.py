@@ -6,6 +6,7 @@ import csv
 import importlib.metadata
 import io
 import json
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ from ddco_pyro.data.files import leftovers, only_one, write_text
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
 from ddco_pyro.data.tensors import write_tensors
-from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, ignore
+from ddco_pyro.events import Event, OnEvent, TrainingBegan, TrainingEnded, ignore
 from ddco_pyro.fitting import labels
 from ddco_pyro.fitting.building import Dimensions, baseline_spec, check_networks, named_baselines, parameters
 from ddco_pyro.fitting.checkpoint import copy_of
@@ -35,7 +36,9 @@ from ddco_pyro.fitting.prepare import demonstrations as read_demonstrations
 from ddco_pyro.fitting.prepare import dimensions, known_demonstrations, parts, seen
 from ddco_pyro.fitting.processes import check_jobs
 from ddco_pyro.fitting.ranks import ALONE, Ranks
+from ddco_pyro.fitting.records import read_record
 from ddco_pyro.fitting.restarts import Trainer
+from ddco_pyro.fitting.training import SAVE_EVERY
 from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.encoding import refuse_unusable
@@ -162,6 +165,8 @@ def _fit(
     name: str | None = None,
 ) -> Fit:
     """:param name: what the model is called in events."""
+    if folder:
+        on_event = clock.go_on(folder, on_event)
     split = parts(spec, demos)
     dimensions = Dimensions.of(demos)
     with clock("training"):
@@ -187,7 +192,7 @@ def _fit(
         "parameters": parameters(trained.hierarchy),
         "training": trained.training,
         **labels.trained_labels(fitted, demos),
-        "seconds": clock.seconds,
+        "seconds": clock.end(),
         "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
     }
     if folder:
@@ -342,13 +347,56 @@ def _write_history(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 
 class _Clock:
-    """Seconds by phase."""
+    """Seconds by phase, of this process and of those that worked on the run before it was interrupted."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
+        self._phase, self._since = "", 0.0
+        self._path: Path | None = None
+        self._kept_at = -math.inf
 
     @contextmanager
     def __call__(self, phase: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[phase] = self.seconds.get(phase, 0.0) + time.perf_counter() - start
+        self._phase, self._since = phase, time.perf_counter()
+        try:
+            yield
+        finally:
+            self._add()
+            self._keep()
+
+    def go_on(self, folder: Path, on_event: OnEvent) -> OnEvent:
+        """Go on from what is kept in a run folder, and keep it there whenever something is told.
+
+        :returns: to be told in place of ``on_event``, which is told in turn.
+        :raises Damaged: what is kept cannot be read.
+        """
+        self._path = folder / "seconds.json"
+        if self._path.exists():
+            kept = read_record(self._path, dict[str, float], "remove it and do the same again")
+            self.seconds = {
+                phase: kept.get(phase, 0) + self.seconds.get(phase, 0) for phase in {**kept, **self.seconds}
+            }
+
+        def told(event: Event) -> None:
+            self._add()
+            if self._since - self._kept_at > SAVE_EVERY:
+                self._keep()
+            on_event(event)
+
+        return told
+
+    def end(self) -> dict[str, float]:
+        """All of them, which the folder has elsewhere from now on."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+        return self.seconds
+
+    def _add(self) -> None:
+        now = time.perf_counter()
+        self.seconds[self._phase] = self.seconds.get(self._phase, 0.0) + now - self._since
+        self._since = now
+
+    def _keep(self) -> None:
+        if self._path is not None:
+            self._kept_at = self._since
+            write_text(self._path, json.dumps(self.seconds))
