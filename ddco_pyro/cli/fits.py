@@ -131,7 +131,7 @@ def select(
     from ddco_pyro import selection
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.prepare import seen
-    from ddco_pyro.fitting.run import claim, fit_run
+    from ddco_pyro.fitting.run import fit_run
     from ddco_pyro.report import write_report
     from ddco_pyro.selection.table import HEAD, cells
 
@@ -139,11 +139,10 @@ def select(
     demos = selection.known_demonstrations(loaded)
     selection.check(loaded, workers, demos)  # before anything is collected, trained or written
     folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"
-    claim(folder, loaded, resume)
     early = " --stop-early" * stop_early
     again = f"select {folder / 'spec.yaml'} --out {folder} --resume{early}{_allowed(loaded)}"
     with _continued(again, folder), console.Progress() as progress:
-        made = selection.select(loaded, folder, progress, workers, stop_early, demos)
+        made = selection.select(loaded, folder, progress, workers, stop_early, demos, resume)
         progress.end()
         assert made.choice.chosen is not None  # or it would have failed
         final = selection.final_spec(made.choice.chosen.candidate)

@@ -80,6 +80,7 @@ def select(
     workers: Workers = HERE,
     stop_early: bool = False,
     demos: Demonstrations | None = None,
+    resume: bool = True,
 ) -> Selection:
     """Score every candidate of the spec's grid in every fold, choose, and write table and figure into the folder.
 
@@ -87,12 +88,13 @@ def select(
     demonstrations and ``stop_early``; neither on the workers nor on interruptions.
 
     :param demos: :func:`known_demonstrations`, where they have been read.
+    :param resume: as of :func:`ddco_pyro.fitting.run.claim`.
     :raises SelectionFailed: every candidate has failed in some fold.
     :raises RunError: the folder holds something else.
     :raises OtherDemonstrations: it is a selection by other demonstrations.
     :raises Busy: another process is at work on the folder.
     """
-    with claimed(folder, spec):
+    with claimed(folder, spec, resume):
         demos = demos or prepare.demonstrations(grid.wide(spec), on_event)
         record(folder, demos)
         return _select(spec, folder, demos, on_event, workers, stop_early)
