@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import math
 from dataclasses import replace
@@ -90,6 +91,25 @@ def test_changed_sources_have_another_file(tmp_path):
     assert cache_path(task, TASK, SPEC) != one
     source.write_text("gain = 1")
     assert cache_path(task, TASK, SPEC) == one
+
+
+@pytest.mark.parametrize("package", ["mujoco", "dm-control", "toy-task"])
+def test_another_version_of_a_simulator_or_of_the_tasks_package_has_another_file(monkeypatch, package):
+    """The toy task is registered by the package ``toy-task``; one that is named by its module has no package."""
+    registered, named = cache_path(toy_task.task, "toy", SPEC), cache_path(toy_task.task, TASK, SPEC)
+    version = importlib.metadata.version
+    other = lambda name: version(name) + ".other" * (name == package)  # noqa: E731
+    monkeypatch.setattr(importlib.metadata, "version", other)
+    assert cache_path(toy_task.task, "toy", SPEC) != registered
+    assert (cache_path(toy_task.task, TASK, SPEC) == named) == (package == "toy-task")
+
+
+def test_a_simulator_that_is_not_installed_is_no_obstacle(monkeypatch):
+    def missing(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", missing)
+    assert cache_path(toy_task.task, TASK, SPEC).suffix == ".hdf5"
 
 
 def test_a_file_of_ones_own_is_written_and_then_kept(tmp_path):

@@ -268,6 +268,23 @@ def test_what_is_trained_elsewhere_is_finished_anywhere(demos: Demonstrations, t
     assert here.metrics["training"]["device"] == THERE.type
 
 
+def test_restarts_that_were_stopped_elsewhere_keep_nothing_from_being_finished(demos, tmp_path, monkeypatch) -> None:
+    """Nothing is left to train; what `halving` stopped is not, wherever that is."""
+    spec = spec_of(DROPPING, initialize="random", restarts=3, halving=1)
+    on(monkeypatch, THERE)
+    with Device():
+        there = ddco_pyro.fit(spec, demos, tmp_path)
+    assert sum(one["stopped"] is not None for one in there.metrics["training"]["restarts"]["each"]) == 2
+    (tmp_path / "metrics.json").unlink()
+    kept = {path.name: path.read_bytes() for path in (tmp_path / "checkpoints").iterdir()}
+    on(monkeypatch, torch.device("cpu"))
+    here = ddco_pyro.fit(spec, demos, tmp_path)
+    for name, values in weights(there).items():
+        np.testing.assert_array_equal(weights(here)[name], values)
+    assert here.metrics["training"] == there.metrics["training"]
+    assert {path.name: path.read_bytes() for path in (tmp_path / "checkpoints").iterdir()} == kept
+
+
 def test_a_fit_leaves_generators_as_they_were(demos: Demonstrations, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of GPUs too, which torch's own seeding reaches."""
     seeded: list[int] = []

@@ -26,6 +26,7 @@ from random_demonstrations import demonstrations
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.tensors import read_tensors
+from ddco_pyro.fitting import fitted_to
 
 
 def same_hdf5(one: Path, other: Path) -> None:
@@ -46,15 +47,18 @@ def _values(node: h5py.HLObject) -> object:
 
 
 def same_run(one: Path, other: Path) -> None:
-    """Equal weights, history and numbers, bit for bit.
+    """Equal weights, history and numbers, bit for bit, and equal demonstrations.
 
-    Seconds differ, and figures are drawn from the rest.
+    Seconds and places differ, and figures are drawn from the rest.
     """
     files = {path.relative_to(one) for path in one.rglob("*") if path.is_file()}
     assert files == {path.relative_to(other) for path in other.rglob("*") if path.is_file()}
     for path in files:
         if path.suffix in (".safetensors", ".csv", ".yaml"):
             assert (one / path).read_bytes() == (other / path).read_bytes(), path
+        if path.name == fitted_to.NAME:
+            each = [fitted_to.recorded((folder / path).parent) for folder in (one, other)]
+            assert fitted_to.difference(*each) == "", path
     metrics = [json.loads((folder / "metrics.json").read_text()) for folder in (one, other)]
     aside = {"seconds": ...}
     assert metrics[0] | aside == metrics[1] | aside
@@ -75,7 +79,7 @@ def rolled(folder: Path) -> set[object] | None:
 
 def same_selection(one: Path, other: Path) -> None:
     """Equal folds, scores, choice, and fit of what was chosen."""
-    for name in ("spec.yaml", "folds.json", "selection.json", "selection.md"):
+    for name in ("spec.yaml", "demonstrations.json", "folds.json", "selection.json", "selection.md"):
         assert (one / name).read_bytes() == (other / name).read_bytes(), name
     scores = [selecting.kept(folder) for folder in (one, other)]
     for found in [*scores[0].values(), *scores[1].values()]:

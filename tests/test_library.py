@@ -88,7 +88,7 @@ def test_demonstrations_from_memory_are_kept_with_the_run(commanded: Path, tmp_p
     before = (folder / "metrics.json").read_bytes()
     assert ddco_pyro.fit(spec, two_skills(), out=folder).metrics == fit.metrics
     assert (folder / "metrics.json").read_bytes() == before
-    with pytest.raises(RunError, match=r"run: holds a run of other demonstrations; choose another folder or remove it"):
+    with pytest.raises(BadInput, match=r"run: is a run of other demonstrations \(actions and obs/place changed\)"):
         ddco_pyro.fit(spec, two_skills(seed=1), out=folder)
 
 

@@ -166,6 +166,7 @@ def test_a_second_process_on_a_run_is_refused(tmp_path: Path) -> None:
     assert (ended.status, ended.err) == (
         2, f"ddco-pyro: {folder}: another process is at work on it; wait for it, or choose another place\n",
     )  # fmt: skip
+    assert not any(folder.iterdir())  # the other may be about to write its own spec
 
 
 def test_a_second_process_on_a_selection_is_refused(tmp_path: Path) -> None:
@@ -176,6 +177,7 @@ def test_a_second_process_on_a_selection_is_refused(tmp_path: Path) -> None:
     assert (ended.status, ended.err) == (
         2, f"ddco-pyro: {folder}: another process is at work on it; wait for it, or choose another place\n",
     )  # fmt: skip
+    assert not any(folder.iterdir())  # the other may be about to write its own spec
 
 
 def test_what_the_dead_have_left_is_removed(tmp_path: Path) -> None:

@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
+import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 import torch
-from command_line import call
+from command_line import Ended, call
 from killing import struck
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import BadInput
+from ddco_pyro.fitting import restarts as restarting
 from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.fitting.checkpoint import Progress
-from ddco_pyro.fitting.launching import check_processes, requested, together
+from ddco_pyro.fitting.launching import check_processes, launched, requested, together
 from ddco_pyro.fitting.objective import Objective, TrainingError
+from ddco_pyro.fitting.ranks import Ranks
 from ddco_pyro.fitting.restarts import Trainer
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.fitting.shards import ascend, cut
@@ -33,7 +41,7 @@ DROPPING = {"network": "mlp", "hidden": [6], "dropout": 0.3}
 TRAINING = {"shards": 4, "batch_size": 5, "epochs": 16, "restarts": 2, "halving": 2, "optimizer": {"lr": 0.03}}
 """Minibatches of 5 and of 3 demonstrations: a shard has two or one, or is empty."""
 
-TORCHRUN = Path(sys.executable).with_name("torchrun")
+TORCHRUN = (sys.executable, "-m", "torch.distributed.run")
 
 
 def make_spec(path="unused.hdf5", **training):
@@ -223,20 +231,113 @@ def assert_ends(pid):
     pytest.fail("the other process goes on alone")
 
 
+def under_torchrun(folder, *arguments, other=lambda: None):
+    """What two processes, as torchrun starts them, end with: the first is this one, the other a copy of it.
+
+    :param other: is called in the other before it begins.
+    """
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    given = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    told = folder / "other.json"
+    child = os.fork()
+    if child == 0:
+        try:
+            os.environ |= given | {"RANK": "1"}
+            other()
+            told.write_text(json.dumps(call(*arguments)))
+        finally:
+            os._exit(0)
+    with mock.patch.dict(os.environ, given | {"RANK": "0"}):
+        first = call(*arguments)
+    for _ in range(int(WAIT / 0.05)):
+        if os.waitpid(child, os.WNOHANG)[0]:
+            return first, Ended(*json.loads(told.read_text()))
+        time.sleep(0.05)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    pytest.fail(f"the other process still waits after the first has ended: {first}")
+
+
+WAIT = 30.0
+"""Seconds after the first process within which the other has to end; it takes a tenth of one on an idle machine."""
+
+
+def test_a_finished_run_keeps_no_process_of_torchrun_waiting(whole, tmp_path):
+    spec, run = whole
+    folder = shutil.copytree(run, tmp_path / "run")
+    first, other = under_torchrun(tmp_path, "fit", spec, "--out", folder, "--resume")
+    assert (first.status, first.out.count("report: ")) == (0, 1)
+    assert other == (0, "", "")
+
+
+@pytest.mark.parametrize("what", ["another number", "bad spec", "busy folder", "damaged checkpoint"])
+def test_what_is_refused_under_torchrun_is_one_line_of_one_process(whole, tmp_path, what):
+    spec, run = whole
+    folder, more = shutil.copytree(run, tmp_path / "run"), []
+    with contextlib.ExitStack() as stack:
+        if what == "another number":
+            more, line = ["--processes", "3"], "--processes 3: torchrun started 2; leave it out"
+        elif what == "bad spec":
+            more, line = ["--set", "training.epochs=-1"], f"{spec}: training.epochs: must be at least 1"
+        elif what == "busy folder":
+            stack.enter_context(only_one(folder))
+            line = f"{folder}: another process is at work on it"
+        else:
+            (folder / "model.safetensors").unlink()
+            (folder / "checkpoints" / "restart-0.safetensors").write_text("damaged")
+            line = f"{folder / 'checkpoints' / 'restart-0.safetensors'}: is damaged: "
+        first, other = under_torchrun(tmp_path, "fit", spec, "--out", folder, "--resume", *more)
+    assert (first.status, first.err.count("\n")) == (2, 1)
+    assert first.err.startswith(f"ddco-pyro: {line}")
+    assert other == (0, "", "")
+
+
+def test_what_went_wrong_in_another_process_is_said_by_the_first(whole, tmp_path):
+    """It was not killed: its own error is the reason."""
+
+    def fails(*_, **__):
+        raise RuntimeError("no room on this device")
+
+    spec, _ = whole
+    first, other = under_torchrun(
+        tmp_path, "fit", spec, "--out", tmp_path / "run", other=lambda: setattr(restarting, "advance", fails)
+    )
+    said = (
+        "ddco-pyro: process 1, which trained together with this one, has failed: RuntimeError: no room on this device"
+    )
+    assert (first.status, first.err) == (1, f"{said}\n")
+    assert other == (0, "", "")
+
+
+def test_a_process_that_is_killed_is_not_said_to_have_failed(whole, tmp_path):
+    def dies(*_, **__):
+        (tmp_path / "other.json").write_text('[1, "", ""]')
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    spec, _ = whole
+    first, _ = under_torchrun(
+        tmp_path, "fit", spec, "--out", tmp_path / "run", other=lambda: setattr(restarting, "advance", dies)
+    )
+    assert (first.status, first.err.count("\n")) == (1, 1)
+    assert first.err.startswith("ddco-pyro: a process that trained together with this one was ended from outside")
+
+
 @pytest.mark.slow
 def test_two_processes_of_torchrun(whole, tmp_path):
     spec, run = whole
     folder = tmp_path / "run"
-    ended = subprocess.run(
-        [TORCHRUN, "--standalone", "--nproc-per-node", "2", "-m", "ddco_pyro.cli", "fit", spec, "--out", folder],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert ended.returncode == 0, ended.stderr
-    assert ended.stdout.count("report: ") == 1
-    assert_same_run(folder, run)
+    command = [*TORCHRUN, "--standalone", "--nproc-per-node", "2", "-m", "ddco_pyro.cli", "fit", spec, "--out", folder]
+    for more in ([], ["--resume"]):  # it is finished then
+        ended = subprocess.run([*command, *more], cwd=tmp_path, capture_output=True, text=True, timeout=600)
+        assert ended.returncode == 0, ended.stderr
+        assert ended.stdout.count("report: ") == 1
+        assert_same_run(folder, run)
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert ended.stderr.count("ddco-pyro: ") == 1
+    assert f"ddco-pyro: {folder}: holds a run of this spec already; show it with --resume" in ended.stderr
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
@@ -286,7 +387,8 @@ def test_an_unknown_limit_of_memory_is_said_before_anything_is_done(tmp_path, mo
 def test_torchrun_decides_how_many_there_are(monkeypatch):
     for name, value in {"RANK": 1, "WORLD_SIZE": 2, "MASTER_ADDR": "here", "MASTER_PORT": 1}.items():
         monkeypatch.setenv(name, str(value))
-    assert requested(None) == requested(2)
-    assert (requested(2).rank, requested(2).size) == (1, 2)
+    assert launched() == Ranks(1, 2)
+    assert requested(None, launched()) == requested(2, launched()) == 2
+    assert (requested(None, None), requested(3, None)) == (1, 3)
     with pytest.raises(BadInput, match=r"^--processes 3: torchrun started 2; leave it out$"):
-        requested(3)
+        requested(3, launched())

@@ -22,7 +22,7 @@ from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan, Trai
 from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.fitting.fit import RunError
 from ddco_pyro.fitting.prepare import demonstrations
-from ddco_pyro.fitting.run import claim, fit, train
+from ddco_pyro.fitting.run import claim, claimed, fit, train
 from ddco_pyro.spec import dump_spec, load_spec, with_overrides
 
 
@@ -56,7 +56,14 @@ class Interrupting:
 
 # --- contents ---------------------------------------------------------------------------------------------------------
 
-FILES = {"spec.yaml", "model.safetensors", "metrics.json", "history.csv", "checkpoints/restart-0.safetensors"}
+FILES = {
+    "spec.yaml",
+    "demonstrations.json",
+    "model.safetensors",
+    "metrics.json",
+    "history.csv",
+    "checkpoints/restart-0.safetensors",
+}
 
 
 def test_the_folder_holds_what_it_promises(toy_run):
@@ -260,6 +267,34 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(toy_run, toy_spec, tmp_pat
     assert not list(folder.rglob("*.tmp"))
 
 
+def test_seconds_are_those_of_all_processes(toy_spec, tmp_path, monkeypatch):
+    """An epoch takes 100 seconds of this clock; nothing else takes time."""
+    now = [0.0]
+    monkeypatch.setattr("ddco_pyro.fitting.run.time.perf_counter", lambda: now[0])
+
+    class Slow(Interrupting):
+        epochs = own = 0
+
+        def __call__(self, event):
+            if isinstance(event, EpochEnded):
+                now[0] += 100
+                self.epochs, self.own = self.epochs + 1, self.own + (event.stage != "policy")
+            super().__call__(event)
+
+    spec = with_overrides(toy_spec, {"compare_with": [{"kind": "flat", "policy": {"network": "linear"}}]})
+    told = [Slow(3), Slow(23), Slow(-1)]  # the second is interrupted in the baseline
+    for each in told[:2]:
+        with pytest.raises(KeyboardInterrupt):
+            fit(spec, out=tmp_path / "run", on_event=each)
+    seconds = fit(spec, out=tmp_path / "run", on_event=told[2]).metrics["seconds"]
+    assert (seconds["demonstrations"], seconds["evaluation"]) == (0, 0)
+    assert seconds["training"] + seconds["baselines"] == now[0] == sum(100 * each.epochs for each in told)
+    assert seconds["training"] == sum(100 * each.own for each in told)
+    own = json.loads((tmp_path / "run" / "baselines" / "flat" / "metrics.json").read_text())["seconds"]
+    assert own["training"] == seconds["baselines"]
+    assert not list(tmp_path.rglob("seconds.json"))
+
+
 def test_the_engines_are_compared_on_a_model_that_the_seed_decides(toy_spec, demos):
     """With dropout, and whatever was drawn before; nothing is drawn from the global generator."""
     spec = with_overrides(toy_spec, {"training.epochs": 1, "hierarchy.levels.0.policy.dropout": 0.5})
@@ -304,8 +339,8 @@ def test_claiming_a_folder(tmp_path, toy_spec):
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match=r": is not empty and not a run; choose another --out$"):
         claim(tmp_path, toy_spec)
-    with pytest.raises(RunError, match=r"file: is a file; choose another --out$"):
-        claim(tmp_path / "file", toy_spec)
+    with pytest.raises(RunError, match=r"file: is a file; choose another --out$"), claimed(tmp_path / "file", toy_spec):
+        pass
 
 
 @pytest.mark.parametrize(

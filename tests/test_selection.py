@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,7 +19,8 @@ from selecting import Told, data_at, kept, score, spec_at, two_skills
 import ddco_pyro
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.building import Dimensions
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fit import Fit, RunError
+from ddco_pyro.fitting.fitted_to import OtherDemonstrations
 from ddco_pyro.fitting.run import train
 from ddco_pyro.selection import SelectionFailed, Workers, check, final_spec, parallel, scoring, select
 from ddco_pyro.selection.folds import FoldError
@@ -105,10 +107,12 @@ def test_what_is_there_is_not_done_again(finished, monkeypatch):
 
 def test_other_demonstrations_are_refused(finished, tmp_path):
     spec, folder, *_ = finished
-    two_skills(seed=1).write(tmp_path / "other.hdf5")
-    other = with_overrides(spec, {"demonstrations.path": str(tmp_path / "other.hdf5")})
-    with pytest.raises(FoldError, match="the demonstrations have changed since"):
-        select(other, folder, Told(), ONE)
+    run = shutil.copytree(folder, tmp_path / "run")
+    with pytest.raises(OtherDemonstrations, match=r"other demonstrations \(actions and obs/place changed\)"):
+        select(spec, run, Told(), ONE, demos=two_skills(seed=1))
+    moved = with_overrides(spec, {"demonstrations.path": str(tmp_path / "other.hdf5")})
+    with pytest.raises(RunError, match="run: holds a run of another spec"):
+        select(moved, run, Told(), ONE)
 
 
 def test_the_final_fit_is_on_all_the_data(finished):

@@ -85,19 +85,32 @@ def fit(
     With --seeds the fit and its baselines are repeated, in --jobs processes, with other training seeds: other first
     weights, clusters and orders of the same demonstrations. RUN/seeds has a run for each.
     """
-    loaded = load_spec(spec, overrides, allow_code)
+    from ddco_pyro.fitting.launching import follow_torchrun, launched, leading, requested
+
+    ranks = launched()
+    if ranks and ranks.rank > 0:
+        follow_torchrun(ranks)
+        return
+    with leading(ranks):
+        loaded = load_spec(spec, overrides, allow_code)
+        _fit(loaded, spec, out, (jobs, requested(processes, ranks)), seeds, resume)
+
+
+def _fit(
+    loaded: Spec, spec: Path, out: Path | None, workers: tuple[int | None, int], seeds: int | None, resume: bool
+) -> None:
+    """The fit once the spec is read.
+
+    :param workers: jobs, None for the default, and processes that share each gradient step.
+    """
+    jobs, processes = workers
     from ddco_pyro.cli import console
-    from ddco_pyro.fitting.launching import follow_torchrun, requested
     from ddco_pyro.fitting.run import fit_run
     from ddco_pyro.fitting.seeds import check_seeds, repeat
     from ddco_pyro.report import write_report
 
-    ranks = requested(processes)
-    if ranks.rank > 0:
-        follow_torchrun(ranks)
-        return
     if jobs is None:
-        jobs = -1 if ranks.size == 1 else 1
+        jobs = -1 if processes == 1 else 1
     if seeds is not None:
         check_seeds(loaded, seeds)
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -105,7 +118,7 @@ def fit(
     repeated = () if seeds is None else ("--seeds", str(seeds))
     again = command("fit", folder / "spec.yaml", "--out", folder, "--resume", *repeated, *_allowed(loaded))
     with _continued(again, folder), console.Progress() as progress:
-        fitted = fit_run(loaded, None, folder, progress, jobs, resume, processes=ranks.size)
+        fitted = fit_run(loaded, None, folder, progress, jobs, resume, processes=processes)
         if seeds is not None:
             fitted = repeat(fitted, seeds, progress, jobs)
     console.log_likelihoods(fitted.metrics)
@@ -141,7 +154,7 @@ def select(
     from ddco_pyro import selection
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.prepare import seen
-    from ddco_pyro.fitting.run import claim, fit_run
+    from ddco_pyro.fitting.run import fit_run
     from ddco_pyro.report import write_report
     from ddco_pyro.selection.table import HEAD, cells
 
@@ -150,11 +163,10 @@ def select(
     _check_folder(folder, spec, loaded)
     demos = selection.known_demonstrations(loaded)
     selection.check(loaded, workers, demos)  # before anything is collected, trained or written
-    claim(folder, loaded, resume)
     early = ["--stop-early"] if stop_early else []
     again = command("select", folder / "spec.yaml", "--out", folder, "--resume", *early, *_allowed(loaded))
     with _continued(again, folder), console.Progress() as progress:
-        made = selection.select(loaded, folder, progress, workers, stop_early, demos)
+        made = selection.select(loaded, folder, progress, workers, stop_early, demos, resume)
         progress.end()
         assert made.choice.chosen is not None  # or it would have failed
         final = selection.final_spec(made.choice.chosen.candidate)

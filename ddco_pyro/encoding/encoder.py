@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -9,6 +10,7 @@ from typing import Literal
 import numpy as np
 import torch
 from pydantic import ValidationError
+from torch import Tensor
 
 from ddco_pyro.data.files import Damaged, whole_folder
 from ddco_pyro.data.tensors import read_tensors, write_tensors
@@ -70,13 +72,24 @@ class Encoder:
 
     def write(self, folder: Path) -> None:
         """Write it as a folder, whole or not at all; a user's encoder is named there, not kept."""
+        with whole_folder(folder) as temporary:
+            (temporary / ABOUT).write_text(self.about.model_dump_json(indent=1) + "\n", encoding="utf-8")
+            write_tensors(temporary / TENSORS, self._tensors(), {})
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of what decides its features."""
+        sha256 = hashlib.sha256(self.about.model_dump_json().encode() + self.kind.decides())
+        for name, tensor in sorted(self._tensors().items()):
+            sha256.update(name.encode() + tensor.contiguous().numpy().tobytes())
+        return sha256.hexdigest()
+
+    def _tensors(self) -> dict[str, Tensor]:
         tensors = {f"network/{key}": value for key, value in self.kind.weights().items()}
         if self.projection is not None:
             tensors["mean"] = torch.from_numpy(self.projection.mean)
             tensors["components"] = torch.from_numpy(self.projection.components)
-        with whole_folder(folder) as temporary:
-            (temporary / ABOUT).write_text(self.about.model_dump_json(indent=1) + "\n", encoding="utf-8")
-            write_tensors(temporary / TENSORS, tensors, {})
+        return tensors
 
 
 def about_of(folder: Path) -> About:

@@ -21,6 +21,7 @@ from ddco_pyro.data.files import Damaged
 from ddco_pyro.data.tensors import read_tensors
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy, named_baselines
+from ddco_pyro.fitting.fitted_to import refuse_others
 from ddco_pyro.fitting.inferred import Inferred, infer
 from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.fitting.records import read_metrics, refit
@@ -73,8 +74,16 @@ class Fit:
 
     @cached_property
     def demonstrations(self) -> Demonstrations:
-        """The demonstrations that it was fitted to, training and held out; those of a run are read when asked for."""
-        return demonstrations(self.spec) if self.given is None else self.given
+        """The demonstrations that it was fitted to, training and held out; those of a run are read when asked for.
+
+        :raises OtherDemonstrations: their file holds others by now.
+        """
+        if self.given is not None:
+            return self.given
+        demos = demonstrations(self.spec)
+        if self.folder is not None:
+            refuse_others(self.folder, demos)
+        return demos
 
     @cached_property
     def baselines(self) -> Mapping[str, Fit]:

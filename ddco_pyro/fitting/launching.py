@@ -8,14 +8,14 @@ import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
 
 from torch import distributed
 
-from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.processes import BackendError
 from ddco_pyro.fitting.ranks import ALONE, LostProcess, Ranks, connected
 from ddco_pyro.fitting.restarts import follow
@@ -31,17 +31,23 @@ LAUNCHED = {"RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"}
 """What ``torchrun`` says to the processes that it starts, in their environment."""
 
 
-def requested(processes: int | None) -> Ranks:
-    """Which of the processes of a fit this is, of so many as were asked for: 1 by default, under ``torchrun`` its own.
+def launched() -> Ranks | None:
+    """Which process of ``torchrun`` this is; None where it was not started by it."""
+    if not os.environ.keys() >= LAUNCHED:
+        return None
+    return Ranks(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]))
+
+
+def requested(processes: int | None, launched: Ranks | None) -> int:
+    """How many processes train together: as many as were asked for, 1 by default, under ``torchrun`` its own.
 
     :raises BackendError: ``torchrun`` started another number.
     """
-    if not os.environ.keys() >= LAUNCHED:
-        return Ranks(0, 1 if processes is None else processes)
-    ranks = Ranks(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]))
-    if processes not in (None, ranks.size):
-        raise BackendError(f"--processes {processes}: torchrun started {ranks.size}; leave it out")
-    return ranks
+    if launched is None:
+        return 1 if processes is None else processes
+    if processes not in (None, launched.size):
+        raise BackendError(f"--processes {processes}: torchrun started {launched.size}; leave it out")
+    return launched.size
 
 
 def check_processes(processes: int, jobs: int, shards: int) -> None:
@@ -67,39 +73,115 @@ def together(processes: int) -> Iterator[Ranks]:
     """So many processes, of which this is the first: inside, the others train along (:func:`follow`).
 
     :raises LostProcess: another process has ended.
+    :raises FailedProcess: another process has failed.
     """
     if processes == 1:
         yield ALONE
-        return
-    started = _joined(None, Ranks(0, processes)) if os.environ.keys() >= LAUNCHED else _started(processes)
-    with started as ranks:
-        yield ranks
-        ranks.share(None)  # that was all
-
-
-def follow_torchrun(ranks: Ranks) -> None:
-    """Train along with the first of the processes that ``torchrun`` started; ends this process where it fails.
-
-    :raises LostProcess: another process has ended.
-    """
-    try:
-        with _joined(None, ranks):
-            follow(ranks)
-    except LostProcess:
-        raise
-    except (BadInput, Failed):
-        sys.exit(1)  # the first process has met the same, and says so
+    elif distributed.is_initialized():  # by `leading`, which also says when that was all
+        yield Ranks(0, processes)
+    else:
+        with _started(processes) as ranks:
+            yield ranks
+            ranks.share(None)  # that was all
 
 
 @contextmanager
-def _joined(store: distributed.Store | None, ranks: Ranks) -> Iterator[Ranks]:
-    """Connected with the others, through a store or as the environment says."""
-    with connected():
-        distributed.init_process_group("gloo", store=store, rank=ranks.rank, world_size=ranks.size, timeout=PATIENCE)
+def leading(launched: Ranks | None) -> Iterator[None]:
+    """Inside, the other processes of ``torchrun`` follow this one (:func:`follow_torchrun`); after it, they end.
+
+    All that the first does belongs inside, refusals too: otherwise the others wait for it.
+    """
+    if launched is None or launched.size == 1:
+        yield
+        return
+    store = _launchers(launched)
     try:
-        yield ranks
+        with _joined(store, launched) as ranks:
+            yield
+            ranks.share(None)  # that was all
+    except LostProcess:
+        raise
+    except BaseException:
+        with suppress(RuntimeError):  # they took too long
+            store.wait([_left(rank) for rank in range(1, launched.size)], LAST_WORDS)
+        raise
+
+
+LAST_WORDS = timedelta(seconds=5)
+"""How long the first process waits, where it fails, for the others to read the reason: the store can end with it."""
+
+
+def follow_torchrun(launched: Ranks) -> None:
+    """Train along with the first of the processes that ``torchrun`` started, until it ends or something fails.
+
+    The first alone says what has failed, and ends with status 1 or 2: ``torchrun`` ends all as soon as one does.
+
+    :raises LostProcess: another process has ended.
+    """
+    store = _launchers(launched)
+    try:
+        with _joined(store, launched):
+            follow(launched)
+    except LostProcess:
+        raise
+    except Exception:
+        return
     finally:
-        distributed.destroy_process_group()
+        with suppress(RuntimeError):
+            store.set(_left(launched.rank), "")
+
+
+def _left(rank: int) -> str:
+    return f"left-{rank}"
+
+
+class FailedProcess(Failed):
+    """A process that trained together with this one has failed by itself."""
+
+    def __init__(self, rank: int, error: str) -> None:
+        super().__init__(f"process {rank}, which trained together with this one, has failed: {error}")
+
+
+def _launchers(launched: Ranks) -> distributed.Store:
+    """The store through which ``torchrun`` connects its processes."""
+    with connected():
+        store, *_ = next(distributed.rendezvous("env://", launched.rank, launched.size, timeout=PATIENCE))
+    return store
+
+
+@contextmanager
+def _joined(store: distributed.Store, ranks: Ranks) -> Iterator[Ranks]:
+    """Connected with the others. Where this process fails, the reason is left in the store for them.
+
+    :raises LostProcess: another process has ended.
+    :raises FailedProcess: it has left a reason.
+    """
+    try:
+        with connected():
+            distributed.init_process_group(
+                "gloo", store=store, rank=ranks.rank, world_size=ranks.size, timeout=PATIENCE
+            )
+        yield ranks
+        with connected():
+            distributed.barrier()
+    except LostProcess:
+        with connected():  # the store, too, may have ended with another process
+            reason = store.get(FAILED).decode() if store.check([FAILED]) else ""
+        if not reason:
+            raise
+        rank, _, error = reason.partition(" ")
+        raise FailedProcess(int(rank), error) from None
+    except BaseException as error:
+        with suppress(RuntimeError):  # where the others have gone there is nobody to tell
+            store.set(FAILED, f"{ranks.rank} {type(error).__name__}: {' '.join(str(error).split())}")
+        raise
+    finally:
+        if distributed.is_initialized():
+            distributed.destroy_process_group()
+
+
+FAILED = "failed"
+"""The key of a store for the rank of a process that failed, and its reason."""
 
 
 ANSWERED_HERE = {signal.SIGINT, signal.SIGTERM}
@@ -154,5 +236,5 @@ def _follow(ranks: Ranks, port: int) -> None:
         os.environ["LOCAL_RANK"] = str(ranks.rank)  # as torchrun does
         with _joined(store, ranks):
             follow(ranks)
-    except (BadInput, Failed):
+    except Exception:
         sys.exit(1)  # the first process says what went wrong

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from copy import copy
 from dataclasses import replace
@@ -15,7 +13,6 @@ import torch
 from ddco_pyro.data.checks import check, check_trained, problem_of_pictures
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, extent
 from ddco_pyro.data.memory import Work, refuse_too_much
-from ddco_pyro.data.pictures import blocks
 from ddco_pyro.data.sources.recording import Recording
 from ddco_pyro.data.sources.robomimic import open_robomimic
 from ddco_pyro.errors import nearest
@@ -158,18 +155,6 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
     )
     masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in demos.masks.items()}
     return replace(demos, demonstrations=kept, masks=masks)
-
-
-def digest(demos: Demonstrations) -> str:
-    """SHA-256 of names, controls and observations."""
-    sha256 = hashlib.sha256()
-    for demo in demos:
-        keys = sorted(demo.observations)
-        sha256.update(json.dumps([demo.name, *demo.actions.shape, *keys]).encode())
-        for array in (demo.actions, *(demo.observations[key] for key in keys)):
-            for block in blocks(array):
-                sha256.update(np.ascontiguousarray(block).tobytes())
-    return sha256.hexdigest()
 
 
 def _labels(spec: Spec) -> tuple[str, ...]:

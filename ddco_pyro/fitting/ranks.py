@@ -94,8 +94,15 @@ ALONE = Ranks()
 
 @contextmanager
 def connected() -> Iterator[None]:
-    """Inside, a connection that is closed is a process that is lost."""
+    """Inside, a connection that is closed is a process that is lost; other errors are this process's own.
+
+    :raises LostProcess: a connection is closed.
+    """
     try:
         yield
-    except RuntimeError as error:  # gloo's for a connection that was closed
+    except distributed.DistError as error:  # of a store
+        raise LostProcess from error
+    except RuntimeError as error:
+        if "/gloo/" not in str(error):  # gloo's own begin with the place in its sources
+            raise
         raise LostProcess from error

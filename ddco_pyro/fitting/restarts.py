@@ -90,6 +90,7 @@ class Trainer:
 
         Where all that were left have diverged, the best of those that were stopped is trained to the end instead.
 
+        :raises OtherDevice: a restart was begun on another kind of device than it is to be continued on.
         :raises TrainingError: every restart has diverged.
         """
         self.restarts = [self._begun(number) for number in range(self.spec.training.restarts)]
@@ -144,21 +145,27 @@ class Trainer:
         return [restart for restart in self.restarts if restart.progress.restart not in self.stopped]
 
     def _begun(self, number: int) -> Restart:
-        """A restart as it was kept, or as it begins; one that is done is taken from any device.
+        """A restart as it was kept, or as it begins.
 
         :raises Damaged: it does not hold what was written.
+        """
+        path = self._path(number)
+        if path is None or not path.exists():
+            return Restart(Progress(number, device=described(device_of(self.spec.training))))
+        return Restart.read(path)
+
+    def _refuse_other_device(self, progress: Progress, until: int | None) -> None:
+        """What has come as far as it is to is taken from any device; what is trained further is not.
+
         :raises OtherDevice: it was begun on another kind of device.
         """
-        path, device = self._path(number), described(device_of(self.spec.training))
-        if path is None or not path.exists():
-            return Restart(Progress(number, device=device))
-        restart = Restart.read(path)
-        if restart.progress.device != device and not restart.progress.done:
+        device, last = described(device_of(self.spec.training)), len(plan(self.spec, self.first.depth)) - 1
+        arrived = until is not None and progress.stage == last and progress.epoch >= until
+        if progress.device != device and not arrived:
             raise OtherDevice(
-                f"{path}: was trained on {restart.progress.device}, and networks are on {device} here, where the last "
-                "digits differ; continue it there, or remove it: this restart then begins anew"
+                f"{self._path(progress.restart)}: was trained on {progress.device}, and networks are on {device} here, "
+                "where the last digits differ; continue it there, or remove it: this restart then begins anew"
             )
-        return restart
 
     def _path(self, number: int) -> Path | None:
         return None if self.checkpoints is None else self.checkpoints / f"restart-{number}.safetensors"
@@ -176,8 +183,13 @@ class Trainer:
                     self.on_event(RestartStopped(number, progress.epoch))
 
     def _train(self, numbers: Sequence[int], until: int | None) -> None:
-        """Train these restarts until so many epochs of the last stage, None for to the end; processes in slices."""
+        """Train these restarts until so many epochs of the last stage, None for to the end; processes in slices.
+
+        :raises OtherDevice: one of them was begun on another kind of device; nothing is trained then.
+        """
         left = [number for number in numbers if not self.restarts[number].progress.done]
+        for number in left:
+            self._refuse_other_device(self.restarts[number].progress, until)
         if self.jobs == 1 or len(left) < 2:
             for number in left:
                 restart, path = self.restarts[number], self._path(number)

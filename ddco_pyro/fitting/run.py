@@ -6,6 +6,7 @@ import csv
 import importlib.metadata
 import io
 import json
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -21,20 +22,23 @@ from ddco_pyro.data.files import json_text, leftovers, only_one, write_text
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
 from ddco_pyro.data.tensors import write_tensors
-from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, ignore
+from ddco_pyro.events import Event, OnEvent, TrainingBegan, TrainingEnded, ignore
 from ddco_pyro.fitting import labels
 from ddco_pyro.fitting.building import Dimensions, baseline_spec, check_networks, named_baselines, parameters
 from ddco_pyro.fitting.checkpoint import copy_of
 from ddco_pyro.fitting.devices import repeatable
 from ddco_pyro.fitting.fit import Fit, RunError, is_finished, load, model_name
+from ddco_pyro.fitting.fitted_to import record, recorded
 from ddco_pyro.fitting.launching import check_processes, together
 from ddco_pyro.fitting.metrics import evaluate, supervisor
 from ddco_pyro.fitting.objective import TrainingError
 from ddco_pyro.fitting.prepare import demonstrations as read_demonstrations
-from ddco_pyro.fitting.prepare import digest, dimensions, known_demonstrations, parts, refuse_unfit, seen
+from ddco_pyro.fitting.prepare import dimensions, known_demonstrations, parts, refuse_unfit, seen
 from ddco_pyro.fitting.processes import check_jobs
 from ddco_pyro.fitting.ranks import ALONE, Ranks
+from ddco_pyro.fitting.records import read_record
 from ddco_pyro.fitting.restarts import Trainer
+from ddco_pyro.fitting.training import SAVE_EVERY
 from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.encoding import refuse_unusable
@@ -81,6 +85,7 @@ def fit(
     :raises SpecError: something in the spec does not fit the demonstrations.
     :raises DemonstrationsError: they cannot be used.
     :raises RunError: the folder holds something else.
+    :raises OtherDemonstrations: the folder is a run of other demonstrations.
     :raises TrainingError: training stopped; nothing that was written before is lost.
     """
     spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else Path(out)
@@ -131,27 +136,23 @@ def fit_run(
         demos = demos or read_demonstrations(spec, on_event)
         with together(processes) as ranks:
             return _fit(spec, demos, None, on_event, jobs, ranks, clock)
-    claim(folder, spec, resume)
-    with only_one(folder):
-        if keep is not None:
-            _keep(keep, Path(str(spec.demonstrations.path)))
-        if is_finished(folder):
+    with claimed(folder, spec, resume):
+        finished = is_finished(folder)
+        with clock("demonstrations"):
+            if demos is None and not finished:
+                demos = read_demonstrations(spec, on_event)
+            if demos is not None:
+                record(folder, demos)
+        if keep is not None and not (kept := Path(str(spec.demonstrations.path))).exists():
+            keep.write(kept)
+        if finished:
             return replace(load(folder, allow_code=True), given=demos)  # it is this very spec, which the caller has
+        assert demos is not None
         for part in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
             for old in leftovers(part):
                 old.unlink()
-        with clock("demonstrations"):
-            demos = demos or read_demonstrations(spec, on_event)
         with together(processes) as ranks:
             return _fit(spec, demos, folder, on_event, jobs, ranks, clock)
-
-
-def _keep(demos: Demonstrations, path: Path) -> None:
-    """:raises RunError: other demonstrations are kept there."""
-    if not path.exists():
-        demos.write(path)
-    elif digest(Demonstrations.read(path)) != digest(demos):
-        raise RunError(f"{path.parent}: holds a run of other demonstrations; choose another folder or remove it")
 
 
 def _fit(
@@ -165,6 +166,8 @@ def _fit(
     name: str | None = None,
 ) -> Fit:
     """:param name: what the model is called in events."""
+    if folder:
+        on_event = clock.go_on(folder, on_event)
     split = parts(spec, demos)
     dimensions = Dimensions.of(demos)
     with clock("training"):
@@ -190,7 +193,7 @@ def _fit(
         "parameters": parameters(trained.hierarchy),
         "training": trained.training,
         **labels.trained_labels(fitted, demos),
-        "seconds": clock.seconds,
+        "seconds": clock.end(),
         "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
     }
     if folder:
@@ -203,8 +206,9 @@ def _baseline(
 ) -> Fit:
     """A baseline trained beside, in a folder of its own where the run has one; nothing where it was done before."""
     folder = run / "baselines" / name if run else None
-    if folder:
+    if run and folder:
         claim(folder, spec)
+        record(folder, demos, recorded(run))
         if is_finished(folder):
             return load(folder, allow_code=True)
     return _fit(spec, demos, folder, on_event, jobs, ranks, _Clock(), name)
@@ -213,6 +217,21 @@ def _baseline(
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
     """Write ``metrics.json``."""
     write_text(folder / "metrics.json", json_text(metrics))
+
+
+@contextmanager
+def claimed(folder: Path, spec: Spec, resume: bool = True) -> Iterator[None]:
+    """The folder is this spec's run, and no other process works on it, while the block lasts.
+
+    :param resume: as of :func:`claim`.
+    :raises RunError: it is a file, or as :func:`claim`.
+    :raises Busy: another process is at work on it.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise RunError(f"{folder}: is a file; choose another --out")
+    with only_one(folder):
+        claim(folder, spec, resume)
+        yield
 
 
 def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
@@ -224,8 +243,6 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     :raises RunError: it holds something else, or all of it and may not.
     """
     text, path = dump_spec(spec), folder / "spec.yaml"
-    if folder.exists() and not folder.is_dir():
-        raise RunError(f"{folder}: is a file; choose another --out")
     if path.exists():
         if path.read_bytes() != text.encode():
             raise RunError(f"{folder}: holds a run of another spec; choose another --out or remove it")
@@ -331,13 +348,56 @@ def _write_history(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 
 class _Clock:
-    """Seconds by phase."""
+    """Seconds by phase, of this process and of those that worked on the run before it was interrupted."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
+        self._phase, self._since = "", 0.0
+        self._path: Path | None = None
+        self._kept_at = -math.inf
 
     @contextmanager
     def __call__(self, phase: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[phase] = self.seconds.get(phase, 0.0) + time.perf_counter() - start
+        self._phase, self._since = phase, time.perf_counter()
+        try:
+            yield
+        finally:
+            self._add()
+            self._keep()
+
+    def go_on(self, folder: Path, on_event: OnEvent) -> OnEvent:
+        """Go on from what is kept in a run folder, and keep it there whenever something is told.
+
+        :returns: to be told in place of ``on_event``, which is told in turn.
+        :raises Damaged: what is kept cannot be read.
+        """
+        self._path = folder / "seconds.json"
+        if self._path.exists():
+            kept = read_record(self._path, dict[str, float], "remove it and do the same again")
+            self.seconds = {
+                phase: kept.get(phase, 0) + self.seconds.get(phase, 0) for phase in {**kept, **self.seconds}
+            }
+
+        def told(event: Event) -> None:
+            self._add()
+            if self._since - self._kept_at > SAVE_EVERY:
+                self._keep()
+            on_event(event)
+
+        return told
+
+    def end(self) -> dict[str, float]:
+        """All of them, which the folder has elsewhere from now on."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+        return self.seconds
+
+    def _add(self) -> None:
+        now = time.perf_counter()
+        self.seconds[self._phase] = self.seconds.get(self._phase, 0.0) + now - self._since
+        self._since = now
+
+    def _keep(self) -> None:
+        if self._path is not None:
+            self._kept_at = self._since
+            write_text(self._path, json.dumps(self.seconds))

@@ -1,6 +1,7 @@
 """Selection by k-fold cross-validation (paper §4.3): any grid over the spec, the same folds for every candidate.
 
-``selection.json`` has the result, ``folds/`` a file for each finished (candidate, fold), ``fit/`` the final fit.
+``selection.json`` has the result, ``folds/`` a file for each finished (candidate, fold), ``fit/`` the final fit, and
+``demonstrations.json`` the digest of the demonstrations.
 """
 
 from __future__ import annotations
@@ -10,10 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import json_text, only_one, write_text
+from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.errors import Failed
 from ddco_pyro.events import CandidateGivenUp, FoldScored, OnEvent, SelectionBegan, ignore
 from ddco_pyro.fitting import prepare
+from ddco_pyro.fitting.fitted_to import record
+from ddco_pyro.fitting.run import claimed
 from ddco_pyro.selection import choice as choosing
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.selection import grid, parallel, plot, scoring, table
@@ -76,6 +79,7 @@ def select(
     workers: Workers = HERE,
     stop_early: bool = False,
     demos: Demonstrations | None = None,
+    resume: bool = True,
 ) -> Selection:
     """Score every candidate of the spec's grid in every fold, choose, and write table and figure into the folder.
 
@@ -83,11 +87,15 @@ def select(
     demonstrations and ``stop_early``; neither on the workers nor on interruptions.
 
     :param demos: :func:`known_demonstrations`, where they have been read.
+    :param resume: as of :func:`ddco_pyro.fitting.run.claim`.
     :raises SelectionFailed: every candidate has failed in some fold.
+    :raises RunError: the folder holds something else.
+    :raises OtherDemonstrations: it is a selection by other demonstrations.
     :raises Busy: another process is at work on the folder.
     """
-    with only_one(folder):
+    with claimed(folder, spec, resume):
         demos = demos or prepare.demonstrations(grid.wide(spec), on_event)
+        record(folder, demos)
         return _select(spec, folder, demos, on_event, workers, stop_early)
 
 

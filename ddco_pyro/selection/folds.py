@@ -13,13 +13,12 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.building import Dimensions
-from ddco_pyro.fitting.prepare import digest
 from ddco_pyro.fitting.record_types import Record
 from ddco_pyro.fitting.records import read_record
 
 
 class FoldError(BadInput):
-    """Demonstrations that cannot be divided as asked, or are others than those that were divided before."""
+    """Demonstrations that cannot be divided as asked, or are divided otherwise in the folder."""
 
 
 @dataclass(frozen=True)
@@ -69,16 +68,15 @@ def keep(folds: Folds, path: Path) -> None:
     """Write the folds, or see that those already there are the same.
 
     :raises Damaged: they cannot be read.
-    :raises FoldError: they are of other demonstrations.
+    :raises FoldError: those are others.
     """
-    text = json.dumps({"demonstrations": digest(folds.demos), "folds": folds.held_out}, indent=1) + "\n"
+    text = json.dumps({"folds": folds.held_out}, indent=1) + "\n"
     if path.exists() and path.read_bytes() != text.encode():
         read_record(path, _Kept, "remove it and do the same again")
-        raise FoldError(f"{path}: the demonstrations have changed since; choose another --out")
+        raise FoldError(f"{path}: another version divided these demonstrations otherwise; choose another --out")
     if not path.exists():
         write_text(path, text)
 
 
 class _Kept(Record):
-    demonstrations: str
     folds: list[list[str]]

@@ -22,6 +22,9 @@ class Camera:
     size: tuple[int, int]
     draw: Callable[[dm_env.Environment], np.ndarray]
 
+    digest = ""
+    """What decides its pictures beside the sources of its task: nothing."""
+
     def spec(self, name: str) -> specs.Array:
         """What the observation is."""
         return specs.BoundedArray((*self.size, 3), np.uint8, 0, 255, name)
@@ -32,11 +35,17 @@ class Encoded:
     """An observation that is what an encoder gives of a camera's picture.
 
     :param encoder: uint8 [height, width, 3] to float32 [features], such as :func:`ddco_pyro.encoding.load` gives.
+        Its attribute ``digest``, if it has one, is for what the sources of the task do not say, such as its weights.
     """
 
     camera: Camera
     encoder: Callable[[np.ndarray], np.ndarray]
     features: int
+
+    @property
+    def digest(self) -> str:
+        """What decides its features beside the sources of its task."""
+        return str(getattr(self.encoder, "digest", ""))
 
     def draw(self, environment: dm_env.Environment) -> np.ndarray:
         """The features of what the camera sees of an environment as it is now, float32 [features]."""

@@ -15,7 +15,7 @@ from ddco_pyro.data.resumable import Parts, parts_of
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.simulation.episodes import run_episodes, summarize
-from ddco_pyro.simulation.task import Task, find_task
+from ddco_pyro.simulation.task import Task, find_task, package_of, version_of
 from ddco_pyro.spec import DemonstrationsSpec
 
 
@@ -26,21 +26,28 @@ def cache_folder() -> Path:
     return Path(own) if own else Path(general) / "ddco-pyro"
 
 
+SIMULATORS = ("mujoco", "dm-control")
+"""Packages whose version can decide what a task's episodes are."""
+
+
 EPISODES_WITH_PICTURES = 8
 """Episodes whose pictures are in memory at a time: they are compressed one after the other, more slowly than they are
 drawn."""
 
 
 def cache_path(task: Task, name: str, spec: DemonstrationsSpec, observed: Collection[str] = ()) -> Path:
-    """Where demonstrations of this task, policy, number, seeds and cameras are kept: the name changes with the task's
-    code.
+    """Where demonstrations of this task, policy, number, seeds and cameras are kept.
+
+    The name changes with the task's code, its encoders and package, and the simulators' versions.
     """
     return cache_folder() / "demonstrations" / f"{task.name}-{_identity(task, name, spec, observed)[:16]}.hdf5"
 
 
 def _identity(task: Task, name: str, spec: DemonstrationsSpec, observed: Collection[str]) -> str:
     """A digest of all that decides what is recorded."""
-    facts = [name, spec.supervisor, spec.count, spec.seed, *task.seen_by_cameras(observed)]
+    cameras = [[camera, task.cameras[camera].digest] for camera in task.seen_by_cameras(observed)]
+    versions = [version_of(package) for package in (*SIMULATORS, package_of(name))]
+    facts = [name, spec.supervisor, spec.count, spec.seed, cameras, versions]
     digest = hashlib.sha256(json.dumps(facts).encode())
     for source in sorted(task.sources):
         digest.update(hashlib.sha256(source.read_bytes()).digest())

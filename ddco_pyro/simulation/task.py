@@ -7,6 +7,7 @@ or by ``module:name``, and sees it only through :class:`Task`.
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
@@ -119,6 +120,20 @@ class OutcomeError(BadInput):
 
 class UnknownTask(BadInput):
     """No task of that name is registered, or ``module:name`` does not lead to a :class:`Task`."""
+
+
+def package_of(name: str) -> str | None:
+    """The package that registers a task under ``name``; None where ``module:name`` leads to it."""
+    points = entry_points(group=TASKS, name=name)
+    return next((point.dist.name for point in points if point.dist is not None), None)
+
+
+def version_of(package: str | None) -> str | None:
+    """The version of a package; None where there is none."""
+    try:
+        return None if package is None else importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def find_task(name: str) -> Task:
