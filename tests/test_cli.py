@@ -221,7 +221,7 @@ GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
         ),
         (["fit", "SPEC", "--out", "RUN"], "holds a run of another spec; choose another --out or remove it"),
         (["fit", "RUN/spec.yaml", "--out", "RUN"], "holds a run of this spec already; show it with --resume, or"),
-        (["fit", "SPEC", "--out", "SPEC"], r"toy\.yaml: is a file; choose another --out"),
+        (["fit", "SPEC", "--out", "SPEC"], r"toy\.yaml: is a file; name a folder"),
         (["select", "SPEC"], "selection.grid: is empty; name what to try, such as selection.grid: {.*}"),
         (["select", "SPEC", "--folds", "1"], "selection.folds: must be at least 2, got 1"),
         (["select", "SPEC", *GRID, "--folds", "13"], "selection.folds: 13 folds of 12 demonstrations; use at most 12"),

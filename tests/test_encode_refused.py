@@ -102,10 +102,7 @@ def test_what_was_not_written_here_stays(few_dots, out):
     out.unlink()
     out.mkdir()
     ended = call("encode", few_dots, "--observation", "camera", "--out", out)
-    assert (ended.status, ended.err) == (
-        2,
-        f"ddco-pyro: {out}: is there already and is no file; choose another --out\n",
-    )
+    assert (ended.status, ended.err) == (2, f"ddco-pyro: --out {out}: is a folder; name a file\n")
     out.rmdir()
     (out.parent / "out.hdf5.encoder").mkdir()
     ended = call("encode", few_dots, "--observation", "camera", "--out", out)

@@ -6,7 +6,6 @@ do; ``--debug`` shows the traceback. A file for each group of commands; they imp
 
 from __future__ import annotations
 
-import _thread
 import io
 import os
 import signal
@@ -83,7 +82,7 @@ def _interruptible() -> Iterator[None]:
     def again(ignored: Any) -> None:
         """Python ignores what is raised in a finalizer: a moment later it is raised elsewhere."""
         if isinstance(ignored.exc_value, KeyboardInterrupt):
-            threading.Timer(0.01, _thread.interrupt_main, [signal.SIGTERM]).start()
+            threading.Timer(0.01, signal.pthread_kill, [threading.main_thread().ident, signal.SIGTERM]).start()
         else:
             hook(ignored)
 

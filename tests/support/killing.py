@@ -176,9 +176,17 @@ def _answered(process: subprocess.Popen[bytes], err: str, by: signal.Signals) ->
     assert INTERRUPTED.fullmatch(err.splitlines()[-1]), err
     assert "Traceback" not in err
     for _ in range(100):
-        try:
-            os.killpg(process.pid, 0)
-        except ProcessLookupError:
+        if not _running(process.pid):
             return
         time.sleep(0.1)
     raise AssertionError("a process is left behind")
+
+
+def _running(group: int) -> list[str]:
+    """The processes of a group; those that have ended, and wait for somebody to notice, are none."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            state, _, its_group, *_ = path.read_text().rpartition(")")[2].split()
+            found += [path.parent.name] if int(its_group) == group and state != "Z" else []
+    return found
