@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.simulation.episodes import rate
-from ddco_pyro.spec import load_spec
+from ddco_pyro.spec import Spec, load_spec
 
 OURS = "ddco"
 RATES = ("success", "grasped", "inserted")
@@ -66,21 +67,26 @@ def run_seed(seed: int, count: int, arguments: argparse.Namespace, made_by: Reco
     if (is_kept(kept, settings, made_by) and set(names) <= kept["results"]["methods"].keys()) or not names:
         return
     records, found = _beside(kept, settings) if len(names) < len(whole) else ([], {})
-    first = DEMONSTRATIONS + APART * seed
-    left_out = ", ".join(f"demo_{first + number}" for number in range(count, ALL))
-    own = [f"seed={seed}", f"demonstrations.seed={first}", f"demonstrations.exclude=[{left_out}]"]
-    own.append(f"rollout.seed={STARTS}")
     folder = arguments.runs / made_by["code"][:12] / path.stem
     for name in names:
-        file, suffix, changes = FITS[name]
+        suffix = FITS[name][1]
         scripted = () if (name, seed, count) == ("ddco", 0, ALL) else ("rollout.policies=[]",)
-        spec = load_spec(file, [*own, *changes, *scripted, *(arguments.set if name.startswith(OURS) else ())])
+        spec = spec_of(name, seed, count, (*scripted, *(arguments.set if name.startswith(OURS) else ())))
         with one_thread():
             fitted = fit(spec, out=folder / name)
             rolled = roll_out(fitted, arguments.episodes, jobs=1)
         for part, values in _numbers(fitted, rolled).items():
             found[part] = found.get(part, {}) | {f"{method}{suffix}": value for method, value in values.items()}
     write_text(path, text(settings | found, [*records, made_by]))
+
+
+def spec_of(name: str, seed: int, count: int, changes: Sequence[str] = ()) -> Spec:
+    """The spec of one of :data:`FITS` for so many demonstrations of a training seed, with further changes."""
+    file, _, own = FITS[name]
+    first = DEMONSTRATIONS + APART * seed
+    left_out = ", ".join(f"demo_{first + number}" for number in range(count, ALL))
+    data = (f"demonstrations.seed={first}", f"demonstrations.exclude=[{left_out}]")
+    return load_spec(file, [f"seed={seed}", *data, f"rollout.seed={STARTS}", *own, *changes])
 
 
 def _beside(kept: dict[str, Any], settings: dict[str, Any]) -> tuple[list[Record], Seed]:
