@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer, model_validator
 
 from ddco_pyro.spec.messages import invalid
 from ddco_pyro.spec.networks import MetaPolicySpec, NetworkSpec, PolicySpec
@@ -138,6 +138,9 @@ def _with_emission(level: LevelSpec, default: Emission) -> LevelSpec:
 Kind = Literal["flat", "flat_equal", "per_timestep", "mixture"]
 
 
+_OF_A_MIXTURE = ("levels", "count", "meta_policy")
+
+
 class BaselineSpec(Model):
     """A policy to compare a hierarchy with: one without options, or one whose options do not last."""
 
@@ -179,10 +182,16 @@ class BaselineSpec(Model):
 
     @model_validator(mode="after")
     def _settings_apply(self) -> BaselineSpec:
-        given = [key for key in ("levels", "count", "meta_policy") if key in self.model_fields_set]
+        given = [key for key in _OF_A_MIXTURE if key in self.model_fields_set]
         if given and self.kind != "mixture":
             raise invalid(*((key, f"is a setting of mixture, not of {self.kind}; leave it out") for key in given))
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_foreign_keys(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A mixture beside a hierarchy has the networks of that, and other kinds nothing of a mixture's."""
+        foreign = ("policy", *_OF_A_MIXTURE[1:]) if self.kind == "mixture" else _OF_A_MIXTURE
+        return {key: value for key, value in serialize(self).items() if key not in foreign}
 
 
 def _policy(network: NetworkSpec) -> PolicySpec:

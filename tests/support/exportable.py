@@ -95,6 +95,8 @@ FITS = {
     "conv": make("conv", camera={"crop": [1, 2, 7, 9], "resize": [6, 8], "frames": 3}, options="sample"),
     "hybrid": make("mlp", (2, 3), ("options", "control"), control="sample"),
     "three levels": make("mlp", (2, 3, 2), ("options", "control")),
+    "mixture": make("mlp", (3,), ("options", "control"), endings="always", control="sample", options="sample"),
+    "memoryless below": make("mlp", (2, 3), endings="always", options="marginal"),
     "marginal": make("mlp", (2, 3, 2), ("options", "control"), options="marginal"),
     "flat": make("mlp", (), built_in=("step",)),
     "lstm": make(RECURRENT, (2, 2), ("options", "control"), endings=RECURRENT, control="sample"),

@@ -12,10 +12,15 @@ from ddco_pyro.spec import parse_spec
 SHAPES = {"state": (3,)}
 
 
-def make_hierarchy(counts=(3,), emits=("options",), network="mlp", seed=0, trunk=None, **control):
-    """A random hierarchy over 3 features and 2 control dimensions; ``counts`` lowest level first."""
+def make_hierarchy(counts=(3,), emits=("options",), network="mlp", seed=0, trunk=None, memoryless=(), **control):
+    """A random hierarchy over 3 features and 2 control dimensions; ``counts`` lowest level first.
+
+    :param memoryless: numbers of the levels, 1 the lowest, whose options end after every step.
+    """
     reads = network if isinstance(network, dict) else {"network": network}
     levels = [{"name": f"level-{d}", "count": k, "policy": dict(reads)} for d, k in enumerate(counts, 1)]
+    for number in memoryless:
+        levels[number - 1]["termination"] = "always"
     for level in levels if trunk else ():
         level["trunk"] = trunk
     for level in levels[1:]:

@@ -1,0 +1,266 @@
+"""A memoryless mixture: the same hierarchy with options that end after every step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from hierarchies import make_batch, make_hierarchy
+from oracle import brute_force
+from planted import make_spec, make_truth, plant
+from toy_task import SPEC
+
+import ddco_pyro
+from ddco_pyro.acting.controller import Controller
+from ddco_pyro.fitting.building import Dimensions, baseline_spec, build_hierarchy, named_baselines, parameters
+from ddco_pyro.fitting.duration import log_duration_prior
+from ddco_pyro.fitting.fit import model_name
+from ddco_pyro.fitting.upper import Constants, fitted
+from ddco_pyro.inference import log_likelihood, posterior
+from ddco_pyro.inference.check import compare_engines
+from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.tables import always_ends
+from ddco_pyro.segmenting import LevelLabels
+from ddco_pyro.spec import DurationSpec, SpecError, dump_spec, load_spec, parse_spec
+from ddco_pyro.spec.reading import read_yaml
+
+SPECS = Path(__file__).parent.parent / "specs"
+
+# --- the likelihood ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("emits", [("options",), ("options", "control")])
+def test_each_step_is_a_mixture_of_experts(emits):
+    """Σ_t log Σ_h η(h | s_t) π_h(a_t | s_t), in plain sums; with control the meta-policy is one more expert."""
+    hierarchy, batch = make_hierarchy((3,), emits, memoryless=[1]), make_batch()
+    with torch.no_grad():
+        tables = hierarchy.tabulate(batch)
+    gate = tables.selection[0][:, :, 0].double().exp()
+    experts = torch.cat([tables.control[1], tables.control[0]], dim=-1).double().exp()
+    steps = (gate * experts).sum(-1).log()
+    for engine in ("fused", "enumerate"):
+        values = log_likelihood(tables, batch.lengths, engine=engine)
+        for n, length in enumerate(batch.lengths.tolist()):
+            assert float(values[n]) == pytest.approx(float(steps[n, :length].sum()), abs=1e-6)
+    (u,) = posterior(tables, batch.lengths).u
+    expected = (gate * experts) / (gate * experts).sum(-1, keepdim=True)
+    assert torch.allclose(u[0], expected[0], atol=1e-6)
+
+
+@pytest.mark.parametrize(("counts", "memoryless"), [((2, 2), [1]), ((2, 2), [2]), ((2, 2), [1, 2])])
+def test_any_level_can_be_without_memory(counts, memoryless):
+    """Against the sum over every path, where ψ is exactly 1, and Pyro's enumeration of the program."""
+    hierarchy, batch = make_hierarchy(counts, memoryless=memoryless), make_batch(steps=3)
+    outputs = hierarchy(batch.inputs)
+    tables = outputs.tables(batch.actions)
+    assert [always_ends(table) for table in tables.termination] == [level in memoryless for level in (1, 2)]
+    truth = brute_force(tables, 0, 3)
+    with torch.no_grad():
+        value = float(log_likelihood(tables, batch.lengths)[0])
+    assert value == pytest.approx(truth.log_likelihood, abs=1e-6)
+    assert compare_engines(outputs, batch.actions, batch.lengths).agrees
+
+
+def test_it_has_the_hierarchys_parameters_without_terminations():
+    lasting, mixture = (make_hierarchy((3,), memoryless=levels) for levels in ([], [1]))
+    names = [name for name, _ in lasting.named_parameters() if "termination" not in name]
+    assert [name for name, _ in mixture.named_parameters()] == names
+    assert "levels.0.termination" not in mixture.networks()
+
+
+# --- acting -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_controller_chooses_by_the_gate_alone():
+    """How often each option follows each other does not depend on the one before: its share is the gate's."""
+    hierarchy = make_hierarchy((3,), memoryless=[1])
+    controller = Controller(hierarchy, options="sample")
+    controller.reset_all(range(400))
+    state = np.array([0.3, -0.2, 0.5])
+    chosen = []
+    for _ in range(25):
+        controller.act_all([{"state": state}] * 400)
+        chosen.append(controller.all_choices[:, 0])
+        assert (controller.all_terminations == 1.0).all()
+    before, after = np.concatenate(chosen[:-1]), np.concatenate(chosen[1:])
+    gate = gate_of(hierarchy, state)
+    for option in (1, 2, 3):
+        rows = after[before == option]
+        shares = np.bincount(rows, minlength=4)[1:] / len(rows)
+        assert np.abs(shares - gate).max() < 4 * math.sqrt(0.25 / len(rows))
+
+
+def gate_of(hierarchy, state):
+    """η(h | s) of each option."""
+    seen = torch.as_tensor(state).float().reshape(1, 1, -1)
+    with torch.no_grad():
+        tables = hierarchy(Inputs({"state": seen}, {}, torch.zeros(1, dtype=torch.int64))).tables()
+    return tables.selection[0][0, 0, 0, 1:].exp().numpy()
+
+
+# --- the spec ---------------------------------------------------------------------------------------------------------
+
+
+def spec_of(**changes):
+    return parse_spec(yaml.safe_load(SPEC) | changes)
+
+
+def test_a_mixture_beside_is_the_spec_with_terminations_always():
+    spec = spec_of(compare_with=["flat", "mixture", {"kind": "mixture", "optimizer": {"lr": 0.5}}])
+    assert list(named_baselines(spec)) == ["flat", "mixture", "mixture_2"]
+    first, second = (baseline_spec(spec, named_baselines(spec)[name], None) for name in ("mixture", "mixture_2"))
+    (level,) = first.hierarchy.levels
+    assert (level.termination, level.policy, first.training) == (
+        "always",
+        spec.hierarchy.levels[0].policy,
+        spec.training,
+    )
+    assert first.hierarchy.meta_policy == spec.hierarchy.meta_policy
+    assert second.training.optimizer.lr == 0.5
+    assert [model_name(own) for own in (spec, first, second)] == ["ddco", "mixture", "mixture"]
+
+
+def test_a_spec_is_read_back_as_it_is_written():
+    spec = spec_of(compare_with=["flat", {"kind": "mixture", "levels": ["option"]}])
+    again = parse_spec(read_yaml(dump_spec(spec)))
+    assert again == spec
+    assert again.compare_with[1].levels == ("option",)
+
+
+def test_one_level_of_several_can_be_without_memory():
+    levels = [{"name": "option", "count": 2}, {"name": "phase", "count": 2}]
+    spec = spec_of(
+        hierarchy={"levels": levels},
+        compare_with=[{"kind": "mixture", "levels": ["phase"]}, "mixture"],
+        training={"duration": {"mean": 5}},
+    )
+    partly, wholly = (baseline_spec(spec, baseline, None) for baseline in named_baselines(spec).values())
+    assert [level.lasts for level in partly.hierarchy.levels] == [True, False]
+    assert list(named_baselines(spec)) == [model_name(partly), model_name(wholly)] == ["mixture_phase", "mixture"]
+    assert (partly.training.duration, wholly.training.duration) == (spec.training.duration, None)
+
+
+def test_a_mixture_that_stands_alone_is_a_hierarchy():
+    spec = spec_of(hierarchy=None, compare_with=[], baseline={"kind": "mixture", "count": 3, "policy": {"hidden": [4]}})
+    (level,) = spec.hierarchy.levels
+    assert (level.count, level.policy.hidden, level.policy.emits, level.lasts) == (3, (4,), ("control",), False)
+    assert spec.baseline is None
+    assert model_name(spec) == "mixture"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"hierarchy": None, "baseline": "mixture", "compare_with": []}, "baseline.count: missing; say how many"),
+        ({"hierarchy": None, "baseline": "flat", "compare_with": ["mixture"]}, "compare_with.0: mixture takes its"),
+        ({"compare_with": [{"kind": "mixture", "count": 3}]}, "compare_with.0.count: a mixture in compare_with has"),
+        (
+            {"compare_with": [{"kind": "flat", "count": 3}]},
+            "compare_with.0.count: is a setting of mixture, not of flat",
+        ),
+        (
+            {"compare_with": [{"kind": "mixture", "levels": ["optoin"]}]},
+            "compare_with.0.levels: there is no level 'optoin' (did you mean 'option'?); there is: option",
+        ),
+        (
+            {"hierarchy": {"levels": [{"count": 2, "termination": "always"}]}, "compare_with": ["mixture"]},
+            "compare_with.0: mixture is what the hierarchy is already",
+        ),
+        (
+            {"hierarchy": {"levels": [{"count": 2, "termination": "alway"}]}, "compare_with": []},
+            "hierarchy.levels.0.termination: must be a network, such as {network: linear}, or always, got 'alway'",
+        ),
+        (
+            {
+                "hierarchy": {"levels": [{"count": 2, "termination": "always"}]},
+                "compare_with": [],
+                "training": {"duration": {"mean": 4}},
+            },
+            "training.duration: there are no options that last; leave it out",
+        ),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(changes, message):
+    with pytest.raises(SpecError) as refused:
+        spec_of(**changes)
+    assert str(refused.value).startswith(message)
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+
+def test_levels_above_start_from_segments_without_memory_too():
+    """ψ of a level whose options end after every step stays exactly 1 in the EM that levels above start from."""
+    hierarchy, batch = make_hierarchy((2, 2), memoryless=[2]), make_batch(4, 6)
+    with torch.no_grad():
+        pieces = [(hierarchy.tabulate(batch), batch.lengths)]
+    constants = fitted(pieces, seed=0)
+    assert isinstance(constants, Constants)
+    assert constants.termination[0].tolist() == [1.0, 1.0]
+    assert all(bool(torch.isfinite(table).all()) for table in constants.selection)
+
+
+def test_a_prior_on_durations_says_nothing_of_them():
+    tables = [make_hierarchy((2, 2), memoryless=levels).tabulate(make_batch()).termination for levels in ([], [1])]
+    prior = DurationSpec.model_validate({"mean": 3.0})
+    whole, lasting = (log_duration_prior(termination, make_batch().lengths, prior) for termination in tables)
+    above = log_duration_prior(tables[1][1:], make_batch().lengths, prior)
+    assert float(lasting) == pytest.approx(float(above))
+    assert float(lasting) != pytest.approx(float(whole))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run with a mixture beside it, and labels of three demonstrations."""
+    labels = {"level": "option", "from": "phase", "count": 3}
+    changes = {"compare_with": ["mixture"], "training": {"epochs": 6, "batch_size": 3, "labels": labels}}
+    return ddco_pyro.fit(spec_of(**changes), out=tmp_path_factory.mktemp("runs") / "mixture")
+
+
+def test_a_fit_trains_it_beside_with_the_same_budget(run):
+    mixture = run.baselines["mixture"]
+    assert run.metrics["comparison"]["mixture"]["training"]["budget"] == run.metrics["training"]["budget"]
+    stages = [[stage["stage"] for stage in fit.metrics["training"]["stages"]] for fit in (run, mixture)]
+    assert stages[0] == stages[1]
+    assert mixture.metrics["engine_check"]["value"] < 1e-6
+    assert mixture.spec.training.labels == run.spec.training.labels
+    again = ddco_pyro.load(run.folder / "baselines" / "mixture")
+    np.testing.assert_array_equal(again.log_likelihood(run.demonstrations), mixture.log_likelihood(run.demonstrations))
+    lasting = parameters(build_hierarchy(run.spec, Dimensions.of(run.demonstrations))) - mixture.metrics["parameters"]
+    assert lasting == sum(p.numel() for p in run.hierarchy.levels[0].termination.parameters())
+
+
+def test_its_segments_are_runs_of_one_expert():
+    """Every step is a termination, which says nothing: a segment ends where another expert acts."""
+    options = np.array([1, 1, 2, 2, 2, 1])
+    ended, active = np.ones(6, int), np.eye(3)[options]
+    assert LevelLabels.of(options, ended, active, lasts=False).runs() == [(1, 0, 2), (2, 2, 5), (1, 5, 6)]
+    assert len(LevelLabels.of(options, ended, active, lasts=True).runs()) == 6
+
+
+def test_shipped_specs_compare_with_it():
+    hierarchies = [path for path in sorted(SPECS.glob("*.yaml")) if "\nhierarchy:" in path.read_text()]
+    assert len(hierarchies) > 10
+    for path in hierarchies:
+        assert "mixture" in [baseline.kind for baseline in load_spec(path).compare_with], path
+
+
+def test_planted_memory_shows_in_the_likelihood():
+    """Options that last whatever the state says are worth nats; the same networks without memory lack them."""
+    truth = make_truth(make_spec((4,)))
+    demos, _ = plant(truth, number=20, steps=30, seed=0)
+    batch = encode(demos, truth.encoder, truth.scaling)
+    with torch.no_grad():
+        tables = truth.tabulate(batch)
+    ended = torch.tensor([-math.inf, 0.0]).expand(tables.termination[0].shape)
+    lasting, mixture = (
+        log_likelihood(each, batch.lengths) / batch.lengths for each in (tables, replace(tables, termination=(ended,)))
+    )
+    difference = (lasting - mixture).numpy()
+    assert difference.mean() - 3 * difference.std() / math.sqrt(len(difference)) > 0.5
