@@ -81,15 +81,19 @@ class Measured(NamedTuple):
 COLUMNS = (*(field.name for field in fields(Cell)), *Measured._fields)
 
 
-def overridden(cell: Cell) -> list[str]:
+def overridden(cell: Cell) -> dict[str, Any]:
     """What a cell changes in its study's spec: nothing is trained beside, and a mixture has no memory."""
-    own = MEMORYLESS if cell.method == MIXTURE else {}
-    return ["compare_with=[]", *(f"{key}={value}" for key, value in own.items())]
+    return {"compare_with": [], **(MEMORYLESS if cell.method == MIXTURE else {})}
+
+
+def words(cell: Cell) -> list[str]:
+    """The same as words of a command."""
+    return [f"{key}={value}" for key, value in overridden(cell).items()]
 
 
 def needle(cell: Cell, runs: Path) -> list[Measured]:
     """As ``needle_success.py`` and ``needle_curve.py`` do."""
-    changes = ["rollout.policies=[]", *overridden(cell)]
+    changes = ["rollout.policies=[]", *words(cell)]
     spec = needle_success.spec_of("ddco", cell.seed, cell.demonstrations, changes)
     fitted = fit(spec, out=runs / "fits" / cell.name)
     rolled = roll_out(fitted, EPISODES["needle"].get(cell.demonstrations, 60), jobs=1)
@@ -101,7 +105,7 @@ def needle(cell: Cell, runs: Path) -> list[Measured]:
 def pushing(cell: Cell, runs: Path) -> list[Measured]:
     """As ``pushing_cell.py`` does, by each way of acting."""
     spec = pushing_cell.spec_of(pushing_cell.Cell("DDCO MLP", 2, cell.demonstrations, cell.seed))
-    spec = with_overrides(spec, MEMORYLESS) if cell.method == MIXTURE else spec
+    spec = with_overrides(spec, overridden(cell))
     demos = pushing_cell.pool(runs / "pushing", spec)
     demos = demos.select(demos.names[: cell.demonstrations])
     hierarchy, _ = pushing_cell.fit(spec, demos, runs / "fits" / cell.name)
@@ -121,7 +125,7 @@ def arena(cell: Cell, runs: Path) -> list[Measured]:
     settings = arena_cell.DEFAULTS
     source = arena_cell.recorded(cell.task, settings)
     own = arena_cell.ArenaCell(cell.task, cell.demonstrations, cell.seed)
-    fitted = arena_cell.fitted_cell(own, source, tuple(overridden(cell)), runs / "fits" / cell.name)
+    fitted = arena_cell.fitted_cell(own, source, tuple(words(cell)), runs / "fits" / cell.name)
     played = arena_cell.sawyer(settings).play(cell.task, {cell.method: fitted}, source, EPISODES["arena"])
     successes = [episode["success"] for episode in played["episodes"][cell.method]]
     return [
@@ -134,7 +138,7 @@ def arena(cell: Cell, runs: Path) -> list[Measured]:
 def bins(cell: Cell, runs: Path) -> list[Measured]:
     """As ``bin_picking.py`` does."""
     spec, folder = bin_picking.SPECS["bin_picking"], runs / "fits" / cell.name
-    found = bin_picking.evaluated(spec, cell.seed, overridden(cell), cell.method, bin_picking.DEFAULTS, folder)
+    found = bin_picking.evaluated(spec, cell.seed, words(cell), cell.method, bin_picking.DEFAULTS, folder)
     own = found["methods"][cell.method]
     cleared = [one["cleared"] for one in own["bins"]]
     return [
@@ -250,9 +254,9 @@ def missing(done: set[Cell]) -> list[str]:
 
 def command(study: str, asked: Asked) -> str:
     """What does these cells."""
-    words = {"counts": asked.counts, "seeds": (asked.seeds,), "check": (asked.check,)}
-    words |= {} if asked.tasks == WHOLE[study].tasks else {"tasks": asked.tasks}
-    said = "".join(f" --{name} {' '.join(map(str, values))}" for name, values in words.items())
+    options = {"counts": asked.counts, "seeds": (asked.seeds,), "check": (asked.check,)}
+    options |= {} if asked.tasks == WHOLE[study].tasks else {"tasks": asked.tasks}
+    said = "".join(f" --{name} {' '.join(map(str, values))}" for name, values in options.items())
     return f"python studies/memory.py {study}{said}"
 
 
