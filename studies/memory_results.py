@@ -167,7 +167,7 @@ def over_tasks(found: Sequence[Row]) -> list[Row]:
             groups.setdefault((one["demonstrations"], one["measure"], one["acting"]), []).append(one)
     whole = []
     for group in groups.values():
-        named = {key: group[0][key] for key in KEY} | {"task": f"{len(group)} tasks", "again": group[0]["again"]}
+        named = {key: group[0][key] for key in KEY} | {"task": f"mean of {len(group)} tasks", "again": group[0]["again"]}
         named["seeds"] = sorted({seed for one in group for seed in one["seeds"]})
         whole.append(named | {part: _over(group, part) for part in ("mean", "difference")})
     return whole
