@@ -134,6 +134,10 @@ def _order(key: tuple[Any, ...]) -> tuple[Any, ...]:
     return (ORDER.index(study), task, count, measure != "nats", measure, acting)
 
 
+def _in_order(one: Row) -> int:
+    return ORDER.index(one["study"])
+
+
 def _compared(named: Row, rows: Sequence[Row], pages: Sequence[Row]) -> Row:
     anyhow = named | {"acting": "marginal"} if named["acting"] else named  # flat policies act in one way
     values = {
@@ -250,8 +254,7 @@ def reproduced(found: Sequence[Row]) -> Iterator[str]:
 def page(found: Sequence[Row], again: Sequence[Row], missing: Sequence[str], made_by: str) -> str:
     """The results as Markdown."""
     tasks, whole = [one for one in found if one["study"] == "arena"], over_tasks(found)
-    place = next((i for i, one in enumerate(found) if one["study"] in ("bins", "planted")), len(found))
-    main = [*(one for one in found[:place] if one["study"] != "arena"), *whole, *found[place:]]
+    main = sorted([*(one for one in found if one["study"] != "arena"), *whole], key=_in_order)
     lines = [
         made_by,
         "",
@@ -279,7 +282,7 @@ def page(found: Sequence[Row], again: Sequence[Row], missing: Sequence[str], mad
         *reproduced(again),
         "",
         "*Options* are the page's; *options again* are fitted by the code that fits the mixtures. A fit is sensitive "
-        "to last digits: on another machine the same seed gives another draw, which is as good for a pair.",
+        "to last digits: on another machine the same seed gives another fit, to the same demonstrations.",
     ]
     if tasks:
         lines += ["", "## Meta-World, by task", "", *table(tasks)]
@@ -301,7 +304,7 @@ PANELS: dict[str, Callable[[str], bool]] = {
 
 def draw(found: Sequence[Row], path: Path) -> None:
     """The two differences of every comparison, a panel for each measure."""
-    rows = [*(one for one in found if one["study"] != "arena"), *over_tasks(found)]
+    rows = sorted([*(one for one in found if one["study"] != "arena"), *over_tasks(found)], key=_in_order)
     groups = {name: [one for one in rows if belongs(one["measure"])] for name, belongs in PANELS.items()}
     groups = {name: group for name, group in groups.items() if group}
     with style():
@@ -329,6 +332,10 @@ def _panel(axes: Axes, name: str, group: Sequence[Row]) -> None:
     axes.set_ylim(len(group) - 0.5, -0.5)
     if name.startswith("held-out"):
         axes.set_xscale("symlog", linthresh=0.1)
+        axes.set_xticks([-1, -0.1, 0, 0.1, 1, 5])
+        axes.xaxis.set_major_formatter("{x:g}")
+    if name == "success":
+        axes.set_xlim(-0.6, 0.6)
 
 
 def _once(axes: Axes, difference: str) -> str | None:
