@@ -23,6 +23,7 @@ import numpy as np
 import rates
 from cells import Cell, Settings, printed, some
 from joblib import Parallel, delayed
+from needle_success import over_seeds, spread
 from provenance import record, sentence, text
 from scipy import stats
 
@@ -30,7 +31,7 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit
-from ddco_pyro.simulation.episodes import paired_difference, rate
+from ddco_pyro.simulation.episodes import rate
 from ddco_pyro.spec import load_spec
 
 SPECS = {"bin_picking": "specs/bin_picking.yaml", "bin_picking_hybrid": "specs/bin_picking_hybrid.yaml"}
@@ -155,20 +156,27 @@ def summarize(cells: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
                 likelihoods.setdefault(name, []).append(one["log_likelihood_per_step"]["valid"])
     return {
         name: measured(one)
-        | {"held_out": likelihoods.get(name, []), "cleared by seed": by_seed[name], "paired": paired(bins, name)}
+        | {"held_out": likelihoods.get(name, []), "cleared by seed": by_seed[name], "paired": paired(by_seed, name)}
         for name, one in bins.items()
     }
 
 
-def paired(bins: Mapping[str, Sequence[Bin]], name: str) -> dict[str, Any] | None:
-    """How many bins only DDCO cleared and how many only another method, of the same bins; None without the same."""
-    ours, theirs = ([one["cleared"] for one in bins.get(method, [])] for method in (OURS, name))
-    return None if name == OURS or len(ours) != len(theirs) else paired_difference(ours, theirs)
+def paired(by_seed: Mapping[str, Sequence[int]], name: str) -> dict[str, Any] | None:
+    """How many more bins DDCO cleared than another method, over training seeds; None where seeds are not the same.
+
+    Bins of one fit tell of one fit: what differs between methods is told by the spread over fits.
+    """
+    ours, theirs = (by_seed.get(method, []) for method in (OURS, name))
+    if name == OURS or len(ours) != len(theirs):
+        return None
+    return over_seeds([more - less for more, less in zip(ours, theirs, strict=True)])
 
 
-def alone(found: Mapping[str, Any] | None) -> str:
+def beside(found: Mapping[str, Any] | None) -> str:
     """What :func:`paired` says, as the page has it."""
-    return "-" if found is None else f"{found['only_ours']}, {found['only_theirs']} (p = {found['p_value']:.2g})"
+    if found is None:
+        return "-"
+    return f"{', '.join(format(one, '+d') for one in found['by_seed'])}: {spread(dict(found), '{:+.1f}')}"
 
 
 def page(summary: Mapping[str, Any], seconds: Sequence[Mapping[str, float]], made_by: str) -> str:
@@ -180,8 +188,8 @@ def page(summary: Mapping[str, Any], seconds: Sequence[Mapping[str, float]], mad
         lines.append(f"| {name} | {' | '.join(cells)} | {PAPER.get(name, '-')} |")
     cells = [", ".join(map(str, one["cleared by seed"])) for one in summary.values()]
     lines.append(f"| bins cleared, by seed | {' | '.join(cells)} | - |")
-    cells = [alone(one["paired"]) for one in summary.values()]
-    lines.append(f"| cleared by {OURS} alone, by this alone | {' | '.join(cells)} | - |")
+    cells = [beside(one["paired"]) for one in summary.values()]
+    lines.append(f"| bins cleared by {OURS} minus this, by seed | {' | '.join(cells)} | - |")
     cells = [f"{one['delivered']:.0%}" for one in summary.values()]
     lines.append(f"| objects brought into cups | {' | '.join(cells)} | - |")
     cells = [", ".join(f"{value:.2f}" for value in one["held_out"]) or "-" for one in summary.values()]
@@ -193,7 +201,8 @@ def page(summary: Mapping[str, Any], seconds: Sequence[Mapping[str, float]], mad
     lines += [
         "",
         "Rates with 95 % Wilson intervals; where counts of a bin are pooled, for as many independent trials as the "
-        "variance between bins gives; p of McNemar's exact test on the same bins. "
+        "variance between bins gives. Differences are of bins that the same seed cleared, with their mean and its 95 % "
+        "t interval over seeds. "
         "Below: how many attempts were empty, took several, lost some of what they had "
         "lifted, ended in the wrong cup, or were over before the jaws opened; then how bins ended that were not "
         "cleared.",

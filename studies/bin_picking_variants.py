@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import rates
-from bin_picking import DEFAULTS, OURS, SPECS, Fitted, alone, evaluated, summarize
+from bin_picking import DEFAULTS, OURS, SPECS, Fitted, beside, evaluated, summarize
 from cells import Cell, Settings, described, printed, some
 from joblib import Parallel, delayed
 from provenance import record, sentence, text
@@ -69,20 +69,20 @@ class Variant(Cell):
 def page(rows: Mapping[str, Mapping[str, Any]], seconds: Mapping[str, Sequence[float]], made_by: str) -> str:
     """The results as Markdown, a row for each method of each variant."""
     shown = ("bins cleared", "grasp of exactly one", "recovery, recall", "categorisation")
-    head = ["variant", "method", *shown, f"cleared by {OURS} alone, by this alone"]
+    head = ["variant", "method", *shown, f"cleared by {OURS} minus this, by seed"]
     head += ["cleared, by seed", "held-out nats per step, by seed", "fits, s"]
     lines = [made_by, "", f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for variant, methods in rows.items():
         took = ", ".join(f"{one:.0f}" for one in seconds[variant])
         for name, one in methods.items():
             cells = [rates.shown(one["criteria"][criterion]) for criterion in shown]
-            cells += [alone(one["paired"]), ", ".join(map(str, one["cleared by seed"]))]
+            cells += [beside(one["paired"]), ", ".join(map(str, one["cleared by seed"]))]
             cells += [", ".join(f"{value:.2f}" for value in one["held_out"]), took]
             lines.append(f"| {' | '.join([variant, name, *cells])} |")
     lines += [
         "",
-        "Rates, and p, as in [summary.md](summary.md). Likelihoods of other controls are in units of their own. Fits: "
-        "of all methods of the row's variant, on one thread.",
+        "Rates, and differences, as in [summary.md](summary.md). Likelihoods of other controls are in units of their "
+        "own. Fits: of all methods of the row's variant, on one thread.",
     ]
     return "\n".join(lines) + "\n"
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.simulation.episodes import rate
-from ddco_pyro.spec import load_spec
+from ddco_pyro.spec import Spec, load_spec
 
 OURS = "ddco"
 RATES = ("success", "grasped", "inserted")
@@ -48,6 +49,9 @@ FITS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "flat_clock": ("specs/needle_flat.yaml", "_clock", (STEP,)),
 }
 """Each model as its own spec has it: file, what stands behind the names of its methods, and what is changed."""
+FLAT_POLICIES = ("flat", "flat_equal")
+"""One network, of 609 and 608 hidden units, with the learning rates of their own specs, 1e-3 and 3e-3."""
+POOLED = "the mean of flat and flat_equal"
 FEW = ("ddco", "flat", "per_timestep")
 """The fits to fewer than all demonstrations."""
 CLOCKED = ("ddco_clock", "flat_clock")
@@ -66,21 +70,26 @@ def run_seed(seed: int, count: int, arguments: argparse.Namespace, made_by: Reco
     if (is_kept(kept, settings, made_by) and set(names) <= kept["results"]["methods"].keys()) or not names:
         return
     records, found = _beside(kept, settings) if len(names) < len(whole) else ([], {})
-    first = DEMONSTRATIONS + APART * seed
-    left_out = ", ".join(f"demo_{first + number}" for number in range(count, ALL))
-    own = [f"seed={seed}", f"demonstrations.seed={first}", f"demonstrations.exclude=[{left_out}]"]
-    own.append(f"rollout.seed={STARTS}")
     folder = arguments.runs / made_by["code"][:12] / path.stem
     for name in names:
-        file, suffix, changes = FITS[name]
+        suffix = FITS[name][1]
         scripted = () if (name, seed, count) == ("ddco", 0, ALL) else ("rollout.policies=[]",)
-        spec = load_spec(file, [*own, *changes, *scripted, *(arguments.set if name.startswith(OURS) else ())])
+        spec = spec_of(name, seed, count, (*scripted, *(arguments.set if name.startswith(OURS) else ())))
         with one_thread():
             fitted = fit(spec, out=folder / name)
             rolled = roll_out(fitted, arguments.episodes, jobs=1)
         for part, values in _numbers(fitted, rolled).items():
             found[part] = found.get(part, {}) | {f"{method}{suffix}": value for method, value in values.items()}
     write_text(path, text(settings | found, [*records, made_by]))
+
+
+def spec_of(name: str, seed: int, count: int, changes: Sequence[str] = ()) -> Spec:
+    """The spec of one of :data:`FITS` for so many demonstrations of a training seed, with further changes."""
+    file, _, own = FITS[name]
+    first = DEMONSTRATIONS + APART * seed
+    left_out = ", ".join(f"demo_{first + number}" for number in range(count, ALL))
+    data = (f"demonstrations.seed={first}", f"demonstrations.exclude=[{left_out}]")
+    return load_spec(file, [f"seed={seed}", *data, f"rollout.seed={STARTS}", *own, *changes])
 
 
 def _beside(kept: dict[str, Any], settings: dict[str, Any]) -> tuple[list[Record], Seed]:
@@ -158,16 +167,17 @@ def over_seeds(values: list[float], bounds: tuple[float, float] = (-np.inf, np.i
 
 def differences(seeds: list[Seed], ours: str = OURS) -> dict[str, dict[str, Any]]:
     """Ours minus every other method that is trained, paired by seed where there are both: success, and held-out nats
-    per step.
+    per step. Where there are both flat policies, their mean is one more: their networks are the same but for a unit.
     """
-    others = [name for name in seeds[0]["log_likelihood_per_step"] if name != ours]
-    both = {name: [one for one in seeds if {ours, name} <= one["methods"].keys()] for name in others}
+    others = {name: (name,) for name in seeds[0]["log_likelihood_per_step"] if name != ours}
+    others |= {POOLED: FLAT_POLICIES} if others.keys() >= set(FLAT_POLICIES) else {}
+    both = {name: [one for one in seeds if {ours, *own} <= one["methods"].keys()] for name, own in others.items()}
     return {
         name: {
-            "success": over_seeds([_success(one, ours) - _success(one, name) for one in paired]),
-            "log_likelihood_valid": over_seeds([_valid(one, ours) - _valid(one, name) for one in paired]),
+            part: over_seeds([of(one, ours) - float(np.mean([of(one, each) for each in own])) for one in both[name]])
+            for part, of in (("success", _success), ("log_likelihood_valid", _valid))
         }
-        for name, paired in both.items()
+        for name, own in others.items()
     }
 
 
@@ -208,6 +218,12 @@ def page(results: dict[str, Any], seeds: int, made_by: str) -> str:
         success = spread(one["success"], "{:+.1%}")
         likelihood = spread(one["log_likelihood_valid"], "{:+.2f}")
         lines.append(f"- {OURS} minus {name}, paired by seed: success {success}, {likelihood} held-out nats/step.")
+    if POOLED in results["differences"]:
+        lines += [
+            "",
+            "`flat` and `flat_equal` are one network, of 609 and 608 hidden units. They differ by learning rates, "
+            "1e-3 and 3e-3, and by what a fit is sensitive to.",
+        ]
     return "\n".join(lines) + "\n"
 
 

@@ -59,8 +59,11 @@ Row = dict[str, Any]
 """The ``way``, the ``seed``, what was found, and what made it."""
 
 
-def one_fit(way: str, seed: int) -> Row:
-    """A way of training on a seed's demonstrations."""
+def one_fit(way: str, seed: int, lasting: bool = True) -> Row:
+    """A way of training on a seed's demonstrations.
+
+    :param lasting: False: the options that are trained end after every step, at every level.
+    """
     torch.set_num_threads(1)
     truth = make_truth(make_spec(COUNTS, control=CONTROL), ENDING)
     kind = way.removesuffix(MANY)
@@ -70,6 +73,7 @@ def one_fit(way: str, seed: int) -> Row:
         found = constants(truth, demos, held_out, choices, seed if kind == "search" else None)
     else:
         spec = make_spec(COUNTS, seed, CONTROL, **{**TRAINING, **WAYS[kind]})
+        spec = spec if lasting else spec.model_copy(update={"hierarchy": spec.hierarchy.without_memory()})
         with tempfile.TemporaryDirectory() as folder:
             found = recovered(make_trainer(spec, demos, Path(folder)).run(), truth, held_out, choices)
     print(way, seed, found, flush=True)

@@ -3,8 +3,10 @@
     python studies/recipe.py [--grid initialization | decay | trunk] [--counts 100] [--spec specs/needle.yaml]
         [--seeds 5000 6000] [--episodes 60] [--jobs 2] [--out DIR]
 
-Each development seed has demonstrations of its own. Every model, baselines too, has as many candidates; each is
-trained once for each seed, scored on held-out demonstrations, and rolled out from starts that no result is about.
+Each development seed has demonstrations of its own. Baselines have as many settings as the hierarchy, which also has
+the recipe of before; each is trained once for each seed, scored on held-out demonstrations, and rolled out from starts
+that no result is about. A hierarchy acts in two ways, so it is chosen among 34 candidates and a baseline among 16 (of
+``decay`` among 12 and 6).
 ``--grid initialization`` tries how options begin, ``decay`` how much weights decay and what policy and termination of
 an option share, ``trunk`` a network that the whole hierarchy reads (fewer candidates than ``decay`` has for each model;
 the hierarchy alone has such a thing); ``--counts`` trains on the first demonstrations of a seed. A cell that is in

@@ -9,7 +9,7 @@ import needle_success
 import numpy as np
 import pytest
 from needle_curve import joined
-from needle_success import differences, over_seeds, page, summarize
+from needle_success import POOLED, differences, over_seeds, page, summarize
 from provenance import ROOT, is_kept
 
 SEEDS, DRAWS = 5, 4000
@@ -84,6 +84,16 @@ def test_differences_are_paired_by_seed(seeds):
     assert (name, others) == ("flat", [])
     assert found["success"]["by_seed"] == pytest.approx([0.1, 0.4])
     assert found["log_likelihood_valid"]["by_seed"] == pytest.approx([1.0, 3.0])
+
+
+def test_the_two_fits_of_one_flat_network_are_pooled_by_seed(seeds):
+    for one in seeds:
+        one["methods"]["flat_equal"] = rates((1, 10), (4, 10), (2, 4), 1.0)
+        one["log_likelihood_per_step"]["flat_equal"] = {"train": 20.0, "valid": 18.0}
+    found = differences(seeds)[POOLED]
+    assert found["success"]["by_seed"] == pytest.approx([0.3 - 0.15, 0.8 - 0.25])
+    assert found["log_likelihood_valid"]["by_seed"] == pytest.approx([21.0 - 19.0, 25.0 - 20.0])
+    assert "one network" in page({"methods": summarize(seeds), "differences": differences(seeds)}, 2, "Made.")
 
 
 def test_a_seed_that_lacks_a_method_has_no_part_in_its_pairs(seeds):

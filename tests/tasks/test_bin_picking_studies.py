@@ -10,7 +10,7 @@ import bin_picking_recovery
 import bin_picking_unseen
 import numpy as np
 import pytest
-from bin_picking import OURS, summarize
+from bin_picking import OURS, beside, summarize
 from bin_picking_films import chosen, part
 from bin_picking_options import ENDS, end, shares, trials
 from bin_picking_recovery import counted
@@ -66,15 +66,17 @@ def test_options_are_shared_over_the_trials_that_end_alike() -> None:
     assert found[ENDS[2]][:5] == [{1: 1.0}] * 4 + [{}]
 
 
-def test_methods_are_paired_on_the_same_bins() -> None:
+def test_methods_are_paired_by_seed() -> None:
     def bins(cleared: list[int]) -> dict[str, list[dict[str, float]]]:
         return {"bins": [Trials(()).measures() | {"cleared": one, "objects": 3, "attempts": 1} for one in cleared]}
 
     cells = [{"methods": {OURS: bins([1, 1, 1]), "flat": bins([0, 1, 0])}}] * 2
     found = summarize([*cells, {"methods": {OURS: bins([0]), "flat": bins([1])}}])
     assert found["flat"]["cleared by seed"] == [1, 1, 1]
-    # Of five bins that one method alone cleared, one or none was the other's: 2 (1 + 5) / 2⁵.
-    assert found["flat"]["paired"] == {"only_ours": 4, "only_theirs": 1, "trials": 7, "p_value": pytest.approx(0.375)}
+    # Two bins more, two more and one fewer: the mean of three is 1, and its standard error 1; t(0.975, 2) is 4.3027.
+    assert found["flat"]["paired"]["by_seed"] == [2, 2, -1]
+    assert found["flat"]["paired"]["interval"] == pytest.approx([1 - 4.3027, 1 + 4.3027], abs=1e-4)
+    assert beside(found["flat"]["paired"]) == "+2, +2, -1: +1.0 [-3.3, +5.3]"
     assert found[OURS]["paired"] is None
 
 

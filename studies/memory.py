@@ -1,0 +1,303 @@
+"""Are options worth it for being several, or for lasting? A memoryless mixture in the cells of other studies.
+
+    python studies/memory.py needle [--counts 20 100] [--seeds 10] [--check 2]
+    python studies/memory.py pushing [--counts 40 80] [--seeds 10] [--check 10]
+    python studies/memory.py arena [--counts 10 50] [--seeds 3] [--check 1] [--tasks pick-place-v3 ...]
+    python studies/memory.py bins [--counts 60] [--seeds 3] [--check 0]
+    python studies/memory.py planted [--seeds 5] [--check 2] [--tasks segments joint]
+    python studies/memory.py page
+
+A mixture is the hierarchy of that study's spec whose options end after every step (``termination: always``): the same
+demonstrations, training seeds, starts and gradient steps. ``--check`` fits options of so many seeds again, to see
+whether this code gives what the study's page has. Each cell is a few rows of ``cells.csv`` as soon as it is done, and
+is not done again. ``page`` pairs mixtures by seed with the numbers that those studies keep, and writes ``memory.md``
+and ``memory.png``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import itertools
+import json
+import os
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import arena_cell
+import bin_picking
+import needle_success
+import planted_levels
+import pushing_cell
+import torch
+from arena import TASKS
+from arena_results import nmi
+from cells import described, printed, some
+from ddco_tasks.pushing import environment as pushing_task
+from memory_results import MIXTURE, OPTIONS, checks, comparisons, draw, of_pages, page
+from provenance import Record, record, sentence, text
+from threadpoolctl import threadpool_limits
+
+from ddco_pyro.acting.lockstep import play
+from ddco_pyro.data.files import only_one, write_text
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.rollouts import roll_out
+from ddco_pyro.fitting.run import fit
+from ddco_pyro.spec import load_spec, with_overrides
+
+MEMORYLESS = {"hierarchy.levels.0.termination": "always"}
+ACTING = ("marginal", "sample", "most_likely")
+EPISODES = {"needle": {20: 60, 100: 200}, "arena": 20, "bins": 20, "pushing": pushing_cell.EPISODES}
+"""Starts of each fit, as on the pages."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A method that is fitted and rolled out."""
+
+    study: str
+    task: str
+    method: str
+    demonstrations: int
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        return "-".join(map(str, astuple(self)))
+
+
+class Measured(NamedTuple):
+    """A number of a cell; ``acting`` is how options are chosen in rollouts, and empty where nothing acts."""
+
+    acting: str
+    measure: str
+    value: float
+
+
+COLUMNS = (*(field.name for field in fields(Cell)), *Measured._fields)
+
+
+def overridden(cell: Cell) -> dict[str, Any]:
+    """What a cell changes in its study's spec: nothing is trained beside, and a mixture has no memory."""
+    return {"compare_with": [], **(MEMORYLESS if cell.method == MIXTURE else {})}
+
+
+def words(cell: Cell) -> list[str]:
+    """The same as words of a command."""
+    return [f"{key}={value}" for key, value in overridden(cell).items()]
+
+
+def needle(cell: Cell, runs: Path) -> list[Measured]:
+    """As ``needle_success.py`` and ``needle_curve.py`` do."""
+    changes = ["rollout.policies=[]", *words(cell)]
+    spec = needle_success.spec_of("ddco", cell.seed, cell.demonstrations, changes)
+    fitted = fit(spec, out=runs / "fits" / cell.name)
+    rolled = roll_out(fitted, EPISODES["needle"].get(cell.demonstrations, 60), jobs=1)
+    success = rolled["methods"][fitted.name]["measures"]["success"]["rate"]
+    nats = fitted.metrics["log_likelihood_per_step"]["valid"]
+    return [Measured("", "nats", nats), Measured(spec.rollout.options, "success", success)]
+
+
+def pushing(cell: Cell, runs: Path) -> list[Measured]:
+    """As ``pushing_cell.py`` does, by each way of acting."""
+    spec = pushing_cell.spec_of(pushing_cell.Cell("DDCO MLP", 2, cell.demonstrations, cell.seed))
+    spec = with_overrides(spec, overridden(cell))
+    demos = pushing_cell.pool(runs / "pushing", spec)
+    demos = demos.select(demos.names[: cell.demonstrations])
+    hierarchy, _ = pushing_cell.fit(spec, demos, runs / "fits" / cell.name)
+    held_out = pushing_cell.held_out(runs / "pushing", spec)
+    found = [Measured("", "nats", pushing_cell.per_step(Fit(spec, hierarchy), held_out))]
+    first = pushing_cell.EVALUATION + 1000 * cell.seed
+    for acting in ACTING:
+        rollout = spec.rollout.model_copy(update={"options": acting})
+        episodes = play(pushing_task.task, hierarchy, rollout, range(first, first + pushing_cell.EPISODES))
+        goals = pushing_cell.summary(episodes)["goals"]
+        found.append(Measured(acting, "goals", sum(goals) / len(goals)))
+    return found
+
+
+def arena(cell: Cell, runs: Path) -> list[Measured]:
+    """As ``arena_cell.py`` does."""
+    settings = arena_cell.DEFAULTS
+    source = arena_cell.recorded(cell.task, settings)
+    own = arena_cell.ArenaCell(cell.task, cell.demonstrations, cell.seed)
+    fitted = arena_cell.fitted_cell(own, source, tuple(words(cell)), runs / "fits" / cell.name)
+    played = arena_cell.sawyer(settings).play(cell.task, {cell.method: fitted}, source, EPISODES["arena"])
+    successes = [episode["success"] for episode in played["episodes"][cell.method]]
+    return [
+        Measured("", "nats", fitted.metrics["log_likelihood_per_step"]["valid"]),
+        Measured("", "NMI", nmi(fitted.metrics["agreement"])),
+        Measured(fitted.spec.rollout.options, "success", sum(successes) / len(successes)),
+    ]
+
+
+def bins(cell: Cell, runs: Path) -> list[Measured]:
+    """As ``bin_picking.py`` does."""
+    spec, folder = bin_picking.SPECS["bin_picking"], runs / "fits" / cell.name
+    found = bin_picking.evaluated(spec, cell.seed, words(cell), cell.method, bin_picking.DEFAULTS, folder)
+    own = found["methods"][cell.method]
+    cleared = [one["cleared"] for one in own["bins"]]
+    return [
+        Measured("", "nats", own["log_likelihood_per_step"]["valid"]),
+        Measured(load_spec(spec).rollout.options, "success", sum(cleared) / len(cleared)),
+    ]
+
+
+def planted(cell: Cell, runs: Path) -> list[Measured]:
+    """As ``planted_levels.py`` does; its mixtures have no memory at any level."""
+    row = planted_levels.one_fit(cell.task, cell.seed, lasting=cell.method == OPTIONS)
+    levels = [Measured("", f"NMI, level {number}", value) for number, value in enumerate(row["found nmi"], 1)]
+    return [Measured("", "nats", row["found"]), *levels]
+
+
+STUDIES: dict[str, Callable[[Cell, Path], list[Measured]]] = {
+    one.__name__: one for one in (needle, pushing, arena, bins, planted)
+}
+
+
+class Asked(NamedTuple):
+    """Cells of a study.
+
+    :param check: options of so many seeds are fitted again.
+    """
+
+    counts: tuple[int, ...]
+    seeds: int
+    check: int
+    tasks: tuple[str, ...]
+
+
+WHOLE = {
+    "needle": Asked((20, 100), 10, 2, ("needle",)),
+    "pushing": Asked((40, 80), 10, 10, ("pushing",)),
+    "arena": Asked((10, 50), 3, 1, TASKS),
+    "bins": Asked((60,), 3, 0, ("bins",)),
+    "planted": Asked((planted_levels.DEMONSTRATIONS,), 5, 2, ("segments", "joint")),
+}
+"""What the page is about."""
+
+
+def cells_of(study: str, asked: Asked) -> list[Cell]:
+    """All counts and tasks of a seed before another seed, mixtures before the options that check them."""
+    grid = itertools.product(range(asked.seeds), asked.counts, asked.tasks, (MIXTURE, OPTIONS))
+    return [
+        Cell(study, task, method, count, seed)
+        for seed, count, task, method in grid
+        if method == MIXTURE or seed < asked.check
+    ]
+
+
+Row = dict[str, Any]
+"""A line of the table, by column."""
+
+
+def read(path: Path) -> list[Row]:
+    """The rows of a table; none where it is not there."""
+    if not path.exists():
+        return []
+    with path.open(encoding="utf-8", newline="") as table:
+        kinds = {"demonstrations": int, "seed": int, "value": float}
+        return [{key: kinds.get(key, str)(value) for key, value in row.items()} for row in csv.DictReader(table)]
+
+
+def cell_of(row: Row) -> Cell:
+    """The cell whose row it is."""
+    return Cell(*(row[field.name] for field in fields(Cell)))
+
+
+def keep(out: Path, cell: Cell, measured: Iterable[Measured], made_by: Record) -> None:
+    """Add a cell's rows to the table, and what made them to the record beside it."""
+    path = out / "cells.csv"
+    with only_one(out, wait=True):
+        rows = read(path) + [dict(zip(COLUMNS, (*astuple(cell), *one), strict=True)) for one in measured]
+        written = io.StringIO()
+        table = csv.DictWriter(written, COLUMNS, lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+        beside = path.with_suffix(".json")
+        records = json.loads(beside.read_text())["provenance"] if beside.exists() else []
+        write_text(beside, text(None, [*records, made_by]))
+        write_text(path, written.getvalue())
+
+
+def work(cells: Sequence[Cell], runs: Path, out: Path, made_by: Record) -> str:
+    """Do the cells that the table has not, one by one; a line of how many there are."""
+    done = {cell_of(row) for row in read(out / "cells.csv")}
+    todo = [cell for cell in cells if cell not in done]
+    torch.set_num_threads(1)
+    for cell in todo:
+        begun, used = time.perf_counter(), sum(os.times()[:4])
+        with threadpool_limits(1):
+            measured = STUDIES[cell.study](cell, runs)
+        keep(out, cell, measured, made_by)
+        shown = ", ".join(f"{one.measure} {one.acting} {one.value:.3f}" for one in measured)
+        seconds = f"{time.perf_counter() - begun:.0f} s, {sum(os.times()[:4]) - used:.0f} s of them worked"
+        print(f"{cell.name}: {shown} ({seconds})", flush=True)
+    return f"{len(todo)} of {len(cells)} cells were not there"
+
+
+def missing(done: set[Cell]) -> list[str]:
+    """Of each study and number of demonstrations how many cells the table has not, and what does them."""
+    lines = []
+    for study, whole in WHOLE.items():
+        for count in whole.counts:
+            cells = cells_of(study, whole._replace(counts=(count,)))
+            left = [cell for cell in cells if cell not in done]
+            if left:
+                kinds = ", ".join(f"{sum(one.method == kind for one in left)} of {kind}" for kind in (MIXTURE, OPTIONS))
+                lines.append(f"`{command(study, whole._replace(counts=(count,)))}`: {kinds}, of {len(cells)} cells")
+    return lines
+
+
+def command(study: str, asked: Asked) -> str:
+    """What does these cells."""
+    options = {"counts": asked.counts, "seeds": (asked.seeds,), "check": (asked.check,)}
+    options |= {} if asked.tasks == WHOLE[study].tasks else {"tasks": asked.tasks}
+    said = "".join(f" --{name} {' '.join(map(str, values))}" for name, values in options.items())
+    return f"python studies/memory.py {study}{said}"
+
+
+def write_page(out: Path) -> str:
+    """``memory.md``, ``memory.json`` and ``memory.png`` beside the folder of the table; the page."""
+    rows, pages = read(out / "cells.csv"), of_pages()
+    found = comparisons(rows, pages)
+    records = json.loads((out / "cells.json").read_text())["provenance"]
+    made_by = sentence("python studies/memory.py page", records)
+    shown = page(found, checks(rows, pages), missing({cell_of(row) for row in rows}), made_by)
+    write_text(out.with_suffix(".json"), text(found, records))
+    write_text(out.with_suffix(".md"), shown)
+    draw(found, out.with_suffix(".png"))
+    return shown
+
+
+def main() -> None:
+    """Do the cells of a study, or write the page."""
+    parser = described(__doc__)
+    parser.add_argument("study", choices=[*STUDIES, "page"])
+    for name in ("counts", "seeds", "check"):
+        parser.add_argument(f"--{name}", type=int, nargs="+" if name == "counts" else None)
+    parser.add_argument("--tasks", nargs="+")
+    parser.add_argument("--runs", type=Path, default=Path("runs/memory"))
+    parser.add_argument("--out", type=Path, default=Path("docs/results/memory"))
+    own = parser.parse_args()
+    printed(lambda: run(own))
+
+
+def run(own: argparse.Namespace) -> str:
+    """What the command line asks for."""
+    if own.study == "page":
+        return write_page(own.out)
+    said = {name: getattr(own, name) for name in Asked._fields if getattr(own, name) is not None}
+    asked = WHOLE[own.study]._replace(
+        **{name: tuple(one) if name in ("counts", "tasks") else one for name, one in said.items()}
+    )
+    return work(some(cells_of(own.study, asked)), own.runs, own.out, record(command(own.study, asked)))
+
+
+if __name__ == "__main__":
+    main()

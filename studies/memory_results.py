@@ -1,0 +1,351 @@
+"""What mixtures without memory say beside flat policies and options: pairs by seed, a page and a figure."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from needle_success import over_seeds, spread
+from provenance import ROOT
+
+from ddco_pyro.drawing.pictures import FAINT, blank, keep, style
+
+OPTIONS, MIXTURE, FLAT, EQUAL = "options", "mixture", "flat", "flat_equal"
+AGAIN = "options again"
+"""Those that the code of the mixtures has fitted."""
+DIFFERENCES = ((MIXTURE, FLAT), (MIXTURE, EQUAL), (OPTIONS, MIXTURE), (AGAIN, MIXTURE))
+RESULTS = ROOT / "docs" / "results"
+ROUNDING = 1e-6
+"""Two codes that do the same differ by less."""
+
+Row = dict[str, Any]
+"""A number, by column: ``study``, ``task``, ``method``, ``demonstrations``, ``seed``, ``acting``, ``measure``,
+``value``.
+"""
+
+Values = dict[int, float]
+"""By training seed."""
+
+
+# --- what the other studies keep --------------------------------------------------------------------------------------
+
+
+def of_pages(root: Path = RESULTS) -> list[Row]:
+    """The numbers of options and of flat policies that the other studies keep, by seed; only ways of acting that the
+    study has of its own.
+    """
+    return [
+        dict(zip(("study", "task", "method", "demonstrations", "seed", "acting", "measure", "value"), row, strict=True))
+        for study in (_needle, _pushing, _arena, _bins, _planted)
+        for row in study(root)
+    ]
+
+
+def _needle(root: Path) -> Iterator[tuple[Any, ...]]:
+    for path in sorted((root / "needle").glob("*seed-*.json")):
+        own = _results(path)
+        if path.name.startswith("clock"):
+            continue
+        count, seed = own.get("count", 100), own["seed"]
+        for method, name in ((OPTIONS, "ddco"), (FLAT, FLAT), (EQUAL, EQUAL)):
+            success = own["methods"][name]["measures"]["success"]["rate"]
+            yield "needle", "needle", method, count, seed, "", "nats", own["log_likelihood_per_step"][name]["valid"]
+            yield "needle", "needle", method, count, seed, "marginal", "success", success
+
+
+def _pushing(root: Path) -> Iterator[tuple[Any, ...]]:
+    called = {"DDCO MLP": OPTIONS, "flat MLP": FLAT, "flat MLP, equal parameters": EQUAL}
+    with (root / "pushing" / "perceptrons" / "sample_complexity.csv").open(encoding="utf-8", newline="") as table:
+        for one in csv.DictReader(table):
+            own = ("pushing", "pushing", called[one["method"]], int(one["demonstrations"]), int(one["seed"]))
+            yield *own, "", "nats", float(one["log_likelihood_held_out"])
+            yield *own, "marginal", "goals", float(one["goals"])
+
+
+def _arena(root: Path) -> Iterator[tuple[Any, ...]]:
+    for task, found in _results(root / "arena" / "summary.json")["tasks"].items():
+        for count, one in found["counts"].items():
+            for seed, value in enumerate(one["nmi_valid"]["by_seed"]):
+                yield "arena", task, OPTIONS, int(count), seed, "", "NMI", value
+            for method, name in ((OPTIONS, "ddco"), (FLAT, FLAT), (EQUAL, EQUAL)):
+                own = one["methods"][name]
+                for seed, value in enumerate(own["log_likelihood_valid"]["by_seed"]):
+                    yield "arena", task, method, int(count), seed, "", "nats", value
+                for seed, value in enumerate(own["success"]["by_seed"]):
+                    yield "arena", task, method, int(count), seed, "marginal", "success", value
+
+
+def _bins(root: Path) -> Iterator[tuple[Any, ...]]:
+    known = {60: _results(root / "bin_picking" / "summary.json")}
+    fewer = _results(root / "bin_picking" / "fewer.json")
+    known |= {int(name.rpartition("-")[2]): methods for name, methods in fewer.items()}
+    for count, methods in known.items():
+        for method, name in ((OPTIONS, "DDCO"), (FLAT, FLAT), (EQUAL, EQUAL)):
+            seeds = len(methods[name]["held_out"])
+            trials = methods[name]["criteria"]["bins cleared"]["trials"] / seeds
+            for seed in range(seeds):
+                own = ("bins", "bins", method, count, seed)
+                yield *own, "", "nats", methods[name]["held_out"][seed]
+                yield *own, "marginal", "success", methods[name]["cleared by seed"][seed] / trials
+
+
+def _planted(root: Path) -> Iterator[tuple[Any, ...]]:
+    for one in _results(root / "planted_levels.json"):
+        if "fitted" not in one and not one["way"].endswith("320"):
+            own = ("planted", one["way"], OPTIONS, 80, one["seed"], "")
+            yield *own, "nats", one["found"]
+            for number, value in enumerate(one["found nmi"], 1):
+                yield *own, f"NMI, level {number}", value
+
+
+def _results(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))["results"]
+
+
+# --- pairs ------------------------------------------------------------------------------------------------------------
+
+
+def comparisons(rows: Sequence[Row], pages: Sequence[Row]) -> list[Row]:
+    """For each study, task, number of demonstrations and measure that mixtures have: the values of each method, and
+    differences of those that one is paired with by seed, over seeds.
+
+    :param rows: of mixtures, and of options that were fitted again.
+    :param pages: of options and flat policies, as the other studies keep them.
+    """
+    keys = dict.fromkeys(_key(row) for row in rows if row["method"] == MIXTURE)
+    return [_compared(dict(zip(KEY, key, strict=True)), rows, pages) for key in sorted(keys, key=_order)]
+
+
+KEY = ("study", "task", "demonstrations", "measure", "acting")
+ORDER = ("needle", "pushing", "arena", "bins", "planted")
+
+
+def _key(row: Row) -> tuple[Any, ...]:
+    return tuple(row[key] for key in KEY)
+
+
+def _order(key: tuple[Any, ...]) -> tuple[Any, ...]:
+    study, task, count, measure, acting = key
+    return (ORDER.index(study), task, count, measure != "nats", measure, acting)
+
+
+def _in_order(one: Row) -> int:
+    return ORDER.index(one["study"])
+
+
+def _compared(named: Row, rows: Sequence[Row], pages: Sequence[Row]) -> Row:
+    anyhow = named | {"acting": "marginal"} if named["acting"] else named  # flat policies act in one way
+    values = {
+        FLAT: _values(anyhow, FLAT, pages),
+        EQUAL: _values(anyhow, EQUAL, pages),
+        MIXTURE: _values(named, MIXTURE, rows),
+        OPTIONS: _values(named, OPTIONS, pages),
+        AGAIN: _values(named, OPTIONS, rows),
+    }
+    mixture = values[MIXTURE]
+    found = named | {"values": values, "seeds": sorted(mixture)}
+    found["mean"] = {name: over_seeds([own[seed] for seed in mixture if seed in own]) for name, own in values.items()}
+    found["difference"] = {
+        f"{more} - {less}": over_seeds(paired(values[more], values[less])) for more, less in DIFFERENCES
+    }
+    return found
+
+
+def _values(named: Row, method: str, rows: Iterable[Row]) -> Values:
+    wanted = (*(named[key] for key in KEY), method)
+    return {row["seed"]: row["value"] for row in rows if (*_key(row), row["method"]) == wanted}
+
+
+def paired(more: Values, less: Values) -> list[float]:
+    """Differences of the seeds that both have, in the order of seeds."""
+    return [more[seed] - less[seed] for seed in sorted(more.keys() & less.keys())]
+
+
+def over_tasks(found: Sequence[Row]) -> list[Row]:
+    """Of a study with several tasks: means over seeds, and over tasks with intervals over tasks."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for one in found:
+        if one["study"] == "arena":
+            groups.setdefault((one["demonstrations"], one["measure"], one["acting"]), []).append(one)
+    whole = []
+    for group in groups.values():
+        named = {key: group[0][key] for key in KEY} | {"task": f"mean of {len(group)} tasks"}
+        named["seeds"] = sorted({seed for one in group for seed in one["seeds"]})
+        whole.append(named | {part: _over(group, part) for part in ("mean", "difference")})
+    return whole
+
+
+def _over(group: Sequence[Row], part: str) -> Row:
+    names = group[0][part]
+    means = {name: [one[part][name]["mean"] for one in group if one[part][name]["mean"] is not None] for name in names}
+    return {name: over_seeds(values) for name, values in means.items()}
+
+
+def checks(rows: Sequence[Row], pages: Sequence[Row]) -> list[Row]:
+    """Of each cell of options that was fitted again by how much it differs from what its study keeps."""
+    again = [row for row in rows if row["method"] == OPTIONS]
+    kept = {(*_key(row), row["seed"]): row["value"] for row in pages if row["method"] == OPTIONS}
+    return [row | {"kept": kept[name]} for row in again if (name := (*_key(row), row["seed"])) in kept]
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+FORMS = {"nats": "{:.2f}", "success": "{:.0%}", "goals": "{:.1f}"}
+NAMED = {"needle": "needle", "pushing": "pushing", "arena": "Meta-World", "bins": "bin picking", "planted": "planted"}
+
+
+def form_of(one: Row, difference: bool = False) -> str:
+    """How a measure is shown; pushing's likelihoods differ by hundredths."""
+    form = (
+        "{:.3f}" if one["measure"] == "nats" and one["study"] in ("pushing", "planted") else FORMS.get(one["measure"])
+    )
+    form = form or "{:.2f}"
+    return form.replace("{:", "{:+") if difference else form
+
+
+def table(found: Sequence[Row]) -> list[str]:
+    """Lines of Markdown."""
+    head = ["study", "demonstrations", "measure", "flat", "flat of equal size", "mixture", "options", "options again"]
+    head += ["mixture − flat", "mixture − flat of equal size", "options − mixture", "options again − mixture", "seeds"]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for one in found:
+        name = NAMED[one["study"]] + (f", {one['task']}" if one["task"] != one["study"] else "")
+        acting = f", {one['acting'].replace('_', ' ')}" if one["study"] == "pushing" and one["acting"] else ""
+        cells = [name, str(one["demonstrations"]), one["measure"] + acting]
+        cells += [_mean(one, method) for method in (FLAT, EQUAL, MIXTURE, OPTIONS, AGAIN)]
+        cells += [_difference(one, more, less) for more, less in DIFFERENCES]
+        lines.append(f"| {' | '.join([*cells, str(len(one['seeds']))])} |")
+    return lines
+
+
+def _mean(one: Row, method: str) -> str:
+    value = one["mean"][method]["mean"]
+    return "-" if value is None else form_of(one).format(value)
+
+
+def _difference(one: Row, more: str, less: str) -> str:
+    own = one["difference"][f"{more} - {less}"]
+    fewer = one["study"] != "arena" and own["mean"] is not None and len(own["by_seed"]) < len(one["seeds"])
+    shown = spread(own, form_of(one, True)) + (f" ({len(own['by_seed'])} seeds)" if fewer else "")
+    return f"**{shown}**" if own["interval"] and np.prod(np.sign(own["interval"])) > 0 else shown
+
+
+def reproduced(found: Sequence[Row]) -> Iterator[str]:
+    """A line for each study: which cells were fitted again, and by how much they differ."""
+    for study in ORDER:
+        own = [one for one in found if one["study"] == study]
+        if not own:
+            continue
+        cells = dict.fromkeys((one["task"], one["demonstrations"], one["seed"]) for one in own)
+        lines = [f"- {NAMED[study]}, {len(cells)} {'cell' if len(cells) == 1 else 'cells'} of options again:"]
+        for measure in dict.fromkeys(one["measure"] for one in own):
+            apart = [one["value"] - one["kept"] for one in own if one["measure"] == measure]
+            same = sum(abs(value) < ROUNDING for value in apart)
+            less = "" if same == len(apart) else f", at most {max(map(abs, apart)):.2g} apart"
+            lines.append(f"{measure} reproduced: {same} of {len(apart)}{less};")
+        yield " ".join(lines).rstrip(";") + "."
+
+
+def page(found: Sequence[Row], again: Sequence[Row], missing: Sequence[str], made_by: str) -> str:
+    """The results as Markdown."""
+    tasks, whole = [one for one in found if one["study"] == "arena"], over_tasks(found)
+    main = sorted([*(one for one in found if one["study"] != "arena"), *whole], key=_in_order)
+    lines = [
+        made_by,
+        "",
+        "# Is it memory, or is it several policies?",
+        "",
+        "A hierarchy differs from a flat policy in two things. It has several policies behind a meta-policy that "
+        "chooses among them, and what is chosen lasts. A *mixture* is the same hierarchy whose options end after every "
+        "step, with the same networks, demonstrations, seeds, starts and gradient steps. So **mixture − flat** is what "
+        "several policies are worth, and **options − mixture** is what it is worth that they last.",
+        "",
+        "Differences are paired by training seed: means with 95 % t intervals over seeds, and for Meta-World over "
+        "tasks, of means over seeds. They are not corrected for the number of comparisons; bold ones leave out 0. "
+        "Options and flat policies are of the studies' own pages, with the same demonstrations, seeds and starts. "
+        "Starts: needle 60 with 20 demonstrations and 200 with 100, pushing 20 episodes of 2000 steps, Meta-World 20, "
+        "bin picking 20 bins, where success is a bin that is cleared. Nats are per step, and NMI is with the labels; "
+        "both are of held-out demonstrations. "
+        "Pushing's page has `marginal` alone of the three ways of choosing options; a flat policy acts in one way.",
+        "",
+        *table(main),
+        "",
+        "![Differences](memory.png)",
+        "",
+        "## Is the code the same?",
+        "",
+        *reproduced(again),
+        "",
+        "*Options* are the page's; *options again* are fitted by the code that fits the mixtures. A fit is sensitive "
+        "to last digits: on another machine the same seed gives another fit, to the same demonstrations.",
+    ]
+    if tasks:
+        lines += ["", "## Meta-World, by task", "", *table(tasks)]
+    if missing:
+        lines += ["", "## What is missing", "", *(f"- {one}" for one in missing)]
+    return "\n".join(lines) + "\n"
+
+
+# --- the figure -------------------------------------------------------------------------------------------------------
+
+COLOURS = {f"{MIXTURE} - {FLAT}": "#c08a30", f"{OPTIONS} - {MIXTURE}": "#1f3f70", f"{AGAIN} - {MIXTURE}": "#84a7d3"}
+PANELS: dict[str, Callable[[str], bool]] = {
+    "held-out nats per step": lambda measure: measure == "nats",
+    "NMI with labels": lambda measure: measure.startswith("NMI"),
+    "success": lambda measure: measure == "success",
+    "goals": lambda measure: measure == "goals",
+}
+
+
+def draw(found: Sequence[Row], path: Path) -> None:
+    """The two differences of every comparison, a panel for each measure."""
+    rows = sorted([*(one for one in found if one["study"] != "arena"), *over_tasks(found)], key=_in_order)
+    groups = {name: [one for one in rows if belongs(one["measure"])] for name, belongs in PANELS.items()}
+    groups = {name: group for name, group in groups.items() if group}
+    with style():
+        figure = blank(1.2 + 0.24 * max(map(len, groups.values())) * ((len(groups) + 1) // 2))
+        panels = figure.subplots((len(groups) + 1) // 2, 2, squeeze=False).flatten()
+        for axes, (name, group) in zip(panels, groups.items(), strict=False):
+            _panel(axes, name, group)
+        for axes in panels[len(groups) :]:
+            axes.set_axis_off()
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+        keep(figure, path, "What several policies are worth, and what it is worth that they last", "")
+
+
+def _panel(axes: Axes, name: str, group: Sequence[Row]) -> None:
+    for place, one in enumerate(group):
+        for shift, (difference, colour) in zip((-0.22, 0, 0.22), COLOURS.items(), strict=True):
+            own = one["difference"][difference]
+            if own["mean"] is None:
+                continue
+            axes.plot(own["mean"], place + shift, "o", ms=4, color=colour, label=_once(axes, difference))
+            if own["interval"]:
+                axes.plot(own["interval"], [place + shift] * 2, lw=2, color=colour, alpha=0.6)
+    axes.axvline(0, color=FAINT, lw=0.7)
+    axes.set(title=name, yticks=range(len(group)), yticklabels=list(map(_label, group)))
+    axes.set_ylim(len(group) - 0.5, -0.5)
+    if name.startswith("held-out"):
+        axes.set_xscale("symlog", linthresh=0.1)
+        axes.set_xticks([-1, -0.1, 0, 0.1, 1, 5])
+        axes.xaxis.set_major_formatter("{x:g}")
+    if name == "success":
+        axes.set_xlim(-0.6, 0.6)
+
+
+def _once(axes: Axes, difference: str) -> str | None:
+    label = difference.replace(" - ", " − ")
+    return None if label in axes.get_legend_handles_labels()[1] else label
+
+
+def _label(one: Row) -> str:
+    words = [NAMED[one["study"]], str(one["demonstrations"])]
+    words += [one["task"]] if one["study"] == "planted" else []
+    words += [one["acting"].replace("_", " ")] if one["measure"] == "goals" else []
+    words += [one["measure"].removeprefix("NMI, ")] if one["measure"].startswith("NMI,") else []
+    return " ".join(words)
