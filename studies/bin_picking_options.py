@@ -133,12 +133,12 @@ def _said(outputs: Outputs, active: Tensor) -> Tensor:
     """The active option's control and the logit of its termination, and log-probabilities of the meta-policy's choices,
     of each step, [T, A].
     """
-    emission, logits = outputs.emissions[0], outputs.callers[-1].logits
-    assert emission is not None  # options emit the control
+    numbers, logits = outputs.callers[0].numbers, outputs.callers[-1].logits
+    assert numbers is not None  # options emit the control
     assert logits is not None  # there are several of them
     steps = torch.arange(len(active))
     ends = outputs.termination_logits[0][0, steps, active - 1, None]
-    return torch.cat([emission.numbers[0, steps, active - 1], ends, logits[0, :, 0].log_softmax(-1)], dim=-1)
+    return torch.cat([numbers[0, steps, active - 1], ends, logits[0, :, 0].log_softmax(-1)], dim=-1)
 
 
 def _spreads(slopes: Mapping[str, Tensor], centred: Mapping[str, Tensor]) -> dict[str, np.ndarray]:

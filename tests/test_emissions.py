@@ -158,9 +158,11 @@ def test_a_clipped_density_is_scipys():
 
 @pytest.mark.parametrize("far", [0.0, 1.0, 1e2, 1e4, 1e8, 1e12])
 @pytest.mark.parametrize("std", [1.0, 0.01, 1e-6])
-def test_far_from_a_bound_value_and_gradient_stay_finite(far, std):
+@pytest.mark.parametrize("of_each_step", [False, True])
+def test_far_from_a_bound_value_and_gradient_stay_finite(far, std, of_each_step):
     mean = torch.full((1, 1, 1), -far, dtype=torch.float64).requires_grad_()
-    deviation = torch.tensor([std], dtype=torch.float64).requires_grad_()
+    shape = (1, 1, 1) if of_each_step else (1,)
+    deviation = torch.full(shape, std, dtype=torch.float64).requires_grad_()
     zero = torch.zeros(1)
     emission = Clipped(mean, deviation, zero, torch.tensor([-INF]), torch.tensor([1.0]))
     value = emission.log_density(torch.ones(1, 1)).sum()
@@ -258,6 +260,9 @@ KINDS = {
     "gaussian, own σ": lambda: Gaussian(numbers(2, 3, 2, 2), torch.stack([STD, 2 * STD]), SCALE.log()),
     "clipped": lambda: clipped(numbers(2, 3, 2, 2)),
     "clipped, own σ": lambda: clipped(numbers(2, 3, 2, 2), torch.stack([STD, 2 * STD])),
+    "gaussian, σ of each step": lambda: Gaussian(numbers(2, 3, 2, 2), std_of_steps(), SCALE.log()),
+    "clipped, σ of each step": lambda: clipped(numbers(2, 3, 2, 2), std_of_steps()),
+    "hurdle, clipped, σ of each step": lambda: hurdle(numbers(2, 3, 2, 1, seed=2), numbers(2, 3, 2, 2), std_of_steps()),
     "binary": lambda: Binary(numbers(2, 3, 2, 2)),
     "categorical": lambda: Categorical(numbers(2, 3, 2, 4), torch.tensor(False)),
     "rows": lambda: Categorical(numbers(2, 3, 2, 4), torch.tensor(True)),
@@ -268,6 +273,10 @@ KINDS = {
     "hurdles": lambda: Product((((1,), one_hurdle(5)), ((0,), one_hurdle(6)))),
     "product": lambda: Product((((2, 0), clipped(numbers(2, 3, 2, 2))), ((1,), Binary(numbers(2, 3, 2, 1, seed=1))))),
 }
+
+
+def std_of_steps():
+    return 0.3 + numbers(2, 3, 2, 2, seed=7).abs()
 
 
 def one_hurdle(seed):
@@ -284,6 +293,7 @@ def actions_of(kind):
     return {
         "hurdle": torch.where(resting == 1, 0.0, reals),
         "hurdle, clipped, own σ": torch.where(resting == 1, 0.0, reals),
+        "hurdle, clipped, σ of each step": torch.where(resting == 1, 0.0, reals),
         "hurdles": torch.where(resting == 1, 0.0, reals),
         "binary": switches,
         "categorical": index.unsqueeze(-1).double(),
@@ -351,7 +361,9 @@ def test_draws_have_the_density_and_stay_possible(kind):
         assert (share - probability).abs().max() < 5 * (0.25 / 1000) ** 0.5
 
 
-@pytest.mark.parametrize("kind", ["gaussian", "gaussian, own σ", "binary", "categorical", "product"])
+@pytest.mark.parametrize(
+    "kind", ["gaussian", "gaussian, own σ", "gaussian, σ of each step", "binary", "categorical", "product"]
+)
 def test_divergences_are_those_of_torch(kind):
     emission = KINDS[kind]()
     if kind == "product":  # the clipped part counts as the normal before it is clipped
@@ -360,8 +372,8 @@ def test_divergences_are_those_of_torch(kind):
         return
     distributions = torch.distributions
     if kind.startswith("gaussian"):
-        std = emission.std.expand(2, 2)
-        p, q = (distributions.Normal(emission.mean[..., k, :], std[k]) for k in (0, 1))
+        std = emission.std.expand(emission.mean.shape)
+        p, q = (distributions.Normal(emission.mean[..., k, :], std[..., k, :]) for k in (0, 1))
     elif kind == "binary":
         p, q = (distributions.Bernoulli(logits=emission.logits[..., k, :]) for k in (0, 1))
     else:

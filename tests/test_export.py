@@ -28,7 +28,7 @@ LIKE_OTHERS = ("lstm", "conv", "three levels")
 )
 def test_every_form_acts_as_the_controller_does(name, tmp_path):
     """On other observations than those that it was compared on when it was written, past the longest demonstration."""
-    fit, onnx = FITS[name], name in ("per_timestep", "conv", "lstm", "trunk", "read by all")
+    fit, onnx = FITS[name], name in ("per_timestep", "conv", "lstm", "trunk", "read by all", "σ of the state")
     found = export(fit, tmp_path, onnx)
     assert list(found) == ["numpy", "torch", *(["onnx"] if onnx else [])]
     assert all(difference < TOLERANCE for difference, _ in found.values())

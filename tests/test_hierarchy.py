@@ -97,7 +97,7 @@ def test_policy_and_termination_read_the_trunk_of_their_option():
     features, _ = answer(level.trunk, batch.inputs)
     assert features.shape == (*batch.inputs.batch, 3, 4)
     for head, found in (
-        (level.policy.network, outputs.callers[0].emission.numbers),
+        (level.policy.network, outputs.callers[0].numbers),
         (level.termination, outputs.termination_logits[0].unsqueeze(-1)),
     ):
         weight, bias = head.layers[0].weight, head.layers[0].bias

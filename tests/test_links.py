@@ -30,7 +30,7 @@ def normal_log_density(mean, std, actions):
 
 
 def squares_as_log_density(mean, std, actions):
-    constant = (std.log() + 0.5 * math.log(2 * math.pi)).expand(mean.shape[-2:]).sum(-1)
+    constant = (std.log() + 0.5 * math.log(2 * math.pi)).expand(mean.shape).sum(-1)
     return weighted_squares(mean, -0.5 / std.square(), actions) - constant
 
 
@@ -45,6 +45,7 @@ CASES = [
     (log_termination, terminations, [(2, 3, 4)]),
     (squares_as_log_density, normal_log_density, [(2, 3, 4, 2), (2,), (2, 3, 2)]),
     (squares_as_log_density, normal_log_density, [(2, 3, 4, 2), (4, 2), (2, 3, 2)]),
+    (squares_as_log_density, normal_log_density, [(2, 3, 4, 2), (2, 3, 4, 2), (2, 3, 2)]),
 ]
 
 

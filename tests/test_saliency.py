@@ -56,7 +56,7 @@ def control(hierarchy, observations, changed, choice):
     vectors = {key: vector.double() for key, vector in inputs.vectors.items()}
     outputs = hierarchy(type(inputs)(vectors, images, inputs.time))
     level = 0 if choice else 1
-    return outputs.emissions[level].numbers[0, -1, choice - 1 if choice else 0].detach().numpy()
+    return outputs.callers[level].numbers[0, -1, choice - 1 if choice else 0].detach().numpy()
 
 
 @pytest.mark.parametrize("trunk", [CONV, LSTM], ids=["conv", "lstm"])

@@ -51,9 +51,9 @@ class Saliency:
             outputs, states = self.hierarchy.advance(Inputs(seen.vectors, images, seen.time), self._states)
             self._states = {name: tuple(part.detach() for part in state) for name, state in states.items()}
             level = next((number for number, choice in enumerate(choices) if choice), len(choices))
-            emission = outputs.emissions[level]
-            assert emission is not None  # whoever is active emits the control
-            numbers = emission.numbers[0, 0, choices[level] - 1 if level < len(choices) else 0]
+            said = outputs.callers[level].numbers
+            assert said is not None  # whoever is active emits the control
+            numbers = said[0, 0, choices[level] - 1 if level < len(choices) else 0, : self.hierarchy.scaling.numbers]
             squared = {key: torch.zeros(image.shape[2:4]) for key, image in images.items()}
             for number in numbers:
                 slopes = torch.autograd.grad(number, [*images.values()], retain_graph=True, allow_unused=True)

@@ -172,15 +172,25 @@ def _state(program: StepProgram) -> list[dict[str, Any]]:
 
 
 def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
-    """What the runner has to know of a part of the control; σ of each level's callers, lowest first, if it has
-    one: callers that emit no control have none.
+    """What the runner has to know of a part of the control.
+
+    ``std`` is the σ of each level's callers, lowest first; callers that emit no control have none. A σ that depends on
+    the state is floor + softplus(y + start). ``per_state`` has, for each such dimension, its place in the part, the
+    place of y among the numbers of a caller, floor and start.
     """
     scaling = hierarchy.scaling
     part, places = scaling.parts[number], list(scaling.groups[number])
     before, callers = scaling.parts[:number], hierarchy.callers()
     first = sum(len(other.dims) for other in before if other.continuous)
     own = slice(first, first + len(places))
-    std = [[] if caller.std is None else caller.std()[..., own].tolist() for caller in callers]
+    each = zip(callers, (*(level.count for level in hierarchy.option_levels()), 1), strict=True)
+    std = [[] if one.std is None else one.std(torch.zeros(k, len(one.std.seen)))[..., own].tolist() for one, k in each]
+    given = next(caller.std for caller in callers if caller.std is not None)  # all have the same kinds of σ
+    per_state = [
+        [at - first, scaling.numbers + number, float(given.floor[at]), float(given.start[at])]
+        for number, at in enumerate(given.seen)
+        if first <= at < first + len(places)
+    ]
     decides = [len(scaling.varying) + sum(bool(other.exact) for other in before)] if part.exact else []
     ends = ([None if math.isinf(end) else end for end in values] for values in (part.low, part.high))
     return {
@@ -193,6 +203,7 @@ def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
         "shift": scaling.shift[places].tolist(),
         "scale": scaling.scale[places].tolist(),
         "std": std if part.continuous else [],
+        "per_state": per_state if part.continuous else [],
     }
 
 

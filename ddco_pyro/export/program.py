@@ -37,8 +37,8 @@ class StepProgram(nn.Module):
         for level, caller in enumerate(said.callers):
             if caller.selection is not None:
                 outputs[f"selection_{level}"] = caller.selection[0, 0]
-            if caller.emission is not None:
-                outputs[f"control_{level}"] = caller.emission.numbers[0, 0]
+            if caller.numbers is not None:
+                outputs[f"control_{level}"] = caller.numbers[0, 0]
         for level, log in enumerate(said.termination):
             outputs[f"termination_{level}"] = log[0, 0, :, 1].double().exp()
         return outputs, [tensor for state in states.values() for tensor in state]

@@ -101,8 +101,8 @@ def _named(said: Outputs) -> runner.Outputs:
     for level, caller in enumerate(said.callers):
         if caller.selection is not None:
             out[f"selection_{level}"] = caller.selection[0].numpy()
-        if caller.emission is not None:
-            out[f"control_{level}"] = caller.emission.numbers[0].numpy()
+        if caller.numbers is not None:
+            out[f"control_{level}"] = caller.numbers[0].numpy()
     return out | {f"termination_{level}": log[0, :, :, 1].exp().numpy() for level, log in enumerate(said.termination)}
 
 

@@ -152,13 +152,21 @@ class Runner:
         control = np.array(self.about["constant"])  # dimensions that never varied in the demonstrations stay so
         for part in self.about["parts"]:
             own, z = numbers[first : first + part["size"]], None if noise is None else noise[part["places"]]
-            std = np.array(part["std"][level]) if part["std"] else np.zeros(0)
-            control[part["dims"]] = KINDS[part["kind"]](part, own, std[actor] if std.ndim == 2 else std, z)
+            control[part["dims"]] = KINDS[part["kind"]](part, own, _std(part, level, actor, numbers), z)
             first += part["size"]
         return control
 
 
 Part = Mapping[str, Any]
+
+
+def _std(part: Part, level: int, actor: int, numbers: np.ndarray) -> np.ndarray:
+    """σ of a part's dimensions for a caller, in scaled units; empty where it has none."""
+    each = np.array(part["std"][level]) if part["std"] else np.zeros(0)
+    std = each[actor] if each.ndim == 2 else each
+    for place, number, floor, start in part["per_state"]:
+        std[place] = floor + np.logaddexp(0, numbers[number] + start)
+    return std
 
 
 def _continuous(part: Part, mean: np.ndarray, std: np.ndarray, z: np.ndarray | None) -> np.ndarray:

@@ -14,8 +14,8 @@ import numpy as np
 
 Outputs = dict[str, np.ndarray]
 """``selection_d`` log-probabilities [K, 1 + k], ``termination_d`` ψ [k], ``control_d`` the numbers of the control
-[K, size] (scaled means, logits of switches and of discrete actions); d counts levels from 0, and the last d is the
-meta-policy."""
+[K, size] (scaled means, logits of switches and of discrete actions, then y of every σ that depends on the state); d
+counts levels from 0, and the last d is the meta-policy."""
 
 State = list[np.ndarray]
 """What networks remember, each array [1, ...]."""

@@ -173,17 +173,19 @@ def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
 
 
 def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) -> Spec:
-    """The spec of a baseline trained beside: another model, and the optimiser that the baseline names; nothing else
-    differs. A mixture keeps labels and durations; policies without options have neither.
+    """The spec of a baseline trained beside: another model, and the optimiser and σ that the baseline names; nothing
+    else differs. A mixture keeps labels and durations; policies without options have neither.
 
     :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
     """
     own = baseline.optimizer.model_dump(exclude_unset=True) if baseline.optimizer else {}
     optimizer = {f"training.optimizer.{key}": value for key, value in own.items()}
-    model = baseline.model_dump(exclude_unset=True, exclude={"optimizer"})
+    model = baseline.model_dump(exclude_unset=True, exclude={"optimizer", "std"})
+    std = baseline.std.model_dump(exclude_unset=True) if baseline.std else {}
+    stds = {path: {"floor": old.floor} | std for path, old in spec.control.learned_stds.items() if std}
 
     def alone(**changes: Any) -> Spec:
-        return with_overrides(spec, {"selection.grid": {}, "model": model | changes, **optimizer})
+        return with_overrides(spec, {"selection.grid": {}, "model": model | changes, **optimizer, **stds})
 
     if baseline.kind != "flat_equal":
         return alone()

@@ -70,7 +70,7 @@ class ControlScaling(nn.Module):
 
     @property
     def numbers(self) -> int:
-        """How many numbers a network gives for the control of a caller."""
+        """How many numbers a network gives for the control of a caller, without those for a σ (:class:`ControlStd`)."""
         return sum(part.size for part in self.parts)
 
     @property
@@ -145,7 +145,7 @@ class ControlScaling(nn.Module):
     def emission(self, numbers: Tensor, std: Tensor) -> Emission:
         """The emission that a network's numbers [..., K, size] stand for.
 
-        :param std: σ of the continuous dimensions, part after part, [C] or [K, C].
+        :param std: σ of the continuous dimensions, part after part, [C], [K, C] or [..., K, C].
         """
         groups: list[tuple[tuple[int, ...], Emission]] = []
         sizes, at = [part.size for part in self.parts], 0
@@ -192,11 +192,13 @@ class ControlStd(nn.Module):
     """The standard deviations σ of the continuous control dimensions, in scaled units: fixed, or learned above a floor.
 
     The options of a level share a σ unless ``per_option`` says otherwise: one of them could collect the steps where a
-    Gaussian control hardly varies (an actuator on its bound), whatever the skill (see docs/decisions.md).
+    Gaussian control hardly varies (an actuator on its bound), whatever the skill (see docs/decisions.md). With
+    ``per_state`` σ = floor + softplus(y + start), where y is a number of the caller's network.
     """
 
     fixed: Tensor
     floor: Tensor
+    start: Tensor
 
     def __init__(self, spec: ControlSpec, scaling: ControlScaling, copies: int) -> None:
         super().__init__()
@@ -204,28 +206,40 @@ class ControlStd(nn.Module):
         fixed = [0.0 if isinstance(std, LearnedStd) else float(std) for std in stds]
         learned = [place for place, std in enumerate(stds) if isinstance(std, LearnedStd)]
         self.own = [place for place in learned if getattr(stds[place], "per_option", False)]
-        self.shared = [place for place in learned if place not in self.own]
+        self.seen = [place for place in learned if getattr(stds[place], "per_state", False)]
+        self.shared = [place for place in learned if place not in (*self.own, *self.seen)]
         floors = [std.floor if isinstance(std, LearnedStd) else 0.0 for std in stds]
         self.register_buffer("fixed", torch.tensor(fixed), persistent=False)
         self.register_buffer("floor", torch.tensor(floors), persistent=False)
         start = torch.tensor([math.log(math.expm1(max(INITIAL_STD - floor, 1e-3))) for floor in floors])
+        self.register_buffer("start", start, persistent=False)
         if self.shared:
             self.raw = nn.Parameter(start[self.shared].clone())
         if self.own:
             self.raw_own = nn.Parameter(start[self.own].repeat(copies, 1))
 
-    def forward(self) -> Tensor:
-        """σ [C], or [K, C] where a dimension has one for each option."""
+    def forward(self, numbers: Tensor | None = None) -> Tensor:
+        """σ [C]; [K, C] where a dimension has one for each option; [..., K, C] where one depends on the state.
+
+        :param numbers: y of each dimension in ``seen``, [..., K, S]; None where there is none.
+        """
         std = self.fixed
         if self.shared:
             std = std.index_put((torch.tensor(self.shared),), self.floor[self.shared] + softplus(self.raw))
         if self.own:
-            own = self.floor[self.own] + softplus(self.raw_own)
-            columns = list(std.expand(len(own), -1).unbind(-1))
-            for place, column in zip(self.own, own.unbind(-1), strict=True):
-                columns[place] = column
-            std = torch.stack(columns, dim=-1)
+            std = _with_columns(std, self.own, self.floor[self.own] + softplus(self.raw_own))
+        if self.seen:
+            assert numbers is not None  # the caller's network gives them
+            std = _with_columns(std, self.seen, self.floor[self.seen] + softplus(numbers + self.start[self.seen]))
         return std
+
+
+def _with_columns(table: Tensor, places: Sequence[int], values: Tensor) -> Tensor:
+    """The table [C] or [K, C] for each row of values [..., S], which stand at S of its places, [..., C]."""
+    columns = list(table.expand(*values.shape[:-1], -1).unbind(-1))
+    for place, column in zip(places, values.unbind(-1), strict=True):
+        columns[place] = column
+    return torch.stack(columns, dim=-1)
 
 
 def _std_of(spec: ControlSpec, dimension: int) -> float | LearnedStd:

@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -64,32 +64,19 @@ class Emission(Steps, Protocol):
         """Mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i) of two callers, [...] nats."""
         ...
 
-    @property
-    def numbers(self) -> Tensor:
-        """What the network gave for each caller, [..., K, size]."""
-        ...
-
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
         """The same of changed tensors."""
         ...
 
 
 class Kind(ABC):
-    """What all kinds share: tensors as fields, of which those over time are the first ones."""
-
-    over_time: ClassVar[int] = 1
-    """Number of fields of shape [N, T, K, ...]; the others are the same at every step."""
-
-    @property
-    def numbers(self) -> Tensor:
-        """What the network gave for each caller, [..., K, size]."""
-        numbers: Tensor = getattr(self, fields(self)[0].name)  # type: ignore[arg-type]
-        return numbers
+    """What all kinds share: tensors as fields, the first one [..., K, ...], others like it or the same at all steps."""
 
     @property
     def shape(self) -> torch.Size:
         """[..., K, A]: a number for each dimension, unless a kind says otherwise."""
-        return self.numbers.shape
+        first: Tensor = getattr(self, fields(self)[0].name)  # type: ignore[arg-type]
+        return first.shape
 
     @property
     def noise(self) -> int:
@@ -105,9 +92,10 @@ class Kind(ABC):
         return self.by_dimension(actions).sum(-1)
 
     def steps(self) -> list[Self]:
-        """The same at each step."""
-        names = [field.name for field in fields(self)[: self.over_time]]  # type: ignore[arg-type]
-        unbound = zip(*(getattr(self, name).unbind(1) for name in names), strict=True)
+        """The same at each step: fields with as many dimensions as the first one differ from step to step."""
+        each = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        names = [name for name, tensor in each.items() if tensor.dim() == next(iter(each.values())).dim()]
+        unbound = zip(*(each[name].unbind(1) for name in names), strict=True)
         return [replace(self, **dict(zip(names, tensors, strict=True))) for tensors in unbound]  # type: ignore[type-var]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
@@ -120,7 +108,8 @@ class Gaussian(Kind):
     """A free continuous control, a ~ N(μ, σ²), each dimension by itself (§4.2).
 
     :param mean: μ, [..., K, A] in scaled units.
-    :param std: σ, [A], or [K, A] where each caller has its own, in scaled units.
+    :param std: σ, [A], [K, A] where each caller has its own, or [..., K, A] where it depends on the state, in scaled
+        units.
     :param log_scale: logarithms of the control's units, [A].
     """
 
@@ -156,7 +145,7 @@ class Gaussian(Kind):
         """KL(π_i ‖ π_j) of two callers, [...] nats."""
         mean, std = self.mean.double(), self.std.double()
         apart = (mean[..., i, :] - mean[..., j, :]).square()
-        first, second = (std, std) if std.dim() == 1 else (std[i], std[j])
+        first, second = (std, std) if std.dim() == 1 else (std[..., i, :], std[..., j, :])
         return (0.5 * (first.square() + apart) / second.square() - 0.5 + second.log() - first.log()).sum(-1)
 
 
@@ -223,11 +212,6 @@ class Hurdle:
     def noise(self) -> int:
         """A + 1: the last one decides which part a control is of."""
         return self.slab.noise + 1
-
-    @property
-    def numbers(self) -> Tensor:
-        """y, then what the network gave for the slab."""
-        return torch.cat([self.logit, self.slab.numbers], dim=-1)
 
     def by_dimension(self, actions: Tensor) -> Tensor:
         """log π(a_d | s), [..., K, A]: each dimension has its share of which part a control is of."""
@@ -299,11 +283,6 @@ class Product:
     def log_density(self, actions: Tensor) -> Tensor:
         """log π(a | s), [..., K]."""
         return sum_of([emission.log_density(actions[..., dims]) for dims, emission in self.groups])
-
-    @property
-    def numbers(self) -> Tensor:
-        """What the network gave for each caller, group after group."""
-        return torch.cat([emission.numbers for _, emission in self.groups], dim=-1)
 
     @property
     def mode(self) -> Tensor:

@@ -19,7 +19,7 @@ from ddco_pyro.data.control_parts import ControlPart, all_gaussian
 from ddco_pyro.data.memory import share
 from ddco_pyro.model.controls import ControlScaling, ControlStd
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch, ObservationEncoder, Shapes
-from ddco_pyro.model.networks import Inputs, InputShape, build, build_trunk, named
+from ddco_pyro.model.networks import Inputs, InputShape, begin_at_zero, build, build_trunk, named
 from ddco_pyro.model.networks.activations import training_bytes
 from ddco_pyro.model.networks.state import Carried, State, States, Trunk, remembers
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
@@ -44,7 +44,8 @@ meta-policy's."""
 class Caller(nn.Module):
     """K policies over the options of the level below, the physical control, or both (§4.2).
 
-    One network gives the log-probabilities y_0 (control), y_1, ..., y_k and the numbers of the control of each.
+    One network gives the log-probabilities y_0 (control), y_1, ..., y_k and the numbers of the control of each; last
+    come those of every σ that depends on the state.
     """
 
     def __init__(
@@ -62,9 +63,12 @@ class Caller(nn.Module):
         self.emits_control = "control" in emits
         self.emits_options = "options" in emits and options > 0
         logits = options + self.emits_control if self.emits_options else 0
-        self.sizes = (logits, scaling.numbers if self.emits_control else 0)
-        self.network = build(network, shape, sum(self.sizes), copies)
         self.std = ControlStd(control, scaling, copies) if self.emits_control else None
+        seen = 0 if self.std is None else len(self.std.seen)
+        self.sizes = (logits, scaling.numbers + seen if self.emits_control else 0)
+        self.network = build(network, shape, sum(self.sizes), copies)
+        if seen:
+            begin_at_zero(self.network, seen)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
         """Models that have a σ also where no control is emitted are read without it."""
@@ -76,8 +80,12 @@ class Caller(nn.Module):
     def forward(self, said: Tensor, scaling: ControlScaling) -> CallerOutputs:
         """What the callers say at every step, given what their network says, [N, T, K, outputs]."""
         logits, numbers = said.split(self.sizes, dim=-1) if all(self.sizes) else (said, said)
-        emission = None if self.std is None else scaling.emission(numbers, self.std())
-        return CallerOutputs(self.options, logits if self.emits_options else None, emission)
+        choices = logits if self.emits_options else None
+        if self.std is None:
+            return CallerOutputs(self.options, choices, None)
+        seen = len(self.std.seen)
+        means, of_std = numbers.split([scaling.numbers, seen], dim=-1) if seen else (numbers, None)
+        return CallerOutputs(self.options, choices, scaling.emission(means, self.std(of_std)), numbers)
 
 
 class Level(nn.Module):

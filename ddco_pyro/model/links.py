@@ -39,9 +39,9 @@ def log_termination(logits: Tensor) -> Tensor:
 
 
 def weighted_squares(mean: Tensor, weight: Tensor, actions: Tensor) -> Tensor:
-    """Σ_d w_d (a_d - μ_d)², [..., K], of means [..., K, A], weights [A] or [K, A] and actions [..., A]."""
+    """Σ_d w_d (a_d - μ_d)², [..., K], of means [..., K, A], weights [A], [K, A] or [..., K, A] and actions [..., A]."""
     actions = actions.to(mean.dtype)
-    if actions.shape[:-1] != mean.shape[:-2]:
+    if actions.shape[:-1] != mean.shape[:-2] or weight.dim() > 2:
         return _squares_formula(mean, weight, actions)
     return _linked(_SQUARES, mean, weight, actions)
 

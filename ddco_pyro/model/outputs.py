@@ -22,11 +22,13 @@ class CallerOutputs:
     :param logits: of their choices [N, T, K, k], or [N, T, K, 1 + k] where control (choice 0) is one of them; None for
         callers that emit control alone.
     :param emission: how they emit the control, [N, T, K, A]; None for callers that emit none.
+    :param numbers: what their network gave for that, [N, T, K, size]; None where there is none.
     """
 
     options: int
     logits: Tensor | None
     emission: Emission | None
+    numbers: Tensor | None = None
 
     @property
     def shape(self) -> torch.Size:
@@ -85,7 +87,7 @@ class Outputs:
     def tensors(self) -> list[Tensor]:
         """Everything that the networks say, each [N, T, ...]."""
         logits = [caller.logits for caller in self.callers if caller.logits is not None]
-        numbers = [emission.numbers for emission in self.emissions if emission is not None]
+        numbers = [caller.numbers for caller in self.callers if caller.numbers is not None]
         return [*logits, *numbers, *(logit for logit in self.termination_logits if logit is not None)]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Outputs:
@@ -95,6 +97,7 @@ class Outputs:
                 caller,
                 logits=None if caller.logits is None else change(caller.logits),
                 emission=None if caller.emission is None else caller.emission.map(change),
+                numbers=None if caller.numbers is None else change(caller.numbers),
             )
             for caller in self.callers
         )

@@ -9,6 +9,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, field_validator, mode
 
 from ddco_pyro.spec.messages import invalid
 from ddco_pyro.spec.networks import MetaPolicySpec, NetworkSpec, PolicySpec
+from ddco_pyro.spec.settings import LearnedStd
 from ddco_pyro.spec.training import OptimizerSpec
 from ddco_pyro.spec.types import Count, Emission, Items, Model, Text, bare, nested
 
@@ -152,6 +153,10 @@ class BaselineSpec(Model):
     optimizer: OptimizerSpec | None = None
     """In ``compare_with``: what of ``training.optimizer`` is otherwise for this baseline, so that each model can have
     what suits it; null: nothing."""
+    std: LearnedStd | None = None
+    """In ``compare_with``: the σ of this baseline wherever σ is learned, in ``control.std`` and ``control.parts``. The
+    floor stays unless it is given; null: as in ``control``. With ``{learn: true, per_state: true}`` a flat policy has a
+    σ that depends on the state, as options that each have their own do."""
 
     @property
     def name(self) -> str:

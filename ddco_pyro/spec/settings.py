@@ -139,6 +139,15 @@ class LearnedStd(Model):
     per_option: bool = False
     """Whether each option has its own. With ``gaussian`` controls that sit on a bound or a value, one option may
     collect those steps, whatever the skill; ``clipped``, ``hurdle`` and ``binary`` ones are safe."""
+    per_state: bool = False
+    """Whether it depends on the observations: the policy's network gives it beside the mean. Each option, and a flat
+    policy, has its own."""
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> LearnedStd:
+        if self.per_option and self.per_state:
+            raise invalid(("per_option", "per_state gives each option a σ of its own already; leave per_option out"))
+        return self
 
 
 Std = Annotated[
@@ -196,6 +205,12 @@ class ControlSpec(Model):
     by which it is divided."""
     parts: Items[PartSpec] = ()
     """Groups of dimensions with a distribution of their own; what is in none of them is as above."""
+
+    @property
+    def learned_stds(self) -> dict[str, LearnedStd]:
+        """Every σ that is learned, by its key path in the spec."""
+        stds = {"control.std": self.std} | {f"control.parts.{n}.std": part.std for n, part in enumerate(self.parts)}
+        return {path: std for path, std in stds.items() if isinstance(std, LearnedStd)}
 
     @model_validator(mode="after")
     def _disjoint(self) -> ControlSpec:

@@ -98,6 +98,7 @@ class Spec(Model):
             *self._unknown_trajectory(),
             *self._nothing_held_out(),
             *self._own_optimizers(),
+            *self._own_stds(),
             *self._labels_of_other_levels(),
             *self._labelled_level(),
             *self._durations(),
@@ -151,6 +152,13 @@ class Spec(Model):
             if baseline.optimizer and baseline.optimizer.schedule == "cosine" and self.training.epochs is None:
                 where = f"compare_with.{number}.optimizer.schedule"
                 yield where, "cosine falls to 0 at the end of training.epochs, which is null"
+
+    def _own_stds(self) -> Iterator[tuple[str, str]]:
+        if self.baseline and self.baseline.std:
+            yield "baseline.std", "is for baselines in compare_with; say it in control.std"
+        for number, baseline in enumerate(self.compare_with):
+            if baseline.std and not self.control.learned_stds:
+                yield f"compare_with.{number}.std", "no σ in control is learned; say control.std: {learn: true}"
 
     def _labels_of_other_levels(self) -> Iterator[tuple[str, str]]:
         names = self.demonstrations.labels

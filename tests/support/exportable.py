@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import torch
+from hierarchies import varied
 
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -24,6 +27,7 @@ def make(
     meta_policy=None,
     vectors=True,
     bins=0,
+    std=MappingProxyType({"learn": True}),
     **rollout,
 ):
     """A run that was never fitted: random weights, observations with a mean and a spread.
@@ -49,7 +53,7 @@ def make(
         {
             "demonstrations": {"path": "unused.hdf5"},
             "observations": [*seen, *pictures],
-            "control": {"std": {"learn": True}},
+            "control": {"std": dict(std)},
             "rollout": rollout,
             **(model if counts else {"baseline": {"kind": "flat", "policy": policy}}),
         }
@@ -65,7 +69,7 @@ def make(
         hierarchy.encoder.high[own] = hierarchy.encoder.low[own] + 2
     hierarchy.scaling.scale.copy_(torch.tensor([10.0, 0.3]))
     hierarchy.scaling.shift.copy_(torch.tensor([-4.0, 1.0]))
-    return Fit(spec, hierarchy.eval())
+    return Fit(spec, varied(hierarchy).eval())
 
 
 CONVOLUTIONS = {
@@ -94,6 +98,9 @@ FITS = {
     "bins": make("mlp", bins=4),
     "conv": make("conv", camera={"crop": [1, 2, 7, 9], "resize": [6, 8], "frames": 3}, options="sample"),
     "hybrid": make("mlp", (2, 3), ("options", "control"), control="sample"),
+    "σ of the state": make(
+        "mlp", (2, 3), ("options", "control"), std={"learn": True, "per_state": True}, control="sample"
+    ),
     "three levels": make("mlp", (2, 3, 2), ("options", "control")),
     "mixture": make("mlp", (3,), ("options", "control"), endings="always", control="sample", options="sample"),
     "memoryless below": make("mlp", (2, 3), endings="always", options="marginal"),

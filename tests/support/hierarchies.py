@@ -41,9 +41,18 @@ def make_hierarchy(counts=(3,), emits=("options",), network="mlp", seed=0, trunk
     return Hierarchy(spec, SHAPES, 2, steps=4)
 
 
-def make_batch(trajectories=2, steps=4, seed=1):
+def varied(hierarchy):
+    """The same without weights that are 0, as if it had been trained."""
+    torch.manual_seed(5)
+    with torch.no_grad():
+        for parameter in hierarchy.parameters():
+            parameter[parameter == 0] = torch.randn(int((parameter == 0).sum()))
+    return hierarchy
+
+
+def make_batch(trajectories=2, steps=4, seed=1, features=3):
     generator = torch.Generator().manual_seed(seed)
-    vector = torch.randn(trajectories, steps, 3, generator=generator)
+    vector = torch.randn(trajectories, steps, features, generator=generator)
     actions = torch.randn(trajectories, steps, 2, generator=generator)
     lengths = torch.tensor([steps, *[steps - 1] * (trajectories - 1)])
     return Batch(Inputs({"state": vector}, {}, torch.arange(steps)), actions, lengths)

@@ -47,9 +47,9 @@ def weights(hierarchy: Hierarchy, option: int, what: str) -> dict[str, np.ndarra
     def said(grasp: list[float], kin: float) -> float:
         vectors = {"grasp": torch.tensor([[grasp]]), "kin": torch.tensor([[[kin]]])}
         outputs = hierarchy(Inputs(vectors, {}, torch.tensor([0])))
-        emission = outputs.emissions[0]
-        assert emission is not None
-        values = emission.numbers[0, 0, option - 1, 0] if what == "control" else outputs.termination_logits[0][0, 0]
+        numbers = outputs.callers[0].numbers
+        assert numbers is not None
+        values = numbers[0, 0, option - 1, 0] if what == "control" else outputs.termination_logits[0][0, 0]
         return (values if what == "control" else values[option - 1]).item()
 
     still = said([0.0, 0.0], 0.0)

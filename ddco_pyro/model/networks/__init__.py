@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
+import torch
 from torch import nn
 
 from ddco_pyro.model.networks.branches import Branches
@@ -23,7 +24,7 @@ from ddco_pyro.model.networks.state import Trunk
 from ddco_pyro.model.networks.trial import try_network
 from ddco_pyro.spec import NetworkSpec, SpecError
 
-__all__ = ["CLASSES", "InputShape", "Inputs", "ShapeError", "build", "build_trunk", "named"]
+__all__ = ["CLASSES", "InputShape", "Inputs", "ShapeError", "begin_at_zero", "build", "build_trunk", "named"]
 
 CLASSES: dict[str, type[nn.Module]] = {
     "linear": Linear,
@@ -51,6 +52,14 @@ def build(spec: NetworkSpec, shape: InputShape | Trunk, outputs: int, copies: in
     if isinstance(shape, Trunk):
         return Head(shape, outputs, copies, **spec.settings)
     return _read(spec, shape, outputs, copies)
+
+
+def begin_at_zero(network: nn.Module, outputs: int) -> None:
+    """Have the last so many outputs of a built-in network start at 0; a user's start where its own weights put them."""
+    if isinstance(network, (*CLASSES.values(), Head)):
+        with torch.no_grad():
+            for parameter in network.layers[-1].parameters():  # type: ignore[index, union-attr]
+                parameter[..., -outputs:] = 0
 
 
 def build_trunk(spec: NetworkSpec, shape: InputShape | Trunk, copies: int) -> Trunk:

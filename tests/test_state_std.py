@@ -1,0 +1,274 @@
+"""A σ that depends on the state: density, start, what it is worth, and that it is no confound of options."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from command_line import call
+from hierarchies import make_batch, make_hierarchy, varied
+from scipy import stats
+
+import ddco_pyro
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.fitting.building import Dimensions, baseline_spec, build_hierarchy, parameters
+from ddco_pyro.inference.check import compare_engines
+from ddco_pyro.model.controls import INITIAL_STD
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.spec import SpecError, parse_spec, with_overrides
+
+OF_STATE = {"learn": True, "per_state": True}
+OF_OPTION = {"learn": True, "per_option": True}
+LINEAR = {"network": "linear"}
+
+
+def softplus(values):
+    return np.log1p(np.exp(values))
+
+
+# --- the density ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("counts", [(), (3,), (2, 2)])
+def test_density_is_scipys_with_the_sigma_of_each_step(counts):
+    """Of every caller, the meta-policy among them: two means, then two y, by the formula of the documentation."""
+    emits = ("options", "control") if counts else ("control",)
+    hierarchy, batch = varied(make_hierarchy(counts, emits, std={**OF_STATE, "floor": 0.05})), make_batch()
+    hierarchy.scaling.scale.copy_(torch.tensor([3.0, 0.2]))
+    with torch.no_grad():
+        outputs = hierarchy(batch.inputs)
+    for caller in outputs.callers:
+        mean, y = (values.double().numpy() for values in caller.numbers.split([2, 2], dim=-1))
+        std = 0.05 + softplus(y + np.log(np.expm1(INITIAL_STD - 0.05)))
+        assert np.ptp(std, axis=(0, 1)).min() > 0.05
+        scale, actions = np.array([3.0, 0.2]), batch.actions.double().numpy()[:, :, None]
+        expected = stats.norm.logpdf(actions * scale, mean * scale, std * scale).sum(-1)
+        np.testing.assert_allclose(caller.log_density(batch.actions), expected, rtol=1e-4, atol=1e-4)
+    check = compare_engines(outputs, batch.actions, batch.lengths)
+    assert check.value < 1e-12
+    assert check.gradient < 1e-10
+
+
+NETWORKS = {
+    "linear": LINEAR,
+    "mlp": {"hidden": [5]},
+    "per_timestep": {"network": "per_timestep"},
+    "lstm": {"network": "lstm", "hidden": 3},
+    "branches": {"network": "branches", "of": {"state": {"hidden": [4]}}},
+}
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+def test_at_first_it_is_the_same_everywhere(network):
+    hierarchy, batch = make_hierarchy((2,), network=NETWORKS[network], std=OF_STATE), make_batch()
+    for caller in hierarchy(batch.inputs).callers[:1]:
+        torch.testing.assert_close(caller.emission.std, torch.full((*batch.inputs.batch, 2, 2), INITIAL_STD))
+        assert caller.emission.mean.std() > 0.01
+        gradient = torch.autograd.grad(caller.log_density(batch.actions).sum(), hierarchy.levels[0].policy.parameters())
+        assert all((slope != 0).any() for slope in gradient if slope.shape[-1] == 4)
+
+
+def test_where_networks_read_a_trunk_it_is_the_same_at_first_too():
+    hierarchy = make_hierarchy((2,), network="linear", trunk={"hidden": [5]}, std=OF_STATE)
+    assert (hierarchy(make_batch().inputs).callers[0].emission.std == INITIAL_STD).all()
+
+
+def test_dimensions_with_other_sigmas_stand_beside():
+    """One of the state, one of each option, one fixed."""
+    parts = [{"name": "a", "dims": [2], "std": OF_STATE}, {"name": "b", "dims": [0], "std": OF_OPTION}]
+    spec = parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": ["state"],
+            "control": {"std": 0.3, "parts": parts},
+            "hierarchy": {"levels": [{"count": 2}]},
+        }
+    )
+    hierarchy, batch = varied(Hierarchy(spec, {"state": (3,)}, 3, 4)), make_batch()
+    with torch.no_grad():
+        hierarchy.levels[0].policy.std.raw_own[1] += 1
+        std = hierarchy(batch.inputs).callers[0].emission.std
+    assert std.shape == (2, 4, 2, 3)  # without demonstrations all dimensions are one part, in their order
+    assert (std[..., 1] == 0.3).all()
+    assert (std[0, 0, :, 0] == std[..., 0]).all()
+    assert std[0, 0, 0, 0] < std[0, 0, 1, 0]
+    assert std[..., 2].flatten().unique().numel() == 16
+
+
+# --- what it is worth -------------------------------------------------------------------------------------------------
+
+
+def noisy(number=40, steps=25):
+    """Controls around a linear policy, with a spread of 0.05 + softplus(2.5 s_0 - 1); and their log-densities.
+
+    One policy does all of it: there is no skill.
+    """
+    random, made, densities = np.random.default_rng(0), [], []
+    for index in range(number):
+        state = random.uniform(-1, 1, (steps, 2))
+        mean = state @ np.array([[1.0, -0.5], [0.3, 1.0]])
+        std = 0.05 + softplus(2.5 * state[:, :1] - 1 + np.array([0.0, 0.5]))
+        actions = mean + std * random.normal(size=mean.shape)
+        made.append(Demonstration(f"demo_{index}", {"state": state}, actions))
+        densities.append(stats.norm.logpdf(actions, mean, std).sum() / steps)
+    return Demonstrations(tuple(made)), dict(zip((demo.name for demo in made), densities, strict=True))
+
+
+def flat_spec(**changes):
+    return parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.4},
+            "observations": ["state"],
+            "control": {"std": {**OF_STATE, "floor": 0.02}, "scale": "none", "kind": "gaussian"},
+            "baseline": {"kind": "flat", "policy": LINEAR},
+            "training": {"epochs": 150, "optimizer": {"lr": 0.03}, "batch_size": 24},
+        }
+        | changes
+    )
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """A flat policy with a σ of the state, beside it one with a constant σ, and the truth's log-densities."""
+    demos, truth = noisy()
+    spec = flat_spec(compare_with=[{"kind": "flat", "policy": LINEAR, "std": {"learn": True}}])
+    return ddco_pyro.fit(spec, demos, out=tmp_path_factory.mktemp("runs") / "flat"), demos, truth
+
+
+def test_a_planted_sigma_of_the_state_is_found(fitted):
+    """Held out: as good as the truth, and better than a constant σ, which is least squares, by many standard errors."""
+    fit, demos, truth = fitted
+    names = [row["name"] for row in fit.metrics["valid"]]
+    found = fit.metrics["log_likelihood_per_step"]["valid"]
+    assert found == pytest.approx(np.mean([truth[name] for name in names]), abs=0.02)
+    train, valid = ([demo for demo in demos if (demo.name in names) == held_out] for held_out in (False, True))
+    seen, actions = zip(*(_rows(part) for part in (train, valid)), strict=True)
+    weights = np.linalg.lstsq(seen[0], actions[0], rcond=None)[0]
+    std = (actions[0] - seen[0] @ weights).std(0)
+    constant = stats.norm.logpdf(actions[1], seen[1] @ weights, std).sum(-1).mean()
+    other = fit.metrics["comparison"]["flat_2"]
+    assert other["log_likelihood_per_step"]["valid"] == pytest.approx(constant, abs=0.02)
+    assert other["difference"]["nats_per_step"] > 10 * other["difference"]["standard_error"] > 0
+    assert fit.metrics["engine_check"]["gradient"] < 1e-6
+
+
+def _rows(demos):
+    states = np.concatenate([demo.observations["state"] for demo in demos])
+    return np.column_stack([states, np.ones(len(states))]), np.concatenate([demo.actions for demo in demos])
+
+
+def test_it_is_counted_saved_and_decomposed(fitted):
+    fit, demos, _ = fitted
+    assert fit.metrics["parameters"] == 2 * 4 + 4  # two means and two y of two observations
+    assert fit.baselines["flat_2"].metrics["parameters"] == 2 * 2 + 2 + 2
+    again = ddco_pyro.load(fit.folder)
+    np.testing.assert_array_equal(again.log_likelihood(demos), fit.log_likelihood(demos))
+    each = fit.metrics["log_likelihood_by_dimension"]["valid"]
+    assert sum(each["by_dimension"]) == pytest.approx(fit.metrics["log_likelihood_per_step"]["valid"], rel=1e-5)
+
+
+def test_sigma_is_no_part_of_the_measure(fitted, tmp_path):
+    fit, demos, _ = fitted
+    other = ddco_pyro.fit(with_overrides(fit.spec, {"control.std": 0.5, "compare_with": []}), demos, tmp_path / "run")
+    ended = call("compare", fit.folder, other.folder)
+    assert ended.status == 0, ended.err
+
+
+def test_without_skill_options_lead_by_their_sigma_alone():
+    """Options that each have a σ beat a flat policy with one σ, but not one whose σ depends on the state."""
+    demos, _ = noisy()
+    spec = flat_spec(
+        control={"std": OF_OPTION, "scale": "none", "kind": "gaussian"},
+        baseline=None,
+        hierarchy={"levels": [{"count": 2, "policy": LINEAR}], "meta_policy": LINEAR},
+        compare_with=[{"kind": "flat", "policy": LINEAR}, {"kind": "flat", "policy": LINEAR, "std": OF_STATE}],
+    )
+    found = ddco_pyro.fit(spec, demos).metrics["comparison"]
+    one, of_state = (found[name]["difference"] for name in ("flat", "flat_2"))
+    assert one["nats_per_step"] > 3 * one["standard_error"] > 0
+    assert of_state["nats_per_step"] < -3 * of_state["standard_error"] < 0
+
+
+# --- a baseline's own -------------------------------------------------------------------------------------------------
+
+
+def beside(*compare_with, **control):
+    return flat_spec(
+        control=control, baseline=None, hierarchy={"levels": [{"count": 3}]}, compare_with=list(compare_with)
+    )
+
+
+def test_a_baseline_has_its_own_wherever_sigma_is_learned():
+    parts = [
+        {"name": "arm", "dims": [0, 1], "std": {**OF_OPTION, "floor": 0.1}},
+        {"name": "wrist", "dims": [2], "std": 0.3},
+        {"name": "jaw", "dims": [3]},
+    ]
+    spec = beside("flat", {"kind": "flat", "std": OF_STATE}, std={**OF_OPTION, "floor": 0.02}, parts=parts)
+    as_it_is, own = (baseline_spec(spec, baseline, None).control for baseline in spec.compare_with)
+    assert as_it_is == spec.control
+    assert own.std.model_dump() == {"learn": True, "floor": 0.02, "per_option": False, "per_state": True}
+    arm, wrist, jaw = own.parts
+    assert (arm.std.floor, arm.std.per_option, arm.std.per_state) == (0.1, False, True)
+    assert (wrist, jaw) == spec.control.parts[1:]
+    (floor,) = (
+        baseline_spec(again, again.compare_with[0], None).control.std.floor
+        for again in [beside({"kind": "mixture", "std": {**OF_STATE, "floor": 0.2}}, std=OF_OPTION)]
+    )
+    assert floor == 0.2
+
+
+def test_flat_equal_counts_the_numbers_for_sigma():
+    spec = beside("flat_equal", {"kind": "flat_equal", "std": OF_STATE}, std=OF_OPTION)
+    size = Dimensions({"state": (2,)}, 2, 25)
+    whole = parameters(build_hierarchy(spec, size))
+    one, of_state = (baseline_spec(spec, baseline, size) for baseline in spec.compare_with)
+    assert of_state.baseline.policy.hidden < one.baseline.policy.hidden
+    for own in (one, of_state):
+        assert parameters(build_hierarchy(own, size)) == pytest.approx(whole, rel=0.02)
+
+
+def test_what_is_not_said_changes_no_bit():
+    demos, _ = noisy(6, 8)
+    models = []
+    for std in (OF_OPTION, {**OF_OPTION, "per_state": False}):
+        fit = ddco_pyro.fit(with_overrides(beside("flat", std=std), {"training.epochs": 4}), demos)
+        models.append([one.hierarchy.state_dict() for one in (fit, fit.baselines["flat"])])
+        emission = fit.hierarchy(make_batch(features=2).inputs).callers[0].emission
+        assert emission.std.shape == (3, 2)
+    for ours, theirs in zip(*models, strict=True):
+        assert list(ours) == list(theirs)
+        assert all(torch.equal(tensor, theirs[name]) for name, tensor in ours.items())
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+BOTH = {"learn": True, "per_option": True, "per_state": True}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"control": {"std": BOTH}},
+            "control.std.per_option: per_state gives each option a σ of its own already; leave per_option out",
+        ),
+        (
+            {"control": {"parts": [{"name": "a", "dims": [0], "std": BOTH}]}},
+            "control.parts.0.std.per_option: per_state gives each option a σ of its own already; leave per_option out",
+        ),
+        (
+            {"baseline": {"kind": "flat", "std": OF_STATE}},
+            "baseline.std: is for baselines in compare_with; say it in control.std",
+        ),
+        (
+            {"control": {"std": 0.1}, "compare_with": [{"kind": "flat", "std": OF_STATE}]},
+            "compare_with.0.std: no σ in control is learned; say control.std: {learn: true}",
+        ),
+        ({"compare_with": [{"kind": "flat", "std": {}}]}, "compare_with.0.std.learn: missing; it has to be given"),
+    ],
+)
+def test_what_does_not_fit_together_is_one_line(changes, message):
+    with pytest.raises(SpecError) as refused:
+        flat_spec(**changes)
+    assert refused.value.problems == (message,)
