@@ -191,7 +191,7 @@ def test_the_merger_of_another_pair_is_another_run(finished: Path, tmp_path: Pat
     run = ddco_pyro.fit(with_overrides(spec, {"training.epochs": 1}))
     merged = merge(run, Pair(0, (1, 2), None), out=tmp_path / "merged")
     assert merge(run, Pair(0, (1, 2), None), out=tmp_path / "merged").metrics == merged.metrics
-    with pytest.raises(BadInput, match=r"is a run of other demonstrations \(labels/merged changed\)"):
+    with pytest.raises(BadInput, match=r"holds options 1 and 2 of level 'option', merged"):
         merge(run, Pair(0, (2, 3), None), out=tmp_path / "merged")
 
 

@@ -15,6 +15,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.inspection import inspect
+from ddco_pyro.errors import command
 
 
 def imported(path: Path, tmp_path: Path) -> Demonstrations:
@@ -108,4 +109,4 @@ def test_what_is_to_be_imported_first_is_named(tmp_path: Path) -> None:
             path = row.make(tmp_path / name)
             ended = call("init", path, "--out", tmp_path / "spec.yaml")
             assert ended.status == 2
-            assert f"first: ddco-pyro import {path} --out demos.hdf5" in ended.err
+            assert f"first: {command('import', path, '--out', 'demos.hdf5')}" in ended.err

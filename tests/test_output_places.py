@@ -286,7 +286,7 @@ def test_a_rollout_asks_for_what_its_report_needs_first(toy_run, tmp_path: Path,
     played: list[object] = []
     monkeypatch.setattr("ddco_pyro.fitting.rollouts.run_episodes", lambda *how: played.append(how))
     spec = (run / "spec.yaml").read_text()
-    (run / "report.html").unlink()
+    (run / "report.html").unlink(missing_ok=True)
     (run / "report.html").mkdir()
     refused(call("rollout", run, "--episodes", 2), f"RUN {run}/report.html: is a folder; name a file")
     (run / "report.html").rmdir()

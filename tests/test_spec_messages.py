@@ -149,7 +149,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"compare_with": ["flt"]},
-        "compare_with.0.kind: must be flat or flat_equal or per_timestep, got 'flt' (did you mean 'flat'?)",
+        "compare_with.0.kind: must be flat or flat_equal or per_timestep or mixture, got 'flt' (did you mean 'flat'?)",
     ),
     (
         {"compare_with": ["flat", {"kind": "flat_equal", "policy": {"network": "linear"}}]},
@@ -194,7 +194,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"training.duration": {"mean": 20, "weight": -1}}, "training.duration.weight: must be at least 0, got -1"),
     (
         {"hierarchy": None, "baseline": "flat", "training.duration.mean": 20},
-        "training.duration: a baseline has no options that last; leave it out",
+        "training.duration: there are no options that last; leave it out",
     ),
     ({"compare_with": [3]}, "compare_with.0: must be a mapping (key: value), got 3"),
     ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),

@@ -26,6 +26,9 @@ class LeRobotFormat(StrEnum):
     SUBTASK_INDEX = "0.4"
 
 
+NO_LABELS = "labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot"
+
+
 def segment(
     run: RunPath,
     demos: Annotated[
@@ -82,6 +85,8 @@ def segment(
     if out and in_place:
         raise BadInput("--out and --in-place exclude each other; keep one")
     labelled = demos if in_place else out
+    if labelled and demos.is_dir():
+        raise BadInput(f"{demos}: {NO_LABELS}")
     if labelled and allow_external:  # a copy would not find the other files, and labels could go into those
         again = command("import", demos, "--allow-external", "--out", "whole.hdf5")
         raise BadInput(f"{demos}: labels go into whole files only; first: {again}")
@@ -106,7 +111,7 @@ def segment(
     fit = load(run, allow_code)
     with open_source(demos, external=allow_external) as source, console.Progress("segmenting") as progress:
         if labelled and source.format != "robomimic":
-            raise BadInput(f"{demos}: labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot")
+            raise BadInput(f"{demos}: {NO_LABELS}")
         if labelled and fit.spec.hierarchy:
             levels = [level.name for level in fit.spec.hierarchy.levels]
             check_labels(demos, levels, chosen_names(source, fit))

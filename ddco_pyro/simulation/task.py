@@ -18,7 +18,7 @@ from typing import Any, Literal, Protocol, get_args
 import dm_env
 import numpy as np
 
-from ddco_pyro.errors import BadInput
+from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.simulation.cameras import Camera, Encoded, Watched
 from ddco_pyro.spec.types import TASKS
 
@@ -151,6 +151,8 @@ def find_task(name: str) -> Task:
         else:
             module, _, attribute = name.partition(":")
             task = getattr(importlib.import_module(module), attribute)
+    except Failed:  # the task says itself what this machine lacks
+        raise
     except Exception as error:  # whatever the task's code raises
         raise UnknownTask(f"task {name!r} cannot be loaded: {' '.join(str(error).split())}") from error
     if not isinstance(task, Task):

@@ -49,7 +49,7 @@ def _of_file(path: Path) -> Format:
     try:
         with h5py.File(path, "r") as file:
             names = set(file)
-            prepared = "env_args" in file["data"].attrs if "data" in names and _has_states_only(file["data"]) else None
+            prepared = "env_args" in file["data"].attrs if _has_states_only(file.get("data")) else None
     except (OSError, RuntimeError, ValueError, KeyError):
         return "robomimic"
     if prepared is not None:
@@ -68,8 +68,10 @@ def _of_file(path: Path) -> Format:
     return "robomimic"
 
 
-def _has_states_only(data: h5py.Group) -> bool:
-    """Whether the first demonstration has states of a simulator, and no observations."""
+def _has_states_only(data: object) -> bool:
+    """Whether ``data`` is a group whose first demonstration has states of a simulator, and no observations."""
+    if not isinstance(data, h5py.Group):
+        return False
     first = next((name for name in data if data.get(name, getclass=True) is h5py.Group), None)
     return first is not None and "states" in data[first] and "obs" not in data[first]
 
