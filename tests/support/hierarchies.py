@@ -46,7 +46,7 @@ def varied(hierarchy):
     torch.manual_seed(5)
     with torch.no_grad():
         for parameter in hierarchy.parameters():
-            parameter[parameter == 0] = torch.randn(int((parameter == 0).sum()))
+            parameter[parameter == 0] = 0.1 * torch.randn(int((parameter == 0).sum()))
     return hierarchy
 
 
