@@ -330,7 +330,11 @@ def test_an_interrupt_within_a_finalizer_is_not_lost(monkeypatch, spec, number):
         time.sleep(HANGS)
 
     monkeypatch.setattr("ddco_pyro.fitting.prepare.dimensions", work)
-    assert call("check", spec) == (1, "", "ddco-pyro: interrupted\n")
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # workers of pytest-xdist ignore it
+    try:
+        assert call("check", spec) == (1, "", "ddco-pyro: interrupted\n")
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_debug_shows_the_traceback():

@@ -22,6 +22,7 @@ from ddco_pyro.comparison import CompareError, Comparison, Row, compare, page, w
 from ddco_pyro.comparison.shared import NotShared
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing import words
+from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.prepare import demonstrations, parts
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit
@@ -219,7 +220,7 @@ def test_demonstrations_that_have_changed_since_are_refused(toy_spec, other, tmp
     for demo in demos:
         demo.actions[0] *= 0.5
     demos.write(path)
-    with pytest.raises(NotShared, match=r"first: demo_\d+ has changed since this run was fitted to it; fit it again"):
+    with pytest.raises(BadInput, match=r"first: is a run of other demonstrations \(actions changed\)"):
         compare([first.folder, second.folder])
 
 

@@ -166,7 +166,9 @@ def test_rows_of_an_episode_that_is_not_named_are_not_annotated(tmp_path: Path, 
 def test_a_copy_into_the_dataset_itself_is_refused(tmp_path: Path, run: Path) -> None:
     dataset = odd.changed()(tmp_path)
     before = contents(tmp_path)
-    refused(call("segment", run, dataset, "--lerobot", dataset / "data" / "new"), "lies in .*, which this command reads")
+    refused(
+        call("segment", run, dataset, "--lerobot", dataset / "data" / "new"), "lies in .*, which this command reads"
+    )
     assert contents(tmp_path) == before
 
 

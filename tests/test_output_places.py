@@ -291,7 +291,7 @@ def test_a_rollout_asks_for_what_its_report_needs_first(toy_run, tmp_path: Path,
     refused(call("rollout", run, "--episodes", 2), f"RUN {run}/report.html: is a folder; name a file")
     (run / "report.html").rmdir()
     (run / "spec.yaml").write_text(spec.replace("task: toy\n", "", 1).replace("path: null", f"path: {gone}"))
-    refused(call("rollout", run, "--episodes", 2), f"{gone}: there is no such file; check the path")
+    refused(call("rollout", run, "--episodes", 2), f"{gone}: there is no such file")
     assert not played
 
 

@@ -22,6 +22,7 @@ from ddco_pyro.data.files import json_text, leftovers, only_one, write_text
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
 from ddco_pyro.data.tensors import write_tensors
+from ddco_pyro.errors import BadInput
 from ddco_pyro.events import Event, OnEvent, TrainingBegan, TrainingEnded, ignore
 from ddco_pyro.fitting import labels
 from ddco_pyro.fitting.building import Dimensions, baseline_spec, check_networks, named_baselines, parameters
@@ -361,9 +362,13 @@ class _Clock:
         self._phase, self._since = phase, time.perf_counter()
         try:
             yield
-        finally:
+        except BadInput:
+            raise  # what is refused changes nothing
+        except BaseException:
             self._add()
             self._keep()
+            raise
+        self._add()
 
     def go_on(self, folder: Path, on_event: OnEvent) -> OnEvent:
         """Go on from what is kept in a run folder, and keep it there whenever something is told.
@@ -380,7 +385,7 @@ class _Clock:
 
         def told(event: Event) -> None:
             self._add()
-            if self._since - self._kept_at > SAVE_EVERY:
+            if not isinstance(event, TrainingBegan) and self._since - self._kept_at > SAVE_EVERY:
                 self._keep()
             on_event(event)
 

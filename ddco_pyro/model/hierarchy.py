@@ -63,12 +63,13 @@ class Caller(nn.Module):
         self.emits_control = "control" in emits
         self.emits_options = "options" in emits and options > 0
         logits = options + self.emits_control if self.emits_options else 0
-        self.std = ControlStd(control, scaling, copies) if self.emits_control else None
-        seen = 0 if self.std is None else len(self.std.seen)
+        std = ControlStd(control, scaling, copies) if self.emits_control else None
+        seen = 0 if std is None else len(std.seen)
         self.sizes = (logits, scaling.numbers + seen if self.emits_control else 0)
         self.network = build(network, shape, sum(self.sizes), copies)
         if seen:
             begin_at_zero(self.network, seen)
+        self.std = std
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
         """Models that have a σ also where no control is emitted are read without it."""

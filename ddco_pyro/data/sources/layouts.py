@@ -27,6 +27,8 @@ def format_of(path: Path) -> Format:
         return _of_file(path)
     if not path.exists():
         raise DemonstrationsError(f"{path}: there is no such file or folder; check the path")
+    if not path.is_dir():
+        raise DemonstrationsError(f"{path}: is neither a regular file nor a folder; name an HDF5 file")
     if (path / "meta" / "info.json").is_file():
         return "lerobot"
     if (path / "data" / "metadata.json").is_file() or (path / "metadata.json").is_file():

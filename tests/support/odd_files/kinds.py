@@ -199,7 +199,7 @@ CONTROL_ROWS: dict[str, Row] = {
     ),
     "controls of another size in one": _row(
         _another_size,
-        says="actions is in 4 of 5 demonstrations",
+        says=r"actions (is in 4 of 5 demonstrations|has shape \(1,\))",
     ),
     "a number that single precision does not hold": _row(_huge),
     "no control that moves": _row(
