@@ -10,11 +10,11 @@ terminations steep within few epochs, and falls along a cosine. One initialisati
 the mixture the same networks, clusters, seed and gradient steps.
 
 Options are drawn (``sample``). Only drawing reproduces a choice that the supervisor makes at random: ``marginal`` and
-``most_likely`` take the likelier side in every episode, and going to one side in every episode takes no memory.
+``most_likely`` take the side that is likelier by what is seen, and going to one side always takes no memory.
 
 Seeds are those that the library counts from by default: demonstrations from 0, starts from 1000, training 0. None is
 chosen for what it gives. Where the supervisor chooses a side, even seeds have one and odd seeds the other: a gate then
-has no side to lean to, and the chance level is that of a fair coin.
+has no side to lean to, and the chance level is that of a supervisor who forgets.
 """
 
 from __future__ import annotations

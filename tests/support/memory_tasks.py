@@ -143,7 +143,11 @@ class Obstacle(Line):
 
 
 class TwoGoals(Line):
-    """By way of both of two goals, at -1 and 1, in either order; the position is seen."""
+    """By way of both of two goals, at -1 and 1, in either order; the position is seen.
+
+    Half of all demonstrations pass a place between the middle and a goal outwards and then inwards, the others outwards
+    alone: two of three moves seen there are outwards.
+    """
 
     steps, speed = 24, 0.25
 
@@ -167,14 +171,15 @@ class TwoGoals(Line):
         return [self.position]
 
     def odds(self) -> float:
-        return 0.5 if abs(self.position) < 1 else float(self.position < 0)
+        outwards = 2 / 3 if abs(self.position) < 0.75 else 0.5 if abs(self.position) < 1 else 0.0
+        return outwards if self.position > 0 else 1 - outwards
 
 
 class Supervisor:
     """Moves as it intends to, with a hand that shakes.
 
-    :param forgetful: it draws its intention anew at every step, as often as the supervisor has it where it sees what is
-        seen. Nothing without memory imitates the supervisor better.
+    :param forgetful: it draws its intention anew at every step, about as often as the supervisor has it where it sees
+        what is seen. It knows both moves exactly, and lacks memory alone.
     """
 
     def __init__(self, environment: Line, forgetful: bool = False) -> None:
