@@ -1,0 +1,123 @@
+"""Where the next skill is hidden from what is seen, options that last succeed and a memoryless mixture does not.
+
+Four kinds of hidden intention (``memory_tasks``): the way there and the way back along one line, a cue that is seen
+once, a side of an obstacle that is chosen at random and kept, and two goals in either order. In the control case the
+intention is observed, with the same demonstrations and starts, and the two are equal.
+
+All tasks have one spec, as a user would write it. Clusters are of observations and controls (``vq_controls``), since
+clusters of observations cannot tell apart what looks alike: that is what is planted. A large learning rate makes linear
+terminations steep within few epochs, and falls along a cosine. One initialisation is enough. ``compare_with`` gives
+the mixture the same networks, clusters, seed and gradient steps.
+
+Options are drawn (``sample``). Only drawing reproduces a choice that the supervisor makes at random: ``marginal`` and
+``most_likely`` take the side that is likelier by what is seen, and going to one side always takes no memory.
+
+Seeds are those that the library counts from by default: demonstrations from 0, starts from 1000, training 0. None is
+chosen for what it gives. Where the supervisor chooses a side, even seeds have one and odd seeds the other: a gate then
+has no side to lean to, and the chance level is that of a supervisor who forgets.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import memory_tasks
+import pytest
+import yaml
+from scipy import stats
+
+import ddco_pyro
+from ddco_pyro.acting.lockstep import play
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.simulation.episodes import paired_difference, rate, run_episode
+from ddco_pyro.spec import parse_spec
+
+SPEC = """
+task: memory_tasks:{task}
+demonstrations: {{count: 40, valid_fraction: 0.25}}
+observations: {observed}
+control: {{std: {{learn: true}}}}
+hierarchy:
+  levels:
+    - {{count: 2, policy: {{network: linear}}}}
+  meta_policy: {{network: linear}}
+compare_with: [mixture]
+training:
+  initialize: vq_controls
+  layerwise: false
+  epochs: 40
+  patience: null
+  batch_size: 6
+  optimizer: {{lr: 0.3, schedule: cosine}}
+rollout: {{options: sample, episodes: 100}}
+"""
+TASKS = ("there_and_back", "cue_once", "obstacle", "two_goals")
+UNLIKELY = 1e-3
+
+
+@cache
+def demonstrations(name):
+    task = getattr(memory_tasks, name)
+    return Demonstrations(tuple(run_episode(task, "supervisor", seed).record for seed in range(40)))
+
+
+def chance(name):
+    """Successes of the supervisor whose intention is drawn anew at every step, in 300 episodes."""
+    task = getattr(memory_tasks, name)
+    episodes = [run_episode(task, "forgetful", seed) for seed in range(2000, 2300)]
+    return rate(int(sum(episode.outcome["success"] for episode in episodes)), len(episodes))
+
+
+def fitted(name, observed):
+    """The fit, and the outcomes of its options and of the mixture from the same starts."""
+    spec = parse_spec(yaml.safe_load(SPEC.format(task=name, observed=observed)))
+    fit = ddco_pyro.fit(spec, demonstrations(name))
+    starts = range(spec.rollout.seed, spec.rollout.seed + spec.rollout.episodes)
+    played = [
+        [episode.outcome for episode in play(getattr(memory_tasks, name), hierarchy, spec.rollout, starts)]
+        for hierarchy in (fit.hierarchy, fit.baselines["mixture"].hierarchy)
+    ]
+    return fit, *played
+
+
+def worth(fit):
+    """What options that last are worth, held-out nats per step: mean, and the ends of its 95 % t interval."""
+    found, held_out = fit.metrics["worth"]["memory"], fit.metrics["demonstrations"]["valid"]
+    half = found["standard_error"] * stats.t.ppf(0.975, held_out - 1)
+    return found["nats_per_step"], found["nats_per_step"] - half, found["nats_per_step"] + half
+
+
+def successes(outcomes):
+    return [outcome["success"] for outcome in outcomes]
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_options_remember_what_a_mixture_cannot(name):
+    """The mixture succeeds no more often than a binomial bound on what the supervisor does without memory."""
+    fit, options, mixture = fitted(name, ["seen"])
+    ours, theirs = sum(successes(options)), sum(successes(mixture))
+    by_chance = chance(name)
+    mean, low, high = worth(fit)
+    print(
+        f"\n{name}: options {ours:.0f}, mixture {theirs:.0f} of {len(options)}; chance {by_chance['rate']:.1%}; "
+        f"memory {mean:.2f} [{low:.2f}, {high:.2f}] nats per step"
+    )
+    assert ours >= 0.95 * len(options)
+    most = stats.binomtest(by_chance["successes"], by_chance["trials"]).proportion_ci(1 - 2 * UNLIKELY).high
+    assert theirs <= stats.binom.isf(UNLIKELY, len(mixture), most)
+    assert low > 0
+    if name == "obstacle":  # either side is passed, as in the demonstrations
+        assert {outcome["side"] for outcome in options} == {-1.0, 1.0}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_where_the_intention_is_seen_there_is_nothing_to_remember(name):
+    fit, options, mixture = fitted(name, ["seen", "intention"])
+    mean, low, high = worth(fit)
+    print(
+        f"\n{name}, intention seen: options {sum(successes(options)):.0f}, mixture {sum(successes(mixture)):.0f} of "
+        f"{len(options)}; memory {mean:.4f} [{low:.4f}, {high:.4f}] nats per step"
+    )
+    assert sum(successes(options)) >= 0.95 * len(options)
+    assert paired_difference(successes(options), successes(mixture))["p_value"] > 0.05
+    assert low <= 0 <= high
