@@ -21,6 +21,7 @@ from ddco_pyro.comparison import CompareError, Comparison, Row, compare, page, w
 from ddco_pyro.comparison.shared import NotShared
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing import words
+from ddco_pyro.fitting.fitted_to import OtherDemonstrations
 from ddco_pyro.fitting.prepare import demonstrations, parts
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit
@@ -205,7 +206,14 @@ def test_demonstrations_that_have_changed_since_are_refused(toy_spec, other, tmp
     assert len(compare([first.folder, second.folder]).rows) == 2
     for demo in demos:
         demo.actions[0] *= 0.5
+    before = path.read_bytes()
     demos.write(path)
+    with pytest.raises(OtherDemonstrations, match=r"first: is a run of other demonstrations \(actions changed\)"):
+        compare([first.folder, second.folder])
+    path.write_bytes(before)
+    metrics = json.loads((first.folder / "metrics.json").read_text())
+    metrics["valid"][0]["log_likelihood"] += 1  # as where the code of a user's network says another one by now
+    (first.folder / "metrics.json").write_text(json.dumps(metrics))
     with pytest.raises(NotShared, match=r"first: demo_\d+ has changed since this run was fitted to it; fit it again"):
         compare([first.folder, second.folder])
 

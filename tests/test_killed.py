@@ -24,6 +24,8 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.tensors import read_tensors
 from ddco_pyro.fitting import fitted_to
+from ddco_pyro.fitting.run import fit
+from ddco_pyro.spec import parse_spec, with_overrides
 
 
 def same_hdf5(one: Path, other: Path) -> None:
@@ -155,7 +157,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory, toy_run) -> dict[str, Case]:
             lambda folder: written(folder.glob("selected/folds/*.json")) | epochs(folder),
         ),
         "merge": Case(
-            ("merge", folder / "run", "--out", "merged", "--jobs", "1"),
+            ("merge", _whole(folder, data), "--out", "merged", "--jobs", "1"),
             "merged",
             same_run,
             epochs,
@@ -174,6 +176,12 @@ def cases(tmp_path_factory: pytest.TempPathFactory, toy_run) -> dict[str, Case]:
             (folder / "toy.hdf5",),
         ),
     }
+
+
+def _whole(folder: Path, data: dict[str, object]) -> Path:
+    """A run that is finished."""
+    spec = parse_spec({key: value for key, value in data.items() if key != "selection"})
+    return fit(with_overrides(spec, {"training.epochs": 60, "training.patience": None}), out=folder / "whole").folder
 
 
 def _pictures(folder: Path) -> Path:
