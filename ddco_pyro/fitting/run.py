@@ -22,8 +22,7 @@ from ddco_pyro.data.files import json_text, leftovers, only_one, write_text
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
 from ddco_pyro.data.tensors import write_tensors
-from ddco_pyro.errors import BadInput
-from ddco_pyro.events import Event, OnEvent, TrainingBegan, TrainingEnded, ignore
+from ddco_pyro.events import EpochEnded, Event, OnEvent, TrainingBegan, TrainingEnded, ignore
 from ddco_pyro.fitting import labels
 from ddco_pyro.fitting.building import Dimensions, baseline_spec, check_networks, named_baselines, parameters
 from ddco_pyro.fitting.checkpoint import copy_of
@@ -362,16 +361,13 @@ class _Clock:
         self._phase, self._since = phase, time.perf_counter()
         try:
             yield
-        except BadInput:
-            raise  # what is refused changes nothing
-        except BaseException:
+        finally:
             self._add()
-            self._keep()
-            raise
-        self._add()
+            if self._kept_at > -math.inf:
+                self._keep()
 
     def go_on(self, folder: Path, on_event: OnEvent) -> OnEvent:
-        """Go on from what is kept in a run folder, and keep it there whenever something is told.
+        """Go on from what is kept in a run folder, and keep it there from the first epoch on, as checkpoints are.
 
         :returns: to be told in place of ``on_event``, which is told in turn.
         :raises Damaged: what is kept cannot be read.
@@ -385,7 +381,7 @@ class _Clock:
 
         def told(event: Event) -> None:
             self._add()
-            if not isinstance(event, TrainingBegan) and self._since - self._kept_at > SAVE_EVERY:
+            if isinstance(event, EpochEnded) and self._since - self._kept_at > SAVE_EVERY:
                 self._keep()
             on_event(event)
 
