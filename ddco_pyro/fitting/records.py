@@ -81,7 +81,7 @@ def read_metrics(folder: Path, counts: Sequence[int]) -> dict[str, Any]:
     ]
     if levels != [list(range(1 + count)) for count in counts] or {len(values) for values in each_level} - {len(counts)}:
         raise Damaged(path, f"is not about levels with {', '.join(map(str, counts)) or 'no'} options", remedy)
-    data: dict[str, Any] = json.loads(path.read_bytes(), parse_constant=lambda _: None)  # runs of before have NaN
+    data: dict[str, Any] = json.loads(path.read_bytes(), parse_constant=lambda _: None)  # NaN of earlier versions
     return data | ({"agreement": as_today(data["agreement"], len(counts))} if "agreement" in data else {})
 
 
