@@ -281,17 +281,20 @@ def test_demonstrations_that_no_option_explains_are_refused(toy_run, file: Path,
 
 
 def test_a_rollout_asks_for_what_its_report_needs_first(toy_run, tmp_path: Path, monkeypatch) -> None:
-    """Demonstrations that were moved are named before any episode is played; so is a report that cannot be written."""
-    run, gone = shutil.copytree(toy_run.folder, tmp_path / "run"), tmp_path / "gone.hdf5"
+    """Demonstrations that cannot be read are named before any episode is played; so is a report that cannot be
+    written.
+    """
+    run, damaged = shutil.copytree(toy_run.folder, tmp_path / "run"), tmp_path / "damaged.hdf5"
+    damaged.write_text("notes")
     played: list[object] = []
     monkeypatch.setattr("ddco_pyro.fitting.rollouts.run_episodes", lambda *how: played.append(how))
     spec = (run / "spec.yaml").read_text()
-    (run / "report.html").unlink()
+    (run / "report.html").unlink(missing_ok=True)
     (run / "report.html").mkdir()
     refused(call("rollout", run, "--episodes", 2), f"RUN {run}/report.html: is a folder; name a file")
     (run / "report.html").rmdir()
-    (run / "spec.yaml").write_text(spec.replace("task: toy\n", "", 1).replace("path: null", f"path: {gone}"))
-    refused(call("rollout", run, "--episodes", 2), f"{gone}: there is no such file; check the path")
+    (run / "spec.yaml").write_text(spec.replace("path: null", f"path: {damaged}"))
+    refused(call("rollout", run, "--episodes", 2), f"{damaged}: cannot be read as HDF5")
     assert not played
 
 
