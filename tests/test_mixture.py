@@ -277,10 +277,18 @@ def test_the_worth_of_a_hierarchy_has_two_parts():
 @pytest.mark.parametrize(
     ("memory", "error", "said"),
     [
-        (0.5, 0.1, "So options that last are worth it on these demonstrations."),
-        (0.1, 0.1, "So this fit does not show that options that last are worth anything."),
-        (-0.5, 0.1, "So options that last explain these demonstrations worse than the same experts without memory."),
-        (0.5, math.nan, "So this fit does not show that options that last are worth anything."),
+        (
+            0.5,
+            0.1,
+            "In this fit options that last explain held-out controls better; one fit of each model is no verdict.",
+        ),
+        (0.1, 0.1, "This fit does not show that options that last are worth anything."),
+        (
+            -0.5,
+            0.1,
+            "In this fit options that last explain held-out controls worse than the same experts without memory.",
+        ),
+        (0.5, math.nan, "This fit does not show that options that last are worth anything."),
     ],
 )
 def test_the_verdict_is_about_options_that_last(memory, error, said):

@@ -86,6 +86,19 @@ def test_the_intervals_are_those_of_scipy():
     assert words.spread(values) == ("2.05", f"{low:.2f} to {high:.2f}", "1.50 to 2.50")
 
 
+@pytest.mark.parametrize(
+    ("memory", "said"),
+    [
+        ([0.3, 0.4, 0.35], "So options that last are worth it on these demonstrations."),
+        ([0.3, 0.4, -0.35], "So it is inconclusive whether options that last are worth anything here."),
+        ([-0.3, -0.4, -0.35], "So options that last explain these demonstrations worse than the same experts"),
+    ],
+)
+def test_the_verdict_is_over_training_seeds(memory, said):
+    text = words.over_seeds({"training_seeds": [0, 1, 2], "held_out": {}, "worth": {"memory": memory}}, "DDCO")
+    assert said in text
+
+
 def test_seeds_follow_the_specs_own(written):
     spec = load_spec(written[0])
     assert training_seeds(spec, 2) == [0, 1]

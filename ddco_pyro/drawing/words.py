@@ -148,7 +148,7 @@ def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out
 
 
 def worth(found: Mapping[str, Any], ours: str, held_out: int) -> str:
-    """What several experts and options that last are worth, and the verdict, which is about the second.
+    """What several experts and options that last are worth in one fit of each model.
 
     :param found: what :func:`ddco_pyro.fitting.worth.worth` gives, with ``steps_in_a_row`` where that is known.
     :param ours: what the hierarchy is called.
@@ -163,9 +163,9 @@ def worth(found: Mapping[str, Any], ours: str, held_out: int) -> str:
     else:
         parts = f"Held-out nats per step: {lasting}."
     decided = {
-        1: "So options that last are worth it on these demonstrations.",
-        0: "So this fit does not show that options that last are worth anything.",
-        -1: "So options that last explain these demonstrations worse than the same experts without memory.",
+        1: "In this fit options that last explain held-out controls better; one fit of each model is no verdict.",
+        0: "This fit does not show that options that last are worth anything.",
+        -1: "In this fit options that last explain held-out controls worse than the same experts without memory.",
     }[_direction(memory, held_out)]
     rows = found.get("steps_in_a_row", ())
     short = [row for row in rows if row["options"] <= row["mixture"]]
@@ -176,7 +176,8 @@ def worth(found: Mapping[str, Any], ours: str, held_out: int) -> str:
 
 
 def over_seeds(found: Mapping[str, Any], ours: str) -> str:
-    """What the parts of the worth are over training seeds, each with a 95 % t interval.
+    """What the parts of the worth are over training seeds, each with a 95 % t interval, and the verdict, which is about
+    options that last.
 
     :param found: what :func:`ddco_pyro.fitting.seeds.over_seeds` gives.
     :param ours: what the hierarchy is called.
@@ -189,14 +190,30 @@ def over_seeds(found: Mapping[str, Any], ours: str) -> str:
     ]
     count = len(found["training_seeds"])
     said = f": {listed(parts)} nats per step" if parts else ""
-    return f"Over {count} training seeds, with the same demonstrations held out{said}."
+    text = f"Over {count} training seeds, with the same demonstrations held out{said}."
+    return f"{text} {_lasting(found['worth']['memory'])}" if "memory" in found["worth"] else text
+
+
+def _lasting(memory: Sequence[float]) -> str:
+    """Whether options that last are worth it, by the 95 % t interval over training seeds."""
+    low, high = _mean_interval(memory)
+    if low > 0:
+        return "So options that last are worth it on these demonstrations."
+    if high < 0:
+        return "So options that last explain these demonstrations worse than the same experts without memory."
+    return "So it is inconclusive whether options that last are worth anything here."
+
+
+def _mean_interval(values: Sequence[float]) -> tuple[float, float]:
+    """The 95 % t interval of the mean of a few values."""
+    mean, count = float(np.mean(values)), len(values)
+    half = float(np.std(values, ddof=1) * stats.t.ppf((1 + CONFIDENCE) / 2, count - 1) / math.sqrt(count))
+    return mean - half, mean + half
 
 
 def spread(values: Sequence[float]) -> tuple[str, str, str]:
     """Mean, 95 % t interval of the mean, and range of a few values."""
-    mean, count = float(np.mean(values)), len(values)
-    half = float(np.std(values, ddof=1) * stats.t.ppf((1 + CONFIDENCE) / 2, count - 1) / math.sqrt(count))
-    return number(mean), interval([mean - half, mean + half]), interval([min(values), max(values)])
+    return number(float(np.mean(values))), interval([*_mean_interval(values)]), interval([min(values), max(values)])
 
 
 def _with_error(difference: Mapping[str, Any]) -> str:
