@@ -52,7 +52,7 @@ class Saliency:
             self._states = {name: tuple(part.detach() for part in state) for name, state in states.items()}
             level = next((number for number, choice in enumerate(choices) if choice), len(choices))
             said = outputs.callers[level].numbers
-            assert said is not None  # whoever is active emits the control
+            assert said is not None  # the active caller emits the control
             numbers = said[0, 0, choices[level] - 1 if level < len(choices) else 0, : self.hierarchy.scaling.numbers]
             squared = {key: torch.zeros(image.shape[2:4]) for key, image in images.items()}
             for number in numbers:
