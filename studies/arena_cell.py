@@ -109,7 +109,7 @@ def recorded(task: str, settings: Settings) -> Path:
 def fitted_cell(cell: ArenaCell, source: Path, overrides: tuple[str, ...], folder: Path) -> Fit:
     """A fit of the spec that ``ddco-pyro init`` writes for the training demonstrations, and of its baselines."""
     names, valid, unused = chosen(source, cell)
-    facts = replace(inspect(source, exclude=[*valid, *unused]), excluded=())  # init is shown no others
+    facts = replace(inspect(source, exclude=[*valid, *unused]), excluded=(), masks={})  # init is shown no others
     started = folder / "started.yaml"
     write_text(started, starting_spec(facts, source.resolve()))
     spec = load_spec(started, [*overrides, f"seed={cell.seed}"])
