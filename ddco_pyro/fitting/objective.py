@@ -130,10 +130,11 @@ class Objective:
         return float(self._total(self._tables(model, batch, self.known[1], rows), batch)) / self._likelihoods
 
     def _tables(self, model: Hierarchy, batch: Batch, known: Known, rows: Tensor) -> Tables:
-        tables = model.tabulate(batch, self.stage.discovering)
-        for level, choices in known.items():
-            tables = tables.clamp(level, choices[rows, : batch.inputs.batch[1]])
-        return tables
+        return _clamped(model.tabulate(batch, self.stage.discovering), known, rows)
+
+    def score(self, tables: Tables, batch: Batch, rows: Tensor) -> Tensor:
+        """What is maximised of some training demonstrations, nats, given their tables."""
+        return self._total(_clamped(tables, self.known[0], rows), batch)
 
     def _total(self, tables: Tables, batch: Batch) -> Tensor:
         likelihood = partial(total_log_likelihood, lengths=batch.lengths, engine=self.material.spec.inference.engine)
@@ -158,6 +159,12 @@ class Objective:
             f"stage {self.stage.name}, epoch {self.progress.epoch + 1}: the log-likelihood of {where} is not "
             "finite; look at these demonstrations, raise control.std, or lower training.optimizer.lr"
         )
+
+
+def _clamped(tables: Tables, known: Known, rows: Tensor) -> Tables:
+    for level, choices in known.items():
+        tables = tables.clamp(level, choices[rows, : tables.steps])
+    return tables
 
 
 def _read_ahead(model: Hierarchy, whole: Batch, pieces: Iterable[Batch]) -> None:

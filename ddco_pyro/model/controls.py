@@ -218,16 +218,22 @@ class ControlStd(nn.Module):
         if self.own:
             self.raw_own = nn.Parameter(start[self.own].repeat(copies, 1))
 
-    def forward(self, numbers: Tensor | None = None) -> Tensor:
-        """σ [C]; [K, C] where a dimension has one for each option; [..., K, C] where one depends on the state.
-
-        :param numbers: y of each dimension in ``seen``, [..., K, S]; None where there is none.
-        """
+    def table(self) -> Tensor:
+        """σ without what depends on the state, [C]; [K, C] where a dimension has one for each option."""
         std = self.fixed
         if self.shared:
             std = std.index_put((torch.tensor(self.shared),), self.floor[self.shared] + softplus(self.raw))
         if self.own:
             std = _with_columns(std, self.own, self.floor[self.own] + softplus(self.raw_own))
+        return std
+
+    def forward(self, numbers: Tensor | None = None, table: Tensor | None = None) -> Tensor:
+        """σ [C]; [K, C] where a dimension has one for each option; [..., K, C] where one depends on the state.
+
+        :param numbers: y of each dimension in ``seen``, [..., K, S]; None where there is none.
+        :param table: what :meth:`table` gives; None for that.
+        """
+        std = self.table() if table is None else table
         if self.seen:
             assert numbers is not None  # the caller's network gives them
             std = _with_columns(std, self.seen, self.floor[self.seen] + softplus(numbers + self.start[self.seen]))

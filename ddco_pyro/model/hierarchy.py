@@ -59,7 +59,7 @@ class Caller(nn.Module):
         copies: int,
     ) -> None:
         super().__init__()
-        self.options = options
+        self.options, self.copies = options, copies
         self.emits_control = "control" in emits
         self.emits_options = "options" in emits and options > 0
         logits = options + self.emits_control if self.emits_options else 0
@@ -80,13 +80,18 @@ class Caller(nn.Module):
 
     def forward(self, said: Tensor, scaling: ControlScaling) -> CallerOutputs:
         """What the callers say at every step, given what their network says, [N, T, K, outputs]."""
+        return self.outputs(said, scaling, None if self.std is None else self.std.table())
+
+    def outputs(self, said: Tensor, scaling: ControlScaling, std: Tensor | None) -> CallerOutputs:
+        """The same for a given σ, :meth:`ControlStd.table`."""
         logits, numbers = said.split(self.sizes, dim=-1) if all(self.sizes) else (said, said)
         choices = logits if self.emits_options else None
         if self.std is None:
             return CallerOutputs(self.options, choices, None)
         seen = len(self.std.seen)
         means, of_std = numbers.split([scaling.numbers, seen], dim=-1) if seen else (numbers, None)
-        return CallerOutputs(self.options, choices, scaling.emission(means, self.std(of_std)), numbers)
+        assert std is not None  # a caller that emits control has one
+        return CallerOutputs(self.options, choices, scaling.emission(means, self.std(of_std, std)), numbers)
 
 
 class Level(nn.Module):

@@ -21,7 +21,7 @@ from ddco_pyro.spec.settings import (
     RolloutSpec,
     SelectionSpec,
 )
-from ddco_pyro.spec.training import DurationSpec, LabelsSpec, OptimizerSpec, TrainingSpec
+from ddco_pyro.spec.training import DurationSpec, LabelsSpec, OptimizerSpec, RidgeSpec, TrainingSpec
 from ddco_pyro.spec.user_code import user_code
 from ddco_pyro.spec.whole import Spec, parse_spec, with_overrides
 
@@ -48,6 +48,7 @@ __all__ = [
     "PolicySpec",
     "Pool",
     "ReportSpec",
+    "RidgeSpec",
     "RolloutSpec",
     "SelectionSpec",
     "Spec",

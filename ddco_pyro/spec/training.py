@@ -10,11 +10,25 @@ from ddco_pyro.spec.messages import invalid
 from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Seed, Share, Text, nested
 
 
+class RidgeSpec(Model):
+    """Ridges of EM: precisions of a normal prior on the weights of linear maps, biases left out."""
+
+    policy: float = Field(default=1.0, ge=0)
+    """Of the means of controls: as many steps, of observations with unit variance, that say 0; in units of 1/σ²."""
+    gate: float = Field(default=1.0, ge=0)
+    """Of logits: of options, switches and discrete actions."""
+    termination: float = Field(default=1.0, ge=0)
+    """Of terminations."""
+
+
 class OptimizerSpec(Model):
     """The optimiser of the expectation-gradient steps."""
 
-    name: Literal["adam", "adamw", "momentum"] = "adam"
-    """``adam``, ``adamw``, or ``momentum`` for gradient descent with momentum."""
+    name: Literal["adam", "adamw", "momentum", "em"] = "adam"
+    """``adam``, ``adamw``, ``momentum`` for gradient descent with momentum, or ``em`` for expectation-maximisation,
+    where every network is linear."""
+    ridge: RidgeSpec = RidgeSpec()
+    """Ridges (``em`` only)."""
     lr: Positive = 1e-3
     """Learning rate."""
     schedule: Literal["constant", "cosine"] = "constant"
