@@ -164,7 +164,7 @@ def _read_all(fit: Fit, metrics: dict[str, Any]) -> None:
     found = metrics.get("rollouts")
     if found:
         tables.measures(found["methods"]), tables.against(found["methods"], metrics["model"])
-        console.successes(found)
+        console.successes(found, "ddco")
     console.log_likelihoods(metrics)
 
 

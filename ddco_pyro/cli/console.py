@@ -303,14 +303,19 @@ def warnings(signs: Sequence[tuple[str, str]]) -> None:
         console.print(Text(f"warning: {what} {advice}"), soft_wrap=True)
 
 
-def successes(results: Mapping[str, Any]) -> None:
-    """What came of each method's rollouts."""
+def successes(results: Mapping[str, Any], ours: str) -> None:
+    """What came of each method's rollouts, and what the hierarchy is worth by them.
+
+    :param ours: the model's name.
+    """
     methods: Mapping[str, Any] = results["methods"]
     measures = list(dict.fromkeys(name for result in methods.values() for name in result["measures"]))
     table = Table("method", *measures, title=f"{results['episodes']} episodes each", show_edge=False)
     for name, result in methods.items():
         table.add_row(name, *(_measure(result["measures"].get(measure)) for measure in measures))
     _show(table)
+    if said := words.success_worth(results, words.method(ours)):
+        Console().print(Text(said), soft_wrap=True)
 
 
 def _measure(summary: Mapping[str, Any] | None) -> str:

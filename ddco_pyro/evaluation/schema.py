@@ -308,12 +308,31 @@ class Method(Record):
     against: Annotated[Against | None, NOT_NULL] = None
 
 
+class SuccessWorth(Record):
+    """The parts of what the hierarchy is worth in success (:func:`ddco_pyro.fitting.worth.success_worth`)."""
+
+    memory: Against
+    experts: Annotated[Against | None, NOT_NULL] = None
+    total: Annotated[Against | None, NOT_NULL] = None
+    flat: Annotated[str | None, NOT_NULL] = None
+
+
+class SuccessOfSeeds(Record):
+    """Success rates of a fit and its repetitions by method, and differences of rates, by training seed."""
+
+    training_seeds: Annotated[list[int], Field(min_length=2)]
+    success: dict[str, list[Finite]]
+    worth: dict[str, list[Finite]]
+
+
 class Rollouts(Record):
     """Those of all methods, from the same initial states."""
 
     seed: int
     episodes: AtLeastOne
     methods: dict[str, Method]
+    worth: Annotated[SuccessWorth | None, NOT_NULL] = None
+    seeds: Annotated[SuccessOfSeeds | None, NOT_NULL] = None
 
 
 class Unfinished(Record):
