@@ -10,7 +10,7 @@ from scipy import optimize, stats
 from sklearn.linear_model import LogisticRegression
 
 from ddco_pyro.data.control_parts import ControlPart
-from ddco_pyro.fitting.em import Expectation, is_linear
+from ddco_pyro.training.em import Expectation, is_linear
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
