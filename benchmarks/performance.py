@@ -18,7 +18,7 @@ import torch
 
 from ddco_pyro.inference import Engine, fused, total_log_likelihood
 from ddco_pyro.inference.structure import structure_of
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import Tables, complete

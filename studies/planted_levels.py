@@ -37,7 +37,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.fitting.upper import Constants, converged, fitted
 from ddco_pyro.inference import log_likelihood, segment
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.batch import encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables
 

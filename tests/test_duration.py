@@ -16,7 +16,7 @@ from ddco_pyro.fitting.duration import log_duration_prior
 from ddco_pyro.fitting.objective import Objective
 from ddco_pyro.fitting.stages import plan
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.batch import encode
 from ddco_pyro.model.links import log_termination
 from ddco_pyro.spec import DurationSpec
 

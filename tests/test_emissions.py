@@ -15,10 +15,8 @@ from scipy import stats
 
 from ddco_pyro.inference import enumeration, log_likelihood, total_log_likelihood
 from ddco_pyro.inference.check import compare_engines
-from ddco_pyro.model.actor import Acting
-from ddco_pyro.model.ahmm import ahmm
-from ddco_pyro.model.discrete import Binary, Categorical
-from ddco_pyro.model.emissions import Clipped, Gaussian, Hurdle, Product
+from ddco_pyro.model.ahmm import Acting, ahmm
+from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Gaussian, Hurdle, Product
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import complete
 

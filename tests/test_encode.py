@@ -25,7 +25,7 @@ from ddco_pyro.encoding.projection import principal_components
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, UpdatesDone
 from ddco_pyro.inference import segment
-from ddco_pyro.model.encoding import encode as prepare
+from ddco_pyro.model.batch import encode as prepare
 
 OWN = "user_encoders:"
 

@@ -39,7 +39,7 @@ def options(trunk, whole=None, **policy):
 MODELS = {
     "a flat policy": (flat(BRANCHES), {}, lambda networks: networks["meta_policy"].of[0]),
     "cut pictures": (flat(BRANCHES), CUT, lambda networks: networks["meta_policy"].of[0]),
-    "options that share it": (options(SHARED), {}, lambda networks: networks["levels.0.trunk"].of[0].network),
+    "options that share it": (options(SHARED), {}, lambda networks: networks["levels.0.trunk"].of[0]),
     "read by all": (options(None, BRANCHES), {}, lambda networks: networks["trunk"].of[0]),
     "under an LSTM": (flat(LSTM), {}, lambda networks: networks["meta_policy"].over),
     "by itself": (flat(SEES | {"inputs": ["camera"]}), {}, lambda networks: networks["meta_policy"].layers[1]),

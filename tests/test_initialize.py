@@ -15,7 +15,7 @@ from ddco_pyro.fitting.checkpoint import Progress
 from ddco_pyro.fitting.clusters import Clusters, EqualParts
 from ddco_pyro.fitting.objective import Objective
 from ddco_pyro.fitting.stages import plan
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.spec import parse_spec

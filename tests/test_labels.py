@@ -26,7 +26,7 @@ from ddco_pyro.fitting.objective import Objective
 from ddco_pyro.fitting.restarts import Trainer
 from ddco_pyro.fitting.stages import plan
 from ddco_pyro.inference import segment
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.batch import encode
 from ddco_pyro.spec import SpecError, dump_spec, parse_spec
 
 STEPS = 3

@@ -34,7 +34,7 @@ from ddco_pyro.fitting.restarts import Trainer
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.fitting.shards import ascend, cut
 from ddco_pyro.fitting.stages import plan
-from ddco_pyro.model.encoding import STEPS_AT_ONCE
+from ddco_pyro.model.batch import STEPS_AT_ONCE
 from ddco_pyro.spec import dump_spec, parse_spec
 
 DROPPING = {"network": "mlp", "hidden": [6], "dropout": 0.3}

@@ -256,7 +256,7 @@ def with_diverging(request, demos, tmp_path_factory):
 def test_a_restart_that_diverges_ends_there_and_is_not_the_best(with_diverging):
     trainer, model, told, _ = with_diverging
     ended = diverged(trainer)
-    starts = [trainer.material.hierarchy(number).meta_policy.network.weight[0, 0] > 0 for number in range(6)]
+    starts = [trainer.material.hierarchy(number).meta_policy.network.module.weight[0, 0] > 0 for number in range(6)]
     passes = int(trainer.spec.baseline.policy.options["passes"])
     rows = [sum(row["restart"] == number for row in trainer.history) for number in range(6)]
     assert ended

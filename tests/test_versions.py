@@ -19,7 +19,8 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, Demonst
 from ddco_pyro.data.pictures import shifted
 from ddco_pyro.encoding import Encoding, encode, load
 from ddco_pyro.errors import BadInput
-from ddco_pyro.model.encoding import Batch, ObservationEncoder
+from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import SpecError, parse_spec
 
 VERSIONS = 3

@@ -12,8 +12,7 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.window import Window
 from ddco_pyro.drawing.heat import overlaid
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks import Inputs
-from ddco_pyro.model.networks.state import States
+from ddco_pyro.model.networks import Inputs, States
 
 
 class Look(NamedTuple):

@@ -239,14 +239,29 @@ def padded(
     for row, array in enumerate(frames):
         at = 0
         for seen in transform.seen(array, steps):
-            whole[row, at : at + len(seen)] = seen if shifts is None else shifted(seen, *shifts[row].tolist())
+            target = whole[row, at : at + len(seen)]
+            shift_into(target, seen, *((0, 0) if shifts is None else shifts[row].tolist()))
             at += len(seen)
     return whole
 
 
-def shifted(frames: np.ndarray, down: int, right: int) -> np.ndarray:
-    """Pictures [T, H, W, C] moved by whole pixels; the edge is repeated."""
+def shift_into(target: Any, frames: Any, down: int, right: int) -> None:
+    """Write pictures [T, H, W, C] into ``target``, shifted by whole pixels; the edge is repeated.
+
+    Both are arrays, or tensors on one device.
+    """
     height, width = frames.shape[1:3]
-    before, behind = (max(down, 0), max(right, 0)), (max(-down, 0), max(-right, 0))
-    wider = np.pad(frames, [(0, 0), *zip(before, behind, strict=True), (0, 0)], mode="edge")
-    return wider[:, behind[0] :, behind[1] :][:, :height, :width]
+    down, right = (max(1 - size, min(size - 1, by)) for size, by in ((height, down), (width, right)))
+    top, left, bottom, end = max(down, 0), max(right, 0), height + min(down, 0), width + min(right, 0)
+    target[:, top:bottom, left:end] = frames[:, top - down : bottom - down, left - right : end - right]
+    target[:, top:bottom, :left] = target[:, top:bottom, left : left + 1]
+    target[:, top:bottom, end:] = target[:, top:bottom, end - 1 : end]
+    target[:, :top] = target[:, top : top + 1]
+    target[:, bottom:] = target[:, bottom - 1 : bottom]
+
+
+def shifted(frames: np.ndarray, down: int, right: int) -> np.ndarray:
+    """Pictures [T, H, W, C] shifted by whole pixels; the edge is repeated."""
+    moved = np.empty_like(frames)
+    shift_into(moved, frames, down, right)
+    return moved

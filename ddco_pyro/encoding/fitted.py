@@ -8,20 +8,19 @@ from pathlib import Path
 import numpy as np
 import torch
 from pydantic import field_validator
-from torch import Tensor, nn
+from torch import nn
 
 from ddco_pyro.data.pictures import Transform
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import Fit, load
-from ddco_pyro.model.networks import Inputs, InputShape, build_trunk
-from ddco_pyro.model.networks.branches import Branches
+from ddco_pyro.model.networks import Inputs, InputShape, Network, build_trunk
 from ddco_pyro.model.networks.conv import Conv
 from ddco_pyro.model.networks.lstm import Lstm
-from ddco_pyro.model.networks.shared import Shared
+from ddco_pyro.model.networks.perceptrons import Branches
 from ddco_pyro.spec import NetworkSpec
 from ddco_pyro.spec.types import Count, Items, Model
 
-Part = tuple[NetworkSpec, nn.Module, Sequence[str]]
+Part = tuple[NetworkSpec, Network, Sequence[str]]
 """A network of a fit: its spec, itself, and the observations that it reads."""
 
 
@@ -59,16 +58,15 @@ class FittedReader(nn.Module):
         self.transform = Transform(about.crop, about.resize, about.grey)
         (self.key,) = about.network.inputs
         shape = InputShape({}, {self.key: self.transform.shape(picture)})
-        trunk = build_trunk(about.network, shape, 1)
-        self.network, self.features = trunk.network, trunk.features
+        self.network = build_trunk(about.network, shape, 1)
         self.eval()
 
     def encode(self, pictures: np.ndarray) -> np.ndarray:
         """Features of each picture by itself, float32 [N, F]."""
         seen = torch.from_numpy(np.ascontiguousarray(self.transform(pictures)))
         with torch.no_grad():
-            features: Tensor = self.network(Inputs({}, {self.key: seen[:, None]}, torch.zeros(1)))
-        return features[:, 0, 0].numpy()
+            features, _ = self.network(Inputs({}, {self.key: seen[:, None]}, torch.zeros(1)), ())
+        return features[:, 0, 0].numpy()  # type: ignore[no-any-return]
 
 
 def from_folder(folder: str, key: str, picture: Sequence[int], allow_code: bool = False) -> FittedReader:
@@ -144,13 +142,11 @@ def _lowest(fit: Fit) -> Part:
 def _readers(part: Part, key: str) -> Iterator[Part]:
     """The networks of convolutions within one that read these pictures and nothing else."""
     spec, network, reads = part
-    if isinstance(network, Shared):
-        network = network.network
     if isinstance(network, Conv) and [*reads] == [key]:
         yield spec, network, reads
     within: list[Part] = []
     if isinstance(network, Branches):
-        named = zip(spec.of.items(), network.of, strict=True)
+        named = zip(spec.of.items(), network.branches(), strict=True)
         within = [(branch, own, branch.inputs or (name,)) for (name, branch), own in named]
     elif isinstance(network, Lstm) and spec.over is not None:
         within = [(spec.over, network.over, spec.over.inputs or reads)]

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ddco_pyro.model.networks import Inputs, InputShape
 from ddco_pyro.model.networks.conv import SHARPNESS, Conv
-from ddco_pyro.model.networks.inputs import Inputs, InputShape
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import ConvolutionLayer
 
@@ -38,15 +38,15 @@ class Convolutions(nn.Module):
         layers = (_FIRST, ConvolutionLayer(filters=BUILT_IN[kind], kernel=3, padding=1))
         with seeded(seed):
             images = InputShape({}, {_KEY: tuple(shape)})
-            self.maps = Conv(images, None, 1, (), 0.0, "relu", 0, 0, layers, "spatial_softmax", 0, False)
+            self.maps = Conv(images, 1, (), 0.0, "relu", 0, 0, layers, "spatial_softmax", 0, False)
         if kind == "random_conv":  # nothing will train them, and strong maps that are random tell less
             self.maps.strengthen(1 / SHARPNESS)
         self.features = self.maps.features
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Features of each picture by itself."""
-        said: Tensor = self.maps(Inputs({}, {_KEY: pictures[:, None]}, torch.zeros(1)))
-        return said[:, 0, 0]
+        maps: Tensor = self.maps(Inputs({}, {_KEY: pictures[:, None]}, torch.zeros(1)))[0]
+        return maps[:, 0, 0]
 
     def encode(self, pictures: np.ndarray) -> np.ndarray:
         """The same of and as numpy arrays, float32."""

@@ -184,11 +184,13 @@ def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
     first = sum(len(other.dims) for other in before if other.continuous)
     own = slice(first, first + len(places))
     each = zip(callers, (*(level.count for level in hierarchy.option_levels()), 1), strict=True)
-    std = [[] if one.std is None else one.std(torch.zeros(k, len(one.std.seen)))[..., own].tolist() for one, k in each]
+    std = [
+        [] if one.std is None else one.std(torch.zeros(k, len(one.std.of_state)))[..., own].tolist() for one, k in each
+    ]
     given = next(caller.std for caller in callers if caller.std is not None)  # all have the same kinds of σ
     per_state = [
         [at - first, scaling.numbers + number, float(given.floor[at]), float(given.start[at])]
-        for number, at in enumerate(given.seen)
+        for number, at in enumerate(given.of_state)
         if first <= at < first + len(places)
     ]
     decides = [len(scaling.varying) + sum(bool(other.exact) for other in before)] if part.exact else []

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks.numpy_form import numpy_form
 
 Arrays = dict[str, np.ndarray]
 
@@ -26,7 +25,7 @@ def weights_and_networks(hierarchy: Hierarchy) -> tuple[Arrays, dict[str, Any]]:
     networks |= {f"end_{n}": level.termination for n, level in enumerate(levels) if level.termination is not None}
     networks |= {f"trunk_{number}": level.trunk for number, level in enumerate(levels) if level.trunk is not None}
     networks |= {} if hierarchy.trunk is None else {"trunk": hierarchy.trunk}
-    forms = {name: form for name, network in networks.items() if (form := numpy_form(network)) is not None}
+    forms = {name: form for name, network in networks.items() if (form := network.numpy_form()) is not None}
     facts = {name: about for name, (about, _) in forms.items()}
     arrays |= {f"{name}.{key}": array for name, (_, each) in forms.items() for key, array in each.items()}
     callers = [

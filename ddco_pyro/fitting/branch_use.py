@@ -14,7 +14,7 @@ from ddco_pyro.fitting.inferred import Inferred
 from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
-from ddco_pyro.model.networks.branches import Branches
+from ddco_pyro.model.networks.perceptrons import Branches
 
 SEED = 0
 """Of the steps whose observations stand in for others."""
@@ -113,7 +113,7 @@ def _watched(branch: nn.Module) -> Iterator[list[Tensor]]:
     given: list[Tensor] = []
 
     def keep(_: nn.Module, __: Any, output: Any) -> None:
-        given.append((output if isinstance(output, Tensor) else output[0]).cpu())
+        given.append(output[0].cpu())
 
     handle = branch.register_forward_hook(keep)
     try:

@@ -15,7 +15,7 @@ from ddco_pyro.data.control_parts import ControlPart, control_parts, refuse_unkn
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.fitting.devices import device_of
 from ddco_pyro.fitting.widths import nearest_widths
-from ddco_pyro.model.encoding import Shapes
+from ddco_pyro.model.encoder import Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import ShapeError
 from ddco_pyro.model.seeding import seeded

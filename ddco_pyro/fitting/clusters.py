@@ -18,7 +18,7 @@ from sklearn.metrics import euclidean_distances
 from torch import Tensor
 
 from ddco_pyro.data.memory import share
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import BYTES_AT_ONCE
 from ddco_pyro.model.networks.conv import POOLED
 

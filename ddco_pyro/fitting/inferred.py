@@ -15,7 +15,7 @@ from ddco_pyro.inference.decomposition import Decomposition, decompose
 from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.inference.paths import Path, most_likely_path
 from ddco_pyro.inference.posteriors import Posterior, posterior
-from ddco_pyro.model.encoding import Batch, encode
+from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.model.tables import Tables

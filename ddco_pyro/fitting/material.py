@@ -13,7 +13,7 @@ from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.checkpoint import State
 from ddco_pyro.fitting.devices import device_of, room
 from ddco_pyro.fitting.labels import Labels
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec
 

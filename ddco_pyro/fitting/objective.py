@@ -19,7 +19,7 @@ from ddco_pyro.fitting.ranks import ALONE, Ranks
 from ddco_pyro.fitting.stages import Stage
 from ddco_pyro.fitting.upper import Constants, expected, fitted
 from ddco_pyro.inference.engines import log_likelihood, total_log_likelihood
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables

@@ -19,7 +19,7 @@ from ddco_pyro.errors import nearest
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.building import Dimensions, baselines, build_hierarchy
 from ddco_pyro.fitting.clusters import most_rows
-from ddco_pyro.model.encoding import STEPS_AT_ONCE
+from ddco_pyro.model.batch import STEPS_AT_ONCE
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.simulation.collect import cache_path, collect

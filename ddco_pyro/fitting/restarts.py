@@ -30,7 +30,7 @@ from ddco_pyro.fitting.processes import pool, results, useful_jobs
 from ddco_pyro.fitting.ranks import ALONE, Ranks
 from ddco_pyro.fitting.stages import plan
 from ddco_pyro.fitting.training import advance
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.batch import encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec
 

@@ -41,7 +41,7 @@ from ddco_pyro.fitting.restarts import Trainer
 from ddco_pyro.fitting.training import SAVE_EVERY
 from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.inference.threads import one_thread
-from ddco_pyro.model.encoding import refuse_unusable
+from ddco_pyro.model.batch import refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import Spec, dump_spec, load_spec, with_overrides

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.inference import fused
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.outputs import Outputs
 
 

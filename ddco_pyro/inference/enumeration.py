@@ -8,8 +8,7 @@ import torch
 from pyro.infer import TraceEnum_ELBO
 from torch import Tensor
 
-from ddco_pyro.model.actor import Scored
-from ddco_pyro.model.ahmm import ahmm
+from ddco_pyro.model.ahmm import Scored, ahmm
 from ddco_pyro.model.emissions import Steps
 from ddco_pyro.model.tables import Tables, complete
 

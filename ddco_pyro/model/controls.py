@@ -13,8 +13,7 @@ from torch.nn.functional import softplus
 from ddco_pyro.data.control_dimensions import number
 from ddco_pyro.data.control_parts import ControlPart
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
-from ddco_pyro.model.discrete import Binary, Categorical
-from ddco_pyro.model.emissions import Clipped, Emission, Gaussian, Hurdle, Product
+from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Emission, Gaussian, Hurdle, Product
 from ddco_pyro.spec import ControlSpec, LearnedStd
 
 INITIAL_STD = 0.5
@@ -206,8 +205,8 @@ class ControlStd(nn.Module):
         fixed = [0.0 if isinstance(std, LearnedStd) else float(std) for std in stds]
         learned = [place for place, std in enumerate(stds) if isinstance(std, LearnedStd)]
         self.own = [place for place in learned if getattr(stds[place], "per_option", False)]
-        self.seen = [place for place in learned if getattr(stds[place], "per_state", False)]
-        self.shared = [place for place in learned if place not in (*self.own, *self.seen)]
+        self.of_state = [place for place in learned if getattr(stds[place], "per_state", False)]
+        self.shared = [place for place in learned if place not in (*self.own, *self.of_state)]
         floors = [std.floor if isinstance(std, LearnedStd) else 0.0 for std in stds]
         self.register_buffer("fixed", torch.tensor(fixed), persistent=False)
         self.register_buffer("floor", torch.tensor(floors), persistent=False)
@@ -221,16 +220,17 @@ class ControlStd(nn.Module):
     def forward(self, numbers: Tensor | None = None) -> Tensor:
         """σ [C]; [K, C] where a dimension has one for each option; [..., K, C] where one depends on the state.
 
-        :param numbers: y of each dimension in ``seen``, [..., K, S]; None where there is none.
+        :param numbers: y of each dimension in ``of_state``, [..., K, S]; None where there is none.
         """
         std = self.fixed
         if self.shared:
             std = std.index_put((torch.tensor(self.shared),), self.floor[self.shared] + softplus(self.raw))
         if self.own:
             std = _with_columns(std, self.own, self.floor[self.own] + softplus(self.raw_own))
-        if self.seen:
+        if self.of_state:
             assert numbers is not None  # the caller's network gives them
-            std = _with_columns(std, self.seen, self.floor[self.seen] + softplus(numbers + self.start[self.seen]))
+            floor, start = self.floor[self.of_state], self.start[self.of_state]
+            std = _with_columns(std, self.of_state, floor + softplus(numbers + start))
         return std
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.data.pictures import Observed, Pictures, Transform
+from ddco_pyro.data.pictures import Observed, Pictures, Transform, shift_into
 from ddco_pyro.data.reading import Job, Readers
 
 
@@ -31,7 +31,7 @@ class Frames(Mapping[str, Tensor]):
     rows: tuple[int, ...]
     steps: slice
     shifts: Mapping[str, np.ndarray] = field(default_factory=dict)
-    readers: Readers | Held = field(default_factory=lambda: Readers(0))
+    readers: Readers | DeviceFrames = field(default_factory=lambda: Readers(0))
 
     def __getitem__(self, key: str) -> Tensor:
         return replace(self, arrays={key: self.arrays[key]}).loaded()[key]
@@ -71,7 +71,7 @@ class Frames(Mapping[str, Tensor]):
 
         :raises DemonstrationsError: a file cannot be read.
         """
-        return replace(self, readers=Held(self, device))
+        return replace(self, readers=DeviceFrames(self, device))
 
     def loaded(self) -> dict[str, Tensor]:
         """All of them, in memory, or on the device that holds them.
@@ -90,7 +90,7 @@ class Frames(Mapping[str, Tensor]):
         return replace(self, arrays=arrays, shifts=shifts, rows=tuple(self.rows[row] for row in chosen), steps=seen)
 
 
-class Held:
+class DeviceFrames:
     """Has the pictures of trajectories on a device, as they are seen, and gives what :class:`Readers` would read."""
 
     def __init__(self, frames: Frames, device: torch.device) -> None:
@@ -105,29 +105,17 @@ class Held:
 
     def take(self, job: Job) -> dict[str, Tensor]:
         """The pictures of a job, on the device."""
-        return {
-            key: _padded([self._pictures[key, row] for row in job.rows], job.steps, job.shifts.get(key))
-            for key in job.arrays
-        }
+        return {key: self._padded(key, job) for key in job.arrays}
+
+    def _padded(self, key: str, job: Job) -> Tensor:
+        """:func:`ddco_pyro.data.pictures.padded` of pictures that are on the device as networks see them."""
+        pictures, shifts = [self._pictures[key, row] for row in job.rows], job.shifts.get(key)
+        whole = pictures[0].new_zeros(len(pictures), job.steps.stop - job.steps.start, *pictures[0].shape[1:])
+        for row, each in enumerate(pictures):
+            seen = each[job.steps]
+            shift_into(whole[row, : len(seen)], seen, *((0, 0) if shifts is None else shifts[row].tolist()))
+        return whole
 
 
 def _whole(array: Observed, transform: Transform) -> Tensor:
     return torch.from_numpy(np.concatenate(list(transform.seen(array, slice(0, len(array))))))
-
-
-def _padded(pictures: Sequence[Tensor], steps: slice, shifts: np.ndarray | None) -> Tensor:
-    """:func:`ddco_pyro.data.pictures.padded` of pictures on a device, which are as they are seen."""
-    whole = pictures[0].new_zeros(len(pictures), steps.stop - steps.start, *pictures[0].shape[1:])
-    for row, each in enumerate(pictures):
-        seen = each[steps]
-        whole[row, : len(seen)] = seen if shifts is None else _shifted(seen, *shifts[row].tolist())
-    return whole
-
-
-def _shifted(pictures: Tensor, down: int, right: int) -> Tensor:
-    """:func:`ddco_pyro.data.pictures.shifted` on a device."""
-    for axis, by in ((1, down), (2, right)):
-        last = pictures.shape[axis] - 1
-        from_ = (torch.arange(last + 1, device=pictures.device) - by).clamp(0, last)
-        pictures = pictures.index_select(axis, from_)
-    return pictures

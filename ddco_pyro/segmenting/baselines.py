@@ -18,7 +18,7 @@ from sklearn.mixture import GaussianMixture
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.fitting.clusters import block_means, distinct, joined
-from ddco_pyro.model.encoding import ObservationEncoder
+from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec
 
 PIECES = 2

@@ -10,9 +10,8 @@ from ddco_pyro.events import ignore
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.restarts import Trainer
 from ddco_pyro.inference import log_likelihood, segment
-from ddco_pyro.model.actor import Acting
-from ddco_pyro.model.ahmm import choose
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.ahmm import Acting, choose
+from ddco_pyro.model.batch import encode
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import complete
 from ddco_pyro.spec import parse_spec

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
-from ddco_pyro.model.networks.numpy_form import NumpyForm, arrays_of, joined, perceptrons, vectors
-from ddco_pyro.model.networks.stacked import ACTIVATIONS, Perceptrons, options_last
+from ddco_pyro.model.networks.numpy_form import NumpyForm, arrays_of, joined, vectors
+from ddco_pyro.model.networks.perceptrons import ACTIVATIONS, Network, Perceptrons, State, options_last
 from ddco_pyro.spec import Activation, ConvolutionLayer, Pool
 
 SHARPNESS = 10.0
@@ -20,7 +20,7 @@ POOLED = 8
 """Blocks by side to whose means a picture is reduced where it is clustered."""
 
 
-class Conv(nn.Module):
+class Conv(Network):
     """K networks of convolutions over each picture, pooled, and a perceptron over that and the vectors.
 
     :param layers: the convolutions; where there are none, a single one of ``filters`` and ``kernel``, stride 2.
@@ -32,7 +32,6 @@ class Conv(nn.Module):
     def __init__(
         self,
         shape: InputShape,
-        outputs: int | None,
         copies: int,
         hidden: tuple[int, ...],
         dropout: float,
@@ -67,19 +66,18 @@ class Conv(nn.Module):
         if pool == "spatial_softmax":
             self.strengthen(SHARPNESS)
         maps = sum(self._map_features(key, size) for key, size in shape.images.items())
-        self.layers = Perceptrons(copies, shape.vector + maps, hidden, outputs, dropout, activation)
-        self.features = self.layers.features
+        self.layers = Perceptrons(copies, shape.vector + maps, hidden, dropout, activation)
 
-    def forward(self, inputs: Inputs) -> Tensor:
-        """[N, T, K, outputs]."""
+    def forward(self, inputs: Inputs, state: State = ()) -> tuple[Tensor, State]:
+        """[N, T, K, features], and the state."""
         vector = inputs.vector.flatten(0, 1).expand(self.copies, -1, -1)
         maps = [self._map(key, image.flatten(0, 1)) for key, image in inputs.images.items()]
-        return options_last(self.layers(torch.cat([vector, *maps], dim=-1)), inputs.batch)
+        return options_last(self.layers(torch.cat([vector, *maps], dim=-1)), inputs.batch), state
 
     def numpy_form(self) -> NumpyForm:
-        """What the numpy runner has to know of it."""
+        """Perceptrons over the vectors and what is read of each picture."""
         pictures = [self._picture_form(key) for key in self.pictures]
-        return perceptrons(self.layers, joined([vectors(self.reads, self.copies), *pictures]))
+        return self.layers.numpy_form(joined([vectors(self.reads, self.copies), *pictures]))
 
     def _picture_form(self, key: str) -> NumpyForm:
         layers = self._layers(key)

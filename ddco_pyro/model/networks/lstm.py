@@ -11,49 +11,45 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape
-from ddco_pyro.model.networks.mlp import Linear
-from ddco_pyro.model.networks.numpy_form import NumpyForm, numpy_form, over_layers, perceptrons
-from ddco_pyro.model.networks.stacked import Perceptrons, StackedLinear, options_first, options_last
-from ddco_pyro.model.networks.state import State, Trunk, answer, initial_state
+from ddco_pyro.model.networks.numpy_form import NumpyForm, over_layers
+from ddco_pyro.model.networks.perceptrons import (
+    Linear,
+    Network,
+    Perceptrons,
+    StackedLinear,
+    State,
+    options_first,
+    options_last,
+)
 
 
-class Lstm(nn.Module):
-    """K LSTMs, of a layer for each size in ``hidden``, and a linear map of what the last layer gives.
+class Lstm(Network):
+    """K LSTMs, of a layer for each size in ``hidden``, over the features of ``over``, or over the vectors.
 
-    They read what ``over`` gives, or else the vectors. The state is that of ``over``, then h and c [N, K, size] of each
-    layer.
+    The state holds that of ``over``, then h and c [N, K, size] of each layer.
 
-    :param horizon: h and c are zeros again before every step whose number in its trajectory is a multiple of it.
+    :param horizon: steps of a window; h and c are zeros again before the first step of each. None for no windows.
     """
 
     def __init__(
-        self,
-        shape: InputShape,
-        outputs: int | None,
-        copies: int,
-        over: Trunk | None,
-        hidden: tuple[int, ...],
-        horizon: int | None,
+        self, shape: InputShape, copies: int, over: Network | None, hidden: tuple[int, ...], horizon: int | None
     ) -> None:
         super().__init__()
-        self.horizon = horizon
-        below = over or Trunk(Linear(shape, None, copies), shape.vector, copies)
-        self.over = below.network
-        sizes = zip([below.features, *hidden], hidden, strict=False)
+        self.copies, self.horizon = copies, horizon
+        self.over = over or Linear(shape, copies)
+        sizes = zip([self.over.features, *hidden], hidden, strict=False)
         self.memory = nn.ModuleList(StackedLstm(copies, *pair) for pair in sizes)
-        self.layers = Perceptrons(copies, hidden[-1], (), outputs)
-        self.features = self.layers.features
+        self.layers = Perceptrons(copies, hidden[-1], ())
 
     def initial_state(self, trajectories: int) -> State:
-        """Zeros, after the state of what it reads."""
+        """Zeros, after the state of ``over``."""
         own = [layer.recurrent.new_zeros(trajectories, *layer.size) for layer in self._memory() for _ in "hc"]
-        return (*initial_state(self.over, trajectories), *own)
+        return (*self.over.initial_state(trajectories), *own)
 
-    def forward(self, inputs: Inputs, state: State | None = None) -> tuple[Tensor, State]:
-        """[N, T, K, outputs], and the state after the last step."""
-        state = self.initial_state(inputs.batch[0]) if state is None else state
+    def forward(self, inputs: Inputs, state: State) -> tuple[Tensor, State]:
+        """[N, T, K, features], and the state after the last step."""
         within = len(state) - 2 * len(self.memory)
-        features, after = answer(self.over, inputs, state[:within])
+        features, after = self.over(inputs, state[:within])
         values = options_first(features)
         for number, layer in enumerate(self._memory()):
             h, c = state[within + 2 * number :][:2]
@@ -65,13 +61,13 @@ class Lstm(nn.Module):
         return options_last(self.layers(values), inputs.batch), after
 
     def numpy_form(self) -> NumpyForm | None:
-        """What the numpy runner has to know of it."""
-        of = numpy_form(self.over)
+        """Layers that remember, over the form of ``over``; None where that has none."""
+        of = self.over.numpy_form()
         if of is None:
             return None
         layers = {str(number): layer for number, layer in enumerate(self.memory)}
         facts = {"kind": "lstm", "layers": len(layers), "horizon": self.horizon}
-        return perceptrons(self.layers, over_layers(of, facts, layers))
+        return self.layers.numpy_form(over_layers(of, facts, layers))
 
     def _memory(self) -> list[StackedLstm]:
         return [layer for layer in self.memory if isinstance(layer, StackedLstm)]

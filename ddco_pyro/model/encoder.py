@@ -1,123 +1,44 @@
-"""Demonstrations as the networks see them: features, scaled controls, padded batches."""
+"""Observations by name to the features that networks see."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, Transform, TransformError
-from ddco_pyro.data.reading import Readers
 from ddco_pyro.data.values import rounding
-from ddco_pyro.model.controls import ControlScaling, refuse_impossible
 from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError
 from ddco_pyro.spec import STEP, AugmentSpec, ObservationSpec
 
 Shapes = Mapping[str, tuple[int, ...]]
-STEPS_AT_ONCE = 8192
-"""Longer batches are processed in parts, in smaller ones where a step takes much memory
-(:attr:`~ddco_pyro.model.hierarchy.Hierarchy.steps_at_once`): it stays bounded, and what the networks compute stays in
-the cache. With MLP-64 options over 50 × 2000 steps a gradient step takes 0.6 of the time that it takes in one piece."""
 
 NARROWEST = 1e-6
-"""A part of a number's range that is narrower, as a share of all of it, is one value, and tells nothing."""
-
-
-@dataclass(frozen=True)
-class Batch:
-    """N demonstrations padded to T steps: ``inputs``; ``actions`` [N, T, A'] in scaled units, of the control dimensions
-    that vary; ``lengths`` [N]; of vectors that are varied in training, their other ``versions`` [N, V, T, F_key] by
-    name.
-    """
-
-    inputs: Inputs
-    actions: Tensor
-    lengths: Tensor
-    versions: Mapping[str, Tensor] = field(default_factory=dict)
-
-    def __len__(self) -> int:
-        return len(self.lengths)
-
-    @property
-    def steps(self) -> int:
-        """Steps in all, padding left out."""
-        return int(self.lengths.sum())
-
-    def pieces(self, steps: int = STEPS_AT_ONCE) -> Iterator[tuple[Tensor, Batch]]:
-        """The whole batch as parts of at most so many steps, padding included, each with its rows; one at least."""
-        longest = int(self.lengths.max())
-        for rows in torch.arange(len(self)).split(max(steps // longest, 1)):
-            yield rows, self.select(rows) if len(rows) < len(self) else self
-
-    def select(self, rows: Tensor, at_most: int | None = None) -> Batch:
-        """The demonstrations ``rows`` [M] as they are seen here, padded to the longest among them; their first
-        ``at_most`` steps if given.
-        """
-        lengths = self.lengths[rows].clamp(max=at_most or int(self.lengths.max()))
-        steps = int(lengths.max())
-        return Batch(self.inputs.part(rows, slice(0, steps)), self.actions[rows, :steps], lengths)
-
-    def varied(self, most: Mapping[str, int], seed: int) -> Batch:
-        """The same with the pictures of each demonstration moved at random, and with vectors as they are or as one of
-        their other versions.
-
-        :param most: by observation, the most pixels along either axis.
-        """
-        random = np.random.default_rng(seed)
-        shifts = {key: random.integers(-pixels, pixels + 1, (len(self), 2)) for key, pixels in most.items()}
-        vectors = dict(self.inputs.vectors)
-        for key, others in self.versions.items():
-            chosen = torch.as_tensor(random.integers(-1, others.shape[1], len(self)))
-            (rows,) = torch.where(chosen >= 0)
-            vectors[key] = vectors[key].index_copy(0, rows, others[rows, chosen[rows]])
-        varied = Batch(Inputs(vectors, self.inputs.images, self.inputs.time), self.actions, self.lengths)
-        return varied._with(lambda images: replace(images, shifts=shifts))
-
-    def read_by(self, readers: Readers) -> Batch:
-        """The same with pictures that are in files read by these."""
-        return self._with(lambda images: replace(images, readers=readers) if images.stored else images)
-
-    def held(self, device: torch.device) -> Batch:
-        """The same with all pictures on a device.
-
-        :raises DemonstrationsError: a file cannot be read.
-        """
-        return self._with(lambda images: images.held(device))
-
-    @property
-    def picture_bytes(self) -> int:
-        """Bytes of all pictures as they are seen."""
-        return self.inputs.images.size if isinstance(self.inputs.images, Frames) else 0
-
-    def _with(self, change: Callable[[Frames], Frames]) -> Batch:
-        images = self.inputs.images
-        if not isinstance(images, Frames):
-            return self
-        return replace(self, inputs=Inputs(self.inputs.vectors, change(images), self.inputs.time))
+"""Least width of a bin that counts as a feature, as a part of the whole range; a narrower bin is only centred."""
 
 
 class ObservationEncoder(nn.Module):
     """Observations by name to one feature vector: differences appended, standardised where the spec says so.
 
-    Where the spec has ``bins``, what networks see of a number x are besides min(max(x, q_k), q_{k+1}) between each two
-    neighbouring quantiles q of its different values in the demonstrations given to :meth:`fit`, standardised as x is: a
-    piecewise-linear encoding (Gorishniy, Rubachev and Babenko, On embeddings for numerical features in tabular deep
-    learning, 2022).
+    Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model. A
+    dimension that varies by rounding alone (:func:`~ddco_pyro.data.values.rounding`) is only centred, and so are
+    differences whose dimension does so within each demonstration. What moves later moves in its own units, not in
+    multiples of a rounding.
 
-    Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model.
-    Pictures are cut and scaled as the spec says when they are read, whether from a file or from memory.
+    ``bins`` add, for a number x, min(max(x, q_k), q_{k+1}) between each two neighbouring quantiles q of its distinct
+    values, standardised as x is. This is a piecewise-linear encoding (Gorishniy, Rubachev and Babenko, On embeddings
+    for numerical features in tabular deep learning, 2022).
 
-    A dimension that never changes, or by rounding alone (:func:`~ddco_pyro.data.values.rounding`), is only centred, and
-    so are the differences of one that does so within each demonstration: rounding is no feature, and what moves later
-    on moves in its own units, not in multiples of a rounding.
+    Pictures are cropped and scaled as the spec says when they are read, from a file or from memory.
 
     The built-in observation :data:`~ddco_pyro.spec.STEP` is made here: the number of the step divided by ``longest``,
     the steps of the longest demonstration given to :meth:`fit`.
+
+    :raises ShapeError: an observation cannot be cropped, scaled, binned or augmented as the spec says.
     """
 
     mean: Tensor
@@ -150,7 +71,7 @@ class ObservationEncoder(nn.Module):
 
     @property
     def steps_seen(self) -> int:
-        """Steps of which the features and pictures of one are made: it, and those before it."""
+        """Steps that the features and pictures of one step are made of: this step and those before it."""
         return max([2, *(transform.frames for transform in self.transforms.values())])
 
     @property
@@ -159,13 +80,11 @@ class ObservationEncoder(nn.Module):
         return [spec.key for spec in self.specs]
 
     def shape(self, steps: int) -> InputShape:
-        """What networks are built for."""
+        """The shapes that networks are built for."""
         return InputShape(dict(zip(self.keys, self.sizes, strict=True)), self.images, steps)
 
     def fit(self, demonstrations: Demonstrations) -> None:
-        """Take mean and standard deviation, and the parts of the range, from every step of these demonstrations, and
-        the longest of them.
-        """
+        """Take mean, standard deviation, bins and the longest demonstration from these demonstrations."""
         if STEP in self.keys:
             self.longest.fill_(max(demonstrations.lengths))
         each = [self.features(demo.observations) for demo in demonstrations]
@@ -182,18 +101,19 @@ class ObservationEncoder(nn.Module):
 
     @property
     def has_bins(self) -> bool:
-        """Whether any number is seen in parts of its range, too."""
+        """Whether any observation has bins."""
         return any(spec.bins for spec in self.specs)
 
     def _places(self) -> np.ndarray:
-        """Which of the features [F] each number is that networks see: those of a key as they are, then bin by bin."""
+        """The feature of :meth:`features` behind each number that networks see, [F']: a key's own, then its bins'."""
         firsts = np.cumsum([0, *self.given])
         rows = zip(self.specs, firsts, self.given, strict=False)
         return np.concatenate([np.tile(np.arange(first, first + count), 1 + spec.bins) for spec, first, count in rows])
 
     def _fit_bins(self, rows: np.ndarray) -> None:
-        """Take the ends of each part from ``rows`` [T, F]: values that there are, with as many different ones between
-        each two. A value that most steps have is one of them: it does not leave all others to a single part.
+        """Take the ends of each bin from ``rows`` [T, F]: quantiles of the distinct values.
+
+        A value that most steps have counts once, so that the other values do not share a single bin.
         """
         at = 0
         for spec, count, size in zip(self.specs, self.given, self.sizes, strict=True):
@@ -204,7 +124,7 @@ class ObservationEncoder(nn.Module):
             at += size
 
     def _cut(self, features: Tensor) -> Tensor:
-        """Features [..., F] as they are, and cut off at the ends of each part."""
+        """Features [..., F], and again clipped to each bin, [..., F']."""
         if not self.has_bins:
             return features
         return torch.minimum(torch.maximum(features[..., self.places], self.low), self.high)
@@ -214,8 +134,9 @@ class ObservationEncoder(nn.Module):
         return ((self._cut(torch.as_tensor(features)) - self.mean) / self.std).numpy()
 
     def _moves(self, rows: Sequence[np.ndarray], demonstrations: Demonstrations) -> np.ndarray:
-        """Which features [F] of these demonstrations' ``rows`` [T_n, F] vary by more than rounding; differences do
-        where their dimension does within a demonstration.
+        """Which features [F] of these demonstrations' ``rows`` [T_n, F] vary by more than rounding.
+
+        Differences do where their dimension does within a demonstration.
         """
         low, high = (np.stack([end(part, axis=0) for part in rows]) for end in (np.min, np.max))
         moves, first = [np.zeros(0, dtype=bool)], 0
@@ -234,7 +155,7 @@ class ObservationEncoder(nn.Module):
     def features(self, observations: Mapping[str, Observed], times: np.ndarray | None = None) -> np.ndarray:
         """Observations [T, ...] by name to features [T, F], not yet standardised.
 
-        :param times: the number of each step [T]; 0 to T - 1 where it is not given.
+        :param times: the number of each step [T]; by default 0 to T - 1.
         """
         steps = len(next(iter(observations.values())))
         times = np.arange(steps) if times is None else times
@@ -254,20 +175,23 @@ class ObservationEncoder(nn.Module):
         return dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)) if self.sizes else {}
 
     def inputs(self, observations: Iterable[Mapping[str, Observed]], times: np.ndarray | None = None) -> Inputs:
-        """Sequences of observations, each [T_n, ...] by name, to padded network inputs, whose pictures are read when
-        they are asked for; ``times`` as in :meth:`features`.
+        """Sequences of observations, each [T_n, ...] by name, to padded network inputs.
+
+        Pictures are read when a network asks for them.
+
+        :param times: as in :meth:`features`.
         """
         sequences = list(observations)
         vectors = [self.scaled(self.features(sequence, times)) for sequence in sequences]
-        vector = _pad(vectors).float()
+        vector = padded(vectors).float()
         by_key, steps = dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)), vector.shape[1]
-        pictures = {key: tuple(_pictures(sequence[key]) for sequence in sequences) for key in self.images}
+        pictures = {key: tuple(_as_pictures(sequence[key]) for sequence in sequences) for key in self.images}
         rows = tuple(range(len(sequences)))
         images = Frames(pictures, self.transforms, rows, slice(0, steps)) if pictures else {}
         return Inputs(by_key, images, torch.arange(steps))
 
     def versions(self, demonstrations: Demonstrations) -> dict[str, Tensor]:
-        """The other versions of vectors that are varied in training, as networks see them, [N, V, T, F_key] by name."""
+        """The versions of the vectors that ``augment.versions`` names, as networks see them, [N, V, T, F_key]."""
         named = {spec.key: spec.augment.versions for spec in self.specs if spec.augment and spec.augment.versions}
         return {
             key: torch.stack(
@@ -284,50 +208,8 @@ class ObservationEncoder(nn.Module):
         }
 
 
-LARGEST_SCALED = 1e12
-"""No feature or control may be larger, once it is scaled: float32 has to hold the square of what networks make of it,
-divided by that of a small σ, and ends at 3e38."""
-
-
-def encode(
-    demonstrations: Demonstrations, encoder: ObservationEncoder, scaling: ControlScaling, fitted: bool = False
-) -> Batch:
-    """All demonstrations as one padded batch.
-
-    :param fitted: whether the model is fitted already, so that nothing can be declared any more.
-    :raises DemonstrationsError: a number is too large for networks.
-    """
-    refuse_unusable(demonstrations, encoder, scaling, fitted)
-    inputs = encoder.inputs(demo.observations for demo in demonstrations)
-    actions = _pad([scaling.scaled(demo.actions) for demo in demonstrations]).float()
-    return Batch(inputs, actions, torch.tensor([len(demo) for demo in demonstrations]))
-
-
-def refuse_unusable(
-    demonstrations: Demonstrations, encoder: ObservationEncoder, scaling: ControlScaling, fitted: bool = False
-) -> None:
-    """See that networks can take every feature, and the emissions every control.
-
-    :raises DemonstrationsError: a number is larger than :data:`LARGEST_SCALED` once it is scaled, or a control has a
-        value that it cannot have.
-    """
-    refuse_impossible(demonstrations, scaling, fitted)
-    places = np.repeat([f"obs/{spec.key}" for spec in encoder.specs], encoder.sizes)
-    for demo in demonstrations:
-        features = encoder.scaled(encoder.features(demo.observations))
-        controls = scaling.scaled(demo.actions)
-        sizes = np.abs(np.concatenate([features, controls], axis=1))
-        if (sizes > LARGEST_SCALED).any():
-            step, column = np.argwhere(sizes > LARGEST_SCALED)[0]
-            place = places[column] if column < len(places) else "actions"
-            raise DemonstrationsError(
-                f"{demo.name}: {place} at step {step} is {sizes[step, column]:.2g} once it is scaled, and networks "
-                f"take at most {LARGEST_SCALED:g}; repair it, or leave {demo.name} out (demonstrations.exclude)"
-            )
-
-
 def _ends(values: np.ndarray, bins: int) -> np.ndarray:
-    """The ends [bins + 1] of parts of the range of ``values`` [T] that hold equally many different values."""
+    """The ends [bins + 1] of bins of ``values`` [T] that hold equally many distinct values."""
     return np.asarray(np.quantile(np.unique(values), np.linspace(0, 1, bins + 1), method="nearest"))
 
 
@@ -336,9 +218,9 @@ def _transform(spec: ObservationSpec) -> Transform:
 
 
 def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
-    """What is seen of a step of an observation.
+    """The shape of a step of an observation as networks see it.
 
-    :raises ShapeError: it cannot be cut, scaled or varied as the spec says.
+    :raises ShapeError: it cannot be cropped, scaled, binned or augmented as the spec says.
     """
     stored = shapes[spec.key]
     if spec.bins and len(stored) == PICTURE_DIMENSIONS:
@@ -352,7 +234,7 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
 
 
 def _refuse_other_versions(key: str, augment: AugmentSpec, shapes: Shapes) -> None:
-    """See that an observation can be varied so; versions are not there where a model is read again.
+    """Check that an observation can be augmented so; a model that is loaded has no versions.
 
     :raises ShapeError: it cannot.
     """
@@ -372,10 +254,10 @@ def _refuse_other_versions(key: str, augment: AugmentSpec, shapes: Shapes) -> No
         )
 
 
-def _pictures(values: Observed) -> Observed:
+def _as_pictures(values: Observed) -> Observed:
     return values if isinstance(values, Pictures) else np.asarray(values)
 
 
-def _pad(sequences: Sequence[np.ndarray]) -> Tensor:
-    """[T_n, ...] arrays to one [N, max T_n, ...] tensor, zeros at the end."""
+def padded(sequences: Sequence[np.ndarray]) -> Tensor:
+    """Arrays [T_n, ...] as one tensor [N, max T_n, ...], zeros past their ends."""
     return nn.utils.rnn.pad_sequence([torch.as_tensor(sequence) for sequence in sequences], batch_first=True)
