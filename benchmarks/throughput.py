@@ -26,7 +26,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import Transform
 from ddco_pyro.data.reading import Job, Readers
 from ddco_pyro.encoding import Encoding, encode
-from ddco_pyro.encoding.networks import Convolutions
+from ddco_pyro.encoding.autoencoder import Convolutions
 from ddco_pyro.events import EpochEnded, Event
 from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.fitting.restarts import Trainer

@@ -20,8 +20,8 @@ from sklearn.linear_model import LinearRegression
 from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.encoding import Encoding, encode, load, training
-from ddco_pyro.encoding.projection import principal_components
+from ddco_pyro.encoding import Encoding, autoencoder, encode, load
+from ddco_pyro.encoding.encoder import principal_components
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, UpdatesDone
 from ddco_pyro.inference import segment
@@ -219,7 +219,7 @@ def killed(path, out, encoding, kind, after):
 
 
 def test_killed_again_and_again(few_dots, tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "KEPT_EVERY", 2)
+    monkeypatch.setattr(autoencoder, "KEPT_EVERY", 2)
     encoding = Encoding("camera", "autoencoder", size=4, updates=9)
     encode(few_dots, tmp_path / "whole.hdf5", encoding)
     out, seen = tmp_path / "killed.hdf5", []

@@ -90,7 +90,7 @@ class Untyped(Typed):
 
 
 def made(options, name="Typed"):
-    return build(NetworkSpec(network=f"{__name__}:{name}", options=options), SHAPE, 2, 4)
+    return build(NetworkSpec(network=f"{__name__}:{name}", options=options), SHAPE, 2, 4).module
 
 
 def test_options_are_of_the_types_that_the_class_says():

@@ -287,7 +287,7 @@ def test_a_network_reads_the_observations_that_it_is_to_read(settings):
     alone = build(NetworkSpec(**settings), InputShape({"goal": 3}), OUTPUTS, COPIES)
     time = torch.arange(LONGEST)
     found = network(Inputs({"pose": pose, "goal": goal}, images, time))[0]
-    assert_close(found, alone(Inputs({"goal": goal}, {}, time)))
+    assert_close(found, alone(Inputs({"goal": goal}, {}, time))[0])
 
 
 def test_all_vectors_are_read_in_the_order_of_the_spec():
@@ -312,7 +312,7 @@ def test_trying_a_network_of_ones_own_leaves_no_trace():
         InputShape({"state": FEATURES}, {"camera": PIXELS}, steps=1),
     )
     torch.manual_seed(0)
-    network = build(spec, shape, OUTPUTS, COPIES)
+    network = build(spec, shape, OUTPUTS, COPIES).module
     drawn = torch.rand(3)
     torch.manual_seed(0)
     untried = Stateful(shape, OUTPUTS, COPIES)
@@ -389,7 +389,7 @@ def test_a_picture_may_have_any_name(keys, layers):
         return make(InputShape({}, dict.fromkeys(names, PIXELS)), network="conv", hidden=[4], **settings)
 
     def given(names):
-        return network_of(names)(Inputs({}, dict(zip(names, seen.images.values(), strict=True)), seen.time))
+        return network_of(names)(Inputs({}, dict(zip(names, seen.images.values(), strict=True)), seen.time))[0]
 
     assert torch.equal(given(keys), given(plain))
     own = network_of(keys)

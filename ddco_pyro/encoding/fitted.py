@@ -1,4 +1,4 @@
-"""The network of a fit that reads pictures, taken out of it: an encoder that has learnt from controls."""
+"""The convolutions of a fit as an encoder, which has learnt from controls."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ddco_pyro.spec import NetworkSpec
 from ddco_pyro.spec.types import Count, Items, Model
 
 Part = tuple[NetworkSpec, Network, Sequence[str]]
-"""A network of a fit: its spec, itself, and the observations that it reads."""
+"""A network of a fit: its spec, the network, and the names of the observations that it reads."""
 
 
 class ReaderError(BadInput):
@@ -32,7 +32,7 @@ class Reader(Model):
     """A network that reads one observation's pictures, beside its weights."""
 
     network: NetworkSpec
-    """Convolutions, never a user's class: what is written beside a file has to be safe to read."""
+    """Convolutions. A user's class is refused, because what is written beside a file has to be safe to read."""
     crop: Items[int] | None = None
     resize: Items[Count] | None = None
     grey: bool = False
@@ -46,9 +46,9 @@ class Reader(Model):
 
 
 class FittedReader(nn.Module):
-    """uint8 pictures [N, H, W, C], as they are stored, to what the last hidden layer of a fit's network gives, [N, F].
+    """uint8 pictures [N, H, W, C], as they are stored, to the last hidden layer of a fit's network, [N, F].
 
-    :param about: the network, and what it sees of a picture.
+    :param about: the network, and how pictures are cropped and scaled for it.
     :param picture: [H, W, C].
     """
 
@@ -81,11 +81,13 @@ def from_folder(folder: str, key: str, picture: Sequence[int], allow_code: bool 
 
 
 def from_fit(fit: Fit, key: str, picture: Sequence[int]) -> FittedReader:
-    """What reads the pictures under ``key`` in a fit: the branch, or the network under an LSTM, that sees nothing else,
-    of a flat policy or, where its options share it, of the lowest options.
+    """The convolutions in a fit that read the pictures under ``key`` and nothing else.
+
+    They are the network of a flat policy or of the lowest options, a branch of it, or the network under its LSTM. The
+    options have to share them.
 
     :param picture: [H, W, C] of the pictures that are to be encoded.
-    :raises ReaderError: it saw other pictures, or several together, or has no such network.
+    :raises ReaderError: the fit observed other pictures, or stacks of several, or has no such network.
     """
     transform = _transform(fit, key, picture)
     found = next(_readers(_lowest(fit), key), None)
@@ -108,7 +110,7 @@ def from_fit(fit: Fit, key: str, picture: Sequence[int]) -> FittedReader:
 
 
 def _transform(fit: Fit, key: str, picture: Sequence[int]) -> Transform:
-    """What a fit sees of such pictures."""
+    """How a fit crops and scales such pictures."""
     encoder = fit.hierarchy.encoder
     if key not in encoder.transforms:
         there = ", ".join(encoder.transforms) or "none"
@@ -122,9 +124,7 @@ def _transform(fit: Fit, key: str, picture: Sequence[int]) -> Transform:
 
 
 def _lowest(fit: Fit) -> Part:
-    """The network of a flat policy, or what the lowest options read: the hierarchy's trunk, their own, or, where there
-    is none, their policy.
-    """
+    """The network of a flat policy; else the hierarchy's trunk, the lowest level's trunk, or that level's policy."""
     networks, encoder = fit.hierarchy.networks(), fit.hierarchy.encoder
     baseline, hierarchy = fit.spec.baseline, fit.spec.hierarchy
     spec: NetworkSpec
@@ -140,7 +140,7 @@ def _lowest(fit: Fit) -> Part:
 
 
 def _readers(part: Part, key: str) -> Iterator[Part]:
-    """The networks of convolutions within one that read these pictures and nothing else."""
+    """The convolutions within a network that read these pictures and nothing else."""
     spec, network, reads = part
     if isinstance(network, Conv) and [*reads] == [key]:
         yield spec, network, reads
