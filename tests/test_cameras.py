@@ -18,8 +18,6 @@ from ddco_pyro.data.pictures import Pictures
 from ddco_pyro.data.sources.video import frames
 from ddco_pyro.encoding.autoencoder import Convolutions
 from ddco_pyro.encoding.encoder import About, Encoder, Extractor, Projection
-from ddco_pyro.fitting.building import Dimensions, build_hierarchy
-from ddco_pyro.fitting.prepare import dimensions
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.report import write_report
 from ddco_pyro.simulation import collect as collecting
@@ -27,6 +25,8 @@ from ddco_pyro.simulation.cameras import Encoded
 from ddco_pyro.simulation.environments import TaskEnvironment
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import DemonstrationsSpec, RolloutSpec, parse_spec
+from ddco_pyro.training.data import dimensions
+from ddco_pyro.training.networks import Dimensions, build_hierarchy
 
 TASK = "toy_task:watched"
 

@@ -13,11 +13,11 @@ from torch import Tensor, nn
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.encoding.pictures import AT_ONCE, Pictures
 from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, UpdatesDone
-from ddco_pyro.fitting.checkpoint import copy_of, optimizer_state, restore_optimizer
 from ddco_pyro.model.networks import Inputs, InputShape
 from ddco_pyro.model.networks.conv import SHARPNESS, Conv
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import ConvolutionLayer
+from ddco_pyro.training.checkpoint import copy_of, optimizer_state, restore_optimizer
 
 _KEY = "picture"
 _FIRST = ConvolutionLayer(filters=16, kernel=5, stride=2, padding=2)
