@@ -122,14 +122,14 @@ def test_random_convolutions_written_out(few_dots, out):
     folder = encode(few_dots, out, Encoding("camera", seed=3)).folder
     weights, picture = load_file(folder / "encoder.safetensors"), together(Demonstrations.read(few_dots), "camera")[7]
     maps = torch.from_numpy(picture).permute(2, 0, 1)[None] / 255
-    for layer, stride, padding in (("convolutions.picture", 2, 2), ("deeper.picture.0", 1, 1)):
-        weight, bias = (weights[f"network/maps.{layer}.{name}"] for name in ("weight", "bias"))
+    for layer, stride, padding in (("0", 2, 2), ("1", 1, 1)):
+        weight, bias = (weights[f"network/maps.convolutions.0.{layer}.{name}"] for name in ("weight", "bias"))
         maps = torch.relu(torch.nn.functional.conv2d(maps, weight, bias, stride, padding))
     share = torch.exp(maps[0]) / torch.exp(maps[0]).sum((1, 2), keepdim=True)
     axis = torch.linspace(-1, 1, SIZE // 2)
     expected = torch.stack([(share.sum(2) * axis).sum(1), (share.sum(1) * axis).sum(1)], 1).flatten()
     assert expected.shape == (128,)
-    np.testing.assert_allclose(load(folder).kind(picture[None])[0], expected, atol=1e-6)
+    np.testing.assert_allclose(load(folder).extractor.encode(picture[None])[0], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [1, 4, 9])

@@ -56,7 +56,9 @@ def fitted(few_dots, folder, model, camera=None):
 def within(fit, network, demo):
     """What the last hidden layer of a network of the fit gives at each step of a demonstration."""
     given = []
-    handle = network.register_forward_hook(lambda _, __, output: given.append(output))
+    handle = network.register_forward_hook(
+        lambda _, __, output: given.append(output[0] if isinstance(output, tuple) else output)
+    )
     with torch.no_grad():
         fit.hierarchy(fit.hierarchy.encoder.inputs([demo.observations]).loaded())
     handle.remove()

@@ -50,7 +50,7 @@ def test_the_settings_of_a_spec_reach_the_network(name):
     )
     assert sum(isinstance(layer, nn.ELU) for layer in network.layers) == len(given.get("hidden", []))
     if name == "conv":
-        assert network.convolutions["camera"].weight.shape == (2 * 4, 3, 3, 3)
+        assert network.convolutions[0][0].weight.shape == (2 * 4, 3, 3, 3)
 
 
 # --- a user's ---------------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from user_networks import Stateful
 
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
-from ddco_pyro.model.networks.conv import POOLED, _module
+from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.model.networks.perceptrons import StackedLinear
 from ddco_pyro.spec import Activation, NetworkSpec
 
@@ -71,7 +71,7 @@ def test_an_activation_follows_every_convolution_and_every_hidden_layer(name, ac
     shape = InputShape({}, {"camera": PIXELS})
     network, inputs = make(shape, network="conv", **settings), random_inputs(shape, 2, LONGEST, 0)
     values = inputs.images["camera"].flatten(0, 1).permute(0, 3, 1, 2) / 255
-    for layer, filters in zip((network.convolutions["camera"], *network.deeper["camera"]), (2, 3), strict=True):
+    for layer, filters in zip(network.convolutions[0], (2, 3), strict=True):
         values = activation(nn.functional.conv2d(values, layer.weight[:filters], layer.bias[:filters]))
     first, second, last = (layer for layer in network.layers if isinstance(layer, StackedLinear))
     values = activation(values.flatten(1) @ first.weight[0] + first.bias[0])
@@ -188,8 +188,7 @@ def test_each_step_costs_one_network_however_many_there_are(trajectories, steps,
 def separate_conv(network, k, inputs, filters):
     """The k-th convolutional network, image by image, with ordinary torch layers."""
     columns = [inputs.vector.flatten(0, 1)]
-    for key, image in inputs.images.items():
-        stacked = network.convolutions[key]
+    for (stacked,), image in zip(network.convolutions, inputs.images.values(), strict=True):
         own = slice(k * filters, (k + 1) * filters)
         pixels = torch.stack([frame.permute(2, 0, 1) for frame in image.flatten(0, 1)]) / 255
         maps = nn.functional.conv2d(pixels, stacked.weight[own], stacked.bias[own], stride=2, padding=2)
@@ -236,7 +235,7 @@ def test_several_convolutions_are_separate_networks(pool):
     network = make(shape, network="conv", layers=layers, pool=pool, pooled=3, hidden=[8])
     inputs = Inputs({}, make_inputs(images=("camera",)).images, torch.arange(LONGEST))
     pixels = inputs.images["camera"].flatten(0, 1).permute(0, 3, 1, 2) / 255
-    first, second = network.convolutions["camera"], network.deeper["camera"][0]
+    first, second = network.convolutions[0]
     expected = []
     for k in range(COPIES):
         a, b = slice(3 * k, 3 * (k + 1)), slice(2 * k, 2 * (k + 1))
@@ -378,7 +377,7 @@ def test_a_network_that_cannot_be_built_says_why(shape, settings, message):
         make(shape, **settings)
 
 
-@pytest.mark.parametrize("keys", [("cam.rgb", "values"), ("type", "cam%2Ergb"), ("%type", "training"), ("a", "b")])
+@pytest.mark.parametrize("keys", [("cam.rgb", "values"), ("type", "training"), ("b", "a")])
 @pytest.mark.parametrize("layers", [[], [{"filters": 2, "kernel": 3}] * 2])
 def test_a_picture_may_have_any_name(keys, layers):
     """A network for two pictures gives what one gives that has the same weights under plain names."""
@@ -392,11 +391,4 @@ def test_a_picture_may_have_any_name(keys, layers):
         return network_of(names)(Inputs({}, dict(zip(names, seen.images.values(), strict=True)), seen.time))[0]
 
     assert torch.equal(given(keys), given(plain))
-    own = network_of(keys)
-    network_of(keys).load_state_dict(own.state_dict())
-    assert ("convolutions.a.weight" in own.state_dict()) == (keys[0] == "a")  # as runs have it
-
-
-def test_no_two_names_of_pictures_become_one():
-    names = ["cam.rgb", "%cam.rgb", "%cam%2Ergb", "cam%2Ergb", "%25cam", "%cam", "values", "%values", "."]
-    assert len({_module(name) for name in names}) == len(names)
+    network_of(keys).load_state_dict(network_of(plain).state_dict())

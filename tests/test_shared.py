@@ -36,8 +36,8 @@ def test_what_options_share_is_what_each_would_give_with_these_weights_and_learn
     assert_close(found, expected)
     found.square().sum().backward()
     expected.square().sum().backward()
-    of_copies = own.of[0].convolutions["camera"].weight.grad.unflatten(0, (COPIES, -1)).sum(0)
-    torch.testing.assert_close(shared.of[0].convolutions["camera"].weight.grad, of_copies, rtol=1e-4, atol=1e-5)
+    of_copies = own.of[0].convolutions[0][0].weight.grad.unflatten(0, (COPIES, -1)).sum(0)
+    torch.testing.assert_close(shared.of[0].convolutions[0][0].weight.grad, of_copies, rtol=1e-4, atol=1e-5)
 
 
 def test_a_policy_that_options_would_share_is_refused():

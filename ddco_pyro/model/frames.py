@@ -1,4 +1,4 @@
-"""Pictures of several trajectories as networks see them, read when a network asks for them, or held on its device."""
+"""Pictures of several trajectories as networks see them, read on demand, or held on the networks' device."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class Frames(Mapping[str, Tensor]):
     """Pictures of N trajectories by observation, each uint8 [N, T, H, W, C], zeros past their ends.
 
     :param arrays: of each observation the pictures [T_n, ...] of each trajectory, in memory or in their file.
-    :param transforms: what is seen of them.
-    :param rows: what the trajectories are called among those that this is a part of.
-    :param steps: the steps of time that are seen, T of them.
-    :param shifts: by how many rows and columns the pictures of each trajectory are moved, [N, 2]; none where left out.
-    :param readers: read what is in files, perhaps before it is asked for, or hold all of it on a device.
+    :param transforms: how they are cropped and scaled.
+    :param rows: the numbers of the trajectories in the batch that these are a part of.
+    :param steps: the T steps of time.
+    :param shifts: rows and columns by which the pictures of each trajectory are shifted, [N, 2]; by default none.
+    :param readers: read files, with prefetching or without, or hold the pictures on a device.
     """
 
     arrays: Mapping[str, tuple[Observed, ...]]
@@ -49,7 +49,7 @@ class Frames(Mapping[str, Tensor]):
 
     @property
     def job(self) -> Job:
-        """What is to be read for them."""
+        """The job of reading them."""
         return Job(self.rows, self.arrays, self.steps, self.transforms, self.shifts)
 
     @property
@@ -59,7 +59,7 @@ class Frames(Mapping[str, Tensor]):
 
     @property
     def size(self) -> int:
-        """Bytes of the trajectories' pictures as they are seen, without padding."""
+        """Bytes of the pictures as networks see them, without padding."""
         return sum(
             len(array) * math.prod(self.transforms[key].shape(array.shape[1:]))
             for key, arrays in self.arrays.items()
@@ -67,21 +67,21 @@ class Frames(Mapping[str, Tensor]):
         )
 
     def held(self, device: torch.device) -> Frames:
-        """The same with all pictures on a device; they are read once, one trajectory at a time.
+        """These frames on a device; the pictures are read once, one trajectory at a time.
 
         :raises DemonstrationsError: a file cannot be read.
         """
         return replace(self, readers=DeviceFrames(self, device))
 
     def loaded(self) -> dict[str, Tensor]:
-        """All of them, in memory, or on the device that holds them.
+        """All pictures, in memory, or on the device that holds them.
 
         :raises DemonstrationsError: a file cannot be read.
         """
         return {key: torch.as_tensor(array) for key, array in self.readers.take(self.job).items()}
 
     def part(self, rows: Tensor | slice, steps: slice) -> Frames:
-        """The same of some trajectories and of consecutive steps; nothing is read."""
+        """The frames of some trajectories and of consecutive steps; nothing is read."""
         chosen = torch.arange(len(self.rows))[rows].tolist()
         arrays = {key: tuple(each[row] for row in chosen) for key, each in self.arrays.items()}
         shifts = {key: each[chosen] for key, each in self.shifts.items()}
@@ -91,7 +91,7 @@ class Frames(Mapping[str, Tensor]):
 
 
 class DeviceFrames:
-    """Has the pictures of trajectories on a device, as they are seen, and gives what :class:`Readers` would read."""
+    """Preprocessed pictures of trajectories on a device, in place of :class:`Readers`."""
 
     def __init__(self, frames: Frames, device: torch.device) -> None:
         self._pictures = {
@@ -101,7 +101,7 @@ class DeviceFrames:
         }
 
     def plan(self, _: Iterable[Job]) -> None:
-        """Nothing is read any more."""
+        """Nothing: all pictures are there."""
 
     def take(self, job: Job) -> dict[str, Tensor]:
         """The pictures of a job, on the device."""

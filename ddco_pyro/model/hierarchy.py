@@ -1,6 +1,6 @@
-"""The networks of a hierarchy and the tables they give: levels of options under a meta-policy (paper §4).
+"""The networks of a hierarchy and the tables that they give: levels of options under a meta-policy (paper §4).
 
-A baseline is a hierarchy without option levels whose meta-policy emits control.
+A flat policy is a hierarchy without option levels, whose meta-policy emits the control.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
 
 BYTES_AT_ONCE = 256 * 10**6
-"""Most bytes that networks take for the steps that go through them together, one step at least; less where less memory
+"""Most bytes that networks take for the steps that go through them together, at least one step. Less where less memory
 is allowed (:func:`ddco_pyro.data.memory.share`)."""
 
 PART_OF_A_GPU = 0.1
-"""The same of the memory of a GPU, whatever else is there: GPUs of one kind cut alike."""
+"""Share of a GPU's whole memory that networks take in place of that, so that GPUs of one kind cut alike."""
 
 Emits = Literal["options", "control"]
 
@@ -121,10 +121,10 @@ class Hierarchy(nn.Module):
     :param shapes: shapes of the observations by name, without time.
     :param control_size: A, the number of control dimensions.
     :param steps: the longest demonstration, for per-timestep networks.
-    :param constant: the control dimensions that are no part of the model, and the values that are emitted for them.
-    :param parts: how the other control dimensions are modelled; by default all of them are Gaussian.
-    :raises ShapeError: where a network cannot read these observations.
-    :raises SpecError: where a user's network does not take its options.
+    :param constant: the control dimensions outside the model, and the values that are emitted for them.
+    :param parts: the kinds of the other control dimensions; by default all are Gaussian.
+    :raises ShapeError: a network cannot read these observations.
+    :raises SpecError: a user's network does not take its options.
     """
 
     def __init__(
@@ -159,7 +159,7 @@ class Hierarchy(nn.Module):
             self.meta_policy = Caller(network, emits, below, shape, spec.control, scaling, copies=1)
 
     def place(self, device: torch.device) -> Hierarchy:
-        """Have the networks, and nothing else, on a device. Whatever calls them gives and gets tensors on the host."""
+        """Move the networks, and nothing else, to a device. Their callers give and get tensors on the host."""
         if device != self.device:
             _ = self.step_bytes  # counted on the host
             for network in self.networks().values():
@@ -173,7 +173,7 @@ class Hierarchy(nn.Module):
         return len(self.levels)
 
     def callers(self) -> list[Caller]:
-        """Who chooses: the policies of each level, lowest first, and the meta-policy."""
+        """The policies of each level, lowest first, and the meta-policy."""
         return [*(level.policy for level in self.option_levels()), self.meta_policy]
 
     def option_levels(self) -> list[Level]:
@@ -202,12 +202,12 @@ class Hierarchy(nn.Module):
 
     @property
     def steps_in_memory(self) -> int:
-        """Steps that networks can be trained on at a time: longer trajectories are processed in chunks of time."""
+        """Most steps of a trajectory in a chunk of time, for training within the memory that is allowed."""
         return max(1, int(_bytes_at_once(self.device)) // max(1, self.step_bytes))
 
     @property
     def steps_at_once(self) -> int:
-        """Steps of several trajectories that go through the networks together, where these are short enough."""
+        """Most steps of several trajectories that go through the networks together."""
         return min(STEPS_AT_ONCE, self.steps_in_memory)
 
     def tabulate(self, batch: Batch, discovering: int | None = None) -> Tables:
@@ -310,5 +310,5 @@ def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
 
 
 def _uniform(like: Tensor, options: int) -> CallerOutputs:
-    """A meta-policy that selects each of the k options with probability 1/k, at as many steps [N, T, ...]."""
+    """A meta-policy that selects each of k options with probability 1/k, at the steps of ``like`` [N, T, ...]."""
     return CallerOutputs(options, torch.zeros(*like.shape[:2], 1, options), None)

@@ -74,7 +74,7 @@ class Lstm(Network):
 
 
 class StackedLstm(nn.Module):
-    """K LSTM layers as one. Gates stand in torch's order (input, forget, cell, output) and have one bias, not two."""
+    """K LSTM layers as one, with gates in torch's order (input, forget, cell, output) and one bias each."""
 
     def __init__(self, copies: int, inputs: int, size: int) -> None:
         super().__init__()
@@ -98,7 +98,7 @@ class StackedLstm(nn.Module):
         return outputs.flatten(1, 2), h[:, 0].transpose(0, 1), c[:, 0].transpose(0, 1)
 
     def _step(self, values: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """A single step of all K at once, which a program of one step can hold.
+        """A single step of all K at once, which can be exported.
 
         For many steps torch's own loop, copy by copy, takes a half to a fifth of the time (5 copies of size 64 over
         16 × 100 and 1 × 1000 steps).
@@ -123,8 +123,9 @@ class StackedLstm(nn.Module):
 def _in_windows(
     layer: StackedLstm, values: Tensor, inputs: Inputs, h: Tensor, c: Tensor, horizon: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What a layer gives where each window of ``horizon`` steps of a trajectory begins with zeros. Windows that are
-    there from their first step to their last are sequences of their own, all together.
+    """A layer's outputs where each window of ``horizon`` steps of a trajectory begins with zeros.
+
+    Windows that are complete in these inputs go through the layer together, as sequences.
     """
     trajectories, steps = inputs.batch
     if steps == 1:  # without a branch, which a program of one step cannot hold
@@ -145,8 +146,9 @@ def _in_windows(
 
 
 def _for_loop(device: torch.device) -> AbstractContextManager[None]:
-    """Not every processor has what torch's loop takes in bfloat16, so there it is float32 on all of them. A GPU warns
-    that it brings weights together each time.
+    """The context of torch's loop: float32 on CPUs, not all of which support it in bfloat16.
+
+    On GPUs a warning about scattered weights is suppressed.
     """
     return torch.autocast("cpu", enabled=False) if device.type == "cpu" else _without_warning()
 
