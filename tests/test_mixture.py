@@ -24,7 +24,7 @@ from ddco_pyro.fitting.fit import model_name
 from ddco_pyro.fitting.upper import Constants, fitted
 from ddco_pyro.fitting.worth import mean_run, worth
 from ddco_pyro.inference import log_likelihood, posterior
-from ddco_pyro.inference.check import compare_engines
+from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import always_ends

@@ -18,7 +18,7 @@ from ddco_pyro.fitting.material import Material
 from ddco_pyro.fitting.ranks import ALONE, Ranks
 from ddco_pyro.fitting.stages import Stage
 from ddco_pyro.fitting.upper import Constants, expected, fitted
-from ddco_pyro.inference.engines import log_likelihood, total_log_likelihood
+from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -136,14 +136,14 @@ class Objective:
         return tables
 
     def _total(self, tables: Tables, batch: Batch) -> Tensor:
-        likelihood = partial(total_log_likelihood, lengths=batch.lengths, engine=self.material.spec.inference.engine)
+        likelihood = partial(log_likelihood, lengths=batch.lengths, engine=self.material.spec.inference.engine)
         if self.constants is not None:
             value = expected(tables, batch.lengths, self.constants)
         elif self.stage.selecting:
             levels, meta_policy = tables.apart()
-            value = likelihood(levels) + likelihood(meta_policy)
+            value = likelihood(levels).sum() + likelihood(meta_policy).sum()
         else:
-            value = likelihood(tables)
+            value = likelihood(tables).sum()
         prior = self.material.spec.training.duration
         if prior is None:
             return value

@@ -39,7 +39,7 @@ from ddco_pyro.fitting.ranks import ALONE, Ranks
 from ddco_pyro.fitting.records import read_record
 from ddco_pyro.fitting.restarts import Trainer
 from ddco_pyro.fitting.training import SAVE_EVERY
-from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_engines
+from ddco_pyro.inference.engines import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.encoding import refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
