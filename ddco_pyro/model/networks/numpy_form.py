@@ -12,7 +12,7 @@ from ddco_pyro.model.networks.stacked import Perceptrons, StackedLinear
 
 NumpyForm = tuple[dict[str, Any], dict[str, np.ndarray]]
 """Facts for ``controller.json`` and arrays for ``weights.npz``: a tree whose nodes have a ``kind``, each a method of
-:class:`ddco_pyro.export.runner_networks.NumpyNetworks`, and read what ``of`` gives; the arrays of ``of`` are
+:class:`ddco_pyro.exporting.runner.NumpyNetworks`, and read what ``of`` gives; the arrays of ``of`` are
 ``of.<name>``."""
 
 
