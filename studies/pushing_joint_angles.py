@@ -118,7 +118,8 @@ def main() -> None:
     sides = np.concatenate([one.record.observations["goal_from_box"][:, 0] > 0 for one in episodes])
     options = np.concatenate([choices for _, choices in ours])
     demos = pool(arguments.runs, spec_of(cell))[: arguments.demonstrations]
-    shown = [(one.observations["joint_angles"], 1 + (one.record.observations["goal_from_box"][:, 0] > 0)) for one in demos]
+    goals = [(one.observations["joint_angles"], one.observations["goal_from_box"][:, 0] > 0) for one in demos]
+    shown = [(angles, 1 + right) for angles, right in goals]
     names = {number: f"option {number}" for number in np.unique(options)}
     figure = draw(
         {

@@ -40,7 +40,7 @@ Exported = dict[str, tuple[float, float]]
 """Form to (largest difference of a control, median seconds of a step)."""
 
 
-def export(fit: Fit, folder: Path, onnx: bool = False) -> Exported:
+def export(fit: Fit, folder: str | Path, onnx: bool = False) -> Exported:
     """Write the controller that a run's ``rollout`` describes, and verify every form of it.
 
     The folder gets ``controller.json``, ``weights.npz`` and ``runner.py``, which run with numpy alone;
@@ -55,9 +55,10 @@ def export(fit: Fit, folder: Path, onnx: bool = False) -> Exported:
     :raises ExportError: a form acts differently, or cannot be made.
     :raises BadInput: ``folder`` holds other files.
 
-    >>> sorted(export(fitted(), folder() / "controller"))  # both forms acted like the original
+    >>> sorted(ddco_pyro.export(fit, "controller"))  # both forms act like the original
     ['numpy', 'torch']
     """
+    folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise BadInput(f"{folder}: is a file; choose another --out")
     others = sorted(path.name for path in folder.iterdir() if path.name not in FILES) if folder.exists() else []

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import dm_env
 import numpy as np
 from joblib import Parallel, delayed
 from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.simulation.task import Observation, Policy, Task, find_task
+
+if TYPE_CHECKING:
+    import dm_env
 
 CONFIDENCE = 0.95
 
