@@ -23,7 +23,7 @@ from cells import Cell, Settings, digest
 from ddco_tasks.pushing import environment as pushing
 from pushing_cell import EVALUATION, HELD_OUT, HELD_OUT_SEED, LABELS, POOL, TRAINING, per_step, summary
 
-from ddco_pyro.acting.lockstep import play
+from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import MOVED, Transform, shifted
 from ddco_pyro.encoding.fitted import FittedReader, from_fit
@@ -31,7 +31,7 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import Trained, train
 from ddco_pyro.simulation.cameras import Camera, Encoded
-from ddco_pyro.simulation.episodes import run_episode
+from ddco_pyro.simulation.episodes import play, run_episode
 from ddco_pyro.simulation.task import Task
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.devices import device_of
@@ -109,7 +109,9 @@ class PictureCell(Cell):
         likelihood = {name: per_step(found, each) for name, each in (("train", demos), ("held_out", test))}
         first = EVALUATION + 1000 * self.seed
         seeds = range(first, first + int(own["episodes"]))
-        episodes, limited = (play(task, trained.hierarchy, spec.rollout, seeds) for task in tasks)
+        controller = Controller.from_spec(trained.hierarchy, spec.rollout)
+        observed = trained.hierarchy.encoder.shapes
+        episodes, limited = (play(task, controller, seeds, observed) for task in tasks)
         ended = time.perf_counter()
         return {
             "log_likelihood_per_step": likelihood,

@@ -18,7 +18,7 @@ from elsewhere import THERE, Device, Elsewhere
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import padded
-from ddco_pyro.export import export
+from ddco_pyro.exporting import export
 from ddco_pyro.model.networks.conv import _field_means
 from ddco_pyro.spec import Spec, parse_spec
 from ddco_pyro.training import devices

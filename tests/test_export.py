@@ -14,9 +14,9 @@ from exportable import FITS, RECURRENT, SHAPES, make
 from user_networks import Remembering
 
 import ddco_pyro
-import ddco_pyro.export as module
+import ddco_pyro.exporting as module
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.export import TOLERANCE, export, runner
+from ddco_pyro.exporting import TOLERANCE, export, runner
 from ddco_pyro.model.networks import InputShape, UserNetwork
 
 LIKE_OTHERS = ("lstm", "conv", "three levels")

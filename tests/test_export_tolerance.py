@@ -12,10 +12,10 @@ import onnx
 import pytest
 import torch
 
-import ddco_pyro.export as module
+import ddco_pyro.exporting as module
 from ddco_pyro.errors import Failed
-from ddco_pyro.export import export, runner
-from ddco_pyro.export.recording import record, tolerance
+from ddco_pyro.exporting import export, runner
+from ddco_pyro.exporting.recording import record, tolerance
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import UserNetwork

@@ -21,7 +21,7 @@ from ddco_pyro.drawing import words
 from ddco_pyro.evaluation.worth import mean_run, worth
 from ddco_pyro.fitting.fit import model_name
 from ddco_pyro.inference import log_likelihood, posterior
-from ddco_pyro.inference.check import compare_engines
+from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.batch import encode
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import always_ends

@@ -11,7 +11,7 @@ from scipy import stats
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.inference.check import compare_engines
+from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.controls import INITIAL_STD
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides

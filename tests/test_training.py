@@ -11,7 +11,7 @@ import torch
 from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plant, recovered
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.inference import total_log_likelihood
+from ddco_pyro.inference import log_likelihood
 from ddco_pyro.spec import parse_spec, with_overrides
 from ddco_pyro.training.averaging import Average
 from ddco_pyro.training.checkpoint import Progress, Restart
@@ -107,7 +107,7 @@ def test_beside_the_levels_under_a_uniform_meta_policy_the_meta_policy_learns_of
     objective = Objective(material, Progress(0), stage)
     tables = model.tabulate(material.train).clamp(1, objective.known[0][1])
     model.zero_grad()
-    (-total_log_likelihood(tables, material.train.lengths) / material.train.steps).backward()
+    (-log_likelihood(tables, material.train.lengths).sum() / material.train.steps).backward()
     whole = {name: each.grad for name, each in model.named_parameters()}
     for name, gradient in found.items():
         expected = whole[name] if name.startswith("meta_policy.") else levels[name]

@@ -6,7 +6,7 @@ import pytest
 import torch
 from hierarchies import SHAPES, make_batch
 
-from ddco_pyro.inference import total_log_likelihood
+from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import SpecError, parse_spec
 from ddco_pyro.training.stages import plan
@@ -37,7 +37,7 @@ def made(spec):
 
 def value_of(hierarchy):
     batch = make_batch(trajectories=3)
-    return total_log_likelihood(hierarchy.tabulate(batch), batch.lengths)
+    return log_likelihood(hierarchy.tabulate(batch), batch.lengths).sum()
 
 
 def first_layers(hierarchy):

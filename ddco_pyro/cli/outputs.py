@@ -180,7 +180,7 @@ def export(
     was there stays.
     """
     from ddco_pyro.data.files import Output, check_outputs
-    from ddco_pyro.export import export as write
+    from ddco_pyro.exporting import export as write
     from ddco_pyro.fitting.fit import load
 
     check_outputs([Output("--out", out, "folder")], [run])

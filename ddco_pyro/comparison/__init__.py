@@ -26,30 +26,35 @@ FILES = ("compare.png", "compare.json", "compare.md", "compare.html")
 """What a comparison is written as."""
 
 
-def compare(folders: Sequence[Path], allow_code: bool = False) -> Comparison:
+def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
     """The runs in these folders (a run's ``baselines/NAME`` is a run too), the best first.
+
+    >>> compared = ddco_pyro.compare(["runs/mine", "runs/mine/baselines/flat"])
+    >>> len(compared.rows), compared.rows[0].difference  # nats per step below the best
+    (2, 0.0)
 
     :param allow_code: import the user code that their specs name.
     :raises CompareError: there are less than two, or one twice.
     :raises NotShared: they were not held out on the same data.
     :raises RunError: a folder is not a finished run.
     """
+    folders = [Path(run) for run in runs]
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise CompareError("the same run is given twice; name each once")
     if len(folders) < 2:
         raise CompareError("one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat")
     fits = [load(folder, allow_code) for folder in folders]
-    runs = held_out(fits)
-    values = np.stack([held.values for held in runs])
+    held_runs = held_out(fits)
+    values = np.stack([held.values for held in held_runs])
     best = int(values.sum(1).argmax())
-    rows = [_row(0, held, values[best]) for held in runs]
+    rows = [_row(0, held, values[best]) for held in held_runs]
     ranked = sorted(rows, key=lambda row: row.difference)
     order = [row.name for row in ranked]
-    with_options = {held.run for held in runs if held.fit.spec.hierarchy}
+    with_options = {held.run for held in held_runs if held.fit.spec.hierarchy}
     return Comparison(
         [Row(**vars(row) | {"rank": rank}) for rank, row in enumerate(ranked)],
-        runs[0].names,
-        runs[0].steps,
+        held_runs[0].names,
+        held_runs[0].steps,
         agreements(fits, order),
         paired_rollouts(fits, order),
         next((row.name for row in ranked if row.name in with_options), ranked[0].name),

@@ -29,6 +29,10 @@ from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimi
 class Demonstration:
     """One demonstration of T steps, s_0 a_0 ... s_{T-1} a_{T-1}.
 
+    >>> demo = ddco_pyro.Demonstration("demo_0", {"place": np.zeros((10, 2))}, np.ones((10, 2)), {"phase": [0] * 10})
+    >>> len(demo), demo.actions.dtype, demo.labels["phase"].shape
+    (10, dtype('float64'), (10,))
+
     :param observations: key to [T, ...]; uint8 stays as it is, other numbers become float64. Pictures uint8
         [T, C, H, W] or [T, H, W] become [T, H, W, C]. Pictures of a file are
         :class:`~ddco_pyro.data.pictures.Pictures`: slices of them are read when they are asked for.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from matplotlib import colormaps
 
@@ -27,4 +26,6 @@ def overlaid(picture: np.ndarray, values: np.ndarray) -> np.ndarray:
     colours = 255 * colormaps["YlOrRd"](share)[..., :3]
     drawn = ((1 - share[..., None]) * grey + share[..., None] * colours).astype(np.uint8)
     width = round(HEIGHT * drawn.shape[1] / drawn.shape[0])
+    import cv2
+
     return np.asarray(cv2.resize(drawn, (width, HEIGHT), interpolation=cv2.INTER_NEAREST))

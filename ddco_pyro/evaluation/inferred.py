@@ -11,10 +11,9 @@ import torch
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.memory import INFERENCE
-from ddco_pyro.inference.decomposition import Decomposition, decompose
 from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.inference.paths import Path, most_likely_path
-from ddco_pyro.inference.posteriors import Posterior, posterior
+from ddco_pyro.inference.posteriors import Decomposition, Posterior, decompose, posterior
 from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs

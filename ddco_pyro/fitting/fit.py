@@ -41,6 +41,9 @@ class RunError(BadInput):
 class Fit:
     """A fitted model.
 
+    >>> fit.spec.hierarchy.levels[0].count, sorted(fit.baselines), fit.metrics["demonstrations"]["valid"]
+    (2, ['flat'], 1)
+
     :param metrics: its numbers, the contents of ``metrics.json``.
     :param folder: its run folder; None where it was not written.
     :param given: the demonstrations that it was fitted to; None for those that the spec names.

@@ -19,7 +19,7 @@ from ddco_pyro.evaluation.inferred import Inferred
 from ddco_pyro.evaluation.worth import MIXTURE, mean_run, worth
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.inference import Posterior
-from ddco_pyro.inference.decomposition import Decomposition
+from ddco_pyro.inference.posteriors import Decomposition
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.training.labels import choices, used
 

@@ -27,7 +27,7 @@ from ddco_pyro.events import EpochEnded, Event, OnEvent, TrainingBegan, Training
 from ddco_pyro.fitting.fit import Fit, RunError, is_finished, load, model_name
 from ddco_pyro.fitting.fitted_to import record, recorded
 from ddco_pyro.fitting.metrics import evaluate, supervisor, trained_labels
-from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_engines
+from ddco_pyro.inference.engines import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.batch import refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy

@@ -12,7 +12,7 @@ import numpy as np
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.memory import INFERENCE, PROGRAM, Extent, refuse_too_much
-from ddco_pyro.data.sources import Recording, Source
+from ddco_pyro.data.sources import Recording, Source, open_source
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.inferred import Inferred
 from ddco_pyro.evaluation.schema import option_labels
@@ -85,6 +85,21 @@ class Segmented:
 
     def __len__(self) -> int:
         return len(self.segments)
+
+
+def segment(fit: Fit, path: str | Path) -> Segmented:
+    """The options of a run over every demonstration of a file or data set.
+
+    >>> segmented = ddco_pyro.segment(fit, "mine.hdf5")
+    >>> len(segmented), segmented.counts, segmented.segments[0].levels["option"].options.shape
+    (6, {'option': 2}, (10,))
+
+    :param path: an HDF5 file, or a Minari or LeRobot dataset.
+    :raises BadInput: the run has no options, or was fitted to other observations.
+    :raises DemonstrationsError: a demonstration cannot be used.
+    """
+    with open_source(Path(path)) as source:
+        return segments(fit, source)
 
 
 def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:

@@ -76,7 +76,7 @@ def check(spec: Spec, workers: Workers = HERE, demos: Demonstrations | None = No
 
 def select(
     spec: Spec,
-    folder: Path,
+    folder: str | Path,
     on_event: OnEvent = ignore,
     workers: Workers = HERE,
     stop_early: bool = False,
@@ -88,6 +88,12 @@ def select(
     What the folder has already is not done again. Which folds are scored depends on nothing but the spec, the
     demonstrations and ``stop_early``; neither on the workers nor on interruptions.
 
+    >>> grid = "selection.grid.hierarchy.levels.0.count=[1, 2]"
+    >>> spec = ddco_pyro.load_spec("mine.yaml", [grid, "selection.folds=2", "training.epochs=2"])
+    >>> selection = ddco_pyro.select(spec, "runs/select")
+    >>> len(selection.choice.rows)  # a row for each candidate
+    2
+
     :param demos: :func:`known_demonstrations`, where they have been read.
     :param resume: as of :func:`ddco_pyro.fitting.run.claim`.
     :raises SelectionFailed: every candidate has failed in some fold.
@@ -95,6 +101,7 @@ def select(
     :raises OtherDemonstrations: it is a selection by other demonstrations.
     :raises Busy: another process is at work on the folder.
     """
+    folder = Path(folder)
     with claimed(folder, spec, resume):
         demos = demos or read_demonstrations(grid.wide(spec), on_event)
         record(folder, demos)

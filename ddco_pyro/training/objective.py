@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ddco_pyro.data.reading import Job
 from ddco_pyro.errors import Failed
-from ddco_pyro.inference.engines import log_likelihood, total_log_likelihood
+from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -136,14 +136,14 @@ class Objective:
         return tables
 
     def _total(self, tables: Tables, batch: Batch) -> Tensor:
-        likelihood = partial(total_log_likelihood, lengths=batch.lengths, engine=self.material.spec.inference.engine)
+        likelihood = partial(log_likelihood, lengths=batch.lengths, engine=self.material.spec.inference.engine)
         if self.constants is not None:
             value = expected(tables, batch.lengths, self.constants)
         elif self.stage.selecting:
             levels, meta_policy = tables.apart()
-            value = likelihood(levels) + likelihood(meta_policy)
+            value = likelihood(levels).sum() + likelihood(meta_policy).sum()
         else:
-            value = likelihood(tables)
+            value = likelihood(tables).sum()
         prior = self.material.spec.training.duration
         if prior is None:
             return value

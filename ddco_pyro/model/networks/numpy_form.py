@@ -1,6 +1,6 @@
 """What the numpy runner of an exported controller has to know of a network: facts and arrays.
 
-A form is a tree. Each node has a ``kind``, a method of :class:`ddco_pyro.export.runner_networks.NumpyNetworks`, and
+A form is a tree. Each node has a ``kind``, a method of :class:`ddco_pyro.exporting.runner.NumpyNetworks`, and
 reads what its ``of`` gives. The arrays of ``of`` are called ``of.<name>``.
 """
 

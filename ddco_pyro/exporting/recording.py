@@ -1,4 +1,4 @@
-"""Made-up episodes, what the original does in them, and how exact it is: what exported forms are compared with."""
+"""Synthetic episodes for checking exports: the original's actions in them, and the tolerance of the comparison."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 import torch
 
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.export import runner
+from ddco_pyro.exporting import runner
+from ddco_pyro.exporting.program import named
 from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs, States
@@ -18,24 +19,22 @@ from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.spec import STEP
 
 EPISODES, STEPS = 3, 20
-"""Made-up episodes on which every form has to act as the original does; without images the first one is a step longer
-than the longest demonstration, so that networks of every step of time are among what is compared."""
+"""Number and length of synthetic episodes. Without images the first one is a step longer than the longest
+demonstration, so that the comparison includes the networks of every time step."""
 
 FINEST = 48
-"""Made-up pictures have about so many squares across the shorter side, or as many as they have pixels."""
+"""Largest number of squares across the shorter side of a synthetic picture."""
 
 ROUNDINGS = 4
-"""An exported form may differ from the original by so many times what the original, in float32, differs from the same
-networks in float64, in a whole episode at once or one step at a time (which adds in another order): either errs by
-about that, in other places, and these are the largest of a few thousand numbers."""
+"""Allowed difference in units of the original's own rounding error. The rounding error is the largest difference
+between float32 and float64 outputs, over an episode in one pass and step by step, which add in different orders."""
 
 MOST = 1e-4
-"""No form may differ by more: networks whose own rounding is beyond a quarter of this say nothing in float32."""
+"""Largest tolerance. Networks with a rounding error beyond a quarter of it are meaningless in float32."""
 
 
 def record(controller: Controller, hierarchy: Hierarchy) -> dict[str, np.ndarray]:
-    """Made-up episodes: observations about as large as those that were fitted to, what was done, by whom, and what the
-    networks say of the whole episode at once.
+    """Synthetic episodes: observations as large as the training data's, actions, options, and network outputs.
 
     ``seeds``, and for each episode ``observation_<episode>_<key>`` [T, ...], ``controls_<episode>`` [T, A],
     ``choices_<episode>`` [T, D], and the runner's outputs as ``<output>_<episode>`` [T, ...].
@@ -58,10 +57,11 @@ def record(controller: Controller, hierarchy: Hierarchy) -> dict[str, np.ndarray
 
 
 def tolerance(hierarchy: Hierarchy, episodes: Mapping[str, np.ndarray]) -> float:
-    """By how much a form may differ from the original in these recorded episodes, in the units of
-    :func:`~ddco_pyro.export.runner.difference`: :data:`ROUNDINGS` times what float32 does to the original's networks,
-    :data:`MOST` at most, and never less than :data:`~ddco_pyro.export.runner.TOLERANCE`, which networks have that
-    cannot be evaluated in float64 (a user's).
+    """Allowed difference of a form from the original, in the units of :func:`~ddco_pyro.exporting.runner.difference`.
+
+    The tolerance is :data:`ROUNDINGS` times the original's rounding error in these recorded episodes, clipped to
+    :data:`~ddco_pyro.exporting.runner.TOLERANCE` and :data:`MOST`. The lower end applies to a user's networks that
+    cannot be evaluated in float64.
     """
     exact, largest = copy.deepcopy(hierarchy).double(), 0.0
     for number in episodes["seeds"]:
@@ -78,35 +78,29 @@ def tolerance(hierarchy: Hierarchy, episodes: Mapping[str, np.ndarray]) -> float
 
 
 def _said(hierarchy: Hierarchy, inputs: Inputs) -> runner.Outputs:
-    """The runner's outputs at every step, [T, ...], from one pass over the episode, as in training."""
+    """The outputs at every step, [T, ...], from one pass over the episode, as in training."""
     with torch.no_grad():
-        return _named(hierarchy(inputs))
+        return _arrays(hierarchy(inputs))
 
 
 def _said_stepwise(hierarchy: Hierarchy, inputs: Inputs) -> runner.Outputs:
-    """The same from one step after the other, as a controller has them."""
+    """The outputs at every step, [T, ...], from one call for each step, as in a controller."""
     each: list[runner.Outputs] = []
     states: States | None = None
     with torch.no_grad():
         for step in inputs.chunks(1):
             said, states = hierarchy.advance(step, states)
-            each.append(_named(said))
+            each.append(_arrays(said))
     return {name: np.concatenate([one[name] for one in each]) for name in each[0]}
 
 
-def _named(said: Outputs) -> runner.Outputs:
+def _arrays(said: Outputs) -> runner.Outputs:
     """The outputs for one episode by the runner's names, [T, ...]."""
-    out: runner.Outputs = {}
-    for level, caller in enumerate(said.callers):
-        if caller.selection is not None:
-            out[f"selection_{level}"] = caller.selection[0].numpy()
-        if caller.numbers is not None:
-            out[f"control_{level}"] = caller.numbers[0].numpy()
-    return out | {f"termination_{level}": log[0, :, :, 1].exp().numpy() for level, log in enumerate(said.termination)}
+    return {name: values[0].numpy() for name, values in named(said).items()}
 
 
 def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generator) -> dict[str, np.ndarray]:
-    """Observations with the mean and spread that were fitted to, and with differences as large where those matter."""
+    """Random observations with the mean and spread of the training data, and of its differences where they are used."""
     observations: dict[str, np.ndarray] = {}
     at = 0
     for spec, size in zip(encoder.specs, encoder.sizes, strict=True):
@@ -127,7 +121,7 @@ def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generato
 
 
 def _pictures(steps: int, shape: tuple[int, ...], random: np.random.Generator) -> np.ndarray:
-    """Noise [T, H, W, C], of squares where pictures are large: every pixel of its own would be most of an export."""
+    """Noise [T, H, W, C]. Large pictures consist of squares, so that they compress to a small file."""
     side = max(1, min(shape[:2]) // FINEST)
     fewer = tuple(-(-size // side) for size in shape[:2])
     noise = random.integers(0, 256, (steps, *fewer, *shape[2:]), dtype=np.uint8)
@@ -135,7 +129,7 @@ def _pictures(steps: int, shape: tuple[int, ...], random: np.random.Generator) -
 
 
 def _walk(start: np.ndarray, differences: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """Values [T, F] that go by these differences [T, F], or back where they would leave the mean by two deviations."""
+    """Values [T, F] that change by these differences [T, F], reflected at two standard deviations from the mean."""
     values = [start]
     for difference in differences[1:]:
         ahead, back = values[-1] + difference, values[-1] - np.copysign(difference, values[-1] - mean)

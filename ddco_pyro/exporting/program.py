@@ -1,4 +1,4 @@
-"""One step of all networks as a program without Python in it, for ``torch.export`` and ONNX."""
+"""One step of all networks as a module that ``torch.export`` and ONNX can hold."""
 
 from __future__ import annotations
 
@@ -7,15 +7,29 @@ from torch import Tensor, nn
 
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.outputs import Outputs
+
+
+def named(said: Outputs) -> dict[str, Tensor]:
+    """Network outputs by the names of the runner, each [N, T, ...].
+
+    ``selection_d``: log-probabilities [K, 1 + k]. ``control_d``: the numbers of the control [K, size]. Both belong to
+    the callers of level d, of which the last is the meta-policy. ``termination_d``: ψ [k].
+    """
+    outputs = {}
+    for level, caller in enumerate(said.callers):
+        if caller.selection is not None:
+            outputs[f"selection_{level}"] = caller.selection
+        if caller.numbers is not None:
+            outputs[f"control_{level}"] = caller.numbers
+    return outputs | {f"termination_{d}": log[..., 1].double().exp() for d, log in enumerate(said.termination)}
 
 
 class StepProgram(nn.Module):
-    """Features [F] (float64, not yet standardised), step [1], images [H, W, C] and the state to the outputs in
-    ``names`` and the next state.
+    """Maps features [F] (float64, not standardised), step [1], images [H, W, C] and the state to outputs and state.
 
-    ``selection_d`` log-probabilities [K, 1 + k], ``control_d`` the numbers of the control [K, size], both of the
-    callers of level d (the last is the meta-policy), and ``termination_d`` ψ [k]. The state has the tensors [1, ...] of
-    each network that remembers, in the order of :meth:`~ddco_pyro.model.hierarchy.Hierarchy.networks`.
+    ``names`` are those of :func:`named`. The state holds tensors [1, ...] of each recurrent network, in the order of
+    :meth:`~ddco_pyro.model.hierarchy.Hierarchy.networks`.
     """
 
     def __init__(self, hierarchy: Hierarchy) -> None:
@@ -33,14 +47,7 @@ class StepProgram(nn.Module):
         vectors = self.hierarchy.encoder.standardized(features.reshape(1, 1, -1))
         pictures = {key: image.reshape(1, 1, *image.shape) for key, image in zip(self.keys, images, strict=True)}
         said, states = self.hierarchy.advance(Inputs(vectors, pictures, step), states)
-        outputs = {}
-        for level, caller in enumerate(said.callers):
-            if caller.selection is not None:
-                outputs[f"selection_{level}"] = caller.selection[0, 0]
-            if caller.numbers is not None:
-                outputs[f"control_{level}"] = caller.numbers[0, 0]
-        for level, log in enumerate(said.termination):
-            outputs[f"termination_{level}"] = log[0, 0, :, 1].double().exp()
+        outputs = {name: values[0, 0] for name, values in named(said).items()}
         return outputs, [tensor for state in states.values() for tensor in state]
 
     def forward(self, features: Tensor, step: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
