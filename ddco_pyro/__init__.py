@@ -9,8 +9,7 @@ if TYPE_CHECKING:
     from ddco_pyro import encoding, inference
     from ddco_pyro.acting.controller import Controller
     from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-    from ddco_pyro.fitting.fit import Fit, load
-    from ddco_pyro.fitting.run import fit
+    from ddco_pyro.fitting.fit import Fit, fit, load
     from ddco_pyro.spec import Spec, load_spec
 
 __all__ = [
@@ -32,7 +31,7 @@ _MODULES = {
     "Demonstrations": "data.demonstrations",
     "Fit": "fitting.fit",
     "Spec": "spec",
-    "fit": "fitting.run",
+    "fit": "fitting.fit",
     "load": "fitting.fit",
     "load_spec": "spec",
 }

@@ -141,7 +141,7 @@ def test_pictures_stay_on_a_device_with_room(demos: Demonstrations, monkeypatch:
     monkeypatch.setattr("ddco_pyro.data.reading.padded", lambda *given: read.append(1) or padded(*given))
     fits, asked = [], []
     for room in (float("inf"), 1.0):
-        monkeypatch.setattr("ddco_pyro.training.material.room", lambda device, room=room: room)
+        monkeypatch.setattr("ddco_pyro.training.checkpoint.room", lambda device, room=room: room)
         with Device():
             fits.append(weights(ddco_pyro.fit(spec, demos)))
         asked.append(len(read) - sum(asked))

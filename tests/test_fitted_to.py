@@ -18,8 +18,8 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import EpochEnded
-from ddco_pyro.fitting import fitted_to
-from ddco_pyro.fitting.fitted_to import difference, digest
+from ddco_pyro.fitting import digest as fitted_to
+from ddco_pyro.fitting.digest import difference, digest
 from ddco_pyro.fitting.merging import Pair, merge
 from ddco_pyro.spec import Spec, parse_spec, with_overrides
 

@@ -26,7 +26,7 @@ from random_demonstrations import demonstrations
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.tensors import read_tensors
-from ddco_pyro.fitting import fitted_to
+from ddco_pyro.fitting import digest as fitted_to
 
 
 def same_hdf5(one: Path, other: Path) -> None:

@@ -1,6 +1,6 @@
-"""Files that a run or a selection keeps, read back: what is damaged is one line with the file, the place, the remedy.
+"""The schema of ``metrics.json``, and reading JSON and CSV files of a run: one line names the file, place and remedy.
 
-Keys that are not named here are kept as they are.
+Log-likelihoods are in nats. A model has ``extra="allow"``: further keys of a file are kept.
 """
 
 from __future__ import annotations
@@ -11,22 +11,37 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.errors import command
-from ddco_pyro.evaluation.agreement_record import Agreement, as_today, each_level_of
-from ddco_pyro.evaluation.record_types import NOT_NULL, AtLeastOne, Finite, Record
 from ddco_pyro.spec.messages import invalid, lines
 
 T = TypeVar("T")
 
 
-def read_record(path: Path, kind: type[T], remedy: str) -> T:
-    """What a JSON file holds, which has to be of this kind.
+def _not_null(value: Any) -> Any:
+    if value is None:
+        raise invalid(("", "must not be null; where there is none the key is left out"))
+    return value
 
-    :param remedy: what to do where it is not.
-    :raises Damaged: it is not.
+
+NOT_NULL = AfterValidator(_not_null)
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+AtLeastOne = Annotated[int, Field(ge=1)]
+
+
+class Record(BaseModel):
+    """Part of a file."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+
+def read_record(path: Path, kind: type[T], remedy: str) -> T:
+    """Read a JSON file as an instance of a type.
+
+    :param remedy: what to do about a damaged file.
+    :raises Damaged: the file is not of this type.
     """
     try:
         return TypeAdapter(kind).validate_json(path.read_bytes(), strict=True)
@@ -37,11 +52,11 @@ def read_record(path: Path, kind: type[T], remedy: str) -> T:
 
 
 def read_table(path: Path, row: Callable[[dict[str, str]], T], remedy: str) -> list[T]:
-    """The rows of a CSV file.
+    """Read the rows of a CSV file.
 
-    :param row: what is made of a row; KeyError, TypeError and ValueError say that it is damaged.
-    :param remedy: what to do where it is.
-    :raises Damaged: it is.
+    :param row: converts a row; a KeyError, TypeError or ValueError means that the file is damaged.
+    :param remedy: what to do about a damaged file.
+    :raises Damaged: the file is damaged.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -51,9 +66,9 @@ def read_table(path: Path, row: Callable[[dict[str, str]], T], remedy: str) -> l
 
 
 def read_successes(folder: Path) -> dict[tuple[str, int], float]:
-    """Success (1) or not (0) by method and seed, from a run's ``rollouts.csv``; nothing where it says nothing of it.
+    """Success (1) or failure (0) of a run's rollouts by method and seed; empty without rollouts or without success.
 
-    :raises Damaged: it cannot be read.
+    :raises Damaged: ``rollouts.csv`` is damaged.
     """
     path = folder / "rollouts.csv"
     if not path.exists():
@@ -68,31 +83,33 @@ def _success(row: Mapping[str, str]) -> tuple[str, int, float | None]:
 
 
 def read_metrics(folder: Path, counts: Sequence[int]) -> dict[str, Any]:
-    """The contents of a run's ``metrics.json``.
+    """Read a run's ``metrics.json``, which has to agree with :class:`Metrics`.
 
     :param counts: the number of options of each level, lowest first.
-    :raises Damaged: it cannot be read, or lacks something that a reader needs.
+    :raises Damaged: the file is damaged, or is about other levels.
     """
     path, remedy = folder / "metrics.json", refit(folder)
     metrics = read_record(path, Metrics, remedy)
     levels = [[use.choice for use in level] for level in metrics.options]
-    each_level = [
-        values for values in (*each_level_of(metrics.agreement), metrics.divergences or None) if values is not None
-    ]
-    if levels != [list(range(1 + count)) for count in counts] or {len(values) for values in each_level} - {len(counts)}:
+    agreement = metrics.agreement
+    lists: list[Sequence[Any] | None] = [metrics.divergences or None]
+    if agreement is not None:
+        lists += [agreement.labels, agreement.train, agreement.valid, agreement.confusion]
+    wrong = {len(values) for values in lists if values is not None} - {len(counts)}
+    if levels != [list(range(1 + count)) for count in counts] or wrong:
         raise Damaged(path, f"is not about levels with {', '.join(map(str, counts)) or 'no'} options", remedy)
-    data: dict[str, Any] = json.loads(path.read_bytes(), parse_constant=lambda _: None)  # NaN of earlier versions
-    return data | ({"agreement": as_today(data["agreement"], len(counts))} if "agreement" in data else {})
+    data: dict[str, Any] = json.loads(path.read_bytes())
+    return data
 
 
 def option_labels(metrics: Mapping[str, Any]) -> dict[str, dict[int, int]]:
-    """The label that each option stands for, by level, of a run trained from labels."""
-    said = metrics.get("trained_labels")
-    return {said["level"]: dict(enumerate(said["values"], start=1))} if said else {}
+    """The label that each option stands for, by level; empty for a run that was not trained from labels."""
+    trained = metrics.get("trained_labels")
+    return {trained["level"]: dict(enumerate(trained["values"], start=1))} if trained else {}
 
 
 def refit(folder: Path, remove: str = "it") -> str:
-    """What to do about a damaged file of a run: what its checkpoint holds need not be trained again."""
+    """The remedy for a damaged file of a run; what the checkpoints hold is not trained again."""
     return f"remove {remove} and fit again: {command('fit', folder / 'spec.yaml', '--out', folder, '--resume')}"
 
 
@@ -139,7 +156,7 @@ class Spent(Record):
 
 
 class Stage(Record):
-    """How a stage of training ended (:class:`ddco_pyro.training.convergence.StageEnd`)."""
+    """How a stage of training ended (:class:`ddco_pyro.training.stages.StageEnd`)."""
 
     stage: str
     epochs: int
@@ -174,7 +191,8 @@ class Training(Record):
     spent: Spent
     stages: Annotated[list[Stage], Field(min_length=1)]
     converged: bool
-    restarts: Annotated[Restarts | None, NOT_NULL] = None
+    restarts: Restarts
+    device: str
 
 
 class Compared(Record):
@@ -182,7 +200,8 @@ class Compared(Record):
 
     log_likelihood_per_step: BothParts
     difference: Difference
-    training: Annotated[Training | None, NOT_NULL] = None
+    parameters: int
+    training: Training
 
 
 class InARow(Record):
@@ -261,7 +280,7 @@ class Use(Record):
     choice: int
     share: Finite
     selected: Finite
-    demonstrations: Finite = 0.0
+    demonstrations: Finite
     duration: Finite | None
 
 
@@ -370,14 +389,69 @@ class TrainedLabels(Record):
     agreement: Finite
 
 
+class Matched(Record):
+    """Measures under a matching of options with labels (:mod:`ddco_pyro.evaluation.agreement`)."""
+
+    accuracy: Finite
+    iou: Finite
+    f1_10: Finite
+    f1_25: Finite
+    f1_50: Finite
+    edit: Finite
+
+
+class Scores(Record):
+    """All measures of a level."""
+
+    nmi: Finite
+    ari: Finite
+    boundary_f1_1: Finite
+    boundary_f1_3: Finite
+    boundary_f1_5: Finite
+    matched_globally: Matched
+    matched_per_demonstration: Matched
+
+
+class Confusion(Record):
+    """Steps of each label in each option, and which label an option is matched with."""
+
+    labels: list[int]
+    options: list[int]
+    steps: list[list[Annotated[int, Field(ge=0)]]]
+    matched: list[int | None]
+
+    @model_validator(mode="after")
+    def _of_one_size(self) -> Confusion:
+        sizes = [len(self.labels), *(len(row) for row in self.steps), len(self.matched)]
+        if sizes != [len(self.steps), *[len(self.options)] * (len(self.steps) + 1)]:
+            raise invalid(("", "is no table of labels by options"))
+        return self
+
+
+class Agreement(Record):
+    """Agreement of each level's segments with the labels so named; None where no label is known."""
+
+    labels: list[str]
+    train: list[Scores | None]
+    valid: Annotated[list[Scores | None] | None, NOT_NULL] = None
+    confusion: list[Confusion]
+
+
+class Engines(Record):
+    """Largest relative differences between the engines before training (:mod:`ddco_pyro.inference.check`)."""
+
+    value: float
+    gradient: float
+
+
 class Metrics(Record):
-    """What ``metrics.json`` has to have for those who read it."""
+    """The contents of ``metrics.json``; what does not apply to a run is left out."""
 
     model: str
     log_likelihood_per_step: PerStep
-    log_likelihood_by_dimension: Annotated[ByDimension | None, NOT_NULL] = None
+    log_likelihood_by_dimension: ByDimension
     valid: list[HeldOut]
-    demonstrations_by_likelihood: list[Listed] = Field(default_factory=list)
+    demonstrations_by_likelihood: list[Listed]
     comparison: dict[str, Compared]
     worth: Annotated[Worth | None, NOT_NULL] = None
     seeds: Annotated[Seeds | None, NOT_NULL] = None
@@ -385,13 +459,13 @@ class Metrics(Record):
     divergences: list[list[Alike]] = Field(default_factory=list)
     agreement: Annotated[Agreement | None, NOT_NULL] = None
     trained_labels: Annotated[TrainedLabels | None, NOT_NULL] = None
-    engine_check: dict[str, float]
+    engine_check: Engines
     demonstrations: Counts
-    control_dimensions: list[ControlRange] = Field(default_factory=list)
-    measure: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
+    control_dimensions: list[ControlRange]
+    measure: dict[str, Annotated[list[Any], Field(min_length=1)]]
     branches: list[Branches] = Field(default_factory=list)
     parameters: int
-    training: Annotated[Training | None, NOT_NULL] = None
+    training: Training
     seconds: dict[str, float]
     versions: dict[str, str]
     rollouts: Annotated[Rollouts | None, NOT_NULL] = None

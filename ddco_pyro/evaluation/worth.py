@@ -7,12 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.evaluation.analysis import paired
 from ddco_pyro.simulation.episodes import paired_difference
 
 MIXTURE = "mixture"
 FLAT = ("flat", "flat_equal")
 """The policies without options that a hierarchy is measured against; the first that is there."""
+
+
+def paired(ours: np.ndarray, theirs: np.ndarray, lengths: np.ndarray) -> dict[str, float]:
+    """Difference in log-likelihood per step between two models on the same demonstrations, with its standard error."""
+    difference = ours - theirs
+    mean = float(difference.sum() / lengths.sum())
+    residual = difference - mean * lengths  # a ratio of sums: the error of its linearisation
+    n = len(difference)
+    error = float(np.sqrt(residual.var(ddof=1) * n) / lengths.sum()) if n > 1 else float("nan")
+    return {"nats_per_step": mean, "standard_error": error}
 
 
 def worth(ours: str, values: Mapping[str, np.ndarray], lengths: Sequence[int]) -> dict[str, Any]:

@@ -18,8 +18,8 @@ from ddco_pyro.errors import command
 from ddco_pyro.evaluation.schema import Unfinished, read_record
 from ddco_pyro.evaluation.worth import success_worth
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
-from ddco_pyro.fitting.fit import Fit, RunError
-from ddco_pyro.fitting.run import write_metrics
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.run import RunError, write_metrics
 from ddco_pyro.simulation.episodes import paired_difference, run_episode, run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task

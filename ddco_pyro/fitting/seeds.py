@@ -11,12 +11,13 @@ from typing import Any
 from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import OnEvent, SeedFitted, ignore
-from ddco_pyro.fitting.fit import Fit, is_finished, load
+from ddco_pyro.fitting.fit import Fit, load
+from ddco_pyro.fitting.fit import fit as fit_again
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.fitting.run import fit_run, write_metrics
+from ddco_pyro.fitting.run import is_finished, write_metrics
 from ddco_pyro.simulation.task import SUCCESS
 from ddco_pyro.spec import Spec, user_code, with_overrides
-from ddco_pyro.training.jobs import pool, results, useful_jobs
+from ddco_pyro.training.processes import pool, results, useful_jobs
 
 DEAD = "a process that repeated the fit was ended from outside (too little memory?); the same command goes on"
 
@@ -66,7 +67,7 @@ def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) ->
 
 def _again(spec: Spec, seed: int, folder: Path) -> None:
     """The fit with another training seed, in a folder of its own."""
-    fit_run(with_overrides(spec, {"training.seed": seed}), None, folder)
+    fit_again(with_overrides(spec, {"training.seed": seed}), None, folder)
 
 
 def roll_out_repetitions(first: Fit, on_event: OnEvent = ignore, jobs: int = -1) -> None:

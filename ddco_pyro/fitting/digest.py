@@ -1,4 +1,4 @@
-"""Which demonstrations a run is of: their digest, kept in the run folder as ``demonstrations.json``."""
+"""The digest of the demonstrations of a run, and the version of its folder's format: ``demonstrations.json``."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.pictures import Observed, Pictures, blocks
 from ddco_pyro.errors import BadInput
-from ddco_pyro.evaluation.record_types import Record
-from ddco_pyro.evaluation.schema import read_record
+from ddco_pyro.evaluation.schema import Record, read_record
 
 NAME = "demonstrations.json"
 
@@ -24,8 +23,22 @@ TRAINED = ("checkpoints", "model.safetensors", "folds.json")
 """What a run or a selection has as soon as something of it is trained."""
 
 
+FORMAT = 2
+"""The version of the run folder's format."""
+
+
 class OtherDemonstrations(BadInput):
-    """Demonstrations are not those that a run is of."""
+    """Demonstrations are not those of a run."""
+
+
+class OtherVersion(BadInput):
+    """A run folder has another format."""
+
+    def __init__(self, folder: Path, version: int) -> None:
+        super().__init__(
+            f"{folder}: this run was written by version {version} of the run folder's format, and version {FORMAT} is "
+            "read here: fit again"
+        )
 
 
 class Digest(Record):
@@ -36,6 +49,7 @@ class Digest(Record):
     """
 
     names: list[str]
+    format: int = 1
     controls: str
     observations: dict[str, str]
     labels: dict[str, str]
@@ -60,6 +74,7 @@ def digest(demos: Demonstrations, known: Digest | None = None) -> Digest:
     unchanged = {key for key in files if known and (known.names, known.files.get(key)) == ([*demos.names], files[key])}
     return Digest(
         names=[*demos.names],
+        format=FORMAT,
         controls=_sha256(demo.actions for demo in demos),
         observations={
             key: known.observations[key] if known and key in unchanged else _sha256(arrays)
@@ -92,19 +107,19 @@ def _file(arrays: Sequence[Observed]) -> list[int] | None:
 
 
 def recorded(folder: Path) -> Digest | None:
-    """The digest of the demonstrations that a run or a selection is of; None where nothing is kept yet.
+    """The digest of the demonstrations of a run or a selection; None where nothing is kept yet.
 
-    :raises Damaged: it cannot be read.
-    :raises OtherDemonstrations: the folder has none, since another version wrote it.
+    :raises Damaged: ``demonstrations.json`` is damaged.
+    :raises OtherVersion: the folder was written in another format.
     """
     path = folder / NAME
     if path.exists():
-        return read_record(path, Digest, "fit again into another --out")
+        kept = read_record(path, Digest, "fit again into another --out")
+        if kept.format != FORMAT:
+            raise OtherVersion(folder, kept.format)
+        return kept
     if any((folder / name).exists() for name in TRAINED):
-        raise OtherDemonstrations(
-            f"{folder}: was written by another version, without a digest of its demonstrations; fit again into another "
-            "--out"
-        )
+        raise OtherVersion(folder, 1)
     return None
 
 

@@ -1,23 +1,65 @@
-"""The processes that train a restart together, and how results pass between them (``torch.distributed``).
+"""Processes: jobs that work side by side (joblib), and ranks that train one restart together (``torch.distributed``).
 
-All of them come to the same exchanges in the same order. Who computes what decides nothing: results are passed on in
-the order of the calls that gave them.
+All ranks come to the same exchanges in the same order. Results are passed on in the order of the calls that gave them,
+whichever rank computed them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, TypeVar
 
+import joblib
+from joblib import Parallel, delayed
 from torch import distributed
 
-from ddco_pyro.errors import Failed
+from ddco_pyro.errors import BadInput, Failed
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+ALL_CORES = -1
+"""As a number of ``jobs``: one for each core."""
+
+
+class BackendError(BadInput):
+    """Work cannot be done where it was asked for."""
+
+
+def check_jobs(jobs: int) -> None:
+    """See that ``jobs`` is a number of processes.
+
+    :raises BackendError: it is not.
+    """
+    if jobs != ALL_CORES and jobs < 1:
+        raise BackendError(f"--jobs {jobs}: give a number of processes, or -1 for one on each core")
+
+
+def useful_jobs(jobs: int, calls: int) -> int:
+    """The number of processes for so many calls: no more than there are calls."""
+    return min(joblib.cpu_count() if jobs == ALL_CORES else jobs, calls)
+
+
+def pool(jobs: int) -> Parallel:
+    """Processes for :func:`results`, to be used in a ``with`` statement."""
+    # One call at a time: each takes long, and whatever is done shall be kept at once.
+    return Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1)
+
+
+def results(parallel: Parallel, calls: Iterable[Callable[[], Result]], dead: str) -> Iterator[Result]:
+    """What the calls return, in the order in which they are done.
+
+    :param dead: what to say where a process dies: what it did, and what to do.
+    :raises Failed: a process died.
+    """
+    try:
+        yield from parallel([delayed(call)() for call in calls])
+    except BrokenProcessPool as error:
+        raise Failed(dead) from error
 
 
 class LostProcess(Failed):
