@@ -1,4 +1,4 @@
-"""The numbers of a finished fit: likelihood, differences to the baselines, use of options, agreement with labels."""
+"""The evaluation of a fit: log-likelihoods, differences to baselines, use of options, agreement with labels."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ddco_pyro.training.labels import choices, used
 
 
 class NotFinite(Failed):
-    """A log-likelihood that is no number to report."""
+    """A log-likelihood is NaN or infinite."""
 
 
 class Fitted(Protocol):
@@ -55,11 +55,11 @@ class Fitted(Protocol):
 
 @dataclass(frozen=True)
 class _Part:
-    """What a model says of a part of the demonstrations.
+    """A model on a part of the demonstrations.
 
-    :param values: log p(ξ) of each, nats, [N].
-    :param each: that in parts.
-    :param segments: the most likely options [T] of each, for each level.
+    :param values: log p(ξ) of each demonstration, nats, [N].
+    :param each: the decomposition of the same.
+    :param segments: the most likely options [T] of each demonstration, for each level.
     """
 
     values: np.ndarray
@@ -92,9 +92,13 @@ def _finite(fit: Fitted, piece: Inferred) -> np.ndarray:
 
 
 def evaluate(fitted: Fitted, parts: dict[str, Demonstrations], demos: Demonstrations) -> dict[str, Any]:
-    """What ``metrics.json`` says of a model: log-likelihood in nats per step of each part of the data and of each
-    demonstration, its paired difference to every baseline, and with options their use, divergences and agreement with
-    labels.
+    """The evaluation of a model for ``metrics.json`` (:class:`ddco_pyro.evaluation.schema.Metrics`).
+
+    It has the log-likelihood in nats per step of each part of the data and of each demonstration, and the paired
+    difference to every baseline. A hierarchy also has the use, divergences and agreement with labels of its options.
+
+    :param parts: training (``train``) and held-out (``valid``) demonstrations.
+    :param demos: all demonstrations.
 
     :raises NotFinite: a log-likelihood is NaN or infinite.
     """
@@ -140,10 +144,9 @@ def evaluate(fitted: Fitted, parts: dict[str, Demonstrations], demos: Demonstrat
 def _worth(
     fit: Fitted, by_method: Mapping[str, dict[str, np.ndarray]], ours: _Part, valid: Demonstrations
 ) -> dict[str, Any]:
-    """What several experts and options that last are worth on held-out demonstrations; nothing without a mixture.
+    """The parts of the hierarchy's advantage on held-out demonstrations; empty without a mixture.
 
-    ``steps_in_a_row`` compares, level by level, how long options stay active with how long the mixture keeps to one
-    expert.
+    ``steps_in_a_row`` has the mean steps in a row of one option, and of one expert of the mixture, for each level.
     """
     found = worth(fit.name, {name: values["valid"] for name, values in by_method.items()}, valid.lengths)
     if not found:
@@ -154,7 +157,7 @@ def _worth(
 
 
 def _options(fit: Fitted, demos: Demonstrations) -> dict[str, Any]:
-    """How options are used, and how differently they act."""
+    """The use and the divergences of options."""
     sums: list[Posterior] = []
 
     def pieces() -> Iterator[tuple[Outputs, Posterior]]:
@@ -177,8 +180,9 @@ def _each(demos: Demonstrations, values: np.ndarray) -> list[dict[str, Any]]:
 def _worst_first(
     ours: str, parts: dict[str, Demonstrations], by_method: dict[str, dict[str, np.ndarray]]
 ) -> list[dict[str, Any]]:
-    """Every demonstration with its part of the data and its log-likelihood per step under each method, by method; the
-    least likely under the method ``ours`` first.
+    """Every demonstration with its part of the data and its log-likelihood per step under each method.
+
+    The least likely demonstration under the method ``ours`` comes first.
     """
     rows = [
         {
@@ -196,8 +200,9 @@ def _worst_first(
 
 
 def _by_dimension(fit: Fitted, each: Decomposition, demos: Demonstrations) -> dict[str, Any]:
-    """What each control dimension (None for constant ones, which are no part of the model) and choosing options add to
-    the log-likelihood per step.
+    """The contributions of each control dimension, and of the choice of options, to the log-likelihood per step.
+
+    Constant dimensions, which the model leaves out, have None.
     """
     scaling, steps = fit.hierarchy.scaling, sum(demos.lengths)
     values: list[float | None] = [None] * scaling.size
@@ -211,8 +216,9 @@ def _difference(ours: np.ndarray, theirs: np.ndarray, valid: Demonstrations) -> 
 
 
 def _agreement(names: tuple[str, ...], ours: dict[str, _Part], parts: dict[str, Demonstrations]) -> dict[str, Any]:
-    """All measures of each level's segments with its ground-truth labels, and in which options the steps of each label
-    lie, held out where there is such a part.
+    """All measures of each level's segments against its labels, and the confusion matrix of the held-out part.
+
+    Without a held-out part the confusion matrix is of the training part.
     """
     scores: dict[str, Any] = {"labels": list(names)}
     for name, part in parts.items():
@@ -226,7 +232,7 @@ def _agreement(names: tuple[str, ...], ours: dict[str, _Part], parts: dict[str, 
 
 
 def supervisor(demos: Demonstrations) -> dict[str, Any]:
-    """What the demonstrations' file says of how often their supervisor succeeded; nothing where it does not."""
+    """The supervisor's success rate from the file of demonstrations; empty where the file has none."""
     said = demos.attributes.get("supervisor")
     return {"supervisor": json.loads(str(said))} if said else {}
 

@@ -17,12 +17,12 @@ from ddco_pyro.model.outputs import CallerOutputs, Outputs
 
 @dataclass(frozen=True)
 class OptionUse:
-    """How one choice of a level (0 is control) is used over all steps of some demonstrations.
+    """The use of one choice of a level (0 is control) in demonstrations.
 
-    :param share: mean of u_t, the part of the time it is active.
-    :param selected: Σ v_t, how often it is selected.
-    :param demonstrations: in how many demonstrations it is selected: the sum over them of min(1, Σ v_t).
-    :param duration: expected steps from a selection to the next, Σ u_t / Σ v_t; None where it is never selected.
+    :param share: mean of u_t, the share of steps in which the choice is active.
+    :param selected: Σ v_t, the expected number of selections.
+    :param demonstrations: the expected number of demonstrations with a selection, Σ_n min(1, Σ_t v_t).
+    :param duration: expected steps from a selection to the next, Σ u_t / Σ v_t; None without a selection.
     """
 
     choice: int
@@ -33,7 +33,7 @@ class OptionUse:
 
 
 def option_use(posterior: Posterior) -> list[list[OptionUse]]:
-    """For each level, lowest first, the use of every choice."""
+    """The use of every choice of each level, lowest first."""
     uses = []
     for u, v in zip(posterior.u, posterior.v, strict=True):
         active, selected = u.sum((0, 1)).numpy(), v.sum(1).numpy()
@@ -43,25 +43,24 @@ def option_use(posterior: Posterior) -> list[list[OptionUse]]:
 
 
 def _use(choice: int, active: float, selected: np.ndarray, total: float) -> OptionUse:
-    """One choice that is ``active`` in so many of ``total`` steps, and ``selected`` so often in each demonstration."""
+    """The use of a choice that is ``active`` in so many of ``total`` steps; ``selected`` is by demonstration."""
     often = float(selected.sum())
     duration = active / often if often > 1e-6 else None
     return OptionUse(choice, active / total, often, float(selected.clip(max=1.0).sum()), duration)
 
 
 def as_rows(use: Sequence[Sequence[OptionUse]]) -> list[list[dict[str, float | int | None]]]:
-    """The same as plain data."""
+    """The uses as plain data."""
     return [[asdict(choice) for choice in level] for level in use]
 
 
 def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[dict[str, Any]]]:
-    """How differently each two ``options`` of each level (lowest first) act, as ``divergence`` in nats per step.
+    """The ``divergence`` of each pair of ``options`` of each level, lowest first, nats per step.
 
-    That is the mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i), averaged over steps with weights u_t(i) + u_t(j): over the
-    time that one of the two is active; None where neither ever is. Two options of divergence 0 are the same skill
-    under two numbers.
+    The divergence is the mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i), averaged over steps with weights u_t(i) + u_t(j);
+    None where neither option is ever active. Two options with divergence 0 are one skill under two numbers.
 
-    :param pieces: what the networks say of some demonstrations, and the posterior given those; gone through once.
+    :param pieces: outputs of the networks and posteriors of demonstrations.
     """
     levels: list[dict[tuple[int, int], Tensor]] = []
     for outputs, posterior in pieces:
@@ -97,17 +96,17 @@ UNUSED_SHARE = 0.01
 DOMINATING_SHARE = 0.9
 SHORTEST_DURATION = 1.5
 AGAIN_AND_AGAIN = 3.0
-"""Selections in each demonstration that has the option; an option may end after one step by design, such as a grasp."""
+"""Selections in each demonstration with the option; one selection of a single step may be meant, such as a grasp."""
 
 HIGH_FITTING_SHARE = 0.5
 SMALLEST_DIVERGENCE = 0.1
 """Nats per step; two Gaussian policies whose means are 0.45 σ apart."""
 
 Use = Sequence[Mapping[str, Any]]
-"""How each choice of one level is used, control (0) first: its rows in ``metrics["options"]``."""
+"""The uses of the choices of one level, control (0) first: rows of ``metrics["options"]``."""
 
 Alike = Sequence[Mapping[str, Any]]
-"""How differently each two ``options`` of one level act: ``divergence`` in nats per step."""
+"""The pairs of ``options`` of one level with their ``divergence``: rows of ``metrics["divergences"]``."""
 
 Kind = Literal["unused", "redundant", "dominating", "never_persisting", "high_fitting"]
 
@@ -125,14 +124,18 @@ ADVICE: Mapping[Kind, str] = {
     "high_fitting": "Train layer by layer (training.layerwise: true), give the calling policy less capacity, or let it "
     "emit options only (emits: [options]).",
 }
-"""What usually helps."""
+"""The usual remedies."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One sign of a degenerate solution: its ``kind``, the ``level`` (1 is the lowest) and ``choice`` it concerns, and
-    the ``value`` that gave it away: a share of the time, a duration in steps, or nats per step. A redundant option acts
-    like the ``other``; one that never persists has so many ``selections`` in each demonstration that has it.
+    """A sign of a degenerate solution.
+
+    :param level: the level, 1 is the lowest.
+    :param choice: the choice of the level.
+    :param value: a share of the time, a duration in steps, or nats per step.
+    :param other: the option that acts like a redundant one.
+    :param selections: of an option that never persists, in each demonstration with the option.
     """
 
     kind: Kind
@@ -144,18 +147,19 @@ class Finding:
 
     @property
     def advice(self) -> str:
-        """What usually helps."""
+        """The usual remedy."""
         return ADVICE[self.kind]
 
 
 def diagnose(options: Sequence[Use], divergences: Sequence[Alike] = ()) -> list[Finding]:
-    """The signs found in ``metrics["options"]`` and ``metrics["divergences"]``, levels lowest first.
+    """The signs of a degenerate solution in ``metrics["options"]`` and ``metrics["divergences"]``, lowest level first.
 
-    An option is unused below 1 % of the time, and dominating above 90 % where it is not the only one. It never persists
-    where it is expected to last less than 1.5 steps and is selected again and again, three times or more in each
-    demonstration that has it: it ends at once, and its caller does all the work. Two options that are both used are
-    redundant where they differ by less than 0.1 nats per step over the time that one of them is active. A caller is
-    high-fitting where it emits the control itself in more than half of the time that it acts.
+    - unused: an option that is active less than 1 % of the time;
+    - dominating: one of several options that is active more than 90 % of the time;
+    - never persisting: an option with an expected duration below 1.5 steps and at least three selections in each
+      demonstration with the option, so that its caller does all the work;
+    - redundant: two used options with a divergence below 0.1 nats per step;
+    - high-fitting: a caller that emits the control itself more than half of the time that it acts.
     """
     findings: list[Finding] = []
     for level, use in enumerate(options, start=1):
@@ -192,7 +196,7 @@ def _of_pairs(level: int, use: Use, alike: Alike) -> list[Finding]:
 
 
 def _of_caller(level: int, control: float, not_acting: float) -> list[Finding]:
-    """The caller of a level acts unless the level above has control already, ``not_acting`` of the time."""
+    """The caller of a level acts unless the level above emits the control, ``not_acting`` of the time."""
     acting = 1.0 - not_acting
     if acting < UNUSED_SHARE:
         return []

@@ -32,7 +32,7 @@ AtLeastOne = Annotated[int, Field(ge=1)]
 
 
 class Record(BaseModel):
-    """Part of a file."""
+    """A part of a file; further keys are kept."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -121,7 +121,7 @@ class PerStep(Record):
 
 
 class HeldOut(Record):
-    """A demonstration that was held out."""
+    """The log-likelihood of a held-out demonstration, nats."""
 
     name: str
     steps: AtLeastOne
@@ -129,34 +129,34 @@ class HeldOut(Record):
 
 
 class Difference(Record):
-    """Paired, in nats per step; a single demonstration has no error."""
+    """A paired difference in nats per step; a single demonstration has no standard error."""
 
     nats_per_step: Finite
     standard_error: float | None
 
 
 class BothParts(PerStep):
-    """Baselines are trained only where demonstrations are held out."""
+    """Log-likelihood of a baseline in nats per step; baselines need held-out demonstrations."""
 
     valid: Finite
 
 
 class Allowed(Record):
-    """What training may spend; None for no limit."""
+    """The budget of training; None for no limit."""
 
     epochs: int | None
     gradient_steps: int | None
 
 
 class Spent(Record):
-    """What training has spent."""
+    """The effort of training."""
 
     epochs: int
     gradient_steps: int
 
 
 class Stage(Record):
-    """How a stage of training ended (:class:`ddco_pyro.training.stages.StageEnd`)."""
+    """The end of a stage of training (:class:`ddco_pyro.training.stages.StageEnd`)."""
 
     stage: str
     epochs: int
@@ -167,9 +167,7 @@ class Stage(Record):
 
 
 class Restart(Record):
-    """What a restart took, after how many epochs of its last stage it was stopped early (None where it was not), and
-    whether it diverged.
-    """
+    """The epochs of a restart, and the epoch of its last stage at which it was stopped early, if it was."""
 
     epochs: int
     stopped: int | None
@@ -177,7 +175,7 @@ class Restart(Record):
 
 
 class Restarts(Record):
-    """Which restart was the best, and what all of them took."""
+    """All restarts of a model, and the number of the best."""
 
     best: int
     spent: Spent
@@ -185,7 +183,7 @@ class Restarts(Record):
 
 
 class Training(Record):
-    """What training spent of its budget, and whether it had converged then."""
+    """The effort of training out of its budget, and whether training converged."""
 
     budget: Allowed
     spent: Spent
@@ -196,7 +194,7 @@ class Training(Record):
 
 
 class Compared(Record):
-    """A baseline."""
+    """A baseline and the model's difference to it."""
 
     log_likelihood_per_step: BothParts
     difference: Difference
@@ -205,14 +203,14 @@ class Compared(Record):
 
 
 class InARow(Record):
-    """Mean steps for which a level of the hierarchy, and of the mixture, keeps to one choice."""
+    """Mean steps in a row of one choice, in a level of the hierarchy and of the mixture."""
 
     options: Finite
     mixture: Finite
 
 
 class Worth(Record):
-    """What the hierarchy is worth (:func:`ddco_pyro.evaluation.worth.worth`)."""
+    """The parts of the hierarchy's advantage (:func:`ddco_pyro.evaluation.worth.worth`)."""
 
     memory: Difference
     experts: Annotated[Difference | None, NOT_NULL] = None
@@ -222,7 +220,7 @@ class Worth(Record):
 
 
 class Seeds(Record):
-    """What a fit and its repetitions say, in the order of their training seeds."""
+    """Results of a fit and its repetitions, in the order of their training seeds."""
 
     training_seeds: Annotated[list[int], Field(min_length=2)]
     held_out: dict[str, list[Finite]]
@@ -230,14 +228,14 @@ class Seeds(Record):
 
 
 class Dimensions(Record):
-    """Log-likelihood per step that each control dimension adds, None for constant ones, and choosing options."""
+    """Contributions to the log-likelihood per step, by control dimension (None for constant ones) and of options."""
 
     by_dimension: list[Finite | None]
     options: Finite
 
 
 class ByDimension(Record):
-    """That of each part of the data."""
+    """The contributions in each part of the data."""
 
     train: Dimensions
     valid: Dimensions | None
@@ -253,7 +251,7 @@ class Listed(Record):
 
 
 class ControlRange(Record):
-    """What a control dimension does in the demonstrations."""
+    """Statistics of a control dimension in the demonstrations."""
 
     number: int
     minimum: Finite
@@ -266,7 +264,7 @@ class ControlRange(Record):
 
 
 class Branches(Record):
-    """Activation of each branch of a level's networks, and what is lost without its input, by option and branch."""
+    """Use of the branches of a level's networks, by option and branch (:mod:`ddco_pyro.evaluation.branch_use`)."""
 
     level: int
     branches: Annotated[list[str], Field(min_length=1)]
@@ -275,7 +273,7 @@ class Branches(Record):
 
 
 class Use(Record):
-    """How a choice of a level is used."""
+    """The use of a choice of a level (:class:`ddco_pyro.evaluation.options.OptionUse`)."""
 
     choice: int
     share: Finite
@@ -285,14 +283,14 @@ class Use(Record):
 
 
 class Alike(Record):
-    """How differently two options act."""
+    """The divergence of two options in nats per step."""
 
     options: tuple[int, int]
     divergence: Finite | None
 
 
 class Measure(Record):
-    """What episodes came to: a rate (``successes``) or a ``mean``."""
+    """A measure of episodes: a ``rate`` of ``successes``, or a ``mean``."""
 
     trials: int
     interval: tuple[Finite, Finite] | None
@@ -312,7 +310,7 @@ class Measure(Record):
 
 
 class Against(Record):
-    """Successes of two methods on the same initial states."""
+    """Successes of two methods from the same initial states (McNemar's test)."""
 
     only_ours: int
     only_theirs: int
@@ -328,7 +326,7 @@ class Method(Record):
 
 
 class SuccessWorth(Record):
-    """The parts of what the hierarchy is worth in success (:func:`ddco_pyro.fitting.worth.success_worth`)."""
+    """The parts of the hierarchy's advantage in success (:func:`ddco_pyro.evaluation.worth.success_worth`)."""
 
     memory: Against
     experts: Annotated[Against | None, NOT_NULL] = None
@@ -345,7 +343,7 @@ class SuccessOfSeeds(Record):
 
 
 class Rollouts(Record):
-    """Those of all methods, from the same initial states."""
+    """The rollouts of all methods, from the same initial states."""
 
     seed: int
     episodes: AtLeastOne
@@ -355,9 +353,7 @@ class Rollouts(Record):
 
 
 class Unfinished(Record):
-    """Rollouts that were interrupted: the outcome of each seed's episode, for every method that was done; null for a
-    measure that does not apply to an episode.
-    """
+    """An interrupted rollout: by finished method, the outcome of each seed's episode; null where a measure does not apply."""
 
     models: str
     seeds: list[int]
@@ -372,7 +368,7 @@ class Unfinished(Record):
 
 
 class Counts(Record):
-    """Demonstrations, and how often their supervisor succeeded."""
+    """Numbers of demonstrations, and the success rate of their supervisor."""
 
     train: AtLeastOne
     tune: int
@@ -381,7 +377,7 @@ class Counts(Record):
 
 
 class TrainedLabels(Record):
-    """The labels that the options 1, 2, ... of a level stand for, and how much of the labelled steps has them."""
+    """The labels that options 1, 2, ... of a level stand for, and the share of labelled steps that agree."""
 
     level: str
     labels: str
@@ -413,7 +409,7 @@ class Scores(Record):
 
 
 class Confusion(Record):
-    """Steps of each label in each option, and which label an option is matched with."""
+    """Steps of each label in each option, and the label that each option is matched with."""
 
     labels: list[int]
     options: list[int]

@@ -61,10 +61,10 @@ TOLERANCE = 1e-4
 class Fit:
     """A fitted model.
 
-    :param metrics: its numbers, the contents of ``metrics.json``.
-    :param folder: its run folder; None where it was not written.
-    :param given: the demonstrations that it was fitted to; None for those that the spec names.
-    :param beside: the baselines that were trained beside it, by name; None for those in its folder.
+    :param metrics: the contents of ``metrics.json``.
+    :param folder: the run folder; None where nothing was written.
+    :param given: the demonstrations of the fit; None for those that the spec names.
+    :param beside: the fitted baselines, by name; None for those in the run folder.
     """
 
     spec: Spec
@@ -79,9 +79,9 @@ class Fit:
 
     @property
     def run_folder(self) -> Path:
-        """The folder, for what is read from it or written into it.
+        """The run folder.
 
-        :raises RunError: there is none.
+        :raises RunError: the fit has none.
         """
         if self.folder is None:
             raise RunError("this fit has no run folder; fit with out=FOLDER, which this needs")
@@ -89,14 +89,14 @@ class Fit:
 
     @property
     def name(self) -> str:
-        """What the model is called in tables."""
+        """The name of the model in tables."""
         return model_name(self.spec)
 
     @cached_property
     def demonstrations(self) -> Demonstrations:
-        """The demonstrations that it was fitted to, training and held out; those of a run are read when asked for.
+        """The demonstrations of the fit, training and held out; those of a run are read when asked for.
 
-        :raises OtherDemonstrations: their file holds others by now.
+        :raises OtherDemonstrations: their file holds other demonstrations.
         """
         if self.given is not None:
             return self.given
@@ -107,30 +107,30 @@ class Fit:
 
     @cached_property
     def baselines(self) -> Mapping[str, Fit]:
-        """The baselines that were trained beside it, by name."""
+        """The fitted baselines, by name."""
         if self.beside is not None or self.folder is None:
             return self.beside or {}
         folders = [self.folder / "baselines" / name for name in named_baselines(self.spec)]
-        allow_code = bool(user_code(self.spec))  # theirs is named in this spec too
+        allow_code = bool(user_code(self.spec))  # the spec names theirs too
         return {folder.name: load(folder, allow_code) for folder in folders if is_finished(folder)}
 
     @cached_property
     def held_out(self) -> dict[str, float]:
-        """log p(ξ) of each demonstration that was held out, by name, as it was then."""
+        """log p(ξ) of each held-out demonstration by name, computed when it was fitted, nats."""
         return {row["name"]: row["log_likelihood"] for row in self.metrics["valid"]}
 
     def was_held_out(self, name: str, log_likelihood: float) -> bool:
-        """Whether a demonstration is one of those that were held out: the same name, and as likely as it was then."""
+        """Whether a demonstration is among the held-out ones: the name and the log-likelihood are equal."""
         return bool(np.isclose(self.held_out.get(name, np.nan), log_likelihood, rtol=TOLERANCE, atol=TOLERANCE))
 
     def infer(self, demos: Iterable[Demonstration]) -> Iterator[Inferred]:
-        """What the model says of demonstrations, in pieces that fit into memory, in their order.
+        """The model's outputs, posteriors and paths for demonstrations, in pieces that fit into memory, in order.
 
         >>> for piece in fit.infer(demos):
         ...     print(piece.log_likelihood.shape, piece.posterior.u[0].shape, piece.path.choices[0].shape)
         (6,) torch.Size([6, 10, 3]) torch.Size([6, 10])
 
-        :param demos: :class:`~ddco_pyro.Demonstrations`, or single ones that are read while this goes on.
+        :param demos: :class:`~ddco_pyro.Demonstrations`, or an iterable that reads one after the other.
         :raises DemonstrationsError: there are none, or a number is too large for networks.
         """
         return infer(self.hierarchy, demos)
@@ -170,12 +170,12 @@ class Fit:
         return Controller.from_spec(self.hierarchy, self.spec.rollout, seed)
 
     def monitor(self) -> Monitor:
-        """A live monitor of the active options, for somebody else's acting."""
+        """A live monitor of the active options while another policy, or a person, acts."""
         return Monitor(self.hierarchy)
 
 
 def _stacked(parts: Sequence[Tensor], padding: float) -> Tensor:
-    """Parts [N_i, T_i, ...] one below the other, padded to the longest."""
+    """Parts [N_i, T_i, ...] stacked along N, padded to the longest."""
     rows = [row for part in parts for row in part]
     return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=padding)
 
@@ -241,7 +241,7 @@ def fit(
         if demos is not None:
             refuse_unfit(spec, demos)
             used(spec, demos)
-    with ExitStack() as stack:  # whatever can be refused has been: now something is collected, written, and trained
+    with ExitStack() as stack:  # all checks are done: from here on files are written
         if folder is not None:
             stack.enter_context(claimed(folder, spec, resume))
         finished = folder is not None and is_finished(folder)

@@ -1,4 +1,4 @@
-"""The run folder: whose run it is, and the files of a fit in it."""
+"""The run folder: its spec, its lock, and the files that a fit writes into it."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def write_history(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 
 class Clock:
-    """Seconds by phase, of this process and of those that worked on the run before it was interrupted."""
+    """Seconds by phase, summed over the processes that worked on an interrupted run."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -141,10 +141,10 @@ class Clock:
                 self._keep()
 
     def go_on(self, folder: Path, on_event: OnEvent) -> OnEvent:
-        """Go on from what is kept in a run folder, and keep it there from the first epoch on, as checkpoints are.
+        """Add the seconds that an interrupted run kept in its folder, and keep them there from the first epoch on.
 
-        :returns: to be told in place of ``on_event``, which is told in turn.
-        :raises Damaged: what is kept cannot be read.
+        :returns: the callback to use in place of ``on_event``, which it calls.
+        :raises Damaged: ``seconds.json`` is damaged.
         """
         self._path = folder / "seconds.json"
         if self._path.exists():
@@ -162,7 +162,7 @@ class Clock:
         return told
 
     def end(self) -> dict[str, float]:
-        """All of them, which the folder has elsewhere from now on."""
+        """The seconds of all phases; ``seconds.json`` is removed, since ``metrics.json`` has them."""
         if self._path is not None:
             self._path.unlink(missing_ok=True)
         return self.seconds

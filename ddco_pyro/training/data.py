@@ -22,14 +22,12 @@ from ddco_pyro.training.networks import Dimensions
 
 
 def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
-    """The dimensions of what the spec names, without collecting anything.
+    """The dimensions of the demonstrations that a spec names, without collecting any.
 
-    They are those of its file, or else of its task; of the control then what is known of demonstrations that have been
-    collected already.
+    They are read from the headers of the spec's file, or else from its task. A task whose episodes have no fixed length
+    counts as having one step. The control of a task is described where demonstrations have been collected already.
 
-    A task that does not say how long its episodes are counts as having one step.
-
-    :param demos: the demonstrations, where they have been read; of a file no observation is read otherwise.
+    :param demos: the demonstrations, where they have been read.
     """
     if demos is None and in_file(spec):
         demos = outline(spec)
@@ -52,7 +50,7 @@ def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
 
 
 def parts(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
-    """The demonstrations to train with, ``train``, and those held out, ``valid``, left out where there are none."""
+    """The demonstrations to train with, ``train``, and the held-out ones, ``valid``, where there are any."""
     if spec.demonstrations.valid_fraction == 0 and not demos.masks.keys() & {"train", "valid"}:
         return {"train": demos}
     train, valid = demos.split(spec.demonstrations.valid_fraction, spec.seed)
@@ -60,9 +58,9 @@ def parts(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
 
 
 def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:
-    """See that networks take the observations, and that the spec's division leaves enough demonstrations for each part.
+    """Refuse pictures that networks cannot read, and a division that leaves too few demonstrations to train with.
 
-    :raises DemonstrationsError: they do not, or it does not.
+    :raises DemonstrationsError: one of both is the case.
     """
     for key in spec.observed:
         observed = demos[0].observations[key]
@@ -72,7 +70,7 @@ def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:
 
 
 def in_file(spec: Spec) -> bool:
-    """Whether the demonstrations are read from the file that the spec names; else they are a task's."""
+    """Whether the demonstrations are read from a file; otherwise they are collected in a task."""
     path = spec.demonstrations.path
     return spec.demonstrated_task is None or (path is not None and Path(path).exists())
 
@@ -83,10 +81,10 @@ def known_demonstrations(spec: Spec) -> Demonstrations | None:
 
 
 def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
-    """The spec's demonstrations: read from its file, collected from its task's supervisor where there is none.
+    """The spec's demonstrations, read from its file or collected from its task's supervisor.
 
-    :raises DemonstrationsError: the file is missing or wrong, lacks an observation or label that the spec names, or a
-        fit to it would take more memory than is allowed.
+    :raises DemonstrationsError: the file is missing or damaged, lacks an observation or label that the spec names, or
+        a fit to it takes more memory than is allowed.
     """
     own = spec.demonstrations
     if in_file(spec):
@@ -99,10 +97,9 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
 
 
 def outline(spec: Spec) -> Demonstrations:
-    """The demonstrations in the spec's file with their controls and labels, but with zeros for observations, of which
-    headers alone are read.
+    """The demonstrations in the spec's file, with zeros in place of observations, of which the headers alone are read.
 
-    :raises DemonstrationsError: as :func:`demonstrations`, but for the values of observations.
+    :raises DemonstrationsError: as :func:`demonstrations`, except for values of observations.
     """
     path = Path(str(spec.demonstrations.path))
     _refuse_what_cannot_be_read(spec, path)
@@ -123,9 +120,9 @@ def _outlined(recording: Recording, demo: Demonstration) -> Demonstration:
 
 
 def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
-    """What the spec names of demonstrations in memory: its observations and labels, without those that it excludes.
+    """Demonstrations in memory, reduced to the observations and labels that a spec names, without the excluded ones.
 
-    :raises DemonstrationsError: they lack one of them.
+    :raises DemonstrationsError: an observation, a label or an excluded demonstration is missing.
     """
     keys, labels, exclude = spec.trained_with, _labels(spec), set(spec.demonstrations.exclude)
     first = demos[0]
@@ -152,13 +149,13 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
 
 
 def _labels(spec: Spec) -> tuple[str, ...]:
-    """Names of the labels to compare with and to train from."""
+    """Names of the labels to compare segments with, and to train from."""
     trained = spec.training.labels
     return tuple(dict.fromkeys((*spec.demonstrations.label_names, *([trained.source] if trained else []))))
 
 
 def _needed(spec: Spec) -> str:
-    """What to do about a file that is not there."""
+    """The remedy for a missing file."""
     read = ["actions", *(f"obs/{key}" for key in spec.trained_with), *(f"labels/{name}" for name in _labels(spec))]
     return (
         "put it there, or fit to another with --set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, "

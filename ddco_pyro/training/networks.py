@@ -1,4 +1,4 @@
-"""The networks that a spec asks for, and those of its baselines, for observations and a control of known dimensions."""
+"""The networks of a spec and of its baselines, for observations and a control of known dimensions."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from ddco_pyro.training.devices import device_of
 
 @dataclass(frozen=True)
 class Dimensions:
-    """Shapes of the observations by name, control dimensions A, and the longest demonstration where it is known.
+    """Shapes of the observations by name, control dimensions A, and steps of the longest demonstration.
 
-    :param constant: the control dimensions that are constant in all demonstrations, and their values: they are no part
-        of the model.
-    :param control: what each control dimension does in the demonstrations; empty where that is not known.
-    :param parts: how a fitted model has the control; None where that is still to be decided.
+    :param constant: control dimensions that are constant in all demonstrations, with their values; the model leaves
+        them out.
+    :param control: statistics of each control dimension in the demonstrations; empty where they are unknown.
+    :param parts: the parts of the control in a fitted model; None before they are decided.
     """
 
     shapes: Shapes
@@ -155,7 +155,7 @@ def check_models(spec: Spec, dimensions: Dimensions) -> dict[str, tuple[Spec, Hi
 
 
 def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
-    """The baselines trained beside, by name, numbered from the second model of one name on: the spec's own counts."""
+    """The spec's baselines (``compare_with``) by name, numbered from the second model of one name on."""
     names: dict[str, BaselineSpec] = {}
     own = spec.baseline.name if spec.baseline else None
     for baseline in spec.compare_with:
@@ -165,8 +165,9 @@ def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
 
 
 def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) -> Spec:
-    """The spec of a baseline trained beside: another model, and the optimiser and σ that the baseline names; nothing
-    else differs. A mixture keeps labels and durations; policies without options have neither.
+    """The spec of a baseline: another model, with the optimiser and σ that the baseline names.
+
+    Nothing else differs. A mixture keeps labels and durations; policies without options have neither.
 
     :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
     """
@@ -195,8 +196,9 @@ def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) ->
 
 
 def nearest_widths(hidden: Sequence[int], target: int, parameters: Callable[[tuple[int, ...]], int]) -> tuple[int, ...]:
-    """Hidden layers, all of them scaled by one factor, whose number of ``parameters`` is nearest to ``target``; the
-    narrower ones where two are equally near.
+    """Sizes of hidden layers, scaled by one factor, whose number of ``parameters`` is nearest to ``target``.
+
+    Of two equally near ones the narrower is taken.
     """
     widest = max(hidden)
 

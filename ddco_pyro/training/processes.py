@@ -23,37 +23,37 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 ALL_CORES = -1
-"""As a number of ``jobs``: one for each core."""
+"""The number of ``jobs`` that stands for one for each core."""
 
 
 class BackendError(BadInput):
-    """Work cannot be done where it was asked for."""
+    """Work cannot be done by these processes or on this backend."""
 
 
 def check_jobs(jobs: int) -> None:
-    """See that ``jobs`` is a number of processes.
+    """Refuse what is no number of processes.
 
-    :raises BackendError: it is not.
+    :raises BackendError: ``jobs`` is none.
     """
     if jobs != ALL_CORES and jobs < 1:
         raise BackendError(f"--jobs {jobs}: give a number of processes, or -1 for one on each core")
 
 
 def useful_jobs(jobs: int, calls: int) -> int:
-    """The number of processes for so many calls: no more than there are calls."""
+    """The number of processes for so many calls, at most one for each call."""
     return min(joblib.cpu_count() if jobs == ALL_CORES else jobs, calls)
 
 
 def pool(jobs: int) -> Parallel:
     """Processes for :func:`results`, to be used in a ``with`` statement."""
-    # One call at a time: each takes long, and whatever is done shall be kept at once.
+    # one call at a time: each takes long, and each result is kept at once
     return Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1)
 
 
 def results(parallel: Parallel, calls: Iterable[Callable[[], Result]], dead: str) -> Iterator[Result]:
-    """What the calls return, in the order in which they are done.
+    """The results of calls, as they are completed.
 
-    :param dead: what to say where a process dies: what it did, and what to do.
+    :param dead: the message for a process that dies.
     :raises Failed: a process died.
     """
     try:
@@ -75,17 +75,17 @@ class LostProcess(Failed):
 
 @dataclass(frozen=True)
 class Ranks:
-    """The processes that train together.
+    """The processes that train a restart together.
 
-    :param rank: the number of this one; 0 is the first, which alone writes and tells how it goes on.
-    :param size: how many there are.
+    :param rank: the number of this one; process 0 alone writes files and reports progress.
+    :param size: the number of processes.
     """
 
     rank: int = 0
     size: int = 1
 
     def share(self, value: Any = None) -> Any:
-        """What the first process gives, in each of them.
+        """The value that the first process gives, in each process.
 
         :raises LostProcess: another process has ended.
         """
@@ -97,13 +97,13 @@ class Ranks:
         return values[0]
 
     def own(self, items: Sequence[Item]) -> Sequence[Item]:
-        """Those of which this process has the work where :meth:`each` is called for all of them."""
+        """The items that this process computes where :meth:`each` is called for all of them."""
         return items[self.rank :: self.size]
 
     def each(self, calls: Iterable[Callable[[], Result]]) -> Iterator[Result]:
-        """What the calls return, in their order, in each of the processes: they take turns in computing it.
+        """The results of calls in order, in each process; the processes take turns in computing them.
 
-        What a call raises is raised in all of them.
+        An error of a call is raised in each process.
 
         :raises LostProcess: another process has ended.
         """
@@ -118,7 +118,7 @@ class Ranks:
                 yield result
 
     def _gathered(self, call: Callable[[], Any] | None) -> list[Any]:
-        """What the call of each process returned or raised; None where there was nothing left to call."""
+        """The result or error of each process's call; None without a call."""
         result: Any = None
         try:
             result = None if call is None else call()
@@ -131,12 +131,12 @@ class Ranks:
 
 
 ALONE = Ranks()
-"""A process that trains by itself."""
+"""A single process."""
 
 
 @contextmanager
 def connected() -> Iterator[None]:
-    """Inside, a connection that is closed is a process that is lost; other errors are this process's own.
+    """Inside, a closed connection raises :class:`LostProcess`; other errors are this process's own.
 
     :raises LostProcess: a connection is closed.
     """
@@ -145,6 +145,6 @@ def connected() -> Iterator[None]:
     except distributed.DistError as error:  # of a store
         raise LostProcess from error
     except RuntimeError as error:
-        if "/gloo/" not in str(error):  # gloo's own begin with the place in its sources
+        if "/gloo/" not in str(error):  # gloo's errors begin with the place in its sources
             raise
         raise LostProcess from error

@@ -16,18 +16,18 @@ RISING = 0.01
 """Nats per step. A stage whose tuning value rose by more than this over its last epochs has not converged."""
 
 WINDOW = 20
-"""How many epochs the last ones are where ``training.patience`` is null."""
+"""The number of last epochs where ``training.patience`` is null."""
 
 
 @dataclass(frozen=True)
 class Stage:
     """One stage of training.
 
-    :param discovering: train levels 1 to d under a uniform meta-policy; None for the whole hierarchy.
+    :param discovering: d trains levels 1 to d under a uniform meta-policy; None trains the whole hierarchy.
     :param clamped: the level whose choices are clamped to clusters or parts of the demonstrations; None for no level.
     :param trained: prefixes of the names of the parameters that are trained.
-    :param selecting: the meta-policy is trained on the same choices, and the levels still have a uniform one.
-    :param from_constants: networks take over what :class:`ddco_pyro.training.upper.Constants` say.
+    :param selecting: train the meta-policy on the clamped choices, beside the levels under a uniform one.
+    :param from_constants: train the networks to :class:`ddco_pyro.training.upper.Constants`.
     """
 
     name: str
@@ -68,8 +68,9 @@ def plan(spec: Spec, depth: int) -> list[Stage]:
 
 
 def _meta_policy_begins(spec: Spec) -> bool:
-    """Whether the meta-policy is trained on the choices that the highest level is clamped to: where no stage trains it
-    before all are trained together, and it does not act itself, of which clusters and parts say nothing.
+    """Whether the meta-policy is trained on the clamped choices of the highest level.
+
+    That is so where no earlier stage trains it, and it does not emit the control itself, which clusters do not show.
     """
     assert spec.hierarchy is not None  # only levels are clamped
     return not spec.training.layerwise and "control" not in spec.hierarchy.meta_policy.emits
@@ -79,9 +80,10 @@ def _meta_policy_begins(spec: Spec) -> bool:
 class StageEnd:
     """How a stage of training ended.
 
-    :param epochs: passes over the training demonstrations that it made, of at most ``cap``; None for no limit.
-    :param rising: nats per step by which the best tuning value rose over the last ``over`` of them
-        (``training.patience``, or all where it made fewer): 0 where patience stopped it.
+    :param epochs: passes over the training demonstrations.
+    :param cap: the epochs that the stage might take; None for no limit.
+    :param rising: nats per step by which the best tuning value rose over the last ``over`` epochs
+        (``training.patience``, or all epochs where there are fewer): 0 where patience ended the stage.
     """
 
     stage: str
@@ -92,19 +94,19 @@ class StageEnd:
 
     @property
     def converged(self) -> bool:
-        """Whether it made epochs, and more of them promised little."""
+        """Whether the stage had epochs, and rose by at most :data:`RISING` over the last of them."""
         return self.epochs > 0 and self.rising <= RISING
 
     @classmethod
     def of(cls, stage: str, cap: int | None, tune: Sequence[float], patience: int | None) -> StageEnd:
-        """From the tuning values: that from before the stage, and those of its epochs."""
+        """The end of a stage with these tuning values: before the stage, and of each epoch."""
         epochs = len(tune) - 1
         over = min(patience or WINDOW, epochs)
         return cls(stage, epochs, cap, max(tune) - max(tune[: epochs - over + 1]), over)
 
 
 def share(budget: int | None, spent: int, stages_left: int) -> int | None:
-    """A stage's cap: what is left of the budget, divided by the stages that are left; None without a budget."""
+    """A stage's cap: the rest of the budget, divided by the stages that are left; None without a budget."""
     return None if budget is None else (budget - spent) // stages_left
 
 
@@ -117,7 +119,7 @@ def summary(
     stopped: Mapping[int, int],
     diverged: Collection[int] = (),
 ) -> dict[str, Any]:
-    """What ``metrics.json`` says of the training of the best restart, and of what all restarts took.
+    """``training`` of ``metrics.json``: the budget, the best restart's stages, and the epochs of all restarts.
 
     :param updates: gradient steps in an epoch.
     :param best: the restart that the stages are of.
@@ -147,7 +149,7 @@ def _effort(epochs: int | None, updates: int) -> dict[str, int | None]:
 
 
 def effort(training: Mapping[str, Any] | None) -> str:
-    """The gradient steps of a :func:`summary` and whether they were enough, for tables; runs of before have none."""
+    """The gradient steps of a :func:`summary` for tables, marked where training had not converged."""
     if training is None:
         return "–"
     return f"{training['spent']['gradient_steps']}{'' if training['converged'] else ', not converged'}"
