@@ -353,7 +353,7 @@ class Rollouts(Record):
 
 
 class Unfinished(Record):
-    """An interrupted rollout: by finished method, the outcome of each seed's episode; null where a measure does not apply."""
+    """An interrupted rollout: the outcomes of finished methods by seed; null where a measure does not apply."""
 
     models: str
     seeds: list[int]
