@@ -169,7 +169,7 @@ def select(
         progress.end()
         assert made.choice.chosen is not None  # or it would have failed
         final = selection.final_spec(made.choice.chosen.candidate)
-        fitted = ddco_pyro.fit(final, None, folder / "fit", progress, jobs)
+        fitted = ddco_pyro.fit(final, made.demos, folder / "fit", progress, jobs, keep=False)
     console.selection(made.choice, HEAD, [cells(row, made.choice) for row in made.choice.rows])
     _warn(fitted)
     print(f"selection: {folder / 'selection.json'}")

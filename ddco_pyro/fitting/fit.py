@@ -188,6 +188,7 @@ def fit(
     jobs: int = 1,
     processes: int = 1,
     resume: bool = True,
+    keep: bool = True,
 ) -> Fit:
     """Fit a spec's hierarchy and its baselines to demonstrations, and evaluate them.
 
@@ -214,6 +215,7 @@ def fit(
     :param processes: processes that share the work of each gradient step instead, at most ``training.shards``; the
         result is the same for any number.
     :param resume: whether ``out`` may hold the finished run.
+    :param keep: whether ``out`` has a copy of demonstrations from memory; False where the spec's file has them.
     :raises BackendError: so many processes cannot share the work.
     :raises SpecError: something in the spec does not fit the demonstrations.
     :raises DemonstrationsError: the demonstrations cannot be used.
@@ -230,7 +232,7 @@ def fit(
         if isinstance(demonstrations, Demonstrations):
             ordered = demonstrations.select(sorted(demonstrations.names, key=natural))  # as they are read back
             given = replace(ordered, masks=demonstrations.masks)
-            if folder is not None:
+            if keep and folder is not None:
                 spec = with_overrides(spec, {"demonstrations.path": str(folder / "demonstrations.hdf5")})
             demos: Demonstrations | None = seen(spec, given)
         else:
@@ -251,7 +253,7 @@ def fit(
             if folder is not None and demos is not None:
                 record(folder, demos)
         if folder is not None:
-            if given is not None and not (kept := folder / "demonstrations.hdf5").exists():
+            if keep and given is not None and not (kept := folder / "demonstrations.hdf5").exists():
                 given.write(kept)
             if finished:
                 return replace(load(folder, allow_code=True), given=demos)  # the caller has this very spec
