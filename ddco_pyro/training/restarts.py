@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
 from ddco_pyro.training.processes import ALONE, Ranks, pool, results, useful_jobs
-from ddco_pyro.training.stages import StageEnd, plan, summary
+from ddco_pyro.training.stages import StageEnd, plan
 
 SLICE = 10.0
 """Seconds that a job trains a restart before it returns, so that progress is shown and a checkpoint written."""
@@ -197,13 +197,26 @@ class Trainer:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """How the best restart was trained, and what all of them took, for ``metrics.json``."""
-        ends = [StageEnd(**end) for end in self.restarts[self.best].progress.ended]
-        updates = math.ceil(len(self.data.train) / self.spec.training.batch_size)
-        spent = [len(restart.progress.history) for restart in self.restarts]
-        diverged = [restart.progress.restart for restart in self.restarts if restart.progress.diverged is not None]
-        made = summary(self.spec.training, ends, updates, self.best, spent, self.stopped, diverged)
-        return made | {"device": self.restarts[self.best].progress.device}
+        """``training`` of ``metrics.json``: the budget, the best restart's stages, and the epochs of all restarts."""
+        best, updates = self.best, math.ceil(len(self.data.train) / self.spec.training.batch_size)
+        ends = [StageEnd(**end) for end in self.restarts[best].progress.ended]
+        each = [
+            {"epochs": len(restart.progress.history), "stopped": self.stopped.get(number)}
+            | ({} if restart.progress.diverged is None else {"diverged": True})
+            for number, restart in enumerate(self.restarts)
+        ]
+
+        def effort(epochs: int | None) -> dict[str, int | None]:
+            return {"epochs": epochs, "gradient_steps": None if epochs is None else epochs * updates}
+
+        return {
+            "budget": effort(self.spec.training.epochs),
+            "spent": effort(sum(end.epochs for end in ends)),
+            "stages": [asdict(end) | {"converged": end.converged} for end in ends],
+            "converged": ends[-1].converged,  # the last stage trains what acts in the end
+            "restarts": {"best": best, "spent": effort(len(self.history)), "each": each},
+            "device": self.restarts[best].progress.device,
+        }
 
     @property
     def _whole(self) -> list[Restart]:

@@ -6,11 +6,11 @@ whatever their number of stages.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from ddco_pyro.spec import Spec, TrainingSpec
+from ddco_pyro.spec import Spec
 
 RISING = 0.01
 """Nats per step. A stage whose tuning value rose by more than this over its last epochs has not converged."""
@@ -110,46 +110,8 @@ def share(budget: int | None, spent: int, stages_left: int) -> int | None:
     return None if budget is None else (budget - spent) // stages_left
 
 
-def summary(
-    training: TrainingSpec,
-    ends: Sequence[StageEnd],
-    updates: int,
-    best: int,
-    epochs: Sequence[int],
-    stopped: Mapping[int, int],
-    diverged: Collection[int] = (),
-) -> dict[str, Any]:
-    """``training`` of ``metrics.json``: the budget, the best restart's stages, and the epochs of all restarts.
-
-    :param updates: gradient steps in an epoch.
-    :param best: the restart that the stages are of.
-    :param epochs: of each restart, in all its stages.
-    :param stopped: restarts that were stopped early, to their epochs of the last stage.
-    :param diverged: restarts that ended because a log-likelihood became NaN or infinite.
-    """
-    spent = sum(end.epochs for end in ends)
-    return {
-        "budget": _effort(training.epochs, updates),
-        "spent": _effort(spent, updates),
-        "stages": [asdict(end) | {"converged": end.converged} for end in ends],
-        "converged": ends[-1].converged,  # the last stage trains what acts in the end
-        "restarts": {
-            "best": best,
-            "spent": _effort(sum(epochs), updates),
-            "each": [
-                {"epochs": count, "stopped": stopped.get(number)} | ({"diverged": True} if number in diverged else {})
-                for number, count in enumerate(epochs)
-            ],
-        },
-    }
-
-
-def _effort(epochs: int | None, updates: int) -> dict[str, int | None]:
-    return {"epochs": epochs, "gradient_steps": None if epochs is None else epochs * updates}
-
-
 def effort(training: Mapping[str, Any] | None) -> str:
-    """The gradient steps of a :func:`summary` for tables, marked where training had not converged."""
+    """The gradient steps of training for tables, marked where training had not converged."""
     if training is None:
         return "–"
     return f"{training['spent']['gradient_steps']}{'' if training['converged'] else ', not converged'}"
