@@ -204,7 +204,7 @@ def epoch(demos: Demonstrations, workers: int = 0) -> float:
 
 def networks_alone(demos: Demonstrations) -> Callable[[], float]:
     """Forward and backward of the same networks with a sum as loss, Adam, and forward alone where an epoch tunes."""
-    material = trainer(demos).material
+    material = trainer(demos).data
     model = material.hierarchy(0).train()
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-3)
     networks = list(model.networks().values())

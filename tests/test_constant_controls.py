@@ -22,8 +22,7 @@ from ddco_pyro.comparison import compare
 from ddco_pyro.comparison.shared import NotShared
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.exporting import TOLERANCE, export, runner
-from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.fit import Fit, fit
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.spec import Spec, parse_spec, with_overrides
 

@@ -114,7 +114,7 @@ def test_what_policies_of_options_do_not_read_does_not_begin_them(read, found):
             "training": {"initialize": "vq", "tune_fraction": 0.3},
         }
     )
-    material = make_trainer(spec, Demonstrations(demos), None).material
+    material = make_trainer(spec, Demonstrations(demos), None).data
     objective = Objective(material, Progress(0), plan(spec, 1)[0])
     known = [int(name.removeprefix("demo_")) for name in material.names]
     truths = np.concatenate([np.split(truth[found], cuts)[number] for number in known])

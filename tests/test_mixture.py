@@ -19,7 +19,6 @@ import ddco_pyro
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.drawing import words
 from ddco_pyro.evaluation.worth import mean_run, worth
-from ddco_pyro.fitting.fit import model_name
 from ddco_pyro.inference import log_likelihood, posterior
 from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.batch import encode
@@ -29,8 +28,15 @@ from ddco_pyro.segmenting import LevelLabels
 from ddco_pyro.selection.grid import candidates
 from ddco_pyro.spec import DurationSpec, SpecError, dump_spec, load_spec, parse_spec, with_overrides
 from ddco_pyro.spec.reading import read_yaml
-from ddco_pyro.training.duration import log_duration_prior
-from ddco_pyro.training.networks import Dimensions, baseline_spec, build_hierarchy, named_baselines, parameters
+from ddco_pyro.training.networks import (
+    Dimensions,
+    baseline_spec,
+    build_hierarchy,
+    model_name,
+    named_baselines,
+    parameters,
+)
+from ddco_pyro.training.objective import log_duration_prior
 from ddco_pyro.training.upper import Constants, fitted
 
 SPECS = Path(__file__).parent.parent / "specs"

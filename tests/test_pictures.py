@@ -24,7 +24,7 @@ from ddco_pyro.data.pictures import Pictures, Transform, shifted
 from ddco_pyro.data.reading import Job, Readers, read
 from ddco_pyro.errors import Failed
 from ddco_pyro.exporting import runner, write_numpy
-from ddco_pyro.fitting.fitted_to import digest
+from ddco_pyro.fitting.digest import digest
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec, SpecError, parse_spec, with_overrides

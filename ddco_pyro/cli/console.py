@@ -31,7 +31,7 @@ from ddco_pyro.events import (
     TrainingEnded,
     UpdatesDone,
 )
-from ddco_pyro.training.convergence import effort
+from ddco_pyro.training.stages import effort
 
 if TYPE_CHECKING:
     from ddco_pyro.fitting.merging import Pair
@@ -179,7 +179,7 @@ def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Se
 
 def _baseline(spec: Spec) -> str:
     """A baseline's name and, of a policy without options, the sizes of its hidden layers."""
-    from ddco_pyro.fitting.fit import model_name
+    from ddco_pyro.training.networks import model_name
 
     if spec.baseline is None:
         return model_name(spec)

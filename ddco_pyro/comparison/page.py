@@ -14,10 +14,10 @@ from ddco_pyro.drawing import words
 from ddco_pyro.drawing.pictures import Picture
 from ddco_pyro.drawing.templates import render
 from ddco_pyro.evaluation.worth import worth
-from ddco_pyro.fitting.fit import HIERARCHY
 from ddco_pyro.report.demonstration_list import SHOWN
 from ddco_pyro.segmenting.timeline import anchor
-from ddco_pyro.training.convergence import effort
+from ddco_pyro.training.networks import HIERARCHY
+from ddco_pyro.training.stages import effort
 
 HEAD = ("rank", "run", "model", "parameters", "total", "se", "diff", "dse", "nats/step", "gradient steps")
 AGREEMENT_HEAD = ("run", "level", "labels", "NMI", "MoF", "boundary F1 ±1", "±3", "±5")

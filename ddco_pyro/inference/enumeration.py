@@ -39,7 +39,7 @@ def log_likelihood(
     trace.compute_log_prob()
     trace.pack_tensors()
     factors = [site["packed"]["log_prob"] for site in trace.nodes.values() if "log_prob" in site.get("packed", {})]
-    enumerated = set("".join(factor._pyro_dims for factor in factors)) - {*trace.plate_to_symbol.values()}
+    enumerated = set("".join(factor._pyro_dims for factor in factors)) - {*trace.plate_to_symbol.values()}  # type: ignore[attr-defined]
     (parts,) = contract_tensor_tree(OrderedDict([(frozenset(), factors)]), enumerated).values()
     total: Tensor = sum(parts)
     return total.expand(len(lengths))

@@ -14,7 +14,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.errors import Failed
 from ddco_pyro.events import CandidateGivenUp, FoldScored, OnEvent, SelectionBegan, ignore
-from ddco_pyro.fitting.fitted_to import record
+from ddco_pyro.fitting.digest import record
 from ddco_pyro.fitting.run import claimed
 from ddco_pyro.selection import choice as choosing
 from ddco_pyro.selection import folds as dividing

@@ -12,8 +12,8 @@ from joblib import Parallel, parallel_config
 from ddco_pyro.selection.folds import Folds
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.selection.scoring import Score, score
-from ddco_pyro.training.jobs import ALL_CORES, BackendError, check_jobs, results
-from ddco_pyro.training.jobs import pool as processes
+from ddco_pyro.training.processes import ALL_CORES, BackendError, check_jobs, results
+from ddco_pyro.training.processes import pool as processes
 
 Pending = Sequence[tuple[Candidate, int]]
 

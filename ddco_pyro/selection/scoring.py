@@ -11,10 +11,10 @@ from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.evaluation.schema import read_record
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import train
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.selection.folds import Folds
 from ddco_pyro.selection.grid import Candidate
+from ddco_pyro.training.restarts import train_model
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def score(folds: Folds, candidate: Candidate, fold: int) -> Score:
     empty = Score(candidate.number, fold, held_out.names, held_out.lengths)
     try:
         with one_thread():
-            trained = train(candidate.spec, folds.dimensions, training, held_out=held_out)
+            trained = train_model(candidate.spec, folds.dimensions, training, held_out=held_out)
             values = tuple(Fit(candidate.spec, trained.hierarchy).log_likelihood(held_out).tolist())
     except (BadInput, Failed) as error:
         result = replace(empty, failed=str(error))
@@ -67,8 +67,8 @@ def score(folds: Folds, candidate: Candidate, fold: int) -> Score:
         bad = [name for name, value in zip(held_out.names, values, strict=True) if not math.isfinite(value)]
         reason = f"the held-out log-likelihood of {', '.join(bad)} is not finite"
         ended = {
-            "gradient_steps": trained.training["spent"]["gradient_steps"],
-            "converged": trained.training["converged"],
+            "gradient_steps": trained.summary["spent"]["gradient_steps"],
+            "converged": trained.summary["converged"],
         }
         result = replace(empty, failed=reason) if bad else replace(empty, log_likelihood=values, **ended)
     return replace(result, seconds=time.perf_counter() - start)

@@ -1,4 +1,4 @@
-"""Which demonstrations a run is of: their digest, kept in the run folder as ``demonstrations.json``."""
+"""The digest of the demonstrations of a run, and the version of its folder's format: ``demonstrations.json``."""
 
 from __future__ import annotations
 
@@ -15,27 +15,41 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.pictures import Observed, Pictures, blocks
 from ddco_pyro.errors import BadInput
-from ddco_pyro.evaluation.record_types import Record
-from ddco_pyro.evaluation.schema import read_record
+from ddco_pyro.evaluation.schema import Record, read_record
 
 NAME = "demonstrations.json"
 
 TRAINED = ("checkpoints", "model.safetensors", "folds.json")
-"""What a run or a selection has as soon as something of it is trained."""
+"""Files that a run or a selection has as soon as training begins."""
+
+
+FORMAT = 2
+"""The version of the run folder's format."""
 
 
 class OtherDemonstrations(BadInput):
-    """Demonstrations are not those that a run is of."""
+    """Demonstrations are not those of a run."""
+
+
+class OtherVersion(BadInput):
+    """A run folder has another format."""
+
+    def __init__(self, folder: Path, version: int) -> None:
+        super().__init__(
+            f"{folder}: this run was written by version {version} of the run folder's format, and version {FORMAT} is "
+            "read here: fit again"
+        )
 
 
 class Digest(Record):
-    """What decides a fit to demonstrations: their ``names`` in order, SHA-256 of the ``controls``, of each of the
-    ``observations`` and of the ``labels`` that are used, and the ``masks`` that divide them.
+    """The digest of demonstrations: ``names`` in order, SHA-256 of controls, observations and labels, and ``masks``.
 
-    :param files: size, time of the last change (ns) and inode of the file that has the pictures of an observation.
+    :param format: the version of the run folder's format.
+    :param files: size, time of the last change (ns) and inode of the file with the pictures of an observation.
     """
 
     names: list[str]
+    format: int = 1
     controls: str
     observations: dict[str, str]
     labels: dict[str, str]
@@ -43,7 +57,7 @@ class Digest(Record):
     files: dict[str, list[int]]
 
     def places(self) -> dict[str, Any]:
-        """All but the names, by place in a file."""
+        """The digests by place in a file of demonstrations."""
         kinds: dict[str, Mapping[str, Any]] = {"obs": self.observations, "labels": self.labels, "mask": self.masks}
         each = {f"{kind}/{key}": value for kind, values in kinds.items() for key, value in values.items()}
         return {"actions": self.controls} | each
@@ -52,7 +66,7 @@ class Digest(Record):
 def digest(demos: Demonstrations, known: Digest | None = None) -> Digest:
     """The digest of demonstrations.
 
-    :param known: one from earlier: pictures whose file has not changed since are not read again.
+    :param known: an earlier digest; pictures in a file that has not changed since are not read again.
     :raises DemonstrationsError: a file of pictures cannot be read.
     """
     seen = {key: [demo.observations[key] for demo in demos] for key in sorted(demos[0].observations)}
@@ -60,6 +74,7 @@ def digest(demos: Demonstrations, known: Digest | None = None) -> Digest:
     unchanged = {key for key in files if known and (known.names, known.files.get(key)) == ([*demos.names], files[key])}
     return Digest(
         names=[*demos.names],
+        format=FORMAT,
         controls=_sha256(demo.actions for demo in demos),
         observations={
             key: known.observations[key] if known and key in unchanged else _sha256(arrays)
@@ -72,7 +87,7 @@ def digest(demos: Demonstrations, known: Digest | None = None) -> Digest:
 
 
 def _sha256(arrays: Iterable[Observed]) -> str:
-    """Of arrays one after the other; pictures of files are read block by block."""
+    """SHA-256 of arrays one after the other; pictures in files are read block by block."""
     sha256 = hashlib.sha256()
     for array in arrays:
         sha256.update(json.dumps([array.dtype.str, *array.shape]).encode())
@@ -82,7 +97,7 @@ def _sha256(arrays: Iterable[Observed]) -> str:
 
 
 def _file(arrays: Sequence[Observed]) -> list[int] | None:
-    """The state of the file that has all of these pictures; None where there is no such file."""
+    """Size, time and inode of the file with all of these pictures; None without such a file."""
     paths = {array.path if isinstance(array, Pictures) else None for array in arrays}
     path = paths.pop()
     if paths or path is None:
@@ -92,28 +107,28 @@ def _file(arrays: Sequence[Observed]) -> list[int] | None:
 
 
 def recorded(folder: Path) -> Digest | None:
-    """The digest of the demonstrations that a run or a selection is of; None where nothing is kept yet.
+    """The digest of the demonstrations of a run or a selection; None where nothing is kept yet.
 
-    :raises Damaged: it cannot be read.
-    :raises OtherDemonstrations: the folder has none, since another version wrote it.
+    :raises Damaged: ``demonstrations.json`` is damaged.
+    :raises OtherVersion: the folder was written in another format.
     """
     path = folder / NAME
     if path.exists():
-        return read_record(path, Digest, "fit again into another --out")
+        kept = read_record(path, Digest, "fit again into another --out")
+        if kept.format != FORMAT:
+            raise OtherVersion(folder, kept.format)
+        return kept
     if any((folder / name).exists() for name in TRAINED):
-        raise OtherDemonstrations(
-            f"{folder}: was written by another version, without a digest of its demonstrations; fit again into another "
-            "--out"
-        )
+        raise OtherVersion(folder, 1)
     return None
 
 
 def record(folder: Path, demos: Demonstrations, known: Digest | None = None) -> None:
-    """Make a folder in which nothing has been trained a run of these demonstrations, or see that it is one.
+    """Write the digest of demonstrations into a new run folder, or compare it with the folder's.
 
-    :param known: as of :func:`digest`, where the folder keeps none.
-    :raises OtherDemonstrations: it is a run of others.
-    :raises Damaged: the digest that is kept cannot be read.
+    :param known: an earlier digest, as in :func:`digest`.
+    :raises OtherDemonstrations: the folder is a run of other demonstrations.
+    :raises Damaged: ``demonstrations.json`` is damaged.
     """
     kept = recorded(folder)
     if kept is None:
@@ -123,10 +138,10 @@ def record(folder: Path, demos: Demonstrations, known: Digest | None = None) -> 
 
 
 def refuse_others(folder: Path, demos: Demonstrations) -> None:
-    """See that a finished run is of these demonstrations.
+    """Refuse demonstrations other than those of a finished run.
 
-    :raises OtherDemonstrations: it is a run of others.
-    :raises Damaged: the digest that is kept cannot be read.
+    :raises OtherDemonstrations: the folder is a run of other demonstrations.
+    :raises Damaged: ``demonstrations.json`` is damaged.
     """
     kept = recorded(folder)
     assert kept is not None  # or it would not be finished
@@ -142,7 +157,7 @@ def _compare(folder: Path, kept: Digest, demos: Demonstrations) -> None:
 
 
 def difference(kept: Digest, now: Digest) -> str:
-    """In what demonstrations differ from those that were kept, in words; nothing where they are the same."""
+    """What differs between two digests, in words; empty where they are equal."""
     missing = [name for name in kept.names if name not in now.names]
     new = [name for name in now.names if name not in kept.names]
     if missing or new:

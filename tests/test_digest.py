@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,8 +19,8 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import EpochEnded
-from ddco_pyro.fitting import fitted_to
-from ddco_pyro.fitting.fitted_to import difference, digest
+from ddco_pyro.fitting import digest as fitted_to
+from ddco_pyro.fitting.digest import difference, digest
 from ddco_pyro.fitting.merging import Pair, merge
 from ddco_pyro.spec import Spec, parse_spec, with_overrides
 
@@ -212,16 +213,19 @@ def test_a_selection_of_a_file_that_has_changed_is_not_continued(tmp_path: Path)
     assert contents(tmp_path) == before
 
 
-def test_a_folder_without_a_digest_is_of_another_version(finished: Path, tmp_path: Path) -> None:
-    said = "was written by another version, without a digest of its demonstrations; fit again into another --out"
+@pytest.mark.parametrize("written", [None, 1, 3])
+def test_a_run_of_another_version_is_to_be_fitted_again(finished: Path, tmp_path: Path, written: int | None) -> None:
+    said = f"this run was written by version {written or 1} of the run folder's format, and version 2 is read here"
     for name in ("run", "interrupted"):
         run = shutil.copytree(finished / name, tmp_path / name)
+        digest = json.loads((run / "demonstrations.json").read_text()) | {"format": written}
         (run / "demonstrations.json").unlink()
+        if written is not None:
+            (run / "demonstrations.json").write_text(json.dumps(digest))
         commands = [("fit", run / "spec.yaml", "--out", run, "--resume"), ("report", run)]
         for command in commands if name == "run" else commands[:1]:
             ended = call(*command)
-            assert (ended.status, ended.err) == (2, f"ddco-pyro: {run}: {said}\n")
-    assert len(ddco_pyro.load(tmp_path / "run").log_likelihood(labelled())) == 12  # which needs none
+            assert (ended.status, ended.err) == (2, f"ddco-pyro: {run}: {said}: fit again\n")
 
 
 def test_a_damaged_digest_is_one_line(finished: Path, tmp_path: Path) -> None:
