@@ -31,7 +31,7 @@ from ddco_pyro.model.tables import always_ends
 from ddco_pyro.segmenting import LevelLabels
 from ddco_pyro.selection.grid import candidates
 from ddco_pyro.spec import DurationSpec, SpecError, dump_spec, load_spec, parse_spec, with_overrides
-from ddco_pyro.spec.reading import read_yaml
+from ddco_pyro.spec.yaml import read_yaml
 
 SPECS = Path(__file__).parent.parent / "specs"
 

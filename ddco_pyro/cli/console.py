@@ -183,7 +183,7 @@ def _baseline(spec: Spec) -> str:
 
     if spec.baseline is None:
         return model_name(spec)
-    hidden = list(spec.baseline.policy.hidden)
+    hidden = list(spec.baseline.policy.hidden_sizes)
     return f"{spec.baseline.kind}, {f'hidden: {hidden}' if hidden else spec.baseline.policy.network}"
 
 

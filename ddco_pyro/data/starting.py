@@ -17,7 +17,7 @@ from ddco_pyro.data.inspection import Field, Inspection, inspect
 from ddco_pyro.data.starting_pictures import seen, sight
 from ddco_pyro.errors import command
 from ddco_pyro.spec import parse_spec
-from ddco_pyro.spec.reading import read_yaml
+from ddco_pyro.spec.yaml import read_yaml
 
 MANY = 100
 """Of so many demonstrations a tenth is held out, of fewer a fifth."""

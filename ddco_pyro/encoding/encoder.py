@@ -18,7 +18,7 @@ from ddco_pyro.encoding.fitted import Reader
 from ddco_pyro.encoding.kinds import Kind, again
 from ddco_pyro.encoding.projection import Projection
 from ddco_pyro.errors import BadInput
-from ddco_pyro.spec.types import Count, Items, Model, Seed
+from ddco_pyro.spec.base import Count, Items, Model, Seed
 
 ABOUT, TENSORS = "encoder.json", "encoder.safetensors"
 AGAIN = "write it again with ddco-pyro encode"

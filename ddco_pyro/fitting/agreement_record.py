@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import Field, model_validator
 
 from ddco_pyro.fitting.record_types import NOT_NULL, Finite, Record
-from ddco_pyro.spec.messages import invalid
+from ddco_pyro.spec.base import invalid
 
 
 class Matched(Record):

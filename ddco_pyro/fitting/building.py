@@ -194,6 +194,7 @@ def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) ->
         policy = baseline.policy.model_copy(update={"hidden": hidden})
         return alone(policy=policy.model_dump(exclude_unset=True))
 
-    build_hierarchy(resized(baseline.policy.hidden), dimensions)  # what is wrong with it is said here
+    sizes = baseline.policy.hidden_sizes
+    build_hierarchy(resized(sizes), dimensions)  # what is wrong with it is said here
     target = parameters(build_hierarchy(spec, dimensions))
-    return resized(nearest_widths(baseline.policy.hidden, target, lambda hidden: _counted(resized(hidden), dimensions)))
+    return resized(nearest_widths(sizes, target, lambda hidden: _counted(resized(hidden), dimensions)))

@@ -18,7 +18,7 @@ from ddco_pyro.fitting.checkpoint import copy_of
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.spec import Spec, with_overrides
-from ddco_pyro.spec.messages import nearest
+from ddco_pyro.spec.base import nearest
 
 LABELS = "merged"
 """Name of the labels that say which option each step begins with, and of what their file says of the merge."""

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from ddco_pyro.spec.messages import invalid
+from ddco_pyro.spec.base import invalid
 
 
 def _not_null(value: Any) -> Any:

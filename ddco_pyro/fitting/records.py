@@ -17,7 +17,7 @@ from ddco_pyro.data.files import Damaged
 from ddco_pyro.errors import command
 from ddco_pyro.fitting.agreement_record import Agreement, as_today, each_level_of
 from ddco_pyro.fitting.record_types import NOT_NULL, AtLeastOne, Finite, Record
-from ddco_pyro.spec.messages import invalid, lines
+from ddco_pyro.spec.base import invalid, lines
 
 T = TypeVar("T")
 

@@ -26,6 +26,7 @@ from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.seeding import HOST
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
+from ddco_pyro.spec.networks import Network, PerTimestepSpec
 
 BYTES_AT_ONCE = 256 * 10**6
 """Most bytes that networks take for the steps that go through them together, one step at least; less where less memory
@@ -117,7 +118,7 @@ class Level(nn.Module):
         with named(f"{place}.policy"):
             self.policy = Caller(spec.policy, spec.policy.emits, options_below, seen, control, scaling, spec.count)
         self.termination: nn.Module | None = None
-        if isinstance(spec.termination, NetworkSpec):
+        if isinstance(spec.termination, Network):
             with named(f"{place}.termination"):
                 self.termination = build(spec.termination, seen, 1, spec.count)
 
@@ -312,8 +313,8 @@ def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
     assert spec.baseline is not None  # a spec has one or the other
     policy = spec.baseline.policy
     if spec.baseline.kind == "per_timestep":
-        kept = {key: getattr(policy, key) for key in ("inputs", "shared", "hidden", "dropout", "activation")}
-        policy = NetworkSpec(network="per_timestep", **kept)
+        kept = {"hidden": ()} | policy.model_dump(exclude={"network"})  # a linear policy has no hidden layers
+        policy = PerTimestepSpec(network="per_timestep", **kept)
     return policy, ("control",)
 
 

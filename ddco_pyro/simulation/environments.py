@@ -21,7 +21,7 @@ from dm_env import specs
 from gymnasium import spaces
 
 from ddco_pyro.simulation.task import find_task
-from ddco_pyro.spec.types import TASKS
+from ddco_pyro.spec.base import TASKS
 
 NAMESPACE = "ddco"
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.simulation.cameras import Camera, Encoded, Watched
-from ddco_pyro.spec.types import TASKS
+from ddco_pyro.spec.base import TASKS
 
 SUCCESS = "success"
 """The measure by which methods are compared."""

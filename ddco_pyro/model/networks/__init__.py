@@ -23,6 +23,7 @@ from ddco_pyro.model.networks.shared import Shared
 from ddco_pyro.model.networks.state import Trunk
 from ddco_pyro.model.networks.trial import try_network
 from ddco_pyro.spec import NetworkSpec, SpecError
+from ddco_pyro.spec.networks import UserNetworkSpec
 
 __all__ = ["CLASSES", "InputShape", "Inputs", "ShapeError", "begin_at_zero", "build", "build_trunk", "named"]
 
@@ -77,7 +78,7 @@ def build_trunk(spec: NetworkSpec, shape: InputShape | Trunk, copies: int) -> Tr
     if spec.shared:
         alone = build_trunk(spec.model_copy(update={"shared": False}), shape, 1)
         return Trunk(Shared(alone.network, copies), alone.features, copies)
-    if spec.network not in CLASSES:
+    if isinstance(spec, UserNetworkSpec):
         return Trunk(build(spec, shape, spec.features, copies), spec.features, copies)
     network = _read(spec, shape, None, copies)
     return Trunk(network, network.features, copies)  # type: ignore[arg-type]
@@ -108,6 +109,7 @@ def _built(spec: NetworkSpec, shape: InputShape, outputs: int | None, copies: in
             settings["of"] = {name: _branch(name, branch, shape, copies) for name, branch in settings["of"].items()}
         return CLASSES[spec.network](shape, outputs, copies, **settings)
     assert outputs is not None  # a user's network always has some
+    assert isinstance(spec, UserNetworkSpec)
     network_class = _imported(spec.network)
     options = checked_options(network_class, spec.settings)
     try:

@@ -13,7 +13,7 @@ from torch import nn
 
 from ddco_pyro.errors import nearest
 from ddco_pyro.spec import SpecError
-from ddco_pyro.spec.messages import in_words, show
+from ddco_pyro.spec.base import in_words, show
 
 POSITIONAL = 3
 """Shape, outputs and copies come first in the constructor of every network; what follows are its options."""
