@@ -13,8 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 from rich.table import Table
 from rich.text import Text
 
-from ddco_pyro.data.control_dimensions import notes
-from ddco_pyro.data.control_parts import described
+from ddco_pyro.data.controls import described, notes
 from ddco_pyro.drawing import words
 from ddco_pyro.events import (
     CandidateGivenUp,

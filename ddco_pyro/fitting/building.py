@@ -10,8 +10,14 @@ from typing import Any
 import torch
 from torch import nn
 
-from ddco_pyro.data.control_dimensions import ControlDimension, all_constant, control_dimensions
-from ddco_pyro.data.control_parts import ControlPart, control_parts, refuse_unknown_dimensions
+from ddco_pyro.data.controls import (
+    ControlDimension,
+    ControlPart,
+    all_constant,
+    control_dimensions,
+    control_parts,
+    refuse_unknown_dimensions,
+)
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.fitting.devices import device_of
 from ddco_pyro.fitting.widths import nearest_widths

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor
-from ddco_pyro.data.control_parts import ControlPart
+from ddco_pyro.data.controls import ControlPart
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.data.tensors import read_tensors

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ddco_pyro.data.reading import Readers
+from ddco_pyro.data.pictures import Readers
 from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.checkpoint import State
 from ddco_pyro.fitting.devices import device_of, room

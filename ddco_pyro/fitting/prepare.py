@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from ddco_pyro.data.checks import check, check_trained, problem_of_pictures
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, extent
-from ddco_pyro.data.memory import Work, refuse_too_much
+from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.sources.recording import Recording
 from ddco_pyro.data.sources.robomimic import open_robomimic
 from ddco_pyro.errors import nearest
 from ddco_pyro.events import OnEvent, ignore
-from ddco_pyro.fitting.building import Dimensions, baselines, build_hierarchy
-from ddco_pyro.fitting.clusters import most_rows
-from ddco_pyro.model.encoding import STEPS_AT_ONCE
-from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks.conv import POOLED
+from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.simulation.collect import cache_path, collect
 from ddco_pyro.simulation.task import find_task
-from ddco_pyro.spec import Spec, SpecError
+from ddco_pyro.spec import Spec
 
 
 def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
@@ -176,36 +170,6 @@ def _refuse_what_cannot_be_read(spec: Spec, path: Path) -> None:
     """There is a file, and a fit to it takes no more memory than is allowed."""
     if not path.exists():
         raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
-    remedy = (
-        "leave observations out, make its demonstrations fewer, shorter or equally long, scale pictures down, or lower "
-        "filters or hidden"
-    )
+    remedy = "leave observations out, or make its demonstrations fewer, shorter or equally long"
     what = f"{path}: a fit to {', '.join(spec.trained_with)}"
-    refuse_too_much(memory_needed(spec, path), what, remedy)
-
-
-def memory_needed(spec: Spec, path: Path) -> float:
-    """Bytes that a fit of the spec and its baselines to a file of demonstrations takes, about, by the file's headers.
-
-    :raises DemonstrationsError: the file cannot be read or does not hold what the spec names.
-    """
-    stored = extent(path, spec.trained_with, spec.demonstrations.exclude)
-    shapes = {place.removeprefix("obs/"): shape for place, shape in stored.shapes.items() if place != "actions"}
-    size = Dimensions(shapes, math.prod(stored.shapes["actions"]), max(1, *stored.lengths))
-    try:
-        with torch.random.fork_rng(devices=[]):
-            models = (spec, build_hierarchy(spec, size)), *baselines(spec, size)
-            works = [_work(*model, size, sum(stored.lengths)) for model in models]
-    except SpecError:  # it is said where networks are checked
-        works = [Work(spec.training.batch_size, STEPS_AT_ONCE, STEPS_AT_ONCE, 0, 0)]
-    return stored.fit(works, spec.seen)
-
-
-def _work(spec: Spec, hierarchy: Hierarchy, dimensions: Dimensions, steps: int) -> Work:
-    """What training a model on so many steps takes."""
-    features = len(hierarchy.encoder.mean) + sum(shape[-1] * POOLED**2 for shape in hierarchy.encoder.images.values())
-    kind = spec.training.initialize if hierarchy.depth else "random"
-    numbers = {"random": 0, "equal_parts": 0, "vq": features, "vq_controls": features + dimensions.control_size}[kind]
-    clustered = min(steps, most_rows(numbers)) * numbers
-    chunk = hierarchy.steps_in_memory
-    return Work(spec.training.batch_size, hierarchy.steps_at_once, chunk, hierarchy.step_bytes, clustered)
+    refuse_too_much(extent(path, spec.trained_with, spec.demonstrations.exclude).fitting, what, remedy)

@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from ddco_pyro.data.control_parts import measure
+from ddco_pyro.data.controls import measure
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import json_text, leftovers, only_one, write_text
 from ddco_pyro.data.hdf5 import natural

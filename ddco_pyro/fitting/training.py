@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ddco_pyro.data.reading import Readers
+from ddco_pyro.data.pictures import Readers
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
 from ddco_pyro.fitting.ascent import Ascent, learning_rate
 from ddco_pyro.fitting.checkpoint import Restart, copy_of

@@ -9,10 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ddco_pyro.data.checks import rounding
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
-from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, Transform, TransformError
-from ddco_pyro.data.reading import Readers
-from ddco_pyro.data.values import rounding
+from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, Readers, Transform, TransformError
 from ddco_pyro.model.controls import ControlScaling, refuse_impossible
 from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError
@@ -112,7 +111,7 @@ class ObservationEncoder(nn.Module):
     Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model.
     Pictures are cut and scaled as the spec says when they are read, whether from a file or from memory.
 
-    A dimension that never changes, or by rounding alone (:func:`~ddco_pyro.data.values.rounding`), is only centred, and
+    A dimension that never changes, or by rounding alone (:func:`~ddco_pyro.data.checks.rounding`), is only centred, and
     so are the differences of one that does so within each demonstration: rounding is no feature, and what moves later
     on moves in its own units, not in multiples of a rounding.
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from ddco_pyro.data.control_parts import ControlPart, all_gaussian
+from ddco_pyro.data.controls import ControlPart, all_gaussian
 from ddco_pyro.data.memory import share
 from ddco_pyro.model.controls import ControlScaling, ControlStd
 from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch, ObservationEncoder, Shapes

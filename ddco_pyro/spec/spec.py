@@ -71,11 +71,6 @@ class Spec(Model):
         versions = (observation.augment.versions for observation in self.observations if observation.augment)
         return list(dict.fromkeys([*self.observed, *filter(None, versions)]))
 
-    @property
-    def seen(self) -> dict[str, int]:
-        """By place in a file, such as ``obs/pose``: network inputs for each number of the observation."""
-        return {f"obs/{observation.key}": observation.seen for observation in self.observations}
-
     @model_validator(mode="after")
     def _mixture_alone(self) -> Spec:
         """A mixture in place of a hierarchy becomes that hierarchy."""
