@@ -11,7 +11,7 @@ from babyai_labels import SUBGOALS
 from needle_success import over_seeds, spread
 
 from ddco_pyro.drawing.pictures import blank, keep, style
-from ddco_pyro.fitting.agreement import MATCHED, UNMATCHED
+from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 
 METHODS = ("flat", "flat_equal", "one", "two")
 PLAYED = ("random", *METHODS, "bot")

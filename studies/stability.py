@@ -29,13 +29,13 @@ from sklearn.metrics import normalized_mutual_info_score
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing.pictures import FAINT, INK, blank, keep, style
-from ddco_pyro.fitting.analysis import divergences, option_use
-from ddco_pyro.fitting.building import Dimensions
-from ddco_pyro.fitting.diagnostics import DOMINATING_SHARE, HIGH_FITTING_SHARE, SMALLEST_DIVERGENCE
+from ddco_pyro.evaluation.analysis import divergences, option_use
+from ddco_pyro.evaluation.diagnostics import DOMINATING_SHARE, HIGH_FITTING_SHARE, SMALLEST_DIVERGENCE
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.prepare import demonstrations, parts
 from ddco_pyro.fitting.run import train
 from ddco_pyro.spec import Spec, load_spec
+from ddco_pyro.training.data import demonstrations, parts
+from ddco_pyro.training.networks import Dimensions
 
 OUT = Path("docs/results")
 RUNS = Path("runs/stability")

@@ -99,7 +99,7 @@ def test_successes(capsys):
         "ddco": {"measures": {"success": rate, "error": mean}},
         "flat": {"measures": {"success": rate, "error": nothing}},
     }
-    console.successes({"episodes": 4, "methods": methods})
+    console.successes({"episodes": 4, "methods": methods}, "ddco")
     printed = capsys.readouterr().out
     assert "4 episodes each" in printed
     ddco, flat = printed.splitlines()[-2:]

@@ -186,7 +186,7 @@ def test_demonstrations_are_taken_as_they_are_needed(in_memory: ddco_pyro.Fit, m
 
 def test_evaluation_does_not_depend_on_the_pieces(in_memory: ddco_pyro.Fit, monkeypatch) -> None:
     from ddco_pyro.fitting.metrics import evaluate
-    from ddco_pyro.fitting.prepare import parts
+    from ddco_pyro.training.data import parts
 
     demos = two_skills()
     monkeypatch.setattr("ddco_pyro.model.hierarchy.STEPS_AT_ONCE", 1)
@@ -304,7 +304,7 @@ def test_the_examples_of_the_public_face(tmp_path: Path, monkeypatch: pytest.Mon
     demos.write("mine.hdf5")
     names = {"ddco_pyro": ddco_pyro, "demos": demos, "fit": ddco_pyro.fit("mine.yaml", demos, out="runs/mine")}
     shown = []
-    for module in ("fitting.run", "fitting.fit", "data.demonstrations", "spec.reading"):
+    for module in ("fitting.run", "fitting.fit", "data.demonstrations", "spec.yaml"):
         found = importlib.import_module(f"ddco_pyro.{module}")
         for example in doctest.DocTestFinder().find(found, extraglobs=names):
             shown += [example.name.rpartition(".")[2]] if example.examples else []

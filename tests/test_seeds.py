@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import toy_task
 import yaml
 from command_line import call
 from random_demonstrations import demonstrations
@@ -92,6 +94,8 @@ def test_the_intervals_are_those_of_scipy():
         ([0.3, 0.4, 0.35], "So options that last are worth it on these demonstrations."),
         ([0.3, 0.4, -0.35], "So it is inconclusive whether options that last are worth anything here."),
         ([-0.3, -0.4, -0.35], "So options that last explain these demonstrations worse than the same experts"),
+        ([0.001, 0.0011, 0.0012], "So options that last make no difference here: less than 0.01 nats per step."),
+        ([0.009, 0.0095, 0.0115], "So options that last are worth it on these demonstrations."),
     ],
 )
 def test_the_verdict_is_over_training_seeds(memory, said):
@@ -110,6 +114,51 @@ def test_a_run_without_a_mixture_has_no_parts():
     found = over_seeds([0, 1], [metrics, metrics])
     assert found == {"training_seeds": [0, 1], "held_out": {"ddco": [0.5, 0.5]}, "worth": {}}
     assert words.over_seeds(found, "DDCO") == "Over 2 training seeds, with the same demonstrations held out."
+
+
+def test_rollouts_have_the_same_two_parts_and_the_same_seeds(tmp_path):
+    """The parts are counted again from ``rollouts.csv`` of each repetition."""
+    spec = yaml.safe_load(toy_task.SPEC) | {"compare_with": ["flat", "mixture"]}
+    spec["training"] = {"epochs": 2, "initialize": "random", "layerwise": False}
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(spec))
+    run = tmp_path / "run"
+    assert call("fit", tmp_path / "spec.yaml", "--out", run, "--seeds", 3, "--jobs", 1).status == 0
+    ended = call("rollout", run, "--episodes", 6, "--jobs", 1)
+    assert ended.status == 0, ended.err
+    found = json.loads((run / "metrics.json").read_text())["rollouts"]
+    succeeded = []
+    for folder in (run, run / "seeds" / "1", run / "seeds" / "2"):
+        rows = list(csv.DictReader((folder / "rollouts.csv").open()))
+        names = ("ddco", "mixture", "flat")
+        succeeded.append({name: sum(float(row["success"]) for row in rows if row["method"] == name) for name in names})
+    assert found["seeds"]["success"]["mixture"] == [one["mixture"] / 6 for one in succeeded]
+    memory = [(one["ddco"] - one["mixture"]) / 6 for one in succeeded]
+    experts = [(one["mixture"] - one["flat"]) / 6 for one in succeeded]
+    assert found["seeds"]["worth"]["memory"] == pytest.approx(memory)
+    assert found["seeds"]["worth"]["experts"] == pytest.approx(experts)
+    own = found["worth"]
+    assert (own["memory"]["only_ours"] - own["memory"]["only_theirs"]) / 6 == pytest.approx(memory[0])
+    assert words.success_worth(found, "DDCO") in ended.out
+    page = (run / "report.html").read_text()
+    assert 'id="worth"' in page
+    assert "Points of success, 3 training seeds" in page
+
+
+def test_what_rollouts_are_worth_in_words():
+    memory = {"only_ours": 8, "only_theirs": 1, "trials": 50, "p_value": 0.039}
+    experts = {"only_ours": 3, "only_theirs": 4, "trials": 50, "p_value": 1.0}
+    total = {"only_ours": 9, "only_theirs": 3, "trials": 50, "p_value": 0.15}
+    found = {"worth": {"memory": memory, "experts": experts, "total": total, "flat": "flat"}}
+    text = words.success_worth(found, "DDCO")
+    assert text == (
+        "Of +6 successes in 50 episodes over flat, −1 (p = 1) come from several experts (mixture − flat) and "
+        "+7 (p = 0.039) from options that last (DDCO − mixture). One fit of each model is no verdict."
+    )
+    seeds = {"training_seeds": [0, 1, 2], "success": {}, "worth": {"memory": [0.14, 0.16, 0.15]}}
+    assert "DDCO − mixture +15 [13 to 17] points of success. In rollouts: options that last help." in (
+        words.success_worth(found | {"seeds": seeds}, "DDCO")
+    )
+    assert words.success_worth({"methods": {}}, "DDCO") == ""
 
 
 @pytest.mark.parametrize(

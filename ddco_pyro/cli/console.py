@@ -30,15 +30,15 @@ from ddco_pyro.events import (
     TrainingEnded,
     UpdatesDone,
 )
-from ddco_pyro.fitting.convergence import effort
+from ddco_pyro.training.convergence import effort
 
 if TYPE_CHECKING:
-    from ddco_pyro.fitting.building import Dimensions
-    from ddco_pyro.fitting.labels import Labels
     from ddco_pyro.fitting.merging import Pair
     from ddco_pyro.model.hierarchy import Hierarchy
     from ddco_pyro.selection import Choice
     from ddco_pyro.spec import Spec
+    from ddco_pyro.training.labels import Labels
+    from ddco_pyro.training.networks import Dimensions
 
 PLAIN_SECONDS = 10.0
 """Time between two plain lines of progress."""
@@ -161,7 +161,7 @@ class Progress(_Bar):
 
 def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Sequence[tuple[Spec, Hierarchy]]) -> None:
     """Shapes of observations and control, and the parameters of each network and of each baseline."""
-    from ddco_pyro.fitting.building import parameters
+    from ddco_pyro.training.networks import parameters
 
     table = Table("", "shape or parameters", show_edge=False)
     for key in spec.observed:
@@ -195,7 +195,7 @@ def control(size: Dimensions, hierarchy: Hierarchy) -> None:
 
 def device(spec: Spec) -> None:
     """Where networks live, where the spec leaves that open or names a GPU."""
-    from ddco_pyro.fitting.devices import described, device_of
+    from ddco_pyro.training.devices import described, device_of
 
     if spec.training.device != "cpu":
         where = f"networks: on {described(device_of(spec.training))}, {spec.training.precision} in gradient steps"
@@ -302,14 +302,19 @@ def warnings(signs: Sequence[tuple[str, str]]) -> None:
         console.print(Text(f"warning: {what} {advice}"), soft_wrap=True)
 
 
-def successes(results: Mapping[str, Any]) -> None:
-    """What came of each method's rollouts."""
+def successes(results: Mapping[str, Any], ours: str) -> None:
+    """What came of each method's rollouts, and what the hierarchy is worth by them.
+
+    :param ours: the model's name.
+    """
     methods: Mapping[str, Any] = results["methods"]
     measures = list(dict.fromkeys(name for result in methods.values() for name in result["measures"]))
     table = Table("method", *measures, title=f"{results['episodes']} episodes each", show_edge=False)
     for name, result in methods.items():
         table.add_row(name, *(_measure(result["measures"].get(measure)) for measure in measures))
     _show(table)
+    if said := words.success_worth(results, words.method(ours)):
+        Console().print(Text(said), soft_wrap=True)
 
 
 def _measure(summary: Mapping[str, Any] | None) -> str:

@@ -53,11 +53,13 @@ def rollout(
 ) -> None:
     """Roll the model, its baselines and the spec's scripted policies out from the same initial states.
 
-    An unfinished rollout of as many episodes is continued.
+    An unfinished rollout of as many episodes is continued. The repetitions of fit --seeds are rolled
+    out, too.
     """
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.fit import load
     from ddco_pyro.fitting.rollouts import roll_out
+    from ddco_pyro.fitting.seeds import roll_out_repetitions
     from ddco_pyro.report import write_report
 
     fitted = load(run, allow_code)
@@ -66,7 +68,8 @@ def rollout(
     demos = fitted.demonstrations  # the report needs them: asked for before any episode
     with console.Progress() as progress:
         results = roll_out(fitted, number, FILMED if video else 0, progress, jobs, resume)
-    console.successes(results)
+        roll_out_repetitions(fitted, progress, jobs)
+    console.successes(results, fitted.name)
     print(f"report: {write_report(fitted, demos)}")
 
 

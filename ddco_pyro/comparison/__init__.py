@@ -17,7 +17,7 @@ from ddco_pyro.comparison.rollouts import paired_rollouts
 from ddco_pyro.comparison.shared import Held, held_out
 from ddco_pyro.comparison.table import CompareError, Comparison, Row
 from ddco_pyro.data.files import json_text, write_text
-from ddco_pyro.fitting.analysis import paired
+from ddco_pyro.evaluation.analysis import paired
 from ddco_pyro.fitting.fit import load
 
 __all__ = ["FILES", "CompareError", "Comparison", "Row", "compare", "write"]

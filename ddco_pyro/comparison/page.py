@@ -13,11 +13,11 @@ from ddco_pyro.comparison.table import Comparison, Row
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.pictures import Picture
 from ddco_pyro.drawing.templates import render
-from ddco_pyro.fitting.convergence import effort
+from ddco_pyro.evaluation.worth import worth
 from ddco_pyro.fitting.fit import HIERARCHY
-from ddco_pyro.fitting.worth import worth
 from ddco_pyro.report.demonstration_list import SHOWN
 from ddco_pyro.segmenting.timeline import anchor
+from ddco_pyro.training.convergence import effort
 
 HEAD = ("rank", "run", "model", "parameters", "total", "se", "diff", "dse", "nats/step", "gradient steps")
 AGREEMENT_HEAD = ("run", "level", "labels", "NMI", "MoF", "boundary F1 ±1", "±3", "±5")

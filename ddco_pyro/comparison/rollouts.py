@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ddco_pyro.evaluation.schema import read_successes
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.records import read_successes
 from ddco_pyro.simulation.episodes import paired_difference, rate
 
 Outcomes = Mapping[int, float]

@@ -12,7 +12,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import same
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.prepare import parts
+from ddco_pyro.training.data import parts
 
 
 class NotShared(BadInput):

@@ -17,7 +17,7 @@ class CompareError(BadInput):
 class Row:
     """One run, in nats over all held-out trajectories.
 
-    Every error is that of :func:`ddco_pyro.fitting.analysis.paired` times the steps: how much the number per step
+    Every error is that of :func:`ddco_pyro.evaluation.analysis.paired` times the steps: how much the number per step
     varies with the demonstrations that happen to be held out, for one fit of each run.
 
     :param total: Σ log p(ξ_n), and its standard error ``se``.

@@ -34,7 +34,7 @@ EXPLAINED = (
 def rows(name: str, scores: Mapping[str, Any] | None) -> list[list[str]]:
     """A row for each matching; runs of before have the NMI alone.
 
-    :param scores: those of :func:`ddco_pyro.fitting.agreement.agreement`.
+    :param scores: those of :func:`ddco_pyro.evaluation.agreement.agreement`.
     """
     scores = scores or {}
     alone = [number(scores.get(key)) for key in ALONE]

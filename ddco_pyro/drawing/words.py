@@ -12,6 +12,9 @@ from scipy import stats
 CONFIDENCE = 0.95
 """A difference is called one where this interval about it leaves out 0."""
 
+SMALLEST = 0.01
+"""A difference in nats per step that is of use: controls are exp(0.01) times, or 1 %, as probable at each step."""
+
 METHODS = {
     "ddco": "DDCO",
     "flat": "flat",
@@ -150,15 +153,15 @@ def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out
 def worth(found: Mapping[str, Any], ours: str, held_out: int) -> str:
     """What several experts and options that last are worth in one fit of each model.
 
-    :param found: what :func:`ddco_pyro.fitting.worth.worth` gives, with ``steps_in_a_row`` where that is known.
+    :param found: what :func:`ddco_pyro.evaluation.worth.worth` gives, with ``steps_in_a_row`` where that is known.
     :param ours: what the hierarchy is called.
     """
     memory = found["memory"]
-    lasting = f"{_with_error(memory)} from options that last ({ours} − mixture)"
+    lasting = f"{with_error(memory)} from options that last ({ours} − mixture)"
     if "flat" in found:
         flat = method(found["flat"])
         total = signed(found["total"]["nats_per_step"])
-        experts = f"{_with_error(found['experts'])} come from several experts (mixture − {flat})"
+        experts = f"{with_error(found['experts'])} come from several experts (mixture − {flat})"
         parts = f"Of {total} nats per step over {flat}, {experts} and {lasting}."
     else:
         parts = f"Held-out nats per step: {lasting}."
@@ -173,6 +176,50 @@ def worth(found: Mapping[str, Any], ours: str, held_out: int) -> str:
         own, mixture = (number(short[0][name], 1) for name in ("options", "mixture"))
         decided += f" Options stay active no longer ({own} steps) than the mixture keeps to one expert ({mixture})."
     return f"{parts} {decided}"
+
+
+def success_worth(rollouts: Mapping[str, Any], ours: str) -> str:
+    """What several experts and options that last are worth in rollouts: in this fit, and over training seeds where it
+    was repeated; empty where there is no mixture.
+
+    :param rollouts: what ``metrics.json`` has under ``rollouts``.
+    :param ours: what the hierarchy is called.
+    """
+    found = rollouts.get("worth")
+    if not found:
+        return ""
+    lasting = f"{of_episodes(found['memory'])} from options that last ({ours} − mixture)"
+    if "flat" in found:
+        flat = method(found["flat"])
+        experts = f"{of_episodes(found['experts'])} come from several experts (mixture − {flat})"
+        total, trials = _more(found["total"]), found["total"]["trials"]
+        text = f"Of {total} successes in {trials} episodes over {flat}, {experts} and {lasting}."
+    else:
+        text = f"Successes in {found['memory']['trials']} episodes: {lasting}."
+    if "seeds" not in rollouts:
+        return f"{text} One fit of each model is no verdict."
+    seeds = rollouts["seeds"]
+    names = {"memory": f"{ours} − mixture", "experts": "mixture − flat"}
+    parts = [
+        f"{names[part]} {signed(100 * float(np.mean(values)), 0)} [{interval([*mean_interval(values)], 100, 0)}]"
+        for part, values in seeds["worth"].items()
+        if part in names
+    ]
+    low, high = mean_interval(seeds["worth"]["memory"])
+    decided = "options that last help" if low > 0 else "options that last harm" if high < 0 else "inconclusive"
+    count = len(seeds["training_seeds"])
+    return f"{text} Over {count} training seeds: {listed(parts)} points of success. In rollouts: {decided}."
+
+
+def _more(pair: Mapping[str, Any]) -> str:
+    return signed(pair["only_ours"] - pair["only_theirs"], 0)
+
+
+def of_episodes(pair: Mapping[str, Any] | None) -> str:
+    """A difference in successes with McNemar's exact p-value; a dash for None."""
+    if pair is None:
+        return "–"
+    return f"{_more(pair)} (p = {p_value(pair['p_value'])})".replace("= <", "<")
 
 
 def over_seeds(found: Mapping[str, Any], ours: str) -> str:
@@ -195,8 +242,10 @@ def over_seeds(found: Mapping[str, Any], ours: str) -> str:
 
 
 def _lasting(memory: Sequence[float]) -> str:
-    """Whether options that last are worth it, by the 95 % t interval over training seeds."""
-    low, high = _mean_interval(memory)
+    """Whether options that last are worth it, by the 95 % t interval over training seeds and :data:`SMALLEST`."""
+    low, high = mean_interval(memory)
+    if low > -SMALLEST and high < SMALLEST:
+        return f"So options that last make no difference here: less than {SMALLEST} nats per step."
     if low > 0:
         return "So options that last are worth it on these demonstrations."
     if high < 0:
@@ -204,7 +253,7 @@ def _lasting(memory: Sequence[float]) -> str:
     return "So it is inconclusive whether options that last are worth anything here."
 
 
-def _mean_interval(values: Sequence[float]) -> tuple[float, float]:
+def mean_interval(values: Sequence[float]) -> tuple[float, float]:
     """The 95 % t interval of the mean of a few values."""
     mean, count = float(np.mean(values)), len(values)
     half = float(np.std(values, ddof=1) * stats.t.ppf((1 + CONFIDENCE) / 2, count - 1) / math.sqrt(count))
@@ -213,10 +262,13 @@ def _mean_interval(values: Sequence[float]) -> tuple[float, float]:
 
 def spread(values: Sequence[float]) -> tuple[str, str, str]:
     """Mean, 95 % t interval of the mean, and range of a few values."""
-    return number(float(np.mean(values))), interval([*_mean_interval(values)]), interval([min(values), max(values)])
+    return number(float(np.mean(values))), interval([*mean_interval(values)]), interval([min(values), max(values)])
 
 
-def _with_error(difference: Mapping[str, Any]) -> str:
+def with_error(difference: Mapping[str, Any] | None) -> str:
+    """A difference in nats per step with its standard error over held-out demonstrations; a dash for None."""
+    if difference is None:
+        return "–"
     return f"{signed(difference['nats_per_step'])} ± {number(difference['standard_error'])}"
 
 
@@ -312,4 +364,5 @@ def success(metrics: Mapping[str, Any]) -> str:
         return ""
     others = [f"{method(name)} in {rate(summary)}" for name, summary in rates.items() if name != ours]
     text = f"In rollouts {method(ours)} succeeds in {rate(rates[ours], 'episodes')}"
-    return f"{text}{'; ' if others else ''}{listed(others) if others else ''}."
+    said = f"{text}{'; ' if others else ''}{listed(others) if others else ''}."
+    return f"{said} {success_worth(metrics['rollouts'], method(ours))}".rstrip()

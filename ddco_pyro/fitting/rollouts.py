@@ -15,9 +15,10 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking
 from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.errors import command
+from ddco_pyro.evaluation.schema import Unfinished, read_record
+from ddco_pyro.evaluation.worth import success_worth
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit, RunError
-from ddco_pyro.fitting.records import Unfinished, read_record
 from ddco_pyro.fitting.run import write_metrics
 from ddco_pyro.simulation.episodes import paired_difference, run_episode, run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
@@ -58,17 +59,17 @@ def roll_out(
     """
     folder = fit.run_folder
     seeds = range(fit.spec.rollout.seed, fit.spec.rollout.seed + episodes)
-    methods = policies(fit)
+    played = policies(fit)
     held = fit.metrics.get("rollouts", {})
     whole = (held.get("seed"), held.get("episodes"), set(held.get("methods", ()))) == (
         seeds.start,
         episodes,
-        {*methods},
+        {*played},
     )
-    if resume and whole and all(_filmed(fit, name, seeds[:film]) for name in methods):
+    if resume and whole and all(_filmed(fit, name, seeds[:film]) for name in played):
         return dict(held)
-    rolled, total = _Unfinished(folder, seeds), len(methods) * episodes
-    for name, policy in methods.items():
+    rolled, total = _Unfinished(folder, seeds), len(played) * episodes
+    for name, policy in played.items():
         if name in rolled.outcomes and _filmed(fit, name, seeds[:film]):
             for _ in seeds:
                 on_event(EpisodeEnded(name, total))
@@ -81,13 +82,13 @@ def roll_out(
                 write_film(_film(fit, name, episode.seed), episode)
             on_event(EpisodeEnded(name, total))
         rolled.keep(name, outcomes)
-    by_method = {name: rolled.outcomes[name] for name in methods}
+    by_method = {name: rolled.outcomes[name] for name in played}
     write_text(folder / "rollouts.csv", _table(by_method, seeds))
-    results = {
-        "seed": seeds.start,
-        "episodes": episodes,
-        "methods": _methods(find_task(str(fit.spec.task)), by_method, fit.name),
-    }
+    methods = _methods(find_task(str(fit.spec.task)), by_method, fit.name)
+    results = {"seed": seeds.start, "episodes": episodes, "methods": methods}
+    succeeded = {name: _successes(outcomes) for name, outcomes in by_method.items() if _judged(outcomes)}
+    if parts := success_worth(fit.name, succeeded):
+        results["worth"] = parts
     fit.metrics["rollouts"] = results
     write_metrics(folder, fit.metrics)
     rolled.end()
@@ -138,15 +139,20 @@ def _numbers(outcome: Mapping[str, float | None]) -> dict[str, float]:
     return {measure: math.nan if value is None else value for measure, value in outcome.items()}
 
 
-def _methods(task: Task, by_method: Outcomes, ours: str) -> dict[str, Any]:
-    def successes(name: str) -> list[float]:
-        return [outcome[SUCCESS] for outcome in by_method[name]]
+def _judged(outcomes: Sequence[Mapping[str, float]]) -> bool:
+    return all(SUCCESS in outcome for outcome in outcomes)
 
+
+def _successes(outcomes: Sequence[Mapping[str, float]]) -> list[float]:
+    return [outcome[SUCCESS] for outcome in outcomes]
+
+
+def _methods(task: Task, by_method: Outcomes, ours: str) -> dict[str, Any]:
     methods: dict[str, Any] = {}
     for name, outcomes in by_method.items():
         methods[name] = {"measures": summarize(task, outcomes)}
-        if name != ours and all(SUCCESS in outcome for outcome in outcomes):
-            methods[name]["against"] = paired_difference(successes(ours), successes(name))
+        if name != ours and _judged(outcomes):
+            methods[name]["against"] = paired_difference(_successes(by_method[ours]), _successes(outcomes))
     return methods
 
 

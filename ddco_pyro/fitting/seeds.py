@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,11 @@ from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import OnEvent, SeedFitted, ignore
 from ddco_pyro.fitting.fit import Fit, is_finished, load
-from ddco_pyro.fitting.processes import pool, results, useful_jobs
+from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit_run, write_metrics
+from ddco_pyro.simulation.task import SUCCESS
 from ddco_pyro.spec import Spec, user_code, with_overrides
+from ddco_pyro.training.jobs import pool, results, useful_jobs
 
 DEAD = "a process that repeated the fit was ended from outside (too little memory?); the same command goes on"
 
@@ -66,16 +69,48 @@ def _again(spec: Spec, seed: int, folder: Path) -> None:
     fit_run(with_overrides(spec, {"training.seed": seed}), None, folder)
 
 
+def roll_out_repetitions(first: Fit, on_event: OnEvent = ignore, jobs: int = -1) -> None:
+    """Roll the repetitions of a rolled out fit out, from the same initial states.
+
+    Fills ``rollouts.seeds`` of the fit's ``metrics.json``: success rates by method and the parts of the worth, in the
+    order of the training seeds. Nothing happens where the fit was not repeated.
+    """
+    if "seeds" not in first.metrics:
+        return
+    rollouts, numbers = first.metrics["rollouts"], first.metrics["seeds"]["training_seeds"]
+    each = [rollouts]
+    for seed in numbers[1:]:
+        again = load(first.run_folder / "seeds" / str(seed), bool(user_code(first.spec)))
+        alone = replace(again, spec=with_overrides(again.spec, {"rollout.policies": []}))  # scripts have no seeds
+        each.append(roll_out(alone, rollouts["episodes"], 0, on_event, jobs, resume=True))
+    rates = {
+        name: [one["methods"][name]["measures"][SUCCESS]["rate"] for one in each]
+        for name, own in each[-1]["methods"].items()
+        if "rate" in own["measures"].get(SUCCESS, {})
+    }
+    worth = {
+        part: [(one["worth"][part]["only_ours"] - one["worth"][part]["only_theirs"]) / one["episodes"] for one in each]
+        for part in PARTS
+        if part in rollouts.get("worth", {})
+    }
+    rollouts["seeds"] = {"training_seeds": numbers, "success": rates, "worth": worth}
+    write_metrics(first.run_folder, first.metrics)
+
+
+PARTS = ("memory", "experts", "total")
+"""What a worth consists of."""
+
+
 def over_seeds(seeds: Sequence[int], each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """What fits with these training seeds say, from the ``metrics`` of each.
 
     :returns: the ``training_seeds``; by model its ``held_out`` log-likelihoods per step; and the parts of ``worth``
-        (:mod:`ddco_pyro.fitting.worth`), nats per step: all in the order of the seeds.
+        (:mod:`ddco_pyro.evaluation.worth`), nats per step: all in the order of the seeds.
     """
     model = each[0]["model"]
     held_out = {model: [metrics["log_likelihood_per_step"]["valid"] for metrics in each]}
     for name in each[0]["comparison"]:
         held_out[name] = [metrics["comparison"][name]["log_likelihood_per_step"]["valid"] for metrics in each]
-    parts = [part for part in ("memory", "experts", "total") if part in each[0].get("worth", {})]
+    parts = [part for part in PARTS if part in each[0].get("worth", {})]
     worth = {part: [metrics["worth"][part]["nats_per_step"] for metrics in each] for part in parts}
     return {"training_seeds": list(seeds), "held_out": held_out, "worth": worth}

@@ -10,7 +10,7 @@ from ddco_pyro.drawing.pictures import style
 from ddco_pyro.drawing.templates import render
 from ddco_pyro.drawing.words import unconverged
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.report import activity, demonstration_list, dimensions, looks, option_figures, sections
+from ddco_pyro.report import activity, demonstration_list, dimensions, looks, option_figures, sections, worth
 from ddco_pyro.report.sections import degeneracies
 
 __all__ = ["degeneracies", "unconverged", "write_report"]
@@ -28,6 +28,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
     with style():
         page = {
             "header": sections.header(fit, metrics),
+            "worth": worth.section(metrics),
             "likelihood": sections.likelihood(fit, metrics),
             "dimensions": dimensions.section(metrics, {name: other.metrics for name, other in fit.baselines.items()}),
             "rollouts": sections.rollouts(fit, metrics),

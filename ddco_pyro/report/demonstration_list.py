@@ -8,8 +8,8 @@ from typing import Any
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.words import method, number
+from ddco_pyro.evaluation.schema import option_labels
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.labels import option_labels
 from ddco_pyro.report.activity import Activity
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
 from ddco_pyro.segmenting.timeline import Timeline, anchor

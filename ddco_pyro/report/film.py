@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from ddco_pyro.data.sources.video import frames
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.pictures import blank, data_uri, hide_frame
-from ddco_pyro.fitting.records import read_successes
+from ddco_pyro.evaluation.schema import read_successes
 
 MOST_BYTES = 4_000_000
 """Films are held in the page up to this size in all; further ones are linked to."""

@@ -10,8 +10,8 @@ from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.heat import overlaid
 from ddco_pyro.drawing.pictures import blank, keep
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.prepare import parts
 from ddco_pyro.report.sections import Figures
+from ddco_pyro.training.data import parts
 
 COLUMNS, ROWS = 4, 3
 CAPTION = (

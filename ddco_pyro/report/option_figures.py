@@ -7,8 +7,8 @@ from typing import Any
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing.pictures import Picture, keep
+from ddco_pyro.evaluation.schema import option_labels
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.labels import option_labels
 from ddco_pyro.report import plot_posterior, plot_rows, plot_timing, plot_trajectories, tables
 from ddco_pyro.report.activity import Activity
 from ddco_pyro.report.sections import Figures, quoted

@@ -17,7 +17,7 @@ SHADES = ("#1f3b73", "#6f8fc9", "#c9a227", "#8c4a32", "#5b8c5a", "#7d6b91")
 def draw(uses: Sequence[Mapping[str, Any]], labels: Sequence[Sequence[str]]) -> Figure:
     """A row for each level: mean activation of each branch, and nats per step lost without what it reads, by option.
 
-    :param uses: those of :func:`ddco_pyro.fitting.branch_use.branch_use`.
+    :param uses: those of :func:`ddco_pyro.evaluation.branch_use.branch_use`.
     :param labels: what the rows of each are called.
     """
     figure = blank(2.6 * len(uses))

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.pictures import INK, blank
-from ddco_pyro.fitting.records import read_table, refit
+from ddco_pyro.evaluation.schema import read_table, refit
 
 COLUMNS = 4
 TUNE = "#c2410c"

@@ -8,7 +8,7 @@ from typing import Any
 
 from ddco_pyro.drawing import scores, words
 from ddco_pyro.drawing.pictures import Picture, keep
-from ddco_pyro.fitting.diagnostics import diagnose
+from ddco_pyro.evaluation.diagnostics import diagnose
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.report import (
     film,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ddco_pyro.drawing.words import number, percent
-from ddco_pyro.fitting.diagnostics import Finding
+from ddco_pyro.evaluation.diagnostics import Finding
 
 
 def warning(finding: Finding, level: str) -> str:

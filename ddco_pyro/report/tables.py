@@ -9,8 +9,8 @@ from typing import Any
 from ddco_pyro.drawing import scores
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.words import interval, measure, method, number, option_name, p_value, percent, rate, signed
-from ddco_pyro.fitting.convergence import effort
 from ddco_pyro.report.plot_likelihood import Likelihood
+from ddco_pyro.training.convergence import effort
 
 
 @dataclass(frozen=True)

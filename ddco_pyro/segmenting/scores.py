@@ -11,11 +11,11 @@ import numpy as np
 from ddco_pyro.data.sources import Source
 from ddco_pyro.drawing.scores import rows
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.agreement import agreement
+from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.prepare import parts
 from ddco_pyro.segmenting import Segmented, Segments, demonstrations
 from ddco_pyro.segmenting.baselines import BASELINES, segment
+from ddco_pyro.training.data import parts
 
 Scores = Mapping[str, Any] | None
 

@@ -14,7 +14,6 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.errors import Failed
 from ddco_pyro.events import CandidateGivenUp, FoldScored, OnEvent, SelectionBegan, ignore
-from ddco_pyro.fitting import prepare
 from ddco_pyro.fitting.fitted_to import record
 from ddco_pyro.fitting.run import claimed
 from ddco_pyro.selection import choice as choosing
@@ -26,6 +25,9 @@ from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.selection.parallel import Workers
 from ddco_pyro.selection.scoring import Score
 from ddco_pyro.spec import Spec, with_overrides
+from ddco_pyro.training import data as training_data
+from ddco_pyro.training.data import demonstrations as read_demonstrations
+from ddco_pyro.training.data import dimensions, in_file, outline
 
 __all__ = ["Choice", "Selection", "SelectionFailed", "Workers", "check", "final_spec", "known_demonstrations", "select"]
 
@@ -50,7 +52,7 @@ class Selection:
 
 def known_demonstrations(spec: Spec) -> Demonstrations | None:
     """The demonstrations, with all that a candidate sees, where nothing has to be collected for them; else None."""
-    return prepare.known_demonstrations(grid.wide(spec))
+    return training_data.known_demonstrations(grid.wide(spec))
 
 
 def check(spec: Spec, workers: Workers = HERE, demos: Demonstrations | None = None) -> list[Candidate]:
@@ -62,8 +64,8 @@ def check(spec: Spec, workers: Workers = HERE, demos: Demonstrations | None = No
     :raises BackendError: the workers cannot be reached.
     """
     wide, own = grid.wide(spec), spec.demonstrations
-    demos = prepare.outline(wide) if demos is None and prepare.in_file(wide) else demos
-    candidates = grid.candidates(spec, prepare.dimensions(wide, demos))
+    demos = outline(wide) if demos is None and in_file(wide) else demos
+    candidates = grid.candidates(spec, dimensions(wide, demos))
     if demos is None:  # they will be collected
         dividing.assign(own.count - len(set(own.exclude)), spec.selection.folds, spec.seed)
     else:
@@ -94,7 +96,7 @@ def select(
     :raises Busy: another process is at work on the folder.
     """
     with claimed(folder, spec, resume):
-        demos = demos or prepare.demonstrations(grid.wide(spec), on_event)
+        demos = demos or read_demonstrations(grid.wide(spec), on_event)
         record(folder, demos)
         return _select(spec, folder, demos, on_event, workers, stop_early)
 

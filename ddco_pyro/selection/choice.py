@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from ddco_pyro.fitting.analysis import paired
+from ddco_pyro.evaluation.analysis import paired
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.selection.scoring import Score
 

@@ -12,9 +12,9 @@ from sklearn.model_selection import KFold
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.building import Dimensions
-from ddco_pyro.fitting.record_types import Record
-from ddco_pyro.fitting.records import read_record
+from ddco_pyro.evaluation.record_types import Record
+from ddco_pyro.evaluation.schema import read_record
+from ddco_pyro.training.networks import Dimensions
 
 
 class FoldError(BadInput):

@@ -9,11 +9,11 @@ from functools import partial
 
 from joblib import Parallel, parallel_config
 
-from ddco_pyro.fitting import processes
-from ddco_pyro.fitting.processes import ALL_CORES, BackendError
 from ddco_pyro.selection.folds import Folds
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.selection.scoring import Score, score
+from ddco_pyro.training.jobs import ALL_CORES, BackendError, check_jobs, results
+from ddco_pyro.training.jobs import pool as processes
 
 Pending = Sequence[tuple[Candidate, int]]
 
@@ -31,7 +31,7 @@ class Workers:
     scheduler: str | None = None
 
     def __post_init__(self) -> None:
-        processes.check_jobs(self.jobs)
+        check_jobs(self.jobs)
 
     def check(self) -> None:
         """See that they are there.
@@ -50,10 +50,10 @@ def pool(workers: Workers) -> Iterator[Parallel]:
     :raises BackendError: dask is not installed, no scheduler answers, or it has no workers.
     """
     if workers.scheduler is None:
-        with processes.pool(workers.jobs) as parallel:
+        with processes(workers.jobs) as parallel:
             yield parallel
         return
-    with _client(workers.scheduler), parallel_config(backend="dask"), processes.pool(workers.jobs) as parallel:
+    with _client(workers.scheduler), parallel_config(backend="dask"), processes(workers.jobs) as parallel:
         yield parallel
 
 
@@ -84,7 +84,7 @@ def scores(parallel: Parallel, folds: Folds, pending: Pending) -> Iterator[Score
     # The demonstrations travel inside the function: as an argument dask would keep them with a worker, and lose them
     # with it.
     calls = [partial(score, folds, candidate, fold) for candidate, fold in pending]
-    yield from processes.results(
+    yield from results(
         parallel,
         calls,
         "a process that trained a fold was ended from outside (too little memory?); what was scored is kept: "

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.evaluation.schema import read_record
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.records import read_record
 from ddco_pyro.fitting.run import train
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.selection.folds import Folds

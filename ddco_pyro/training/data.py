@@ -15,10 +15,10 @@ from ddco_pyro.data.sources.recording import Recording
 from ddco_pyro.data.sources.robomimic import open_robomimic
 from ddco_pyro.errors import nearest
 from ddco_pyro.events import OnEvent, ignore
-from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.simulation.collect import cache_path, collect
 from ddco_pyro.simulation.task import find_task
 from ddco_pyro.spec import Spec
+from ddco_pyro.training.networks import Dimensions
 
 
 def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ddco_pyro.fitting.analysis import paired
+from ddco_pyro.evaluation.analysis import paired
+from ddco_pyro.simulation.episodes import paired_difference
 
 MIXTURE = "mixture"
 FLAT = ("flat", "flat_equal")
@@ -25,15 +26,28 @@ def worth(ours: str, values: Mapping[str, np.ndarray], lengths: Sequence[int]) -
     :param lengths: steps of each demonstration, [N].
     :returns: nothing where ``values`` has no mixture, or the hierarchy is one.
     """
-    if ours == MIXTURE or MIXTURE not in values:
-        return {}
     steps = np.array(lengths, dtype=float)
+    return _parts(ours, values, lambda one, other: paired(one, other, steps))
+
+
+def success_worth(ours: str, successes: Mapping[str, Sequence[float]]) -> dict[str, Any]:
+    """The same parts of the success in rollouts from the same initial states, each by
+    :func:`ddco_pyro.simulation.episodes.paired_difference`.
+
+    :param successes: success (1) or not (0) of each episode, by method.
+    """
+    return _parts(ours, successes, paired_difference)
+
+
+def _parts(ours: str, values: Mapping[str, Any], difference: Callable[[Any, Any], dict[str, Any]]) -> dict[str, Any]:
+    if ours == MIXTURE or ours not in values or MIXTURE not in values:
+        return {}
     flat = next((name for name in FLAT if name in values), None)
     pairs = {"memory": (ours, MIXTURE)}
     if flat is not None:
         pairs |= {"experts": (MIXTURE, flat), "total": (ours, flat)}
-    differences = {name: paired(values[one], values[other], steps) for name, (one, other) in pairs.items()}
-    return differences | ({} if flat is None else {"flat": flat})
+    found = {name: difference(values[one], values[other]) for name, (one, other) in pairs.items()}
+    return found | ({} if flat is None else {"flat": flat})
 
 
 def mean_run(choices: Sequence[np.ndarray]) -> float:

@@ -1,0 +1,48 @@
+"""The page's section on what the hierarchy is worth: several experts and options that last, apart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ddco_pyro.drawing import words
+from ddco_pyro.report.tables import Table
+
+
+def section(metrics: Mapping[str, Any]) -> Table | None:
+    """The parts in held-out log-likelihood and in success, a row each; None where the run has no mixture."""
+    if "worth" not in metrics:
+        return None
+    ours, rollouts = words.method(metrics["model"]), metrics.get("rollouts", {})
+    flat = words.method(metrics["worth"].get("flat", "flat"))
+    parts = {
+        "experts": f"Several experts: mixture − {flat}",
+        "memory": f"Options that last: {ours} − mixture",
+        "total": f"Together: {ours} − {flat}",
+    }
+    columns = {"Nats per step, this fit": {part: words.with_error(metrics["worth"].get(part)) for part in parts}}
+    if "seeds" in metrics:
+        count = len(metrics["seeds"]["training_seeds"])
+        columns[f"Nats per step, {count} training seeds"] = _over_seeds(metrics["seeds"]["worth"], 1, 2)
+    if "worth" in rollouts:
+        column = f"Successes of {rollouts['episodes']} episodes, this fit"
+        columns[column] = {part: words.of_episodes(rollouts["worth"].get(part)) for part in parts}
+    if "seeds" in rollouts:
+        count = len(rollouts["seeds"]["training_seeds"])
+        columns[f"Points of success, {count} training seeds"] = _over_seeds(rollouts["seeds"]["worth"], 100, 0)
+    rows = [
+        [name, *(values.get(part, "–") for values in columns.values())]
+        for part, name in parts.items()
+        if part in metrics["worth"]
+    ]
+    return Table(["Part", *columns], rows)
+
+
+def _over_seeds(worth: Mapping[str, list[float]], scale: float, digits: int) -> dict[str, str]:
+    shown = {}
+    for part, values in worth.items():
+        mean, low_high = words.signed(scale * float(np.mean(values)), digits), [*words.mean_interval(values)]
+        shown[part] = f"{mean} [{words.interval(low_high, scale, digits)}]"
+    return shown
