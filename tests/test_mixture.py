@@ -193,7 +193,7 @@ def test_what_is_no_model_is_refused():
         ),
         (
             {"hierarchy": {"levels": [{"count": 2, "termination": "always"}]}, "compare_with": ["mixture"]},
-            "compare_with.0: mixture is what the hierarchy is already",
+            "compare_with.0: the hierarchy is a mixture already",
         ),
         (
             {"hierarchy": {"levels": [{"count": 2, "termination": "alway"}]}, "compare_with": []},
