@@ -23,8 +23,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.pictures import Transform
-from ddco_pyro.data.reading import Job, Readers
+from ddco_pyro.data.pictures import Job, Readers, Transform
 from ddco_pyro.encoding import Encoding, encode
 from ddco_pyro.encoding.autoencoder import Convolutions
 from ddco_pyro.events import EpochEnded, Event

@@ -26,7 +26,7 @@ from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.simulation.episodes import Episode, play, run_episode
 from ddco_pyro.simulation.task import Task
-from ddco_pyro.spec import BaselineSpec, NetworkSpec, Spec, load_spec, with_overrides
+from ddco_pyro.spec import BaselineSpec, Spec, load_spec, network_spec, with_overrides
 from ddco_pyro.training.data import dimensions
 from ddco_pyro.training.networks import Dimensions, baseline_spec, build_hierarchy
 from ddco_pyro.training.restarts import train_model
@@ -111,7 +111,7 @@ def spec_of(cell: Cell, settings: Mapping[str, Any] | None = None) -> Spec:
 
 def _flat_equal(spec: Spec) -> Spec:
     """A flat perceptron with as many parameters as the spec's hierarchy."""
-    baseline = BaselineSpec(kind="flat_equal", policy=NetworkSpec(hidden=(64,)))
+    baseline = BaselineSpec(kind="flat_equal", policy=network_spec(hidden=[64]))
     return baseline_spec(spec, baseline, dimensions(spec))
 
 

@@ -139,7 +139,7 @@ def test_pictures_stay_on_a_device_with_room(demos: Demonstrations, monkeypatch:
     spec = spec_of(OTHER["field means"])
     on(monkeypatch, THERE)
     read: list[int] = []
-    monkeypatch.setattr("ddco_pyro.data.reading.padded", lambda *given: read.append(1) or padded(*given))
+    monkeypatch.setattr("ddco_pyro.data.pictures.padded", lambda *given: read.append(1) or padded(*given))
     fits, asked = [], []
     for room in (float("inf"), 1.0):
         monkeypatch.setattr("ddco_pyro.training.checkpoint.room", lambda device, room=room: room)

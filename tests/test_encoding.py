@@ -8,7 +8,7 @@ import torch
 from scipy import stats
 from sklearn.preprocessing import QuantileTransformer
 
-from ddco_pyro.data.control_parts import all_gaussian
+from ddco_pyro.data.controls import all_gaussian
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.batch import encode

@@ -78,11 +78,11 @@ def test_a_baseline_beside_trains_as_it_would_alone(toy_spec, tmp_path):
     [
         (
             {"compare_with": [OWN | {"optimizer": {"schedule": "cosine"}}], "training.epochs": None},
-            "compare_with.0.optimizer.schedule: cosine falls to 0 at the end of training.epochs, which is null",
+            "compare_with.0.optimizer.schedule: cosine ends at training.epochs, which is null",
         ),
         (
             {"hierarchy": None, "baseline": OWN, "compare_with": []},
-            "baseline.optimizer: is for baselines in compare_with; say it in training.optimizer",
+            "baseline.optimizer: is for baselines in compare_with; give it in training.optimizer",
         ),
     ],
 )

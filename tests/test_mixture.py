@@ -27,7 +27,7 @@ from ddco_pyro.model.tables import always_ends
 from ddco_pyro.segmenting import LevelLabels
 from ddco_pyro.selection.grid import candidates
 from ddco_pyro.spec import DurationSpec, SpecError, dump_spec, load_spec, parse_spec, with_overrides
-from ddco_pyro.spec.reading import read_yaml
+from ddco_pyro.spec.yaml import read_yaml
 from ddco_pyro.training.networks import (
     Dimensions,
     baseline_spec,
@@ -199,7 +199,7 @@ def test_what_is_no_model_is_refused():
         ),
         (
             {"hierarchy": {"levels": [{"count": 2, "termination": "always"}]}, "compare_with": ["mixture"]},
-            "compare_with.0: mixture is what the hierarchy is already",
+            "compare_with.0: the hierarchy is a mixture already",
         ),
         (
             {"hierarchy": {"levels": [{"count": 2, "termination": "alway"}]}, "compare_with": []},

@@ -28,7 +28,7 @@ from user_networks import Stateful
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
 from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.model.networks.perceptrons import StackedLinear
-from ddco_pyro.spec import Activation, NetworkSpec
+from ddco_pyro.spec import Activation, network_spec
 
 
 @pytest.mark.parametrize("settings", [{"network": "linear"}, {"hidden": [8]}, {"hidden": [8, 6], "dropout": 0.5}])
@@ -281,9 +281,9 @@ def test_a_network_reads_the_observations_that_it_is_to_read(settings):
     pose, goal = (torch.randn(2, LONGEST, size, generator=generator) for size in (2, 3))
     images = make_inputs(images=("camera",)).images
     torch.manual_seed(0)
-    network = build(NetworkSpec(**settings, inputs=("goal",)), shape, OUTPUTS, COPIES)
+    network = build(network_spec(**settings, inputs=("goal",)), shape, OUTPUTS, COPIES)
     torch.manual_seed(0)
-    alone = build(NetworkSpec(**settings), InputShape({"goal": 3}), OUTPUTS, COPIES)
+    alone = build(network_spec(**settings), InputShape({"goal": 3}), OUTPUTS, COPIES)
     time = torch.arange(LONGEST)
     found = network(Inputs({"pose": pose, "goal": goal}, images, time))[0]
     assert_close(found, alone(Inputs({"goal": goal}, {}, time))[0])
@@ -307,7 +307,7 @@ def test_a_network_of_ones_own():
 
 def test_trying_a_network_of_ones_own_leaves_no_trace():
     spec, shape = (
-        NetworkSpec(network="user_networks:Stateful"),
+        network_spec(network="user_networks:Stateful"),
         InputShape({"state": FEATURES}, {"camera": PIXELS}, steps=1),
     )
     torch.manual_seed(0)

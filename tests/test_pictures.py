@@ -20,8 +20,7 @@ from killing import struck
 import ddco_pyro
 from ddco_pyro.acting.window import ObservationError, Window
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
-from ddco_pyro.data.pictures import Pictures, Transform, shifted
-from ddco_pyro.data.reading import Job, Readers, read
+from ddco_pyro.data.pictures import Job, Pictures, Readers, Transform, read, shifted
 from ddco_pyro.errors import Failed
 from ddco_pyro.exporting import runner, write_numpy
 from ddco_pyro.fitting.digest import digest

@@ -7,7 +7,7 @@ import torch
 from stacked_networks import COPIES, FEATURES, LONGEST, PIXELS, answer, assert_close, make, random_inputs
 
 from ddco_pyro.model.networks import InputShape, ShapeError, build_trunk
-from ddco_pyro.spec import NetworkSpec
+from ddco_pyro.spec import network_spec
 
 SEEING = {
     "network": "branches",
@@ -24,8 +24,8 @@ def test_what_options_share_is_what_each_would_give_with_these_weights_and_learn
     """Copies of their own, given the shared weights, give the same; the shared gradient is the sum of theirs."""
     shape = InputShape({"vector": FEATURES}, {"camera": PIXELS})
     alone = {name: each | {"shared": False} for name, each in SEEING["of"].items()}
-    shared = build_trunk(NetworkSpec(**SEEING), shape, COPIES)
-    own = build_trunk(NetworkSpec(**SEEING | {"of": alone}), shape, COPIES)
+    shared = build_trunk(network_spec(**SEEING), shape, COPIES)
+    own = build_trunk(network_spec(**SEEING | {"of": alone}), shape, COPIES)
     weights = own.state_dict()
     for name, values in shared.state_dict().items():
         repeats = weights[name].shape[0] // values.shape[0]

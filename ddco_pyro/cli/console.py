@@ -13,8 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 from rich.table import Table
 from rich.text import Text
 
-from ddco_pyro.data.control_dimensions import notes
-from ddco_pyro.data.control_parts import described
+from ddco_pyro.data.controls import described, notes
 from ddco_pyro.drawing import words
 from ddco_pyro.events import (
     CandidateGivenUp,
@@ -183,7 +182,7 @@ def _baseline(spec: Spec) -> str:
 
     if spec.baseline is None:
         return model_name(spec)
-    hidden = list(spec.baseline.policy.hidden)
+    hidden = list(spec.baseline.policy.hidden_sizes)
     return f"{spec.baseline.kind}, {f'hidden: {hidden}' if hidden else spec.baseline.policy.network}"
 
 

@@ -7,9 +7,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from ddco_pyro.data.checks import LARGEST
 from ddco_pyro.data.hdf5 import printable
 from ddco_pyro.data.inspection import Field, Inspection
-from ddco_pyro.data.values import LARGEST
 
 WIDTH = 160
 """Columns where there is no terminal: names in a file that is read by a program are not to be cut."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ddco_pyro.data.control_parts import difference
+from ddco_pyro.data.controls import difference
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import same
 from ddco_pyro.errors import BadInput

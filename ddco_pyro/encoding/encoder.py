@@ -22,7 +22,7 @@ from ddco_pyro.encoding.fitted import FittedReader, Reader, from_folder
 from ddco_pyro.encoding.pictures import Pictures
 from ddco_pyro.encoding.user import imported, try_out
 from ddco_pyro.errors import BadInput, nearest
-from ddco_pyro.spec.types import Count, Items, Model, Seed
+from ddco_pyro.spec.base import Count, Items, Model, Seed
 
 ABOUT, TENSORS = "encoder.json", "encoder.safetensors"
 AGAIN = "write it again with ddco-pyro encode"

@@ -18,7 +18,8 @@ from ddco_pyro.model.networks.conv import Conv
 from ddco_pyro.model.networks.lstm import Lstm
 from ddco_pyro.model.networks.perceptrons import Branches
 from ddco_pyro.spec import NetworkSpec
-from ddco_pyro.spec.types import Count, Items, Model
+from ddco_pyro.spec.base import Count, Items, Model
+from ddco_pyro.spec.networks import BranchesSpec, LstmSpec
 
 Part = tuple[NetworkSpec, Network, Sequence[str]]
 """A network of a fit: its spec, the network, and the names of the observations that it reads."""
@@ -145,10 +146,10 @@ def _readers(part: Part, key: str) -> Iterator[Part]:
     if isinstance(network, Conv) and [*reads] == [key]:
         yield spec, network, reads
     within: list[Part] = []
-    if isinstance(network, Branches):
+    if isinstance(network, Branches) and isinstance(spec, BranchesSpec):
         named = zip(spec.of.items(), network.branches(), strict=True)
         within = [(branch, own, branch.inputs or (name,)) for (name, branch), own in named]
-    elif isinstance(network, Lstm) and spec.over is not None:
+    elif isinstance(network, Lstm) and isinstance(spec, LstmSpec) and spec.over is not None:
         within = [(spec.over, network.over, spec.over.inputs or reads)]
     for inner in within:
         yield from _readers(inner, key)

@@ -22,9 +22,8 @@ import numpy as np
 from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.data.hdf5 import DemonstrationsError, opened
 from ddco_pyro.data.pictures import MOVED, shifted
-from ddco_pyro.data.resumable import parts_of
 from ddco_pyro.data.sources import Column, Recording, format_of
-from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
+from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, parts_of, robomimic_file, write_recording
 from ddco_pyro.encoding.autoencoder import UPDATES, Convolutions, train
 from ddco_pyro.encoding.encoder import (
     About,

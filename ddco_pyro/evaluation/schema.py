@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, 
 
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.errors import command
-from ddco_pyro.spec.messages import invalid, lines
+from ddco_pyro.spec.base import invalid, lines
 
 T = TypeVar("T")
 

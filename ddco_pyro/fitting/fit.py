@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor
-from ddco_pyro.data.control_parts import measure
+from ddco_pyro.data.controls import measure
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import json_text, leftovers
 from ddco_pyro.data.hdf5 import natural

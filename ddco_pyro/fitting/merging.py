@@ -16,7 +16,7 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit, fit
 from ddco_pyro.spec import Spec, with_overrides
-from ddco_pyro.spec.messages import nearest
+from ddco_pyro.spec.base import nearest
 from ddco_pyro.training.checkpoint import copy_of
 
 LABELS = "merged"

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from ddco_pyro.data.control_parts import ControlPart
+from ddco_pyro.data.controls import ControlPart
 from ddco_pyro.data.files import Damaged, json_text, leftovers, only_one, write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.errors import BadInput

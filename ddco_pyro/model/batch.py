@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
-from ddco_pyro.data.reading import Readers
+from ddco_pyro.data.pictures import Readers
 from ddco_pyro.model.controls import ControlScaling, refuse_impossible
 from ddco_pyro.model.encoder import ObservationEncoder, padded
 from ddco_pyro.model.frames import Frames

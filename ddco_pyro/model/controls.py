@@ -10,8 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from ddco_pyro.data.control_dimensions import number
-from ddco_pyro.data.control_parts import ControlPart
+from ddco_pyro.data.controls import ControlPart, number
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Emission, Gaussian, Hurdle, Product
 from ddco_pyro.spec import ControlSpec, LearnedStd

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ddco_pyro.data.checks import rounding
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, Transform, TransformError
-from ddco_pyro.data.values import rounding
 from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError
 from ddco_pyro.spec import STEP, AugmentSpec, ObservationSpec
@@ -25,7 +25,7 @@ class ObservationEncoder(nn.Module):
     """Observations by name to one feature vector: differences appended, standardised where the spec says so.
 
     Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model. A
-    dimension that varies by rounding alone (:func:`~ddco_pyro.data.values.rounding`) is only centred, and so are
+    dimension that varies by rounding alone (:func:`~ddco_pyro.data.checks.rounding`) is only centred, and so are
     differences whose dimension does so within each demonstration. What moves later moves in its own units, not in
     multiples of a rounding.
 

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.data.pictures import Observed, Pictures, Transform, shift_into
-from ddco_pyro.data.reading import Job, Readers
+from ddco_pyro.data.pictures import Job, Observed, Pictures, Readers, Transform, shift_into
 
 
 @dataclass(frozen=True, eq=False)

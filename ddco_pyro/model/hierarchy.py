@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from ddco_pyro.data.control_parts import ControlPart, all_gaussian
+from ddco_pyro.data.controls import ControlPart, all_gaussian
 from ddco_pyro.data.memory import share
 from ddco_pyro.model.batch import STEPS_AT_ONCE, Batch
 from ddco_pyro.model.controls import ControlScaling, ControlStd
@@ -26,6 +26,8 @@ from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.seeding import HOST
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
+from ddco_pyro.spec.networks import Network as AnyNetworkSpec
+from ddco_pyro.spec.networks import PerTimestepSpec
 
 BYTES_AT_ONCE = 256 * 10**6
 """Most bytes that networks take for the steps that go through them together, at least one step. Less where less memory
@@ -110,7 +112,7 @@ class Level(nn.Module):
         with named(f"{place}.policy"):
             self.policy = Caller(spec.policy, spec.policy.emits, options_below, read, control, scaling, spec.count)
         self.termination: Network | None = None
-        if isinstance(spec.termination, NetworkSpec):
+        if isinstance(spec.termination, AnyNetworkSpec):
             with named(f"{place}.termination"):
                 self.termination = build(spec.termination, read, 1, spec.count)
 
@@ -304,8 +306,8 @@ def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
     assert spec.baseline is not None  # a spec has one or the other
     policy = spec.baseline.policy
     if spec.baseline.kind == "per_timestep":
-        kept = {key: getattr(policy, key) for key in ("inputs", "shared", "hidden", "dropout", "activation")}
-        policy = NetworkSpec(network="per_timestep", **kept)
+        kept = {"hidden": ()} | policy.model_dump(exclude={"network"})  # a linear policy has no hidden layers
+        policy = PerTimestepSpec(network="per_timestep", **kept)
     return policy, ("control",)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ddco_pyro.data.control_dimensions import ControlDimension
+from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.drawing.words import method, number
 from ddco_pyro.report.tables import Table
 

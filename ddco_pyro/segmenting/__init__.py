@@ -11,7 +11,7 @@ import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
-from ddco_pyro.data.memory import INFERENCE, PROGRAM, Extent, refuse_too_much
+from ddco_pyro.data.memory import Extent, refuse_too_much
 from ddco_pyro.data.sources import Recording, Source, open_source
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.inferred import Inferred
@@ -166,9 +166,7 @@ def _refuse_too_long(recording: Recording, fit: Fit, before: int) -> None:
     seen = {f"obs/{key}": known[key] for key in fit.hierarchy.encoder.shapes if key in known}
     extent = Extent.of([{"actions": recording.actions, **seen}])
     (steps,) = extent.lengths
-    each, networks = extent.step(fit.spec.seen) + INFERENCE, min(steps, fit.hierarchy.steps_in_memory)
-    needed = PROGRAM + extent.size + steps * each + networks * fit.hierarchy.step_bytes
-    needed += FOUND * fit.hierarchy.depth * (before + steps)
+    needed = extent.segmenting + FOUND * fit.hierarchy.depth * (before + steps)
     refuse_too_much(needed, f"{recording.name}: segmenting its {steps} steps", "divide it, or the file")
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from ddco_pyro.data.control_parts import control_parts, difference
+from ddco_pyro.data.controls import control_parts, difference
 from ddco_pyro.spec import Spec, SpecError, with_overrides
-from ddco_pyro.spec.messages import show
+from ddco_pyro.spec.base import show
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, parameters
 
 DATA = ("task", "demonstrations")

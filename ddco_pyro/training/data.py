@@ -167,6 +167,6 @@ def _refuse_what_cannot_be_read(spec: Spec, path: Path) -> None:
     """See that there is a file, and that its demonstrations fit into memory, by the file's headers."""
     if not path.exists():
         raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
-    needed = extent(path, spec.trained_with, spec.demonstrations.exclude).fit((), spec.seen)
-    remedy = "leave observations out, make its demonstrations fewer, shorter or equally long, or scale pictures down"
-    refuse_too_much(needed, f"{path}: a fit to {', '.join(spec.trained_with)}", remedy)
+    remedy = "leave observations out, or make its demonstrations fewer, shorter or equally long"
+    what = f"{path}: a fit to {', '.join(spec.trained_with)}"
+    refuse_too_much(extent(path, spec.trained_with, spec.demonstrations.exclude).fitting, what, remedy)

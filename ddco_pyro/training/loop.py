@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from ddco_pyro.data.reading import Readers
+from ddco_pyro.data.pictures import Readers
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.batch import Batch

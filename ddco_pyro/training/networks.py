@@ -10,8 +10,14 @@ from typing import Any
 import torch
 from torch import nn
 
-from ddco_pyro.data.control_dimensions import ControlDimension, all_constant, control_dimensions
-from ddco_pyro.data.control_parts import ControlPart, control_parts, refuse_unknown_dimensions
+from ddco_pyro.data.controls import (
+    ControlDimension,
+    ControlPart,
+    all_constant,
+    control_dimensions,
+    control_parts,
+    refuse_unknown_dimensions,
+)
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.model.encoder import Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -192,7 +198,7 @@ def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) ->
             return parameters(build_hierarchy(resized(hidden), dimensions))
 
     target = parameters(check_networks(spec, dimensions))
-    return resized(nearest_widths(baseline.policy.hidden, target, count))
+    return resized(nearest_widths(baseline.policy.hidden_sizes, target, count))
 
 
 def nearest_widths(hidden: Sequence[int], target: int, parameters: Callable[[tuple[int, ...]], int]) -> tuple[int, ...]:

@@ -9,7 +9,7 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from ddco_pyro.data.reading import Job
+from ddco_pyro.data.pictures import Job
 from ddco_pyro.errors import Failed
 from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.model.batch import Batch

@@ -8,7 +8,7 @@ from torch import nn
 
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
 from ddco_pyro.model.networks.perceptrons import StackedLinear
-from ddco_pyro.spec import NetworkSpec
+from ddco_pyro.spec import network_spec
 
 FEATURES, OUTPUTS, COPIES, LONGEST = 3, 2, 4, 5
 SHAPE = InputShape({"state": FEATURES}, {}, LONGEST)
@@ -17,7 +17,7 @@ PIXELS = (14, 18, 3)
 
 def make(shape=SHAPE, **settings):
     torch.manual_seed(0)
-    return build(NetworkSpec(**settings), shape, OUTPUTS, COPIES).eval()
+    return build(network_spec(**settings), shape, OUTPUTS, COPIES).eval()
 
 
 def answer(network, inputs, state=None):

@@ -13,6 +13,7 @@ from ddco_pyro.model.networks.lstm import Lstm
 from ddco_pyro.model.networks.perceptrons import Branches, Linear, Mlp, Network, PerTimestep, State, States
 from ddco_pyro.model.networks.user import UserNetwork
 from ddco_pyro.spec import NetworkSpec, SpecError
+from ddco_pyro.spec.networks import UserNetworkSpec
 
 __all__ = [
     "CLASSES",
@@ -48,9 +49,9 @@ def build(spec: NetworkSpec, shape: InputShape | Network, outputs: int, copies: 
     """
     if spec.shared:
         raise ShapeError("shared: options would all do the same; share a trunk, or a network in of or over")
-    if spec.network in CLASSES:
-        return build_trunk(spec, shape, copies).add_head(outputs)
-    return _of_user(spec, shape, outputs, copies)
+    if isinstance(spec, UserNetworkSpec):
+        return _of_user(spec, shape, outputs, copies)
+    return build_trunk(spec, shape, copies).add_head(outputs)
 
 
 def build_trunk(spec: NetworkSpec, shape: InputShape | Network, copies: int) -> Network:
@@ -64,7 +65,7 @@ def build_trunk(spec: NetworkSpec, shape: InputShape | Network, copies: int) -> 
     :raises SpecError: the options do not fit the signature of a user's class.
     """
     copies = 1 if spec.shared else copies
-    if spec.network not in CLASSES:
+    if isinstance(spec, UserNetworkSpec):
         return _of_user(spec, shape, spec.features, copies)
     settings, seen = spec.settings, _selected(spec, shape)
     if isinstance(seen, InputShape):
@@ -76,7 +77,7 @@ def build_trunk(spec: NetworkSpec, shape: InputShape | Network, copies: int) -> 
     return _selecting(spec, CLASSES[spec.network](seen, copies, **settings))
 
 
-def _of_user(spec: NetworkSpec, shape: InputShape | Network, outputs: int, copies: int) -> Network:
+def _of_user(spec: UserNetworkSpec, shape: InputShape | Network, outputs: int, copies: int) -> Network:
     seen = _selected(spec, shape)
     assert isinstance(seen, InputShape)  # a spec has built-in networks over a trunk
     return _selecting(spec, UserNetwork.made(spec.network, seen, outputs, copies, spec.options))

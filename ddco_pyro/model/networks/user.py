@@ -17,7 +17,7 @@ from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.perceptrons import Network, State
 from ddco_pyro.model.networks.probe import try_network
 from ddco_pyro.spec import SpecError
-from ddco_pyro.spec.messages import in_words, show
+from ddco_pyro.spec.base import in_words, show
 
 POSITIONAL = 3
 """A user's class is made as ``Class(shape, outputs, copies, **options)``: the first three are no options."""

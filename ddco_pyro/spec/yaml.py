@@ -1,23 +1,22 @@
-"""YAML in and out, and the JSON Schema of it. Nothing else reads YAML."""
+"""Specs in YAML files, the JSON Schema of such files, and the user code that a spec names."""
 
 from __future__ import annotations
 
 import re
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import yaml
 
-from ddco_pyro.spec.keypaths import plain
-from ddco_pyro.spec.messages import SpecError, show
-from ddco_pyro.spec.user_code import refuse_user_code
-from ddco_pyro.spec.whole import Spec, parse_spec
+from ddco_pyro.spec.base import Importable, Model, SpecError, show
+from ddco_pyro.spec.spec import Spec, parse_spec, plain, with_overrides
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads numbers as YAML 1.2 does, ``1e-3``, ``010`` (ten) and ``1:30`` (text), and refuses a key given twice."""
+    """Reads numbers as YAML 1.2 does, ``1e-3``, ``010`` (ten) and ``1:30`` (text), and refuses duplicate keys."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -29,7 +28,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes the text that :class:`_Loader` would read as a number; repeats what is shared rather than use anchors."""
+    """Quotes text that :class:`_Loader` would read as a number, and writes no anchors."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -42,7 +41,7 @@ _NUMBER = re.compile(
     r"|[-+]?\.(?:inf|Inf|INF)$|\.(?:nan|NaN|NAN)$"
 )
 for _yaml in (_Loader, _Dumper):
-    _yaml.yaml_implicit_resolvers = {  # YAML 1.1 has 010 for eight, and 1:30 for ninety
+    _yaml.yaml_implicit_resolvers = {  # in YAML 1.1, 010 is eight and 1:30 is ninety
         first: [(tag, pattern) for tag, pattern in known if tag not in (_INT, _FLOAT)]
         for first, known in _yaml.yaml_implicit_resolvers.items()
     }
@@ -51,7 +50,6 @@ for _yaml in (_Loader, _Dumper):
 
 
 def _whole(loader: _Loader, node: yaml.ScalarNode) -> int:
-    """The whole number that a text says, in decimal digits or, after 0x, in hexadecimal ones."""
     text = loader.construct_scalar(node)
     return int(text, 16 if "x" in text else 10)
 
@@ -62,13 +60,13 @@ _Loader.add_constructor(_INT, _whole)
 def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool = False) -> Spec:
     """The spec in a YAML file, after ``overrides`` such as ``"hierarchy.levels.0.count=3"`` (the value is YAML).
 
-    Nothing that it names is imported here.
+    Code that the spec names is not imported.
 
     >>> spec = ddco_pyro.load_spec("mine.yaml", ["hierarchy.levels.0.count=3"])
     >>> spec.hierarchy.levels[0].count, spec.training.batch_size
     (3, 16)
 
-    :param allow_code: whether it may name user code (``module:name``), which is imported where the spec is used.
+    :param allow_code: whether the spec may name user code (``module:name``), which later use of the spec imports.
     :raises SpecError: the file cannot be read, is not YAML, is not a valid spec, or names code that is not allowed; one
         line for each problem.
     """
@@ -89,12 +87,12 @@ def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool 
     except SpecError as error:
         raise SpecError(*(f"{path}: {problem}" for problem in error.problems)) from None
     if not allow_code:
-        refuse_user_code(spec, path)
+        _refuse_user_code(spec, path)
     return spec
 
 
 def dump_spec(spec: Spec) -> str:
-    """The spec as YAML with every default written out. Reading it again gives an equal spec."""
+    """The spec as YAML with all defaults written out; reading the YAML gives an equal spec."""
     return yaml.dump(
         spec.model_dump(), Dumper=_Dumper, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120
     )
@@ -109,31 +107,30 @@ def spec_schema() -> dict[str, Any]:
 def read_yaml(content: bytes | str) -> Any:
     """Plain data in YAML text.
 
-    :raises SpecError: it is not YAML.
+    :raises SpecError: the text is not YAML, or expands to more than a spec can be.
     """
     try:
         return plain(_constructed(content))
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        where = _place(mark) if mark else ""
+        where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
         raise SpecError(f"{where}not valid YAML: {error.problem or error.context}") from None
     except RecursionError:
         raise SpecError("not valid YAML: nested too deeply") from None
-    except (yaml.YAMLError, ValueError) as error:  # not text, or a date or number that Python cannot hold
+    except (yaml.YAMLError, ValueError) as error:  # not text, or a date or number that Python cannot represent
         raise SpecError(f"not valid YAML: {' '.join(str(error).split())}") from None
 
 
 MOST_BYTES = 256 * 1024
-"""Of a spec file; an ordinary one has a few thousand. Reading so many takes seconds."""
+"""Largest spec file; an ordinary one has a few thousand bytes. Reading the largest takes seconds."""
 
 MOST_VALUES = 10_000
-"""Keys and values of a spec where its aliases are written out; an ordinary one has a few hundred."""
+"""Most keys and values of a spec with its aliases expanded; an ordinary spec has a few hundred."""
 
 DEEPEST = 100
 
 
 def _constructed(content: bytes | str) -> Any:
-    """What YAML text holds, once its aliases are known to stand for no more than that."""
     loader = _Loader(content)
     try:
         node = loader.get_single_node()
@@ -146,10 +143,10 @@ def _constructed(content: bytes | str) -> Any:
 
 
 def _extent(node: yaml.Node, known: dict[yaml.Node, tuple[int, int]]) -> tuple[int, int]:
-    """How many keys and values a node is where its aliases are written out, and how deeply they are nested.
+    """Number of keys and values of a node with its aliases expanded, and their depth.
 
-    :param known: of nodes that were met before: an alias is the node that it refers to, met again.
-    :raises RecursionError: they are nested too deeply, or a node holds itself.
+    :param known: results for earlier nodes; an alias is the node that it refers to.
+    :raises RecursionError: the node is nested too deeply, or contains itself.
     """
     if node not in known:
         parts = [] if isinstance(node, yaml.ScalarNode) else node.value
@@ -165,10 +162,6 @@ def _extent(node: yaml.Node, known: dict[yaml.Node, tuple[int, int]]) -> tuple[i
     return known[node]
 
 
-def _place(mark: yaml.Mark) -> str:
-    return f"line {mark.line + 1}, column {mark.column + 1}: "
-
-
 def _parse_override(text: str) -> tuple[str, Any]:
     path, equals, value = text.partition("=")
     if not equals or not path.strip():
@@ -177,3 +170,55 @@ def _parse_override(text: str) -> tuple[str, Any]:
         return path.strip(), read_yaml(value)
     except SpecError as error:
         raise SpecError(f"override {text!r}: {error}") from None
+
+
+# --- user code --------------------------------------------------------------------------------------------------------
+
+
+def user_code(spec: Spec) -> dict[str, str]:
+    """Key path to ``module:name`` of the code that using the spec imports, its grid excluded.
+
+    Names registered by installed packages are not user code.
+    """
+    return dict(_named(spec, ""))
+
+
+def _refuse_user_code(spec: Spec, path: str | Path) -> None:
+    """Refuse a spec that names user code, in its grid included."""
+    places = user_code(spec)
+    for key, values in spec.selection.grid.items():
+        for value in values:
+            candidate = with_overrides(spec, {"selection.grid": {}, key: value})
+            places |= {f"selection.grid.{key}": name for name in user_code(candidate).values()}
+    if places:
+        raise SpecError(
+            *(
+                f"{path}: {place}: would import user code ({name}); pass --allow-code if you trust it "
+                "(in Python: allow_code=True)"
+                for place, name in places.items()
+            )
+        )
+
+
+def _named(value: Any, place: str) -> Iterator[tuple[str, str]]:
+    """Key paths and names of user code below a part of the spec."""
+    if isinstance(value, Model):
+        for key, field in type(value).model_fields.items():
+            below, part = f"{place}.{key}" if place else key, getattr(value, key)
+            for mark in (*field.metadata, *_metadata(field.annotation)):
+                if isinstance(mark, Importable) and isinstance(part, str) and ":" in part:
+                    group = entry_points(group=mark.entry_points) if mark.entry_points else ()
+                    if part not in {point.name for point in group}:
+                        yield below, part
+            yield from _named(part, below)
+    elif isinstance(value, tuple | Mapping):
+        items = value.items() if isinstance(value, Mapping) else enumerate(value)
+        for name, part in items:
+            yield from _named(part, f"{place}.{name}")
+
+
+def _metadata(annotation: Any) -> Iterator[Any]:
+    """The metadata within a type such as ``Annotated[str, mark] | None``."""
+    yield from getattr(annotation, "__metadata__", ())
+    for argument in get_args(annotation):
+        yield from _metadata(argument)
