@@ -15,10 +15,10 @@ import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import EpochEnded, Event
-from ddco_pyro.fitting.building import Dimensions
-from ddco_pyro.fitting.launching import together
-from ddco_pyro.fitting.restarts import Trainer
 from ddco_pyro.spec import Spec, parse_spec
+from ddco_pyro.training.launching import together
+from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.restarts import Trainer
 
 NUMBER, STEPS, EPOCHS = 8, 16, 4
 FF = {"network": "conv", "filters": 64, "kernel": 5, "hidden": [64]}

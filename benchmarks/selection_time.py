@@ -21,10 +21,10 @@ from typing import Any
 
 from ddco_pyro.data.files import write_text
 from ddco_pyro.events import Event, FoldScored
-from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.fitting.run import claim
 from ddco_pyro.selection import Workers, folds, grid, scoring, select
 from ddco_pyro.spec import load_spec
+from ddco_pyro.training.data import demonstrations
 
 sys.path.append(str(Path(__file__).parents[1] / "studies"))
 from provenance import record, text

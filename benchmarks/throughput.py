@@ -28,10 +28,10 @@ from ddco_pyro.data.reading import Job, Readers
 from ddco_pyro.encoding import Encoding, encode
 from ddco_pyro.encoding.networks import Convolutions
 from ddco_pyro.events import EpochEnded, Event
-from ddco_pyro.fitting.building import Dimensions
-from ddco_pyro.fitting.restarts import Trainer
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.spec import parse_spec
+from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.restarts import Trainer
 
 sys.path.append(str(Path(__file__).parents[1] / "studies"))
 from processes import FF

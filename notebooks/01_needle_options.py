@@ -28,9 +28,9 @@ warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widg
 from ddco_pyro import load_spec
 from ddco_pyro.cli.console import Progress
 from ddco_pyro.drawing import words
-from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.report import tables, write_report
+from ddco_pyro.training.data import demonstrations
 
 RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))
 SMALLER = os.environ.get("NOTEBOOK_SMALLER", "").split()  # a test makes the fits smaller

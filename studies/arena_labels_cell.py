@@ -19,10 +19,10 @@ from arena_segments import flat
 from cells import Cell, Settings
 
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.agreement import agreement
+from ddco_pyro.evaluation.agreement import agreement
+from ddco_pyro.evaluation.schema import option_labels
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.labels import option_labels
-from ddco_pyro.fitting.prepare import parts
+from ddco_pyro.training.data import parts
 
 TRAINED = 50
 DEFAULTS = Settings({"demonstrations": 70, "noise": 0.1}, Path("runs/arena"))

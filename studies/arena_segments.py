@@ -8,10 +8,10 @@ import numpy as np
 from needle_success import over_seeds, spread
 from scipy import stats
 
-from ddco_pyro.fitting.agreement import agreement
+from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.prepare import parts
 from ddco_pyro.segmenting.baselines import BASELINES, segment
+from ddco_pyro.training.data import parts
 
 OURS = "ddco"
 MEASURES = ("nmi", "ari", "accuracy", "iou", "f1_10", "f1_25", "f1_50", "edit", "boundary_f1_1", "boundary_f1_3",

@@ -22,14 +22,14 @@ from ddco_pyro.acting.lockstep import Played, play
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
-from ddco_pyro.fitting.building import Dimensions, baseline_spec, build_hierarchy
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.prepare import dimensions
 from ddco_pyro.fitting.run import train
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.simulation.task import Task
 from ddco_pyro.spec import BaselineSpec, NetworkSpec, Spec, load_spec, with_overrides
+from ddco_pyro.training.data import dimensions
+from ddco_pyro.training.networks import Dimensions, baseline_spec, build_hierarchy
 
 SETTINGS = Path(__file__).parent / "pushing_settings.json"  # written by the sweep
 POOL = 80  # demonstrations of a seed; a cell takes the first ones

@@ -28,14 +28,14 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import MOVED, Transform, shifted
 from ddco_pyro.encoding.fitted import FittedReader, from_fit
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.building import Dimensions, baseline_spec, parameters
-from ddco_pyro.fitting.devices import device_of
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import Trained, train
 from ddco_pyro.simulation.cameras import Camera, Encoded
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.simulation.task import Task
 from ddco_pyro.spec import Spec, load_spec, with_overrides
+from ddco_pyro.training.devices import device_of
+from ddco_pyro.training.networks import Dimensions, baseline_spec, parameters
 
 SPECS = Path(__file__).parents[1] / "specs"
 SIZE, FINER, LARGE = (48, 64), 3, (480, 640)

@@ -53,10 +53,10 @@ from pushing_results import grouped, write
 from ddco_pyro.acting.lockstep import play
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
-from ddco_pyro.fitting.building import Dimensions, build_hierarchy
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec
+from ddco_pyro.training.networks import Dimensions, build_hierarchy
 
 COUNTS = (5, 20, 40, 80)
 OPTIONS = (1, 2, 3, 4, 5, 6, 7, 8)

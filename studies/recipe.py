@@ -212,7 +212,7 @@ def run(own: argparse.Namespace) -> str:
     command = f"python studies/recipe.py --grid {own.grid} --counts {counts} --spec {own.spec} --seeds {seeds} "
     made_by = record(f"{command}--episodes {own.episodes}")
     for seed in own.seeds:  # collected by whoever comes first, and only once
-        ddco_pyro.fitting.prepare.demonstrations(load_spec(own.spec, [f"demonstrations.seed={seed}"]))
+        ddco_pyro.training.data.demonstrations(load_spec(own.spec, [f"demonstrations.seed={seed}"]))
     models, summary = {}, ""
     for count, (model, tried) in product(own.counts, grid().items()):
         calls = [

@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 from sklearn.metrics import adjusted_rand_score, jaccard_score, normalized_mutual_info_score
 
-from ddco_pyro.fitting.agreement import MATCHED, UNKNOWN, UNMATCHED, agreement, confusion
+from ddco_pyro.evaluation.agreement import MATCHED, UNKNOWN, UNMATCHED, agreement, confusion
 
 WAYS = ("matched_globally", "matched_per_demonstration")
 

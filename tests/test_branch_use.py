@@ -8,7 +8,7 @@ import torch
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.fitting.branch_use import branch_use
+from ddco_pyro.evaluation.branch_use import branch_use
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import parse_spec
 

@@ -20,8 +20,6 @@ from ddco_pyro.encoding.encoder import About, Encoder
 from ddco_pyro.encoding.kinds import Drawn
 from ddco_pyro.encoding.networks import Convolutions
 from ddco_pyro.encoding.projection import Projection
-from ddco_pyro.fitting.building import Dimensions, build_hierarchy
-from ddco_pyro.fitting.prepare import dimensions
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.report import write_report
 from ddco_pyro.simulation import collect as collecting
@@ -29,6 +27,8 @@ from ddco_pyro.simulation.cameras import Encoded
 from ddco_pyro.simulation.environments import TaskEnvironment
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import DemonstrationsSpec, RolloutSpec, parse_spec
+from ddco_pyro.training.data import dimensions
+from ddco_pyro.training.networks import Dimensions, build_hierarchy
 
 TASK = "toy_task:watched"
 

@@ -306,13 +306,13 @@ def test_training_that_fails_says_why(spec, tmp_path):
     ],
 )
 def test_what_fails_otherwise_has_one_line_too(monkeypatch, spec, error, message):
-    monkeypatch.setattr("ddco_pyro.fitting.prepare.dimensions", mock.Mock(side_effect=error))
+    monkeypatch.setattr("ddco_pyro.training.data.dimensions", mock.Mock(side_effect=error))
     assert call("check", spec) == (1, "", f"ddco-pyro: {message}\n")
 
 
 def test_a_scheduler_that_preempts_means_ctrl_c(monkeypatch, spec):
     before = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr("ddco_pyro.fitting.prepare.dimensions", lambda *_: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.setattr("ddco_pyro.training.data.dimensions", lambda *_: signal.raise_signal(signal.SIGTERM))
     assert call("check", spec) == (1, "", "ddco-pyro: interrupted\n")
     assert signal.getsignal(signal.SIGTERM) is before
 
@@ -329,7 +329,7 @@ def test_an_interrupt_within_a_finalizer_is_not_lost(monkeypatch, spec, number):
         Interrupted()
         time.sleep(HANGS)
 
-    monkeypatch.setattr("ddco_pyro.fitting.prepare.dimensions", work)
+    monkeypatch.setattr("ddco_pyro.training.data.dimensions", work)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # workers of pytest-xdist ignore it
     try:
         assert call("check", spec) == (1, "", "ddco-pyro: interrupted\n")

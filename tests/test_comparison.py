@@ -23,11 +23,11 @@ from ddco_pyro.comparison.shared import NotShared
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.fitted_to import OtherDemonstrations
-from ddco_pyro.fitting.prepare import demonstrations, parts
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import with_overrides
+from ddco_pyro.training.data import demonstrations, parts
 
 SHORT = {"training.epochs": 1, "compare_with": []}
 

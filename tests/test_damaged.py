@@ -23,11 +23,11 @@ from ddco_pyro.cli import console
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.drawing import words
+from ddco_pyro.evaluation.schema import read_metrics, read_successes
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.prepare import demonstrations
-from ddco_pyro.fitting.records import read_metrics, read_successes
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.report import option_figures, plot_likelihood, sections, tables
+from ddco_pyro.training.data import demonstrations
 
 LINE = r"ddco-pyro: {path}: is damaged: "
 

@@ -8,9 +8,9 @@ import pytest
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.events import DemonstrationsDone
-from ddco_pyro.fitting.building import Dimensions, build_hierarchy, check_networks
-from ddco_pyro.fitting.prepare import demonstrations, dimensions
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
+from ddco_pyro.training.data import demonstrations, dimensions
+from ddco_pyro.training.networks import Dimensions, build_hierarchy, check_networks
 
 TASK = "toy_task:task"
 SIZE = Dimensions({"offsets": (4,), "camera": (8, 8, 3), "visited": (1,)}, control_size=2, steps=12)

@@ -11,13 +11,13 @@ from oracle import paths
 from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.decomposition import decompose
 from ddco_pyro.model.encoding import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.spec import parse_spec
+from ddco_pyro.training.networks import Dimensions
 
 LENGTHS = (3, 2)
 

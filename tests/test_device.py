@@ -19,10 +19,10 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import padded
 from ddco_pyro.export import export
-from ddco_pyro.fitting import devices
-from ddco_pyro.fitting.restarts import OtherDevice
 from ddco_pyro.model.networks.conv import _field_means
 from ddco_pyro.spec import Spec, parse_spec
+from ddco_pyro.training import devices
+from ddco_pyro.training.restarts import OtherDevice
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*to a meta parameter:UserWarning")  # the double is called meta
 
@@ -93,7 +93,7 @@ def spec_of(level: dict[str, Any], **training: Any) -> Spec:
 
 def on(monkeypatch: pytest.MonkeyPatch, device: torch.device) -> None:
     # it counts on the device that the double is named after
-    monkeypatch.setattr("ddco_pyro.fitting.building._refuse_giants", lambda *_: None)
+    monkeypatch.setattr("ddco_pyro.training.networks._refuse_giants", lambda *_: None)
     for module in USERS:
         monkeypatch.setattr(f"ddco_pyro.fitting.{module}.device_of", lambda training: device)
 
@@ -141,7 +141,7 @@ def test_pictures_stay_on_a_device_with_room(demos: Demonstrations, monkeypatch:
     monkeypatch.setattr("ddco_pyro.data.reading.padded", lambda *given: read.append(1) or padded(*given))
     fits, asked = [], []
     for room in (float("inf"), 1.0):
-        monkeypatch.setattr("ddco_pyro.fitting.material.room", lambda device, room=room: room)
+        monkeypatch.setattr("ddco_pyro.training.material.room", lambda device, room=room: room)
         with Device():
             fits.append(weights(ddco_pyro.fit(spec, demos)))
         asked.append(len(read) - sum(asked))

@@ -11,14 +11,14 @@ from planted import make_spec, make_trainer, make_truth, plant
 from scipy import integrate, stats
 
 import ddco_pyro
-from ddco_pyro.fitting.checkpoint import Progress
-from ddco_pyro.fitting.duration import log_duration_prior
-from ddco_pyro.fitting.objective import Objective
-from ddco_pyro.fitting.stages import plan
 from ddco_pyro.inference import log_likelihood, total_log_likelihood
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.links import log_termination
 from ddco_pyro.spec import DurationSpec
+from ddco_pyro.training.checkpoint import Progress
+from ddco_pyro.training.duration import log_duration_prior
+from ddco_pyro.training.objective import Objective
+from ddco_pyro.training.stages import plan
 
 LENGTHS = torch.tensor([4, 3])
 

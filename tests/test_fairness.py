@@ -16,15 +16,15 @@ from selecting import Told, candidate, score, spec_at
 
 import ddco_pyro
 from ddco_pyro.comparison import compare, write
-from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit
-from ddco_pyro.fitting.widths import nearest_widths
 from ddco_pyro.report import unconverged, write_report
 from ddco_pyro.selection import Workers, select
 from ddco_pyro.selection.choice import as_data, choose
 from ddco_pyro.selection.table import HEAD, cells, markdown
 from ddco_pyro.spec import SpecError, dump_spec, with_overrides
+from ddco_pyro.training.data import demonstrations
+from ddco_pyro.training.widths import nearest_widths
 
 BASELINES = ["flat", "flat_equal", "per_timestep"]
 

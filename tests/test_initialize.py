@@ -11,14 +11,14 @@ from planted import make_trainer
 from sklearn.metrics import adjusted_rand_score
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.fitting.checkpoint import Progress
-from ddco_pyro.fitting.clusters import Clusters, EqualParts
-from ddco_pyro.fitting.objective import Objective
-from ddco_pyro.fitting.stages import plan
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.spec import parse_spec
+from ddco_pyro.training.checkpoint import Progress
+from ddco_pyro.training.initialization import Clusters, EqualParts
+from ddco_pyro.training.objective import Objective
+from ddco_pyro.training.stages import plan
 
 LENGTHS = (7, 4, 6)
 PLACES = np.array([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
@@ -188,7 +188,7 @@ def test_it_does_not_matter_how_many_images_are_looked_at_together(monkeypatch):
     images = np.random.default_rng(8).integers(0, 256, (sum(LENGTHS), 16, 16, 3), dtype=np.uint8)
     batch = make_batch(random_rows(9, 2), random_rows(10, 2), {"camera": images})
     together = Clusters(batch, 3, seed=0).choices(batch)
-    monkeypatch.setattr("ddco_pyro.fitting.clusters.FRAMES_AT_ONCE", 2)
+    monkeypatch.setattr("ddco_pyro.training.initialization.FRAMES_AT_ONCE", 2)
     assert torch.equal(Clusters(batch, 3, seed=0).choices(batch), together)
 
 

@@ -224,8 +224,8 @@ def _pictures(folder: Path) -> Path:
 
 
 def _toy_demonstrations(folder: Path) -> Path:
-    from ddco_pyro.fitting.prepare import demonstrations as of
     from ddco_pyro.spec import load_spec
+    from ddco_pyro.training.data import demonstrations as of
 
     path = folder / "toy_source.hdf5"
     of(load_spec(folder / "toy.yaml", allow_code=True)).write(path)

@@ -18,16 +18,16 @@ from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.fitting.building import Dimensions
-from ddco_pyro.fitting.checkpoint import Progress
-from ddco_pyro.fitting.clusters import Clusters
-from ddco_pyro.fitting.labels import Labels
-from ddco_pyro.fitting.objective import Objective
-from ddco_pyro.fitting.restarts import Trainer
-from ddco_pyro.fitting.stages import plan
 from ddco_pyro.inference import segment
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.spec import SpecError, dump_spec, parse_spec
+from ddco_pyro.training.checkpoint import Progress
+from ddco_pyro.training.initialization import Clusters
+from ddco_pyro.training.labels import Labels
+from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.objective import Objective
+from ddco_pyro.training.restarts import Trainer
+from ddco_pyro.training.stages import plan
 
 STEPS = 3
 LABELS = [[5, -1, -1], [-1, 9, 5], [-1, -1, 9], [-1, -1, -1], [9, 9, -1]]

@@ -19,8 +19,8 @@ from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.memory import PROGRAM, allowed
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.prepare import demonstrations, memory_needed
 from ddco_pyro.spec import load_spec, parse_spec
+from ddco_pyro.training.data import demonstrations, memory_needed
 
 GIGABYTE = 10**9
 LIMIT = 2 * GIGABYTE

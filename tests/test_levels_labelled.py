@@ -8,7 +8,7 @@ from command_line import call
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.fitting.agreement import agreement
+from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import SpecError, dump_spec, parse_spec
 

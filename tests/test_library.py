@@ -186,7 +186,7 @@ def test_demonstrations_are_taken_as_they_are_needed(in_memory: ddco_pyro.Fit, m
 
 def test_evaluation_does_not_depend_on_the_pieces(in_memory: ddco_pyro.Fit, monkeypatch) -> None:
     from ddco_pyro.fitting.metrics import evaluate
-    from ddco_pyro.fitting.prepare import parts
+    from ddco_pyro.training.data import parts
 
     demos = two_skills()
     monkeypatch.setattr("ddco_pyro.model.hierarchy.STEPS_AT_ONCE", 1)

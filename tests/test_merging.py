@@ -16,8 +16,8 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.merging import LABELS, MergeError, Pair, chosen, merge, merged_labels, merged_spec
-from ddco_pyro.fitting.prepare import parts
 from ddco_pyro.spec import with_overrides
+from ddco_pyro.training.data import parts
 
 SETTINGS = {"epochs": 300, "patience": 15, "initialize": "vq_controls"}
 

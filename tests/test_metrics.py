@@ -11,10 +11,10 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import json_text
 from ddco_pyro.drawing import words
-from ddco_pyro.fitting.prepare import parts
 from ddco_pyro.fitting.rollouts import policies
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import parse_spec
+from ddco_pyro.training.data import parts
 
 POLICY = {"network": "mlp", "hidden": [4]}
 

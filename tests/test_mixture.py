@@ -18,11 +18,8 @@ from toy_task import SPEC
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.drawing import words
-from ddco_pyro.fitting.building import Dimensions, baseline_spec, build_hierarchy, named_baselines, parameters
-from ddco_pyro.fitting.duration import log_duration_prior
+from ddco_pyro.evaluation.worth import mean_run, worth
 from ddco_pyro.fitting.fit import model_name
-from ddco_pyro.fitting.upper import Constants, fitted
-from ddco_pyro.fitting.worth import mean_run, worth
 from ddco_pyro.inference import log_likelihood, posterior
 from ddco_pyro.inference.check import compare_engines
 from ddco_pyro.model.encoding import encode
@@ -32,6 +29,9 @@ from ddco_pyro.segmenting import LevelLabels
 from ddco_pyro.selection.grid import candidates
 from ddco_pyro.spec import DurationSpec, SpecError, dump_spec, load_spec, parse_spec, with_overrides
 from ddco_pyro.spec.reading import read_yaml
+from ddco_pyro.training.duration import log_duration_prior
+from ddco_pyro.training.networks import Dimensions, baseline_spec, build_hierarchy, named_baselines, parameters
+from ddco_pyro.training.upper import Constants, fitted
 
 SPECS = Path(__file__).parent.parent / "specs"
 

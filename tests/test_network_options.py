@@ -10,10 +10,10 @@ import torch
 from pydantic import Field
 from torch import nn
 
-from ddco_pyro.fitting.building import Dimensions, check_networks
 from ddco_pyro.model.networks import CLASSES, InputShape, build
 from ddco_pyro.spec import NetworkSpec, SpecError, parse_spec
 from ddco_pyro.spec.networks import SETTINGS
+from ddco_pyro.training.networks import Dimensions, check_networks
 
 if TYPE_CHECKING:
     from collections.abc import Hashable

@@ -22,7 +22,7 @@ from random_demonstrations import demonstrations
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import NotWritable, Output, check_outputs
-from ddco_pyro.fitting.prepare import demonstrations as of
+from ddco_pyro.training.data import demonstrations as of
 
 
 def digest(folder: Path) -> dict[str, object]:
@@ -265,7 +265,7 @@ def test_a_name_that_is_a_formula_is_quoted_in_csv(toy_run, file: Path, tmp_path
 
 
 def test_demonstrations_that_no_option_explains_are_refused(toy_run, file: Path, tmp_path: Path, monkeypatch) -> None:
-    from ddco_pyro.fitting.inferred import Inferred
+    from ddco_pyro.evaluation.inferred import Inferred
 
     monkeypatch.setattr(Inferred, "log_likelihood", np.full(12, -np.inf))
     ended = call("segment", toy_run.folder, file, "--csv", tmp_path / "a.csv")

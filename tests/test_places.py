@@ -62,7 +62,7 @@ def test_a_full_disk_while_importing(source: Path, tmp_path: Path, size: int) ->
 
 @pytest.mark.parametrize("size", [0, 3000])
 def test_a_full_disk_while_segmenting(toy_run, toy_spec, tmp_path: Path, size: int) -> None:
-    from ddco_pyro.fitting.prepare import demonstrations as of
+    from ddco_pyro.training.data import demonstrations as of
 
     path = tmp_path / "demos.hdf5"
     of(toy_spec).write(path)

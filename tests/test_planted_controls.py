@@ -9,7 +9,7 @@ from planted import make_spec, make_trainer, make_truth, plant, recovered
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.control_parts import ControlPart, control_parts
-from ddco_pyro.fitting.building import Dimensions
+from ddco_pyro.training.networks import Dimensions
 
 BOUND = 0.12
 """Far from its corner an option is on a bound nearly always: more than half of the controls are."""

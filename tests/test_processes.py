@@ -24,18 +24,18 @@ from killing import struck
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting import restarts as restarting
-from ddco_pyro.fitting.building import Dimensions
-from ddco_pyro.fitting.checkpoint import Progress
-from ddco_pyro.fitting.launching import check_processes, launched, requested, together
-from ddco_pyro.fitting.objective import Objective, TrainingError
-from ddco_pyro.fitting.ranks import Ranks
-from ddco_pyro.fitting.restarts import Trainer
 from ddco_pyro.fitting.run import fit
-from ddco_pyro.fitting.shards import ascend, cut
-from ddco_pyro.fitting.stages import plan
 from ddco_pyro.model.encoding import STEPS_AT_ONCE
 from ddco_pyro.spec import dump_spec, parse_spec
+from ddco_pyro.training import restarts as restarting
+from ddco_pyro.training.checkpoint import Progress
+from ddco_pyro.training.launching import check_processes, launched, requested, together
+from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.objective import Objective, TrainingError
+from ddco_pyro.training.ranks import Ranks
+from ddco_pyro.training.restarts import Trainer
+from ddco_pyro.training.shards import ascend, cut
+from ddco_pyro.training.stages import plan
 
 DROPPING = {"network": "mlp", "hidden": [6], "dropout": 0.3}
 TRAINING = {"shards": 4, "batch_size": 5, "epochs": 16, "restarts": 2, "halving": 2, "optimizer": {"lr": 0.03}}

@@ -19,8 +19,8 @@ from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.building import Dimensions, build_hierarchy, parameters
 from ddco_pyro.spec import SpecError, load_spec
+from ddco_pyro.training.networks import Dimensions, build_hierarchy, parameters
 
 
 def results(goals, held_out):

@@ -10,15 +10,15 @@ import toy_task
 from moving_demonstrations import made, reaches, recorded
 
 from ddco_pyro.drawing import words
-from ddco_pyro.fitting.agreement import MATCHED, UNMATCHED
+from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.fitting.fit import load
-from ddco_pyro.fitting.prepare import demonstrations, parts
 from ddco_pyro.fitting.run import fit, write_metrics
 from ddco_pyro.report import film, write_report
 from ddco_pyro.report.activity import activity
 from ddco_pyro.simulation.episodes import Episode, paired_difference, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.spec import parse_spec
+from ddco_pyro.training.data import demonstrations, parts
 
 LINEAR = {"network": "linear"}
 
@@ -43,7 +43,7 @@ def run(folder, demos, **changes):
 def coarse():
     """Small pictures are drawn faster."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ddco_pyro.drawing.pictures.DOTS_PER_INCH", 40)
+        patch.setattr("ddco_pyro.drawing.figures.DOTS_PER_INCH", 40)
         yield
 
 

@@ -12,12 +12,12 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing import words
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import EpochEnded, RestartDiverged, RestartStopped
-from ddco_pyro.fitting import restarts as restarting
-from ddco_pyro.fitting import training
-from ddco_pyro.fitting.checkpoint import Progress, Restart
-from ddco_pyro.fitting.objective import TrainingError
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.spec import parse_spec
+from ddco_pyro.training import loop as training
+from ddco_pyro.training import restarts as restarting
+from ddco_pyro.training.checkpoint import Progress, Restart
+from ddco_pyro.training.objective import TrainingError
 
 QUICK = {"initialize": "random", "layerwise": False, "epochs": 14, "patience": 5, "optimizer": {"lr": 0.05}}
 """Some restarts of it end by patience, others by their budget."""

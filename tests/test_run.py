@@ -19,11 +19,11 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan, TrainingEnded
-from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.fitting.fit import RunError
-from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.fitting.run import claim, claimed, fit, train
 from ddco_pyro.spec import dump_spec, load_spec, with_overrides
+from ddco_pyro.training.data import demonstrations
+from ddco_pyro.training.networks import Dimensions
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.agreement import agreement
+from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.segmenting.baselines import BASELINES, segment
 from ddco_pyro.spec import ObservationSpec
 

@@ -17,11 +17,11 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.fitting.agreement import agreement
-from ddco_pyro.fitting.prepare import demonstrations
-from ddco_pyro.fitting.prepare import parts as split_in_parts
+from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.segmenting import Segmented, segments
 from ddco_pyro.segmenting.baselines import BASELINES, segment
+from ddco_pyro.training.data import demonstrations
+from ddco_pyro.training.data import parts as split_in_parts
 
 
 @pytest.fixture

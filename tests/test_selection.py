@@ -18,7 +18,6 @@ from selecting import Told, data_at, kept, score, spec_at, two_skills
 
 import ddco_pyro
 from ddco_pyro.errors import Failed
-from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.fitting.fit import Fit, RunError
 from ddco_pyro.fitting.fitted_to import OtherDemonstrations
 from ddco_pyro.fitting.run import train
@@ -26,6 +25,7 @@ from ddco_pyro.selection import SelectionFailed, Workers, check, final_spec, par
 from ddco_pyro.selection.folds import FoldError
 from ddco_pyro.selection.parallel import BackendError
 from ddco_pyro.spec import SpecError, with_overrides
+from ddco_pyro.training.networks import Dimensions
 
 ONE = Workers(1)
 COMMAND = Path(sys.executable).with_name("ddco-pyro")

@@ -7,9 +7,9 @@ import re
 import pytest
 from selecting import DATA, spec_at
 
-from ddco_pyro.fitting.building import Dimensions
 from ddco_pyro.selection.grid import candidates, wide
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
+from ddco_pyro.training.networks import Dimensions
 
 PLACE, TURN = {"place": (2,)}, {"turn": (1,)}
 SIZE = Dimensions(PLACE | TURN, 2, 10)

@@ -11,11 +11,11 @@ from scipy import stats
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.fitting.building import Dimensions, baseline_spec, build_hierarchy, parameters
 from ddco_pyro.inference.check import compare_engines
 from ddco_pyro.model.controls import INITIAL_STD
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
+from ddco_pyro.training.networks import Dimensions, baseline_spec, build_hierarchy, parameters
 
 OF_STATE = {"learn": True, "per_state": True}
 OF_OPTION = {"learn": True, "per_option": True}

@@ -11,14 +11,14 @@ import torch
 from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plant, recovered
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.fitting.averaging import Average
-from ddco_pyro.fitting.checkpoint import Progress, Restart
-from ddco_pyro.fitting.convergence import RISING, StageEnd
-from ddco_pyro.fitting.objective import Objective, TrainingError
-from ddco_pyro.fitting.stages import plan
-from ddco_pyro.fitting.training import advance
 from ddco_pyro.inference import total_log_likelihood
 from ddco_pyro.spec import parse_spec, with_overrides
+from ddco_pyro.training.averaging import Average
+from ddco_pyro.training.checkpoint import Progress, Restart
+from ddco_pyro.training.convergence import RISING, StageEnd
+from ddco_pyro.training.loop import advance
+from ddco_pyro.training.objective import Objective, TrainingError
+from ddco_pyro.training.stages import plan
 
 
 def random_demonstrations(number=10, steps=8, seed=0):
@@ -301,7 +301,7 @@ def test_resuming_gives_the_same_bits(tmp_path, optimizer, training, rows):
 
 
 def test_frozen_levels_stay_as_they_were_discovered(tmp_path, monkeypatch):
-    monkeypatch.setattr("ddco_pyro.fitting.training.SAVE_EVERY", 0.0)
+    monkeypatch.setattr("ddco_pyro.training.loop.SAVE_EVERY", 0.0)
     before = {}
     spec = make_spec((2,), lower_levels="frozen", epochs=15)
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 from hierarchies import SHAPES, make_batch
 
-from ddco_pyro.fitting.stages import plan
 from ddco_pyro.inference import total_log_likelihood
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import SpecError, parse_spec
+from ddco_pyro.training.stages import plan
 
 SEES = {"network": "mlp", "hidden": [5], "activation": "tanh"}
 JOINED = {"network": "mlp", "hidden": [4], "activation": "tanh"}

@@ -10,10 +10,10 @@ import torch
 from planted import CONTROL, make_spec, make_trainer, make_truth, plant
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.fitting.checkpoint import Progress
-from ddco_pyro.fitting.objective import Objective
-from ddco_pyro.fitting.stages import plan
 from ddco_pyro.inference import log_likelihood
+from ddco_pyro.training.checkpoint import Progress
+from ddco_pyro.training.objective import Objective
+from ddco_pyro.training.stages import plan
 
 LEARNT = {"std": {"learn": True, "floor": 0.01}, "scale": "none"}
 TRAINING = {"epochs": 200, "patience": 10, "initialize": "vq_controls"}

@@ -13,10 +13,10 @@ from oracle import paths, random_tables
 from planted import make_spec
 from sklearn.metrics import normalized_mutual_info_score
 
-from ddco_pyro.fitting import upper
-from ddco_pyro.fitting.upper import Constants, expected, fitted, improved
 from ddco_pyro.inference import segment
 from ddco_pyro.spec import SpecError, with_overrides
+from ddco_pyro.training import upper
+from ddco_pyro.training.upper import Constants, expected, fitted, improved
 
 STEPS = 3
 

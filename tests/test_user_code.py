@@ -14,8 +14,8 @@ import yaml
 from command_line import call, with_set
 
 import ddco_pyro
-from ddco_pyro.fitting.prepare import demonstrations
 from ddco_pyro.spec import SpecError, load_spec, parse_spec, user_code, with_overrides
+from ddco_pyro.training.data import demonstrations
 
 HERE = Path(__file__).parent
 MODULE = """

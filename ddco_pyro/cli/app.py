@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ddco_pyro.cli import demos, fits, outputs, runs
+from ddco_pyro.cli import demos, fits, runs
 from ddco_pyro.errors import BadInput, Failed
 
 app = typer.Typer(
@@ -41,8 +41,8 @@ EXAMPLES: dict[Callable[..., None], str] = {
     demos.init: "init mine.hdf5 --out mine.yaml",
     demos.import_: "import pusht --out demos.hdf5",
     demos.encode: "encode demos.hdf5 --observation camera --encoder random_conv --out encoded.hdf5",
-    outputs.segment: "segment runs/mine mine.hdf5 --html segments.html",
-    outputs.export: "export runs/mine --out controller --onnx",
+    runs.segment: "segment runs/mine mine.hdf5 --html segments.html",
+    runs.export: "export runs/mine --out controller --onnx",
 }
 """Every command, in the order of ``--help``."""
 

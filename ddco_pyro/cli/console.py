@@ -36,11 +36,11 @@ from ddco_pyro.events import (
 
 if TYPE_CHECKING:
     from ddco_pyro.data.inspection import Field, Inspection
-    from ddco_pyro.fitting.building import Dimensions
-    from ddco_pyro.fitting.labels import Labels
     from ddco_pyro.fitting.merging import Pair
     from ddco_pyro.model.hierarchy import Hierarchy
     from ddco_pyro.spec import Spec
+    from ddco_pyro.training.labels import Labels
+    from ddco_pyro.training.networks import Dimensions
 
 PLAIN_SECONDS = 10.0
 """Time between two plain lines of progress."""
@@ -162,7 +162,7 @@ def show(table: Table) -> None:
 
 def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Sequence[tuple[Spec, Hierarchy]]) -> None:
     """Shapes of observations and control, and the parameters of each network and of each baseline."""
-    from ddco_pyro.fitting.building import parameters
+    from ddco_pyro.training.networks import parameters
 
     rows = [[f"observation {key}", str(list(size.shapes[key]))] for key in spec.observed]
     rows += [["features", str(len(hierarchy.encoder.mean))], ["control", str([size.control_size])]]
@@ -192,7 +192,7 @@ def control(size: Dimensions, hierarchy: Hierarchy) -> None:
 
 def device(spec: Spec) -> None:
     """The device of the networks, unless the spec says ``cpu``."""
-    from ddco_pyro.fitting.devices import described, device_of
+    from ddco_pyro.training.devices import described, device_of
 
     if spec.training.device != "cpu":
         say(f"networks: on {described(device_of(spec.training))}, {spec.training.precision} in gradient steps")
@@ -202,7 +202,9 @@ def labels(spec: Spec, used: Labels | None) -> None:
     """The label of each option, where training uses labels."""
     own = spec.training.labels
     if used is not None and own is not None:
-        names = ", ".join(f"{value} is {words.option_name(option)}" for option, value in enumerate(used.values, start=1))
+        names = ", ".join(
+            f"{value} is {words.option_name(option)}" for option, value in enumerate(used.values, start=1)
+        )
         say(f"labels/{own.source}, level {own.level!r}: {names}; used of {len(used.demonstrations)} demonstrations")
 
 

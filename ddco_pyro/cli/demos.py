@@ -74,9 +74,9 @@ def inspect(
     if as_json:
         print(json.dumps(facts.as_json(), indent=1))
         return
-    from ddco_pyro.cli.console_inspection import show
+    from ddco_pyro.cli import console
 
-    show(facts)
+    console.inspection(facts)
     if facts.format != "robomimic":
         print(f"\nto fit to it, import it first: {command('import', file, '--out', 'demos.hdf5')}")
         return

@@ -42,9 +42,9 @@ def check(
         raise SpecError("name a spec, such as: ddco-pyro check specs/needle.yaml")
     loaded = load_spec(spec, overrides, allow_code)
     from ddco_pyro.cli import console
-    from ddco_pyro.fitting.building import baselines, check_networks
-    from ddco_pyro.fitting.labels import used
-    from ddco_pyro.fitting.prepare import dimensions, in_file, outline, refuse_unfit
+    from ddco_pyro.training.data import dimensions, in_file, outline, refuse_unfit
+    from ddco_pyro.training.labels import used
+    from ddco_pyro.training.networks import baselines, check_networks
 
     demos = outline(loaded) if in_file(loaded) else None
     size = dimensions(loaded, demos)
@@ -85,7 +85,7 @@ def fit(
     With --seeds the fit and its baselines are repeated, in --jobs processes, with other training seeds: other first
     weights, clusters and orders of the same demonstrations. RUN/seeds has a run for each.
     """
-    from ddco_pyro.fitting.launching import follow_torchrun, launched, leading, requested
+    from ddco_pyro.training.launching import follow_torchrun, launched, leading, requested
 
     ranks = launched()
     if ranks and ranks.rank > 0:
@@ -153,10 +153,10 @@ def select(
         raise SpecError("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
     from ddco_pyro import selection
     from ddco_pyro.cli import console
-    from ddco_pyro.fitting.prepare import seen
     from ddco_pyro.fitting.run import fit_run
     from ddco_pyro.report import write_report
-    from ddco_pyro.selection.table import HEAD, cells
+    from ddco_pyro.selection.choice import table
+    from ddco_pyro.training.data import seen
 
     workers = selection.Workers(jobs, scheduler)
     folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -171,7 +171,9 @@ def select(
         assert made.choice.chosen is not None  # or it would have failed
         final = selection.final_spec(made.choice.chosen.candidate)
         fitted = fit_run(final, seen(final, made.demos), folder / "fit", progress, jobs)
-    console.selection(made.choice, HEAD, [cells(row, made.choice) for row in made.choice.rows])
+    console.show(table(made.choice, "held-out log-likelihood by cross-validation, nats per step"))
+    for note in made.choice.notes:
+        console.say(f"note: {note}")
     _warn(fitted)
     print(f"selection: {folder / 'selection.json'}")
     print(f"report: {write_report(fitted, fitted.demonstrations)}")

@@ -50,7 +50,7 @@ def legend(choices: Iterable[int]) -> list[Patch]:
 def add_legend(figure: Figure, choices: Iterable[int], place: str = "outside lower center") -> None:
     """Name the colours of these choices below a figure."""
     handles = legend(sorted(set(choices)))
-    figure.legend(handles=handles, loc=place, ncols=min(len(handles), 11), handlelength=1)
+    figure.legend(handles=handles, loc=place, ncols=min(len(handles), 11), handlelength=1)  # type: ignore[call-overload]
 
 
 def with_heat(picture: np.ndarray, values: np.ndarray) -> np.ndarray:

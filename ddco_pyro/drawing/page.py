@@ -209,6 +209,8 @@ def _kind(block: Any) -> str:
 def _markdown(blocks: Sequence[Block]) -> str:
     flat = chain.from_iterable(block.blocks if isinstance(block, Folded) else [block] for block in blocks)
     shown = (
-        block.markdown() if isinstance(block, Table) else block.text for block in flat if isinstance(block, Table | Text)
+        block.markdown() if isinstance(block, Table) else block.text
+        for block in flat
+        if isinstance(block, Table | Text)
     )
     return "\n\n".join(shown)

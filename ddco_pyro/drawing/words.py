@@ -153,7 +153,7 @@ def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out
 def worth(found: Mapping[str, Any], ours: str, held_out: int) -> str:
     """What several experts and options that last are worth in one fit of each model.
 
-    :param found: what :func:`ddco_pyro.fitting.worth.worth` gives, with ``steps_in_a_row`` where that is known.
+    :param found: what :func:`ddco_pyro.evaluation.worth.worth` gives, with ``steps_in_a_row`` where that is known.
     :param ours: what the hierarchy is called.
     """
     memory = found["memory"]

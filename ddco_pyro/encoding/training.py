@@ -14,7 +14,7 @@ from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.encoding.networks import Autoencoder, Convolutions
 from ddco_pyro.encoding.pictures import AT_ONCE, Pictures
 from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, UpdatesDone
-from ddco_pyro.fitting.checkpoint import copy_of, optimizer_state, restore_optimizer
+from ddco_pyro.training.checkpoint import copy_of, optimizer_state, restore_optimizer
 
 UPDATES = 2000
 """Gradient steps, each on :data:`ddco_pyro.encoding.pictures.AT_ONCE` pictures."""

@@ -1,1 +1,1 @@
-"""From a spec and demonstrations to a fitted hierarchy, its run folder and its numbers."""
+"""A fitted model, its run folder, and what is done with it."""

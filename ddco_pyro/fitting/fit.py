@@ -20,14 +20,14 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.data.tensors import read_tensors
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.building import Dimensions, build_hierarchy, named_baselines
+from ddco_pyro.evaluation.inferred import Inferred, infer
+from ddco_pyro.evaluation.schema import read_metrics, refit
 from ddco_pyro.fitting.fitted_to import refuse_others
-from ddco_pyro.fitting.inferred import Inferred, infer
-from ddco_pyro.fitting.prepare import demonstrations
-from ddco_pyro.fitting.records import read_metrics, refit
 from ddco_pyro.inference import Posterior
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, user_code
+from ddco_pyro.training.data import demonstrations
+from ddco_pyro.training.networks import Dimensions, build_hierarchy, named_baselines
 
 TOLERANCE = 1e-4
 """Relative; a log-likelihood computed again on another machine differs in the last digits of float32."""

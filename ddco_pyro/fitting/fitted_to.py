@@ -15,8 +15,8 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.pictures import Observed, Pictures, blocks
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.record_types import Record
-from ddco_pyro.fitting.records import read_record
+from ddco_pyro.evaluation.record_types import Record
+from ddco_pyro.evaluation.schema import read_record
 
 NAME = "demonstrations.json"
 

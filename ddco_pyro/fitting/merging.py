@@ -14,11 +14,11 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.tensors import digest_of
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import OnEvent, ignore
-from ddco_pyro.fitting.checkpoint import copy_of
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.spec.messages import nearest
+from ddco_pyro.training.checkpoint import copy_of
 
 LABELS = "merged"
 """Name of the labels that say which option each step begins with, and of what their file says of the merge."""

@@ -12,15 +12,16 @@ import torch
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import Failed
-from ddco_pyro.fitting import analysis
-from ddco_pyro.fitting.agreement import agreement, confusion
-from ddco_pyro.fitting.branch_use import branch_use
+from ddco_pyro.evaluation import analysis
+from ddco_pyro.evaluation.agreement import agreement, confusion
+from ddco_pyro.evaluation.branch_use import branch_use
+from ddco_pyro.evaluation.inferred import Inferred
+from ddco_pyro.evaluation.worth import MIXTURE, mean_run, worth
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.inferred import Inferred
-from ddco_pyro.fitting.worth import MIXTURE, mean_run, worth
 from ddco_pyro.inference import Posterior
 from ddco_pyro.inference.decomposition import Decomposition
 from ddco_pyro.model.outputs import Outputs
+from ddco_pyro.training.labels import choices, used
 
 
 class NotFinite(Failed):
@@ -202,3 +203,19 @@ def supervisor(demos: Demonstrations) -> dict[str, Any]:
     """What the demonstrations' file says of how often their supervisor succeeded; nothing where it does not."""
     said = demos.attributes.get("supervisor")
     return {"supervisor": json.loads(str(said))} if said else {}
+
+
+def trained_labels(fit: Fit, demos: Demonstrations) -> dict[str, Any]:
+    """What ``metrics.json`` says of the labels that a fit used; nothing where it used none.
+
+    ``agreement`` is the part of the labelled steps whose most likely option, as if they had no label, is the label's.
+    """
+    labels, own = used(fit.spec, demos), fit.spec.training.labels
+    if labels is None or own is None:
+        return {}
+    labelled = demos.select(labels.demonstrations)
+    segments = torch.as_tensor(fit.segment(labelled)[labels.level - 1])
+    known = choices(labelled, own.source, labels.values, labelled.names)
+    agreement = float((segments == known)[known >= 0].double().mean())
+    said = {"level": own.level, "labels": own.source, "values": labels.values, "demonstrations": labels.demonstrations}
+    return {"trained_labels": {**said, "agreement": agreement}}

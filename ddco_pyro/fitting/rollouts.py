@@ -15,11 +15,11 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking
 from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.errors import command
+from ddco_pyro.evaluation.schema import Unfinished, read_record
+from ddco_pyro.evaluation.worth import success_worth
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit, RunError
-from ddco_pyro.fitting.records import Unfinished, read_record
 from ddco_pyro.fitting.run import write_metrics
-from ddco_pyro.fitting.worth import success_worth
 from ddco_pyro.simulation.episodes import paired_difference, run_episode, run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task

@@ -22,29 +22,29 @@ from ddco_pyro.data.files import json_text, leftovers, only_one, write_text
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
 from ddco_pyro.data.tensors import write_tensors
+from ddco_pyro.evaluation.schema import read_record
 from ddco_pyro.events import EpochEnded, Event, OnEvent, TrainingBegan, TrainingEnded, ignore
-from ddco_pyro.fitting import labels
-from ddco_pyro.fitting.building import Dimensions, baseline_spec, check_networks, named_baselines, parameters
-from ddco_pyro.fitting.checkpoint import copy_of
-from ddco_pyro.fitting.devices import repeatable
 from ddco_pyro.fitting.fit import Fit, RunError, is_finished, load, model_name
 from ddco_pyro.fitting.fitted_to import record, recorded
-from ddco_pyro.fitting.launching import check_processes, together
-from ddco_pyro.fitting.metrics import evaluate, supervisor
-from ddco_pyro.fitting.objective import TrainingError
-from ddco_pyro.fitting.prepare import demonstrations as read_demonstrations
-from ddco_pyro.fitting.prepare import dimensions, known_demonstrations, parts, refuse_unfit, seen
-from ddco_pyro.fitting.processes import check_jobs
-from ddco_pyro.fitting.ranks import ALONE, Ranks
-from ddco_pyro.fitting.records import read_record
-from ddco_pyro.fitting.restarts import Trainer
-from ddco_pyro.fitting.training import SAVE_EVERY
+from ddco_pyro.fitting.metrics import evaluate, supervisor, trained_labels
 from ddco_pyro.inference.check import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.encoding import refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import Spec, dump_spec, load_spec, with_overrides
+from ddco_pyro.training import labels
+from ddco_pyro.training.checkpoint import copy_of
+from ddco_pyro.training.data import demonstrations as read_demonstrations
+from ddco_pyro.training.data import dimensions, known_demonstrations, parts, refuse_unfit, seen
+from ddco_pyro.training.devices import repeatable
+from ddco_pyro.training.jobs import check_jobs
+from ddco_pyro.training.launching import check_processes, together
+from ddco_pyro.training.loop import SAVE_EVERY
+from ddco_pyro.training.networks import Dimensions, baseline_spec, check_networks, named_baselines, parameters
+from ddco_pyro.training.objective import TrainingError
+from ddco_pyro.training.ranks import ALONE, Ranks
+from ddco_pyro.training.restarts import Trainer
 
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
 
@@ -192,7 +192,7 @@ def _fit(
         "control_dimensions": [dimension.as_data() for dimension in dimensions.control],
         "parameters": parameters(trained.hierarchy),
         "training": trained.training,
-        **labels.trained_labels(fitted, demos),
+        **trained_labels(fitted, demos),
         "seconds": clock.end(),
         "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
     }
@@ -260,7 +260,7 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
 class Trained:
     """What training gave: the ``hierarchy``, the ``check`` of the engines before it, the ``history`` of its epochs, the
     numbers of ``demonstrations`` that it was trained and tuned on, and what it spent of its budget, ``training``
-    (:func:`ddco_pyro.fitting.convergence.summary`).
+    (:func:`ddco_pyro.training.convergence.summary`).
     """
 
     hierarchy: Hierarchy

@@ -12,11 +12,11 @@ from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import OnEvent, SeedFitted, ignore
 from ddco_pyro.fitting.fit import Fit, is_finished, load
-from ddco_pyro.fitting.processes import pool, results, useful_jobs
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit_run, write_metrics
 from ddco_pyro.simulation.task import SUCCESS
 from ddco_pyro.spec import Spec, user_code, with_overrides
+from ddco_pyro.training.jobs import pool, results, useful_jobs
 
 DEAD = "a process that repeated the fit was ended from outside (too little memory?); the same command goes on"
 
@@ -105,7 +105,7 @@ def over_seeds(seeds: Sequence[int], each: Sequence[Mapping[str, Any]]) -> dict[
     """What fits with these training seeds say, from the ``metrics`` of each.
 
     :returns: the ``training_seeds``; by model its ``held_out`` log-likelihoods per step; and the parts of ``worth``
-        (:mod:`ddco_pyro.fitting.worth`), nats per step: all in the order of the seeds.
+        (:mod:`ddco_pyro.evaluation.worth`), nats per step: all in the order of the seeds.
     """
     model = each[0]["model"]
     held_out = {model: [metrics["log_likelihood_per_step"]["valid"] for metrics in each]}

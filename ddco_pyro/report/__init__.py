@@ -12,7 +12,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import style
-from ddco_pyro.drawing.page import Block, Facts, Page, Section, Text, note
+from ddco_pyro.drawing.page import Block, Facts, Page, Text, note
 from ddco_pyro.drawing.words import unconverged
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, training, worth

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.evaluation.inferred import Inferred
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.inferred import Inferred
 
 MOST_BINS = 60
 
@@ -107,4 +107,6 @@ def bins(lengths: np.ndarray) -> Bins:
         return Bins(index, np.arange(lengths[0] + 1) - 0.5, "step t")
     count = int(min(MOST_BINS, lengths.min()))
     index = np.minimum((steps + 0.5) / lengths[:, None] * count, count - 1).astype(int)
-    return Bins(np.where(alive, index, -1), np.linspace(0.0, 1.0, count + 1), "share of the demonstration that has passed")
+    return Bins(
+        np.where(alive, index, -1), np.linspace(0.0, 1.0, count + 1), "share of the demonstration that has passed"
+    )

@@ -16,7 +16,7 @@ from ddco_pyro.drawing.figures import FAINT, WIDTH, blank, save
 from ddco_pyro.drawing.page import Section, Table, note
 from ddco_pyro.drawing.words import number
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.prepare import parts
+from ddco_pyro.training.data import parts
 
 COLUMNS, ROWS = 4, 3
 
@@ -41,7 +41,9 @@ def saliency(fit: Fit, demos: Demonstrations) -> Section | None:
         looks = gradients.step({key: values[step] for key, values in demo.observations.items()}, choices)
         if step in shown:
             title = f"step {step}" + (f", option {choices[0]}" if choices else "")
-            panels.append((title, choices[0] if choices else 0, np.hstack([with_heat(*look) for look in looks.values()])))
+            panels.append(
+                (title, choices[0] if choices else 0, np.hstack([with_heat(*look) for look in looks.values()]))
+            )
     height, width = panels[0][2].shape[:2]
     figure = blank(ROWS * (WIDTH / COLUMNS * height / width + 0.25))
     for axes, (title, choice, drawn) in zip(figure.subplots(ROWS, COLUMNS, squeeze=False).flat, panels, strict=False):
@@ -59,8 +61,8 @@ def saliency(fit: Fit, demos: Demonstrations) -> Section | None:
     alt = f"Saliency of {', '.join(keys)} over {demo.name}"
     command = Markup("<code>ddco-pyro rollout --video</code>")
     limits = Markup(
-        "A gradient is the effect of a small change, not of the absence of a thing. {} films the saliency of an episode "
-        "(<code>videos/saliency</code>)."
+        "A gradient is the effect of a small change, not of the absence of a thing. {} films the saliency of an "
+        "episode (<code>videos/saliency</code>)."
     ).format(command)
     picture = save(figure, fit.run_folder / "figures" / "looks.png", alt, caption)
     return Section("looks", "What it looks at", [picture, note(limits)])
@@ -79,8 +81,8 @@ def branches(fit: Fit) -> Section | None:
         for use in uses
     ]
     caption = (
-        "Left: mean size of each branch's output to the joint layer while the option is active. Right: loss in nats per "
-        "step when the branch reads the observation of another step."
+        "Left: mean size of each branch's output to the joint layer while the option is active. Right: loss in nats "
+        "per step when the branch reads the observation of another step."
     )
     explained = (
         "Held-out demonstrations, or all where none is held out, weighted by the posterior of the options. Activations "
@@ -93,7 +95,7 @@ def branches(fit: Fit) -> Section | None:
 def branch_table(uses: Sequence[Mapping[str, Any]], names: Sequence[Sequence[str]]) -> Table:
     """Activation and loss of each branch, a row for each option and branch.
 
-    :param uses: as :func:`ddco_pyro.fitting.branch_use.branch_use` gives them.
+    :param uses: as :func:`ddco_pyro.evaluation.branch_use.branch_use` gives them.
     :param names: the options of each.
     """
     rows = [

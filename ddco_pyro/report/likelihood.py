@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 
 from ddco_pyro.data.control_dimensions import ControlDimension
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
-from ddco_pyro.drawing.page import Cell, Section, Table, Text, note
+from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, note
 from ddco_pyro.drawing.words import about, method, number, signed
-from ddco_pyro.fitting.convergence import effort
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.segmenting.page import anchor
+from ddco_pyro.training.convergence import effort
 
 SHOWN = 20
 """Rows of the list of demonstrations that are not folded."""
@@ -75,7 +75,7 @@ def section(fit: Fit) -> Section:
         "log-probabilities. Another unit adds the same constant to every method. So differences in nats can be "
         "compared; percentages cannot."
     )
-    blocks = [
+    blocks: list[Block] = [
         Text(f"Nats per step; higher is better. {about(row.name for row in rows)}"),
         table(rows),
         save(draw(rows), fit.run_folder / "figures" / "likelihood.png", alt, caption),
@@ -132,7 +132,9 @@ def demonstrations(metrics: Mapping[str, Any], anchors: Collection[str]) -> Sect
     )
     found = Table(["Demonstration", "", "Steps", *map(method, methods)], rows, {0, 1})
     links = " A name leads to the demonstration’s segments." if anchors else ""
-    return Section("demonstrations", "Every demonstration", [Text(text + links), *found.folded(SHOWN, "demonstrations")])
+    return Section(
+        "demonstrations", "Every demonstration", [Text(text + links), *found.folded(SHOWN, "demonstrations")]
+    )
 
 
 def dimensions(fit: Fit) -> Section:
@@ -161,5 +163,5 @@ def dimensions(fit: Fit) -> Section:
     )
     shown = "held-out" if part == "valid" else "training"
     text = f"Nats per step on {shown} demonstrations."
-    blocks = [Text(text), Table(head, rows, {0, len(head) - 2, len(head) - 1}), note(explained)]
+    blocks: list[Block] = [Text(text), Table(head, rows, {0, len(head) - 2, len(head) - 1}), note(explained)]
     return Section("dimensions", "Log-likelihood by control dimension", blocks)

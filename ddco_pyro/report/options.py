@@ -18,8 +18,8 @@ from ddco_pyro.drawing.colours import add_legend, option_colour
 from ddco_pyro.drawing.figures import FAINT, GRID, Picture, blank, hide_frame, save
 from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, Timeline, note
 from ddco_pyro.drawing.words import number, option_name, percent
+from ddco_pyro.evaluation.schema import option_labels
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.labels import option_labels
 from ddco_pyro.report import trajectories
 from ddco_pyro.report.activity import Activity, Bins, LevelActivity, bins
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
@@ -204,7 +204,7 @@ def row_order(activity: Activity) -> np.ndarray:
 
 
 def draw_rows(activity: Activity, labels: Mapping[str, Sequence[np.ndarray]]) -> Figure:
-    """A panel for each level, the highest first, and for each kind of labels; a row of colour for each demonstration."""
+    """A panel for each level, the highest first, and each kind of labels; a row of colour for each demonstration."""
     rows = row_order(activity)
     images = [(f"level “{level.name}”", colour_image(level.path[rows])) for level in reversed(activity.levels)]
     for name, values in labels.items():

@@ -13,8 +13,8 @@ from ddco_pyro.data.sources.video import frames
 from ddco_pyro.drawing.figures import WIDTH, Interval, Panel, blank, data_uri, hide_frame, interval_plot, save
 from ddco_pyro.drawing.page import Block, Film, Films, Section, Table, Text, note
 from ddco_pyro.drawing.words import interval, measure, method, number, p_value, rate
+from ddco_pyro.evaluation.schema import read_successes
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.records import read_successes
 
 MOST_BYTES = 4_000_000
 """Films are held in the page up to this size together; the page links to the others."""
@@ -30,8 +30,8 @@ def success(fit: Fit) -> Section | None:
         return None
     methods = record["methods"]
     explained = (
-        "Rates: successes of trials (Wilson 95 % interval). Other measures: mean ± standard deviation [95 % interval of "
-        "the mean], n episodes in which the measure is known."
+        "Rates: successes of trials (Wilson 95 % interval). Other measures: mean ± standard deviation [95 % interval "
+        "of the mean], n episodes in which the measure is known."
     )
     text = f"{record['episodes']} episodes of each method from the same initial states (seeds from {record['seed']})."
     blocks: list[Block] = [Text(text), measures_table(methods), note(explained)]

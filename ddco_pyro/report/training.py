@@ -17,9 +17,9 @@ from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import INK, blank, save
 from ddco_pyro.drawing.page import Block, Code, Columns, Facts, Folded, Section, Text, Warned, note
 from ddco_pyro.drawing.words import number, percent
-from ddco_pyro.fitting.diagnostics import Finding, diagnose
+from ddco_pyro.evaluation.diagnostics import Finding, diagnose
+from ddco_pyro.evaluation.schema import read_table, refit
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.records import read_table, refit
 from ddco_pyro.spec import Spec, dump_spec
 
 COLUMNS = 4
@@ -28,8 +28,8 @@ TUNE = "#c2410c"
 STAGES = {
     "vq": "“From clusters” trains each option of a level on a cluster of steps, so that options differ from the "
     "beginning. Its values can be compared within the panel only.",
-    "parts": "“From equal parts” trains each option of a level on one of equally long parts of every demonstration. Its "
-    "values can be compared within the panel only.",
+    "parts": "“From equal parts” trains each option of a level on one of equally long parts of every demonstration. "
+    "Its values can be compared within the panel only.",
     "level": "“Alone” trains a level’s options while all are equally likely.",
     "meta": "“Meta-policy alone” then trains the policy that selects the options.",
     "joint": "“All together” trains all networks.",
@@ -140,7 +140,7 @@ def warnings(fit: Fit) -> Section | None:
             Text(
                 "No sign of a degenerate solution. Every option is used (at least 1 % of all steps) and none dominates "
                 "(more than 90 %). No two options act alike (differ by less than 0.1 nats per step). No option ends at "
-                "once again and again (lasts less than 1.5 steps, with three selections or more in each demonstration). "
+                "once again and again (lasts less than 1.5 steps, with three selections or more in a demonstration). "
                 "No caller emits the control itself most of the time."
             )
         )

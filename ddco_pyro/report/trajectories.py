@@ -38,9 +38,9 @@ def picture(fit: Fit, demos: Demonstrations, activity: Activity) -> Picture | No
     if key is None:
         return None
     caption = (
-        f"{min(len(demos), MOST_TRAJECTORIES)} demonstrations in space, coloured by the most likely option: first three "
-        f"numbers of observation “{key}”, in its own units. {'' if named else CHOSEN}Circles: first steps. Seen from "
-        "the direction in which the trajectories spread the most."
+        f"{min(len(demos), MOST_TRAJECTORIES)} demonstrations in space, coloured by the most likely option: first "
+        f"three numbers of observation “{key}”, in its own units. {'' if named else CHOSEN}Circles: first steps. Seen "
+        "from the direction in which the trajectories spread the most."
     )
     figure = draw(activity, [np.asarray(demo.observations[key])[:, :3] for demo in demos], key)
     alt = f"Trajectories of {key} in three dimensions, coloured by option"
@@ -102,7 +102,7 @@ def panel(axes: Axes3D, level: LevelActivity, positions: Sequence[np.ndarray], k
 
 
 def _places(count: int, height: float) -> list[tuple[float, float, float, float]]:
-    """Panels, two in a row, as (left, bottom, width, height) in shares of the figure, with room for titles and legend."""
+    """Panels, two in a row, as (left, bottom, width, height) in shares of the figure, titles and legend left out."""
     rows = -(-count // 2)
     bottom, each = 0.55 / height, (1 - 0.55 / height) / rows
     return [(0.5 * (n % 2), bottom + (rows - 1 - n // 2) * each, 0.5, 0.93 * each) for n in range(count)]

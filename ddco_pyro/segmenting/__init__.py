@@ -14,10 +14,10 @@ from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.memory import INFERENCE, PROGRAM, Extent, refuse_too_much
 from ddco_pyro.data.sources import Recording, Source
 from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.evaluation.inferred import Inferred
+from ddco_pyro.evaluation.schema import option_labels
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.inferred import Inferred
-from ddco_pyro.fitting.labels import option_labels
 from ddco_pyro.spec import LevelSpec
 
 __all__ = ["LevelLabels", "Segmented", "Segments", "demonstrations", "segments"]

@@ -10,14 +10,14 @@ from ddco_pyro.data.sources import Source
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.drawing.words import number
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.agreement import MATCHED, UNMATCHED, agreement
+from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED, agreement
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.prepare import parts
 from ddco_pyro.segmenting import Segmented, Segments, demonstrations
 from ddco_pyro.segmenting.baselines import BASELINES, segment
+from ddco_pyro.training.data import parts
 
 Scores = Mapping[str, Any] | None
-"""Measures as :func:`ddco_pyro.fitting.agreement.agreement` gives them; None where no label is known."""
+"""Measures as :func:`ddco_pyro.evaluation.agreement.agreement` gives them; None where no label is known."""
 
 MATCHINGS = {"matched_globally": "one for all", "matched_per_demonstration": "each its own"}
 
@@ -26,8 +26,8 @@ EXPLAINED = (
     "by chance) compare steps without regard to the options' names. Boundary F1 compares the steps at which segments "
     "begin, within so many steps. The other measures match options with labels so that most steps agree. The match is "
     "the same in all demonstrations (one for all) or separate in each (each its own). Accuracy: share of steps that "
-    "agree. IoU: intersection over union, mean over labels. F1@P: a segment is right where it overlaps one of its label "
-    "by P % or more. Edit: 1 − edit distance of the sequences of segments."
+    "agree. IoU: intersection over union, mean over labels. F1@P: a segment is right where it overlaps one of its "
+    "label by P % or more. Edit: 1 − edit distance of the sequences of segments."
 )
 
 

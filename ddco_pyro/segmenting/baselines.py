@@ -17,9 +17,9 @@ from sklearn.mixture import GaussianMixture
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput, nearest
-from ddco_pyro.fitting.clusters import block_means, distinct, joined
 from ddco_pyro.model.encoding import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec
+from ddco_pyro.training.initialization import block_means, distinct, joined
 
 PIECES = 2
 """Pieces into which change points divide a demonstration, for each of the segments asked for."""

@@ -49,8 +49,8 @@ def check_labels(path: Path, levels: Iterable[str], names: Iterable[str]) -> Non
             for label in labels:
                 if label in group and group[label].attrs.get(OURS) != SIGNATURE:
                     raise BadInput(
-                        f"{path}: {name}: labels/{label} exists and was not written by ddco-pyro segment; give the level "
-                        "another name in the run's spec"
+                        f"{path}: {name}: labels/{label} exists and was not written by ddco-pyro segment; give the "
+                        "level another name in the run's spec"
                     )
 
 
@@ -114,7 +114,7 @@ def _has(path: Path, segmented: Segmented) -> bool:
     return True
 
 
-# --- tables ------------------------------------------------------------------------------------------------------------
+# --- tables -----------------------------------------------------------------------------------------------------------
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """First characters of a text that a spreadsheet may execute as a formula."""

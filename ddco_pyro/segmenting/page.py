@@ -25,9 +25,7 @@ ROOM = 0.03
 """A segment carries text if it is longer than this share of the longest demonstration."""
 
 
-def write_page(
-    path: Path, segmented: Segmented, run: str, file: str, agreements: Mapping[str, LevelAgreement]
-) -> None:
+def write_page(path: Path, segmented: Segmented, run: str, file: str, agreements: Mapping[str, LevelAgreement]) -> None:
     """Write the page, whole or not at all.
 
     :param agreements: agreement of each level with labels.
@@ -80,7 +78,7 @@ def duration(steps: float, frequency: float | None) -> str:
 
 
 def timelines(segmented: Segmented, most_segments: float = math.inf) -> list[Timeline]:
-    """Timelines of the first demonstrations on one scale: about ``most_segments`` in all, at least one demonstration."""
+    """Timelines of the first demonstrations on one scale: about ``most_segments`` segments, at least one of them."""
     counts = [sum(len(level.runs()) for level in demo.levels.values()) for demo in segmented.segments]
     before = accumulate(counts, initial=0)
     shown = [demo for demo, count in zip(segmented.segments, before, strict=False) if count < most_segments]

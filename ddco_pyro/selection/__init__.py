@@ -1,7 +1,7 @@
 """Selection by k-fold cross-validation (paper §4.3) over a grid of spec keys, with the same folds for every candidate.
 
-The folder holds ``selection.json`` (the result), ``folds/`` (a file for each finished candidate and fold), ``fit/`` (the
-final fit) and ``demonstrations.json`` (the digest of the demonstrations).
+The folder holds ``selection.json`` (the result), ``folds/`` (a file for each finished candidate and fold), ``fit/``
+(the final fit) and ``demonstrations.json`` (the digest of the demonstrations).
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.errors import Failed
 from ddco_pyro.events import CandidateGivenUp, FoldScored, OnEvent, SelectionBegan, ignore
-from ddco_pyro.fitting import prepare
 from ddco_pyro.fitting.fitted_to import record
 from ddco_pyro.fitting.run import claimed
 from ddco_pyro.selection import choice as choosing
@@ -24,6 +23,7 @@ from ddco_pyro.selection.choice import STOP_RULE, Choice
 from ddco_pyro.selection.folds import Folds, Score, Workers
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.spec import Spec, with_overrides
+from ddco_pyro.training import data
 
 __all__ = ["Choice", "Selection", "SelectionFailed", "Workers", "check", "final_spec", "known_demonstrations", "select"]
 
@@ -47,7 +47,7 @@ class Selection:
 
 def known_demonstrations(spec: Spec) -> Demonstrations | None:
     """The demonstrations with the observations of every candidate; None where they have to be collected first."""
-    return prepare.known_demonstrations(grid.wide(spec))
+    return data.known_demonstrations(grid.wide(spec))
 
 
 def check(spec: Spec, workers: Workers = HERE, demos: Demonstrations | None = None) -> list[Candidate]:
@@ -60,8 +60,8 @@ def check(spec: Spec, workers: Workers = HERE, demos: Demonstrations | None = No
     :raises BackendError: the workers cannot be reached.
     """
     wide, own = grid.wide(spec), spec.demonstrations
-    demos = prepare.outline(wide) if demos is None and prepare.in_file(wide) else demos
-    candidates = grid.candidates(spec, prepare.dimensions(wide, demos))
+    demos = data.outline(wide) if demos is None and data.in_file(wide) else demos
+    candidates = grid.candidates(spec, data.dimensions(wide, demos))
     if demos is None:  # they will be collected
         dividing.assign(own.count - len(set(own.exclude)), spec.selection.folds, spec.seed)
     else:
@@ -92,7 +92,7 @@ def select(
     :raises Busy: another process works on the folder.
     """
     with claimed(folder, spec, resume):
-        demos = demos or prepare.demonstrations(grid.wide(spec), on_event)
+        demos = demos or data.demonstrations(grid.wide(spec), on_event)
         record(folder, demos)
         folds = dividing.divide(demos, spec.selection.folds, spec.seed)
         dividing.keep_folds(folds, folder / "folds.json")
@@ -141,13 +141,13 @@ def final_spec(chosen: Candidate) -> Spec:
 
 
 def _write(folder: Path, spec: Spec, choice: Choice, folds: Folds, stop_early: bool) -> None:
-    data = {
+    found = {
         "folds": len(folds.held_out),
         "demonstrations": len(folds.demos),
         "seed": spec.seed,
         "stop_early": STOP_RULE if stop_early else None,
         **choosing.as_data(choice),
     }
-    write_text(folder / "selection.md", choosing.markdown(choice, data))
+    write_text(folder / "selection.md", choosing.markdown(choice, found))
     choosing.write_figure(choice, folder / "figures" / "selection.png")
-    write_text(folder / "selection.json", json_text(data))
+    write_text(folder / "selection.json", json_text(found))

@@ -19,7 +19,7 @@ from scipy import stats
 from ddco_pyro.drawing.figures import ACCENT, FAINT, INK, Interval, Panel, interval_plot, save, style
 from ddco_pyro.drawing.page import Page, Table, Text
 from ddco_pyro.drawing.words import number, signed
-from ddco_pyro.fitting.analysis import paired
+from ddco_pyro.evaluation.analysis import paired
 from ddco_pyro.selection.folds import Score
 from ddco_pyro.selection.grid import Candidate
 
@@ -250,19 +250,22 @@ def draw(choice: Choice) -> Figure:
     means: list[Interval | None] = []
     differences: list[Interval | None] = []
     for row in choice.rows:
-        looks = {
+        looks: dict[str, Any] = {
             "marker": "D" if row is best else "s" if row is choice.chosen else "o",
             "colour": ACCENT if row is choice.chosen else INK if row.status == "scored" else FAINT,
         }
-        paired_folds = {fold: value - best.folds[fold] for fold, value in row.folds.items() if best and fold in best.folds}
+        best_folds = best.folds if best else {}
+        each = [value - best_folds[fold] for fold, value in row.folds.items() if fold in best_folds]
         points = list(row.folds.values())
         means.append(None if row.mean is None else Interval.around(row.mean, row.error, points, **looks))
-        differences.append(row.difference and Interval.around(*row.difference, [*paired_folds.values()], **looks))
+        differences.append(row.difference and Interval.around(*row.difference, each, **looks))
     panels = [
         Panel("Each candidate, ± one standard error", "held-out log-likelihood (nats per step)", means, band=band),
         Panel("Minus the best, ± one standard error", "nats per step above the best, same folds", differences, line=0),
     ]
-    marks = "diamond: best; orange: chosen, the smallest within one standard error of the best (band); grey: single folds"
+    marks = (
+        "diamond: best; orange: chosen, the smallest within one standard error of the best (band); dots: single folds"
+    )
     notes = [line for note in choice.notes for line in textwrap.wrap(f"Note: {note}.", 150)]
     status = {"scored": "", "failed": " (failed)", "stopped": " (stopped)"}
     names = [f"{row.candidate.name} ({row.candidate.parameters} parameters){status[row.status]}" for row in choice.rows]

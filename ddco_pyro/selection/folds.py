@@ -18,15 +18,15 @@ from sklearn.model_selection import KFold
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.fitting import processes
-from ddco_pyro.fitting.building import Dimensions
+from ddco_pyro.evaluation.record_types import Record
+from ddco_pyro.evaluation.schema import read_record
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.processes import ALL_CORES, BackendError
-from ddco_pyro.fitting.record_types import Record
-from ddco_pyro.fitting.records import read_record
 from ddco_pyro.fitting.run import train
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.selection.grid import Candidate
+from ddco_pyro.training import jobs as processes
+from ddco_pyro.training.jobs import ALL_CORES, BackendError
+from ddco_pyro.training.networks import Dimensions
 
 CONNECT_SECONDS = 10
 """How long a dask scheduler may take to answer."""

@@ -8,9 +8,9 @@ from itertools import product
 from typing import Any
 
 from ddco_pyro.data.control_parts import control_parts, difference
-from ddco_pyro.fitting.building import Dimensions, build_hierarchy, parameters
 from ddco_pyro.spec import Spec, SpecError, with_overrides
 from ddco_pyro.spec.messages import show
+from ddco_pyro.training.networks import Dimensions, build_hierarchy, parameters
 
 DATA = ("task", "demonstrations")
 """What all candidates have to share, because they are compared on the same demonstrations."""

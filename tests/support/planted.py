@@ -7,8 +7,6 @@ from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import ignore
-from ddco_pyro.fitting.building import Dimensions, build_hierarchy
-from ddco_pyro.fitting.restarts import Trainer
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.actor import Acting
 from ddco_pyro.model.ahmm import choose
@@ -16,6 +14,8 @@ from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import complete
 from ddco_pyro.spec import parse_spec
+from ddco_pyro.training.networks import Dimensions, build_hierarchy
+from ddco_pyro.training.restarts import Trainer
 
 CONTROL = {"std": 0.05, "scale": "none"}
 TRAINING = {"epochs": 900, "restarts": 3, "patience": 25, "initialize": "vq_controls"}

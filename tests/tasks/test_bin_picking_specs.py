@@ -11,12 +11,12 @@ from ddco_tasks.bin_picking import task
 from ddco_tasks.bin_picking.supervisor import JAW_OPEN
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.fitting.building import check_networks
-from ddco_pyro.fitting.prepare import dimensions
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import load_spec
+from ddco_pyro.training.data import dimensions
+from ddco_pyro.training.networks import check_networks
 
 SPECS = sorted((Path(__file__).parents[2] / "specs").glob("bin_picking*.yaml"))
 SEEDS = (2, 15)  # bins of three objects

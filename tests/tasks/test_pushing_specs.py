@@ -11,11 +11,11 @@ from ddco_tasks.pushing import environment as pushing
 
 from ddco_pyro.acting.lockstep import play
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.fitting.building import check_networks
-from ddco_pyro.fitting.prepare import dimensions
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import Spec, load_spec
+from ddco_pyro.training.data import dimensions
+from ddco_pyro.training.networks import check_networks
 
 SPECS = sorted((Path(__file__).parents[2] / "specs").glob("pushing*.yaml"))
 LEVELS = {

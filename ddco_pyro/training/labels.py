@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,10 +11,9 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.prepare import parts
-from ddco_pyro.fitting.stages import Stage
 from ddco_pyro.spec import LevelSpec, Spec, SpecError
+from ddco_pyro.training.data import parts
+from ddco_pyro.training.stages import Stage
 
 
 @dataclass(frozen=True)
@@ -56,8 +54,8 @@ class Labels:
             )
         _refuse_too_many(own.source, values, level, number)
         names = tuple(demo.name for demo in used)
-        choices = (_choices(part, own.source, values, names) for part in (train, tune))
-        return cls(number, own.hold, values, names, *choices)
+        each = (choices(part, own.source, values, names) for part in (train, tune))
+        return cls(number, own.hold, values, names, *each)
 
     def matter_in(self, stage: Stage) -> bool:
         """Whether a stage of training uses them."""
@@ -75,28 +73,6 @@ def used(spec: Spec, demos: Demonstrations) -> Labels | None:
     return Labels.of(spec, *parts(spec, demos)["train"].split(spec.training.tune_fraction, spec.seed))
 
 
-def trained_labels(fit: Fit, demos: Demonstrations) -> dict[str, Any]:
-    """What ``metrics.json`` says of the labels that a fit used; nothing where it used none.
-
-    ``agreement`` is the part of the labelled steps whose most likely option, as if they had no label, is the label's.
-    """
-    labels, own = used(fit.spec, demos), fit.spec.training.labels
-    if labels is None or own is None:
-        return {}
-    labelled = demos.select(labels.demonstrations)
-    segments = torch.as_tensor(fit.segment(labelled)[labels.level - 1])
-    known = _choices(labelled, own.source, labels.values, labelled.names)
-    agreement = float((segments == known)[known >= 0].double().mean())
-    said = {"level": own.level, "labels": own.source, "values": labels.values, "demonstrations": labels.demonstrations}
-    return {"trained_labels": {**said, "agreement": agreement}}
-
-
-def option_labels(metrics: Mapping[str, Any]) -> dict[str, dict[int, int]]:
-    """The label that each option stands for, by level, of a run trained from labels."""
-    said = metrics.get("trained_labels")
-    return {said["level"]: dict(enumerate(said["values"], start=1))} if said else {}
-
-
 def _known(labels: Any) -> tuple[int, ...]:
     """The different labels from 0 on, sorted."""
     return tuple(sorted({int(value) for array in labels for value in np.unique(array) if value >= 0}))
@@ -111,7 +87,7 @@ def _refuse_too_many(name: str, values: tuple[int, ...], level: LevelSpec, numbe
         )
 
 
-def _choices(demos: Demonstrations, name: str, values: tuple[int, ...], labelled: tuple[str, ...]) -> Tensor:
+def choices(demos: Demonstrations, name: str, values: tuple[int, ...], labelled: tuple[str, ...]) -> Tensor:
     """The option of each step, [N, T]; -1 where it is free, and past a demonstration's end."""
     each = []
     for demo in demos:

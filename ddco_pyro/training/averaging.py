@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from ddco_pyro.fitting.checkpoint import State, copy_of
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.training.checkpoint import State, copy_of
 
 
 class Average:

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
-from ddco_pyro.fitting.averaging import Average
-from ddco_pyro.fitting.checkpoint import State, copy_of, optimizer_state, restore_optimizer
-from ddco_pyro.fitting.objective import Objective
-from ddco_pyro.fitting.shards import Shard, ascend
-from ddco_pyro.fitting.stages import Stage
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import OptimizerSpec, TrainingSpec
+from ddco_pyro.training.averaging import Average
+from ddco_pyro.training.checkpoint import State, copy_of, optimizer_state, restore_optimizer
+from ddco_pyro.training.objective import Objective
+from ddco_pyro.training.shards import Shard, ascend
+from ddco_pyro.training.stages import Stage
 
 
 class Ascent:

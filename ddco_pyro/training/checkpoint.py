@@ -22,7 +22,7 @@ class Progress:
     """Where a restart stands at the end of an epoch; with the tensors of a checkpoint it is all that is needed.
 
     ``start`` is the tuning log-likelihood per step from before this stage, ``best`` that of its best epoch, ``ended``
-    has a :class:`ddco_pyro.fitting.convergence.StageEnd` for each stage that has ended, ``history`` a row for each
+    has a :class:`ddco_pyro.training.convergence.StageEnd` for each stage that has ended, ``history`` a row for each
     epoch. Where all stages have ended (``done``), ``epoch``, ``start`` and ``best`` are still those of the last.
     ``device`` is the kind of device that its networks were trained on. ``diverged`` says where a log-likelihood became
     NaN or infinite in a further epoch, which ended the restart.

@@ -16,9 +16,9 @@ from multiprocessing.process import BaseProcess
 from torch import distributed
 
 from ddco_pyro.errors import Failed
-from ddco_pyro.fitting.processes import BackendError
-from ddco_pyro.fitting.ranks import ALONE, LostProcess, Ranks, connected
-from ddco_pyro.fitting.restarts import follow
+from ddco_pyro.training.jobs import BackendError
+from ddco_pyro.training.ranks import ALONE, LostProcess, Ranks, connected
+from ddco_pyro.training.restarts import follow
 
 HERE = "127.0.0.1"
 

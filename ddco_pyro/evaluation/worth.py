@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.fitting.analysis import paired
+from ddco_pyro.evaluation.analysis import paired
 from ddco_pyro.simulation.episodes import paired_difference
 
 MIXTURE = "mixture"

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ddco_pyro.fitting.objective import Objective
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seed
+from ddco_pyro.training.objective import Objective
 
 Gradients = list[np.ndarray | None]
 """Of each parameter; None where there is none."""

@@ -15,7 +15,7 @@ class Stage:
     :param clamped: the level whose choices are clamped to clusters or parts of the demonstrations; None for no level.
     :param trained: prefixes of the names of the parameters that are trained.
     :param selecting: the meta-policy is trained on the same choices, and the levels still have a uniform one.
-    :param from_constants: networks take over what :class:`ddco_pyro.fitting.upper.Constants` say.
+    :param from_constants: networks take over what :class:`ddco_pyro.training.upper.Constants` say.
     """
 
     name: str

@@ -6,12 +6,12 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from ddco_pyro.fitting.record_types import NOT_NULL, Finite, Record
+from ddco_pyro.evaluation.record_types import NOT_NULL, Finite, Record
 from ddco_pyro.spec.messages import invalid
 
 
 class Matched(Record):
-    """Measures under a matching of options with labels (:mod:`ddco_pyro.fitting.agreement`)."""
+    """Measures under a matching of options with labels (:mod:`ddco_pyro.evaluation.agreement`)."""
 
     accuracy: Finite
     iou: Finite

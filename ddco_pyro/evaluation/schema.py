@@ -15,8 +15,8 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.errors import command
-from ddco_pyro.fitting.agreement_record import Agreement, as_today, each_level_of
-from ddco_pyro.fitting.record_types import NOT_NULL, AtLeastOne, Finite, Record
+from ddco_pyro.evaluation.agreement_record import Agreement, as_today, each_level_of
+from ddco_pyro.evaluation.record_types import NOT_NULL, AtLeastOne, Finite, Record
 from ddco_pyro.spec.messages import invalid, lines
 
 T = TypeVar("T")
@@ -85,6 +85,12 @@ def read_metrics(folder: Path, counts: Sequence[int]) -> dict[str, Any]:
     return data | ({"agreement": as_today(data["agreement"], len(counts))} if "agreement" in data else {})
 
 
+def option_labels(metrics: Mapping[str, Any]) -> dict[str, dict[int, int]]:
+    """The label that each option stands for, by level, of a run trained from labels."""
+    said = metrics.get("trained_labels")
+    return {said["level"]: dict(enumerate(said["values"], start=1))} if said else {}
+
+
 def refit(folder: Path, remove: str = "it") -> str:
     """What to do about a damaged file of a run: what its checkpoint holds need not be trained again."""
     return f"remove {remove} and fit again: {command('fit', folder / 'spec.yaml', '--out', folder, '--resume')}"
@@ -133,7 +139,7 @@ class Spent(Record):
 
 
 class Stage(Record):
-    """How a stage of training ended (:class:`ddco_pyro.fitting.convergence.StageEnd`)."""
+    """How a stage of training ended (:class:`ddco_pyro.training.convergence.StageEnd`)."""
 
     stage: str
     epochs: int
@@ -187,7 +193,7 @@ class InARow(Record):
 
 
 class Worth(Record):
-    """What the hierarchy is worth (:func:`ddco_pyro.fitting.worth.worth`)."""
+    """What the hierarchy is worth (:func:`ddco_pyro.evaluation.worth.worth`)."""
 
     memory: Difference
     experts: Annotated[Difference | None, NOT_NULL] = None

@@ -17,14 +17,14 @@ from ddco_pyro.data.sources.recording import Recording
 from ddco_pyro.data.sources.robomimic import open_robomimic
 from ddco_pyro.errors import nearest
 from ddco_pyro.events import OnEvent, ignore
-from ddco_pyro.fitting.building import Dimensions, baselines, build_hierarchy
-from ddco_pyro.fitting.clusters import most_rows
 from ddco_pyro.model.encoding import STEPS_AT_ONCE
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.simulation.collect import cache_path, collect
 from ddco_pyro.simulation.task import find_task
 from ddco_pyro.spec import Spec, SpecError
+from ddco_pyro.training.initialization import most_rows
+from ddco_pyro.training.networks import Dimensions, baselines, build_hierarchy
 
 
 def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:

@@ -11,18 +11,18 @@ from torch import Tensor
 
 from ddco_pyro.data.reading import Job
 from ddco_pyro.errors import Failed
-from ddco_pyro.fitting.checkpoint import Progress
-from ddco_pyro.fitting.clusters import Clusters, EqualParts
-from ddco_pyro.fitting.duration import log_duration_prior
-from ddco_pyro.fitting.material import Material
-from ddco_pyro.fitting.ranks import ALONE, Ranks
-from ddco_pyro.fitting.stages import Stage
-from ddco_pyro.fitting.upper import Constants, expected, fitted
 from ddco_pyro.inference.engines import log_likelihood, total_log_likelihood
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables
+from ddco_pyro.training.checkpoint import Progress
+from ddco_pyro.training.duration import log_duration_prior
+from ddco_pyro.training.initialization import Clusters, EqualParts
+from ddco_pyro.training.material import Material
+from ddco_pyro.training.ranks import ALONE, Ranks
+from ddco_pyro.training.stages import Stage
+from ddco_pyro.training.upper import Constants, expected, fitted
 
 
 class TrainingError(Failed):

@@ -13,13 +13,13 @@ from torch import nn
 from ddco_pyro.data.control_dimensions import ControlDimension, all_constant, control_dimensions
 from ddco_pyro.data.control_parts import ControlPart, control_parts, refuse_unknown_dimensions
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
-from ddco_pyro.fitting.devices import device_of
-from ddco_pyro.fitting.widths import nearest_widths
 from ddco_pyro.model.encoding import Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import ShapeError
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code, with_overrides
+from ddco_pyro.training.devices import device_of
+from ddco_pyro.training.widths import nearest_widths
 
 
 @dataclass(frozen=True)

@@ -21,19 +21,19 @@ import torch
 
 from ddco_pyro.data.reading import Readers
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
-from ddco_pyro.fitting.ascent import Ascent, learning_rate
-from ddco_pyro.fitting.checkpoint import Restart, copy_of
-from ddco_pyro.fitting.convergence import StageEnd, share
-from ddco_pyro.fitting.devices import device_of, repeatable
-from ddco_pyro.fitting.material import Material
-from ddco_pyro.fitting.objective import Diverged, Objective
-from ddco_pyro.fitting.ranks import ALONE, Ranks
-from ddco_pyro.fitting.shards import cut
-from ddco_pyro.fitting.stages import Stage, plan
-from ddco_pyro.fitting.upper import Constants
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seeded
+from ddco_pyro.training.ascent import Ascent, learning_rate
+from ddco_pyro.training.checkpoint import Restart, copy_of
+from ddco_pyro.training.convergence import StageEnd, share
+from ddco_pyro.training.devices import device_of, repeatable
+from ddco_pyro.training.material import Material
+from ddco_pyro.training.objective import Diverged, Objective
+from ddco_pyro.training.ranks import ALONE, Ranks
+from ddco_pyro.training.shards import cut
+from ddco_pyro.training.stages import Stage, plan
+from ddco_pyro.training.upper import Constants
 
 SAVE_EVERY = 1.0  # s between checkpoints, at least: an epoch of a small model takes less time than its checkpoint
 

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 
 from ddco_pyro.data.reading import Readers
-from ddco_pyro.fitting.building import Dimensions, build_hierarchy
-from ddco_pyro.fitting.checkpoint import State
-from ddco_pyro.fitting.devices import device_of, room
-from ddco_pyro.fitting.labels import Labels
 from ddco_pyro.model.encoding import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec
+from ddco_pyro.training.checkpoint import State
+from ddco_pyro.training.devices import device_of, room
+from ddco_pyro.training.labels import Labels
+from ddco_pyro.training.networks import Dimensions, build_hierarchy
 
 
 @dataclass(frozen=True)

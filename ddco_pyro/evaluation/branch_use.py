@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ddco_pyro.fitting.inferred import Inferred
+from ddco_pyro.evaluation.inferred import Inferred
 from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs

@@ -19,20 +19,20 @@ from typing import Any
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import EpochEnded, OnEvent, RestartDiverged, RestartStopped, ignore
-from ddco_pyro.fitting.building import Dimensions, build_hierarchy
-from ddco_pyro.fitting.checkpoint import Progress, Restart
-from ddco_pyro.fitting.convergence import StageEnd, summary
-from ddco_pyro.fitting.devices import described, device_of
-from ddco_pyro.fitting.labels import Labels
-from ddco_pyro.fitting.material import Material
-from ddco_pyro.fitting.objective import TrainingError
-from ddco_pyro.fitting.processes import pool, results, useful_jobs
-from ddco_pyro.fitting.ranks import ALONE, Ranks
-from ddco_pyro.fitting.stages import plan
-from ddco_pyro.fitting.training import advance
 from ddco_pyro.model.encoding import encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec
+from ddco_pyro.training.checkpoint import Progress, Restart
+from ddco_pyro.training.convergence import StageEnd, summary
+from ddco_pyro.training.devices import described, device_of
+from ddco_pyro.training.jobs import pool, results, useful_jobs
+from ddco_pyro.training.labels import Labels
+from ddco_pyro.training.loop import advance
+from ddco_pyro.training.material import Material
+from ddco_pyro.training.networks import Dimensions, build_hierarchy
+from ddco_pyro.training.objective import TrainingError
+from ddco_pyro.training.ranks import ALONE, Ranks
+from ddco_pyro.training.stages import plan
 
 SLICE = 10.0
 """Seconds that a process trains a restart before it tells how it went, and is given the next."""

@@ -1,0 +1,1 @@
+"""From a spec and demonstrations to trained networks."""
