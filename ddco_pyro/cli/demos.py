@@ -113,7 +113,7 @@ def import_(
     form: FormatOption = None,
     observations: Annotated[
         list[str], typer.Option("--observation", metavar="KEY", help="Import only this one; repeatable.")
-    ] = [],  # noqa: B006 (typer reads the default, nobody changes it)
+    ] = [],  # noqa: B006 (typer reads the default, which never changes)
     mask: Annotated[str | None, typer.Option(help="Import only the demonstrations of this mask (filter key).")] = None,
     videos: Annotated[bool, typer.Option("--videos", help="Decode the videos of a LeRobot dataset too.")] = False,
     image_size: Annotated[

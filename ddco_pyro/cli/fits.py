@@ -30,7 +30,7 @@ class Backend(StrEnum):
 
 def check(
     spec: Annotated[Path | None, typer.Argument(metavar="[SPEC]", help="The spec, a YAML file.")] = None,
-    overrides: Overrides = [],  # noqa: B006 (typer reads the default, nobody changes it)
+    overrides: Overrides = [],  # noqa: B006 (typer reads the default, which never changes)
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON Schema of specs instead.")] = False,
     allow_code: AllowCode = False,
 ) -> None:

@@ -52,18 +52,19 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             options.segments(drawn, len(metrics["demonstrations_by_likelihood"])) if drawn else None,
         ]
     name = fit.run_folder.resolve().name
-    write_text(path, Page(words.method(fit.name), _header(fit, metrics), sections, subtitle=name).html())
+    write_text(path, Page(words.method(fit.name), header(fit, metrics), sections, subtitle=name).html())
     return path
 
 
-def _header(fit: Fit, metrics: Mapping[str, Any]) -> list[Block]:
+def header(fit: Fit, metrics: Mapping[str, Any]) -> list[Block]:
     """The verdict, success in rollouts, warnings, and facts about demonstrations and training."""
     counts = metrics["demonstrations"]
     facts = {
         "Demonstrations": f"{counts['train']} for training, {counts['tune']} for tuning, {counts['valid']} held out",
         "Parameters": str(metrics["parameters"]),
-        "Training": words.spent(metrics["training"]),
     }
+    if "training" in metrics:
+        facts["Training"] = words.spent(metrics["training"])
     supervisor = counts.get("supervisor", {}).get("success")
     if supervisor and "successes" in supervisor:
         facts["Supervisor’s own success"] = f"{words.rate(supervisor, 'demonstrations')}, 95 % interval"

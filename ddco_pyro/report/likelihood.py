@@ -44,7 +44,7 @@ def likelihoods(metrics: Mapping[str, Any], baselines: Mapping[str, Mapping[str,
     """The model and its baselines, from their ``metrics.json``."""
     own = metrics["log_likelihood_per_step"]
     valid = np.nan if own["valid"] is None else own["valid"]
-    rows = [Likelihood(metrics["model"], own["train"], valid, None, (), metrics["parameters"], metrics["training"])]
+    rows = [Likelihood(metrics["model"], own["train"], valid, None, (), metrics["parameters"], metrics.get("training"))]
     for name, other in metrics["comparison"].items():
         values, difference = other["log_likelihood_per_step"], other["difference"]
         theirs = {row["name"]: row["log_likelihood"] for row in baselines.get(name, {}).get("valid", ())}

@@ -154,7 +154,7 @@ def degeneracies(spec: Spec, metrics: Mapping[str, Any]) -> list[tuple[str, str]
     levels = spec.hierarchy.levels
     return [
         (_sign(finding, levels[finding.level - 1].name), finding.advice)
-        for finding in diagnose(metrics["options"], metrics["divergences"])
+        for finding in diagnose(metrics["options"], metrics.get("divergences", ()))
         if finding.kind != "never_persisting" or levels[finding.level - 1].lasts
     ]
 
