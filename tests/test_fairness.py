@@ -216,7 +216,7 @@ def test_the_report_says_so_too(fitted):
         assert text in shown
         assert advice in shown
     assert shown.count("<td>27, not converged</td>") == 4
-    assert "Not converged: DDCO, flat, flat of equal size and per-timestep; more epochs may change this result." in shown
+    assert "Not converged: DDCO, flat, flat of equal size and per-timestep; more epochs may change this" in shown
 
 
 def test_where_nothing_rises_nothing_is_said(still, tmp_path):

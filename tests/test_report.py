@@ -1,6 +1,5 @@
 import html
 import re
-import shutil
 from html.parser import HTMLParser
 
 import h5py
@@ -333,5 +332,5 @@ def test_the_spec_may_say_what_is_drawn(tmp_path, labelled):
     shown = " ".join(text(write_report(found, demos).read_text()).split())
     assert "first three numbers of observation “hand”, in its own units" in shown
     automatic = " ".join(text(labelled[1]).split())
-    assert "observation “place”, in its own units. Among observations of three numbers or more, it moves the most" in automatic
+    assert "observation “place”, in its own units. Among observations of three numbers or more, it moves" in automatic
     assert "report.trajectory in the spec names another" in automatic

@@ -123,9 +123,7 @@ def _explained(metrics: Mapping[str, Any]) -> str:
         return f"{name} was fitted to all demonstrations ({value} nats per step); none was held out to evaluate it."
     if not metrics["comparison"]:
         value = number(metrics["log_likelihood_per_step"]["valid"])
-        return (
-            f"{name} gives held-out demonstrations {value} nats per step; no baseline was trained to compare with."
-        )
+        return f"{name} gives held-out demonstrations {value} nats per step; no baseline was trained to compare with."
     differences = {method(other): comparison["difference"] for other, comparison in metrics["comparison"].items()}
     said = [explains(name, differences, held_out)]
     if "worth" in metrics:
