@@ -1,4 +1,4 @@
-"""From a spec to a fit: ``check``, ``fit``, ``select`` and ``merge``."""
+"""Commands that fit: ``check``, ``fit``, ``select`` and ``merge``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Backend(StrEnum):
-    """Where folds are trained."""
+    """Backends of ``select``."""
 
     LOKY = "loky"
     DASK = "dask"
@@ -73,9 +73,11 @@ def fit(
     ] = None,
     seeds: Annotated[
         int | None,
-        typer.Option(min=2, help="Fit with so many training seeds in all, and say how much they differ."),
+        typer.Option(min=2, help="Fit with so many training seeds in all, and report their variation."),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Where --out holds this run whole, show it again.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Where --out holds this run, finished, show it again.")
+    ] = False,
     allow_code: AllowCode = False,
 ) -> None:
     """Fit the spec's hierarchy and its baselines; write the run folder with its report.
@@ -142,7 +144,7 @@ def select(
     scheduler: Annotated[str | None, typer.Option(help="Address of the dask scheduler, tcp://HOST:PORT.")] = None,
     allow_code: AllowCode = False,
 ) -> None:
-    """Choose among the candidates of the spec's grid by cross-validation; then fit what was chosen to all the data.
+    """Choose among the candidates of the spec's grid by cross-validation; then fit the chosen one to all the data.
 
     With --stop-early, after each fold from the third on, a candidate is given up where the paired t-test over the folds
     so far puts it below the best so far (one-sided, p < 0.001), or where a fold of it has failed.
@@ -190,9 +192,9 @@ def merge(
     jobs: Annotated[int, typer.Option(help="Processes that train restarts; -1 is one for each core.")] = -1,
     allow_code: AllowCode = False,
 ) -> None:
-    """Make two options of a run one, and fit again from its segments; write a run folder of its own.
+    """Merge two options of a run and fit again from its segments, into another run folder.
 
-    Called again, an unfinished one is continued.
+    An unfinished one is continued.
     """
     from ddco_pyro.cli import console
     from ddco_pyro.data.files import Output, check_outputs
@@ -215,7 +217,7 @@ def merge(
 
 
 def _check_folder(folder: Path, spec: Path, loaded: Spec) -> None:
-    """See that the folder of a fit or a selection may be written."""
+    """Check that the folder of a fit or a selection may be written."""
     from ddco_pyro.data.files import Output, check_outputs
 
     own = loaded.demonstrations.path
@@ -224,7 +226,7 @@ def _check_folder(folder: Path, spec: Path, loaded: Spec) -> None:
 
 @contextmanager
 def _continued(again: str, folder: Path) -> Iterator[None]:
-    """Ctrl-C ends with 1 and the command that continues, where there is something to continue."""
+    """On Ctrl-C, print the command that continues and exit with 1, where a run has begun."""
     try:
         yield
     except KeyboardInterrupt:
@@ -235,7 +237,7 @@ def _continued(again: str, folder: Path) -> Iterator[None]:
 
 
 def _warn(fitted: Fit) -> None:
-    """Signs of too short a training, and of a degenerate solution."""
+    """Warn of too short a training and of a degenerate solution."""
     from ddco_pyro.cli import console
     from ddco_pyro.report import degeneracies, unconverged
 
@@ -243,5 +245,5 @@ def _warn(fitted: Fit) -> None:
 
 
 def _allowed(spec: Spec) -> list[str]:
-    """The option that lets the user code of this spec be imported again."""
+    """``--allow-code`` where the spec names user code."""
     return ["--allow-code"] if user_code(spec) else []

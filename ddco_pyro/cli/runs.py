@@ -27,7 +27,7 @@ Jobs = Annotated[int, typer.Option(help="Processes that run episodes; -1 is one 
 
 def compare(
     runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN RUN...", help="Run folders; a run's baselines are some too.")
+        list[Path], typer.Argument(metavar="RUN RUN...", help="Run folders; a run's baselines are runs, too.")
     ],
     out: Annotated[Path | None, written(out_folder, "The folder to write to; by default runs/compare-TIME.")] = None,
     allow_code: AllowCode = False,
@@ -54,7 +54,7 @@ def rollout(
     video: Annotated[bool, typer.Option("--video", help="Film the first episodes of each method.")] = False,
     jobs: Jobs = -1,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Where RUN holds these very rollouts, show them again.")
+        bool, typer.Option("--resume", help="Where RUN holds these rollouts, finished, show them again.")
     ] = False,
     allow_code: AllowCode = False,
 ) -> None:
@@ -91,7 +91,7 @@ def report(run: RunPath, allow_code: AllowCode = False) -> None:
 
 
 def _check_run(run: Path, *names: str) -> None:
-    """See that the report of a run, and these files of it, may be written."""
+    """Check that the report of a run, and these files of the run, may be written."""
     from ddco_pyro.data.files import Output, check_outputs
 
     files = [Output("RUN", run / name, "file") for name in ("report.html", *names)]
@@ -102,7 +102,7 @@ def _check_run(run: Path, *names: str) -> None:
 
 
 class LeRobotFormat(StrEnum):
-    """The first version of LeRobot that reads it."""
+    """Forms of subtasks, by the first version of LeRobot that reads them."""
 
     LANGUAGE = "0.6"
     SUBTASK_INDEX = "0.4"
@@ -156,7 +156,7 @@ def segment(
 ) -> None:
     """Label every step of demonstrations with a run's options: as a page, a table, labels in HDF5, or subtasks.
 
-    Only what is asked for is written; DEMOS is left as it is unless --in-place says otherwise.
+    DEMOS is changed with --in-place only.
     """
     if not (out or in_place or csv or parquet or html or lerobot or baselines):
         raise BadInput(
@@ -215,9 +215,9 @@ def segment(
 
 
 def _annotate(fit: Fit, source: Source, out: Path, how: tuple[str | None, str], on_event: OnEvent) -> Segmented:
-    """The segments of a LeRobot dataset, after a copy with a level's options as subtasks was written.
+    """Segment a LeRobot dataset and write a copy with a level's options as subtasks.
 
-    :param how: the level, the lowest where it is None, and the format.
+    :param how: the level (None: the lowest) and the format.
     """
     from ddco_pyro.segmenting import segments
 
@@ -245,15 +245,14 @@ def export(
     onnx: Annotated[bool, typer.Option("--onnx", help="Write ONNX too (pip install 'ddco-pyro\\[export]').")] = False,
     allow_code: AllowCode = False,
 ) -> None:
-    """Write the controller as files that need nothing of this library: numpy with a runner, torch.export, ONNX.
+    """Write the controller as files that do not need this library: numpy with a runner, torch.export, ONNX.
 
-    Every form is loaded again and acts in three episodes of made-up
-    observations, by the loop of runner.py. It has to choose the options
-    that the run's controller chooses, with probabilities within 1e-6 and
-    controls within 1e-6 of the largest of 1, their spread, and their
-    distance from their mean, or within four times what float32 does to the
-    run's own networks where that is more; else nothing is written and what
-    was there stays.
+    Every form is loaded again and acts in three synthetic episodes, by the
+    loop of runner.py. It must choose the options of the run's controller,
+    with probabilities within 1e-6. Controls must be within 1e-6 of the
+    largest of 1, their spread, and their distance from their mean, or
+    within four times the error of float32 in the run's networks where that
+    is more. Otherwise nothing is written.
     """
     from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.export import export as write
