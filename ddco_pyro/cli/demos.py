@@ -11,7 +11,8 @@ from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli.options import AllowCode, AllowExternal, Overrides, SpecPath, out_file, written
+from ddco_pyro.cli import AllowCode, AllowExternal, Overrides, SpecPath, out_file, written
+from ddco_pyro.data.files import Output, check_outputs, write_text
 from ddco_pyro.errors import BadInput, command
 from ddco_pyro.spec import SpecError, load_spec
 
@@ -49,7 +50,6 @@ def collect(
     if loaded.demonstrated_task is None:
         raise SpecError(f"{spec}: names no task, so there is no supervisor to record")
     from ddco_pyro.cli import console
-    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.simulation.collect import collect as record
 
     own = loaded.demonstrations.path
@@ -92,7 +92,6 @@ def init(
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
 ) -> None:
     """Write a commented spec for a file of demonstrations, ready to fit."""
-    from ddco_pyro.data.files import Output, check_outputs, write_text
     from ddco_pyro.data.inspection import inspect as look
     from ddco_pyro.data.starting import starting_spec
 
@@ -126,7 +125,6 @@ def import_(
 ) -> None:
     """Write demonstrations of another format into this project's layout; an interrupted import is continued."""
     from ddco_pyro.cli import console
-    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.data.importing import Choice, import_demonstrations
     from ddco_pyro.events import DemonstrationsDone
 
@@ -176,7 +174,6 @@ def encode(
     The encoder is written to OUT.encoder; ddco_pyro.encoding.load reads it for acting.
     """
     from ddco_pyro.cli import console
-    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.encoding import Encoding
     from ddco_pyro.encoding import encode as write
     from ddco_pyro.encoding.writing import encoder_folder

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli.options import AllowCode, Overrides, RunPath, SpecPath, out_folder, written
+from ddco_pyro.cli import AllowCode, Overrides, RunPath, SpecPath, out_folder, written
+from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import command
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
 
@@ -197,7 +198,6 @@ def merge(
     An unfinished one is continued.
     """
     from ddco_pyro.cli import console
-    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.fitting import merging
     from ddco_pyro.fitting.fit import load
     from ddco_pyro.report import write_report
@@ -218,8 +218,6 @@ def merge(
 
 def _check_folder(folder: Path, spec: Path, loaded: Spec) -> None:
     """Check that the folder of a fit or a selection may be written."""
-    from ddco_pyro.data.files import Output, check_outputs
-
     own = loaded.demonstrations.path
     check_outputs([Output("--out", folder, "folder")], [spec, *([Path(own)] if own else [])])
 

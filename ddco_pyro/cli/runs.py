@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli.options import AllowCode, AllowExternal, RunPath, out_file, out_folder, written
+from ddco_pyro.cli import AllowCode, AllowExternal, RunPath, out_file, out_folder, written
+from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, command
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ def compare(
     from ddco_pyro.cli import console
     from ddco_pyro.comparison import compare as compare_runs
     from ddco_pyro.comparison import page
-    from ddco_pyro.data.files import Output, check_outputs
 
     folder = out or Path("runs") / time.strftime("compare-%Y%m%d-%H%M%S")
     check_outputs([Output("--out", folder / name) for name in page.FILES], runs)
@@ -92,8 +92,6 @@ def report(run: RunPath, allow_code: AllowCode = False) -> None:
 
 def _check_run(run: Path, *names: str) -> None:
     """Check that the report of a run, and these files of the run, may be written."""
-    from ddco_pyro.data.files import Output, check_outputs
-
     files = [Output("RUN", run / name, "file") for name in ("report.html", *names)]
     check_outputs([*files, Output("RUN", run / "figures", "folder")])
 
@@ -173,7 +171,6 @@ def segment(
         again = command("import", demos, "--allow-external", "--out", "whole.hdf5")
         raise BadInput(f"{demos}: labels go into whole files only; first: {again}")
     from ddco_pyro.cli import console
-    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.data.sources import open_source
     from ddco_pyro.fitting.fit import load
     from ddco_pyro.segmenting import chosen_names, segments
@@ -254,7 +251,6 @@ def export(
     within four times the error of float32 in the run's networks where that
     is more. Otherwise nothing is written.
     """
-    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.export import export as write
     from ddco_pyro.fitting.fit import load
 

@@ -19,7 +19,7 @@ from ddco_pyro.evaluation.agreement import UNMATCHED
 from ddco_pyro.evaluation.worth import worth
 from ddco_pyro.fitting.fit import HIERARCHY
 from ddco_pyro.report.likelihood import SHOWN
-from ddco_pyro.segmenting.agreement import measure_name
+from ddco_pyro.segmenting.agreement import measure_names
 from ddco_pyro.segmenting.page import anchor
 from ddco_pyro.training.convergence import effort
 
@@ -86,7 +86,7 @@ def agreement_table(compared: Comparison) -> Table | None:
         [row["run"], row["level"], row["labels"], *(words.number(row[measure], 3) for measure in measures)]
         for row in compared.agreement
     ]
-    head = ["run", "level", "labels", *map(measure_name, measures)]
+    head = ["run", "level", "labels", *measure_names(measures)]
     return Table(head, rows, {0, 1, 2}, "agreement with labels, held out") if rows else None
 
 

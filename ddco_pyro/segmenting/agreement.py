@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,21 +31,27 @@ EXPLAINED = (
 )
 
 
-def measure_name(key: str) -> str:
-    """The name of a measure in tables.
+def measure_names(keys: Iterable[str]) -> list[str]:
+    """The names of measures as heads of columns.
 
-    >>> [measure_name(key) for key in ("nmi", "boundary_f1_3", "f1_10", "accuracy")]
-    ['NMI', 'boundary F1 ±3', 'F1@10', 'accuracy']
+    >>> measure_names(["nmi", "boundary_f1_1", "boundary_f1_3", "accuracy", "f1_10", "f1_25"])
+    ['NMI', 'boundary F1 ±1', '±3', 'accuracy', 'F1@10', '@25']
     """
-    base, _, parameter = key.rpartition("_")
-    if base:
-        return f"boundary F1 ±{parameter}" if base == "boundary_f1" else f"F1@{parameter}"
-    return {"nmi": "NMI", "ari": "ARI", "iou": "IoU"}.get(key, key)
+    names, before = [], ""
+    for key in keys:
+        base, _, parameter = key.rpartition("_")
+        if base:
+            prefix = {"boundary_f1": "boundary F1 ±", "f1": "F1@"}[base]
+            names.append((prefix[-1] if base == before else prefix) + parameter)
+        else:
+            names.append({"nmi": "NMI", "ari": "ARI", "iou": "IoU"}.get(key, key))
+        before = base
+    return names
 
 
 def agreement_table(scores: Mapping[str, Scores], title: str | None = None) -> Table:
     """Two rows for each name of segments, one for each way to match options with labels."""
-    head = ["Segments", *map(measure_name, UNMATCHED), "matching", *map(measure_name, MATCHED)]
+    head = ["Segments", *measure_names(UNMATCHED), "matching", *measure_names(MATCHED)]
     rows = []
     for name, known in scores.items():
         found = known or {}

@@ -14,7 +14,7 @@ import numpy as np
 from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Strip, Table, Text, Timeline, note
-from ddco_pyro.drawing.words import option_name
+from ddco_pyro.drawing.words import number, option_name
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
 from ddco_pyro.segmenting.agreement import EXPLAINED, LevelAgreement, agreement_table
 
@@ -87,7 +87,7 @@ def timelines(segmented: Segmented, most_segments: float = math.inf) -> list[Tim
         Timeline(
             demo.name,
             anchor(demo.name),
-            f"{duration(len(demo), segmented.frequency)}, {demo.log_likelihood:.2f} nats/step",
+            f"{duration(len(demo), segmented.frequency)}, {number(demo.log_likelihood)} nats/step",
             demo.held_out,
             list(_rows(demo, segmented, longest)),
         )
@@ -117,9 +117,9 @@ def _option(
 
 def _labels(name: str, values: np.ndarray, longest: int) -> Iterator[Strip]:
     edges = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
-    for number, (start, end) in enumerate(pairwise(edges)):
+    for place, (start, end) in enumerate(pairwise(edges)):
         value = str(values[start])
-        yield _strip(start, end, longest, SHADES[number % 2], value, f"{name} {value}, steps {start} to {end - 1}")
+        yield _strip(start, end, longest, SHADES[place % 2], value, f"{name} {value}, steps {start} to {end - 1}")
 
 
 def _strip(start: int, end: int, longest: int, colour: str, text: str, title: str) -> Strip:
