@@ -17,6 +17,7 @@ from selecting import Told, candidate, score, spec_at
 import ddco_pyro
 from ddco_pyro.comparison import compare
 from ddco_pyro.comparison.page import write
+from ddco_pyro.drawing import words
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import fit
 from ddco_pyro.report import unconverged, write_report
@@ -185,7 +186,7 @@ def test_stages_that_needed_more_are_named_on_the_console(fitted):
     said = " ".join(ended.out.split())
     for name, row in {"ddco": run.metrics, **run.metrics["comparison"]}.items():
         assert not row["training"]["converged"]
-        assert re.search(rf" {name} │[^┃]*│ 27, not converged ", said)
+        assert re.search(rf" {words.method(name)} │[^┃]*│ 27, not converged ", said)
         for stage in row["training"]["stages"]:
             rise = f"{stage['rising']:.2f} nats per step over the last {stage['epochs']})"
             assert f"stage {stage['stage']} after {stage['epochs']} epochs (tuning log-likelihood up by {rise}" in said

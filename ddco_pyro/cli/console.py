@@ -121,8 +121,8 @@ class Progress:
     def _advance(
         self, label: str = "", total: int | None = None, done: int | None = None, note: str = "", by: int = 1
     ) -> None:
-        """Count ``by`` more, or ``done`` in all; begin with this label and total where nothing is counted yet."""
-        if self._task is None:
+        """Count ``by`` more, or ``done`` in all; begin with this label and total where no count is open."""
+        if self._task is None or (label and self._task.finished):
             self._begin(label, total)
         assert self._task is not None
         task, advance = self._task, by if done is None else None
