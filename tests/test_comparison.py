@@ -191,7 +191,7 @@ def test_demonstrations_may_be_held_out_in_another_order(folders, toy_spec, othe
     [
         ({"seed": 1}, r"not held out on the same data: demo_\d+ was held out by \S+ alone; fit both with the same"),
         ({"demonstrations__seed": 50}, r"same data: demo_\d+ was held out by \S+ alone"),
-        ({"demonstrations__valid_fraction": 0.0}, r"held nothing out \(demonstrations.valid_fraction: 0\), so it"),
+        ({"demonstrations__valid_fraction": 0.0}, r"held nothing out \(demonstrations.valid_fraction: 0\); there is"),
     ],
     ids=["another split", "other demonstrations", "nothing held out"],
 )

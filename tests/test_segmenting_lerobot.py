@@ -148,7 +148,7 @@ def test_a_copy_with_subtasks(lerobot_run, tmp_path, form, features, more):
             [LEROBOT, "--lerobot", out, "--lerobot-format", form],
             "annotated: exists; choose another --lerobot",
         ),
-        ([LEROBOT, "--lerobot", out, "--level", "phase", "--lerobot-format", other], "annotated: is there already"),
+        ([LEROBOT, "--lerobot", out, "--level", "phase", "--lerobot-format", other], "annotated: exists"),
         ([out, "--lerobot", tmp_path / "twice"], "has subtasks already; name a dataset without them"),
         ([out, "--lerobot", tmp_path / "twice", "--lerobot-format", other], "has subtasks already; name a dataset"),
     ):
