@@ -52,7 +52,7 @@ WIDE = 200
 class Progress:
     """Shows events: a bar with the time left on a terminal, elsewhere a plain line every ten seconds.
 
-    :param label: what is done with demonstrations one by one.
+    :param label: the work on demonstrations, such as ``importing``.
     """
 
     def __init__(self, label: str = "collecting demonstrations") -> None:
@@ -251,7 +251,7 @@ def merged(pair: Pair, before: Mapping[str, Any], after: Mapping[str, Any]) -> N
 
 
 def warnings(signs: Sequence[tuple[str, str]]) -> None:
-    """Warnings, each in words and with what usually helps."""
+    """Warnings, each with the usual remedy."""
     for what, advice in signs:
         say(f"warning: {what} {advice}")
 

@@ -167,7 +167,7 @@ def segment(
     labelled = demos if in_place else out
     if labelled and demos.is_dir():
         raise BadInput(f"{demos}: {NO_LABELS}")
-    if labelled and allow_external:  # a copy would not find the other files, and labels could go into those
+    if labelled and allow_external:  # a copy lacks the other files, and labels could go into them
         again = command("import", demos, "--allow-external", "--out", "whole.hdf5")
         raise BadInput(f"{demos}: labels go into whole files only; first: {again}")
     from ddco_pyro.cli import console

@@ -58,7 +58,7 @@ class Table:
         return table
 
     def folded(self, shown: int, what: str) -> list[Block]:
-        """The first rows, and the others behind a line to click on that says how many of ``what`` there are."""
+        """The first rows; the others are folded, and ``what`` names them, such as ``demonstrations``."""
         first, rest = (Table(self.head, rows, self.left) for rows in (self.rows[:shown], self.rows[shown:]))
         return [first, Folded(f"The other {len(rest.rows)} {what}", [rest])] if rest.rows else [first]
 
@@ -76,13 +76,13 @@ class Text:
 
 
 def note(text: str) -> Text:
-    """A small paragraph, such as what a table's columns mean."""
+    """A small paragraph, such as the meaning of a table's columns."""
     return Text(text, "note")
 
 
 @dataclass(frozen=True)
 class Facts:
-    """Names and values in two columns, with a heading where there is a ``title`` and a ``note`` below."""
+    """Names and values in two columns, under an optional ``title`` and over an optional ``note``."""
 
     values: Mapping[str, str]
     title: str = ""
@@ -113,7 +113,7 @@ class Code:
 
 @dataclass(frozen=True)
 class Warned:
-    """A warning and what usually helps."""
+    """A warning and the usual remedy."""
 
     text: str
     advice: str

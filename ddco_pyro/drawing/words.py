@@ -87,7 +87,7 @@ def p_value(value: float) -> str:
 
 
 def rate(result: Mapping[str, Any], of: str = "") -> str:
-    """``41 of 50 (69 to 90 %)``: successes, trials (``of`` what) and the 95 % interval of the rate."""
+    """``41 of 50 (69 to 90 %)``: successes, trials (with a noun ``of``) and the 95 % interval of the rate."""
     text = f"{result['successes']} of {result['trials']} {of}".rstrip()
     return text if result["interval"] is None else f"{text} ({interval(result['interval'], 100, 0)} %)"
 

@@ -320,7 +320,7 @@ def segmented(fit: Fit, demos: Demonstrations, activity: Activity) -> Segmented:
 
 
 def segments(timelines: Sequence[Timeline], demonstrations: int) -> Section:
-    """The timelines, and what to do about those of so many demonstrations that are left out."""
+    """The timelines; a note on the others where not all of so many demonstrations have one."""
     explained = Markup(
         'In the order of the <a href="#demonstrations">list</a>, on one scale of time. Colours are options; a white '
         "line is a new choice. Grey rows are ground-truth labels. Rest the pointer on a segment for its steps and its "

@@ -148,7 +148,7 @@ def warnings(fit: Fit) -> Section | None:
 
 
 def degeneracies(spec: Spec, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Signs of a degenerate solution in ``metrics.json``, each in words with its number, and what usually helps."""
+    """Signs of a degenerate solution in ``metrics.json``, each in words with its number, and the usual remedy."""
     if spec.hierarchy is None:
         return []
     levels = spec.hierarchy.levels

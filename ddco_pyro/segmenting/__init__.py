@@ -95,7 +95,7 @@ class Segmented:
 
 
 def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
-    """The segments of every demonstration of a source, but those that the run's spec excludes from its own file.
+    """The segments of every demonstration of a source, except those that the run's spec excludes from its file.
 
     :raises BadInput: the run has no options.
     :raises DemonstrationsError: a demonstration cannot be used, or lacks an observation of the run.
@@ -121,7 +121,7 @@ def demonstrations(source: Source, names: Iterable[str], fit: Fit) -> Demonstrat
 
 
 def chosen_names(source: Source, fit: Fit) -> list[str]:
-    """The demonstrations to segment: all but those that the spec excludes from its own file."""
+    """The demonstrations to segment: all except those that the spec excludes from its file."""
     known = fit.spec.demonstrations
     same = known.path is not None and Path(known.path).resolve() == source.files[0].resolve()
     return [name for name in source.names if not (same and name in known.exclude)]

@@ -109,7 +109,7 @@ def select(
 def _score_all(
     folder: Path, folds: Folds, candidates: Sequence[Candidate], on_event: OnEvent, workers: Workers, stop_early: bool
 ) -> list[Score]:
-    """The scores of all candidates in all folds, in their order; of candidates given up early, those before that."""
+    """The scores of all candidates in all folds, in their order; up to the last fold of a candidate given up early."""
     count = len(folds.held_out)
     pairs = [(candidate.number, fold) for candidate in candidates for fold in range(count)]
     kept = {pair: dividing.kept_score(folder, *pair) for pair in pairs}
@@ -136,7 +136,7 @@ def _score_all(
 
 
 def final_spec(chosen: Candidate) -> Spec:
-    """The spec of the final fit: the chosen candidate on all demonstrations but those that the file sets apart."""
+    """The spec of the final fit: the chosen candidate on all demonstrations except those that the file sets apart."""
     return with_overrides(chosen.spec, {"demonstrations.valid_fraction": 0.0})
 
 

@@ -48,7 +48,7 @@ class Folds:
     dimensions: Dimensions
 
     def split(self, fold: int) -> tuple[Demonstrations, Demonstrations]:
-        """The demonstrations to train with in a fold, and those to score."""
+        """The training demonstrations and the held-out demonstrations of a fold."""
         out = set(self.held_out[fold])
         train = [name for name in self.demos.names if name not in out]
         return self.demos.select(train), self.demos.select(self.held_out[fold])
