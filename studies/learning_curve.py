@@ -22,7 +22,7 @@ from provenance import Record, record, sentence, text
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
-from ddco_pyro.drawing.pictures import blank, keep, style
+from ddco_pyro.drawing.figures import blank, save, style
 from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.selection.folds import Folds, divide
@@ -132,7 +132,7 @@ def draw(summary: dict[str, Any], path: Path) -> None:
         _lines(right, summary, ["ddco", "ddco, dropout"])
         left.set(title="Models (SM 1.3, figure A)", ylabel="held-out nats per step, ± se over folds")
         right.set(title=f"Dropout {RATE:g} (SM 2.5)")
-        keep(figure, path, "Cross-validated log-likelihood against the number of demonstrations", "")
+        save(figure, path, "Cross-validated log-likelihood against the number of demonstrations", "")
 
 
 def _lines(axes: Axes, summary: dict[str, Any], names: list[str]) -> None:

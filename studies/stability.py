@@ -28,7 +28,7 @@ from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
-from ddco_pyro.drawing.pictures import FAINT, INK, blank, keep, style
+from ddco_pyro.drawing.figures import FAINT, INK, blank, save, style
 from ddco_pyro.evaluation.options import (
     DOMINATING_SHARE,
     HIGH_FITTING_SHARE,
@@ -214,7 +214,7 @@ def draw(summaries: dict[str, Any], path: Path) -> None:
             left.locator_params(axis="x", nbins=5)
             middle.set(xlabel="NMI of pairs of seeds", xlim=(-0.02, 1.02))
             right.set(xlabel="P(meta-policy selects an option)", xlim=(-0.02, 1.02))
-        keep(figure, path, "Quality and structure of fits from different seeds, for each way to train", "")
+        save(figure, path, "Quality and structure of fits from different seeds, for each way to train", "")
 
 
 def _dots(axes: Axes, place: int, values: list[float]) -> None:

@@ -79,8 +79,8 @@ def test_inspect_says_so(path: Path) -> None:
         assert found.fields[f"obs/{key}"].rounding == []
     assert found.fields["actions"].rounding == []
     rows = {line.split("│")[0].strip(): line.split("│")[-1].strip() for line in call("inspect", path).out.splitlines()}
-    assert rows["obs/resting"] == "constant but for rounding"
-    assert rows["obs/half"] == "constant but for rounding: 1"
+    assert rows["obs/resting"] == "constant up to rounding"
+    assert rows["obs/half"] == "constant up to rounding: 1"
     fields = {field["place"]: field for field in json.loads(call("inspect", path, "--json").out)["fields"]}
     assert fields["obs/resting"]["rounding"] == [1, 2, 3]
 

@@ -1,4 +1,4 @@
-"""Trajectories in space, coloured by option (the paper's figure B of SM 1.3)."""
+"""Trajectories in space, coloured by option (paper, SM 1.3, figure B)."""
 
 from __future__ import annotations
 
@@ -11,42 +11,57 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.drawing.pictures import FAINT, INK, blank
+from ddco_pyro.drawing.colours import add_legend, option_colour
+from ddco_pyro.drawing.figures import FAINT, INK, Picture, blank, save
+from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.report.activity import Activity, LevelActivity
-from ddco_pyro.report.strips import legend
 
 MOST_TRAJECTORIES = 40
 MOST_POINTS = 300
 TURN = 70.0
 LEAST_OBLIQUE = 15.0
-"""Degrees; looking straight along an axis would hide its scale."""
+"""Degrees between the view and an axis, at least; a view along an axis hides the axis' scale."""
 
 MOST_STRETCHED = 4.0
-"""Axes whose ranges differ by more than this are not drawn to one scale."""
+"""Axes whose ranges differ by more than this factor are not drawn to one scale."""
+
+CHOSEN = (
+    "Among observations of three numbers or more, it moves the most within demonstrations; report.trajectory in the "
+    "spec names another. "
+)
+
+
+def picture(fit: Fit, demos: Demonstrations, activity: Activity) -> Picture | None:
+    """The demonstrations in space; None where no observation looks like a position."""
+    named = fit.spec.report.trajectory
+    key = named or position_key(demos)
+    if key is None:
+        return None
+    caption = (
+        f"{min(len(demos), MOST_TRAJECTORIES)} demonstrations in space, coloured by the most likely option: first "
+        f"three numbers of observation “{key}”, in its own units. {'' if named else CHOSEN}Circles: first steps. Seen "
+        "from the direction in which the trajectories spread the most."
+    )
+    figure = draw(activity, [np.asarray(demo.observations[key])[:, :3] for demo in demos], key)
+    alt = f"Trajectories of {key} in three dimensions, coloured by option"
+    return save(figure, fit.run_folder / "figures" / "trajectories.png", alt, caption)
 
 
 def position_key(demos: Demonstrations) -> str | None:
-    """The vector of at least three numbers that moves the most (:func:`movement`); None where none of them does."""
+    """The vector of three numbers or more with the most :func:`movement`; None where none moves."""
     keys = [key for key, shape in demos.observation_shapes.items() if len(shape) == 1 and shape[0] >= 3]
     moves = {key: movement([np.asarray(demo.observations[key]) for demo in demos]) for key in keys}
     best = max(moves, key=moves.__getitem__, default=None)
     return best if best is not None and moves[best] > 0 else None
 
 
-def positions(demos: Demonstrations, key: str) -> list[np.ndarray]:
-    """The first three numbers of an observation of each demonstration, [T, 3]."""
-    return [np.asarray(demo.observations[key])[:, :3] for demo in demos]
-
-
 def movement(values: Sequence[np.ndarray]) -> float:
-    """How much like a position the first three of n numbers [T, n] move, from 0 to 1; the product of three parts.
+    """How much the first three of n numbers [T, n] move like a position, 0 to 1. The product of three factors:
 
-    - Their standard deviation within demonstrations over that of all of them: 0 for a goal that is set anew for each
-      demonstration.
-    - How far a demonstration gets, measured across the box around it, for T steps as long as its (root mean square)
-      step: 1 along a straight line at one speed, little for a velocity, for noise, and for what hardly ever moves.
-    - The part of the numbers that is drawn, 3 / n.
+    - Standard deviation within demonstrations over the total one: 0 for a goal that is constant in a demonstration.
+    - Diagonal of the box around a demonstration over the length of T steps of its root mean square step: 1 along a
+      straight line at one speed, near 0 for a velocity or noise.
+    - The share of the numbers that is drawn, 3 / n.
     """
     points = [array[:, :3].astype(float) for array in values]
     reach = float(np.mean([_reach(path) for path in points]))
@@ -65,17 +80,16 @@ def _reach(points: np.ndarray) -> float:
 
 
 def draw(activity: Activity, positions: Sequence[np.ndarray], key: str) -> Figure:
-    """The positions [T_n, 3] of each demonstration, once for each level; a single level is seen from two sides."""
+    """The positions [T_n, 3] of each demonstration, a panel for each level; a single level is seen from two sides."""
     figure = blank(0.55 + 4.2 * -(-max(2, len(activity.levels)) // 2))
-    figure.set_layout_engine("none")  # it does not know how much room labels in space take
+    figure.set_layout_engine("none")  # it leaves too little room for labels of 3D axes
     turns = (0.0, TURN) if len(activity.levels) == 1 else (0.0,)
     panels = [(level, turn) for level in reversed(activity.levels) for turn in turns]
     for place, (level, turn) in zip(_places(len(panels), figure.get_figheight()), panels, strict=True):
         axes = figure.add_axes(place, projection="3d", proj_type="ortho")
         panel(axes, level, positions, key, turn)
         axes.set_title(f"level “{level.name}”" + (f", turned by {turn:.0f}°" if turn else ""))
-    choices = sorted({choice for level in activity.levels for choice in level.choices})
-    figure.legend(handles=legend(choices), loc="lower center", ncols=min(len(choices), 11), handlelength=1)
+    add_legend(figure, activity.choices, "lower center")
     return figure
 
 
@@ -88,7 +102,7 @@ def panel(axes: Axes3D, level: LevelActivity, positions: Sequence[np.ndarray], k
 
 
 def _places(count: int, height: float) -> list[tuple[float, float, float, float]]:
-    """Panels two in a row, (left, bottom, width, height) in parts of the figure; room for titles and the legend."""
+    """Panels, two in a row, as (left, bottom, width, height) in shares of the figure, titles and legend left out."""
     rows = -(-count // 2)
     bottom, each = 0.55 / height, (1 - 0.55 / height) / rows
     return [(0.5 * (n % 2), bottom + (rows - 1 - n // 2) * each, 0.5, 0.93 * each) for n in range(count)]
@@ -122,9 +136,9 @@ def _frame(axes: Axes3D, points: np.ndarray, key: str, turn: float) -> None:
 
 
 def view(points: np.ndarray, span: np.ndarray) -> tuple[float, float]:
-    """Elevation and azimuth (degrees) from which positions [M, 3] spread the most: along their least spread direction.
+    """Elevation and azimuth (degrees) of a view along the direction in which positions [M, 3] spread the least.
 
-    The third axis stays upright, so the elevation lies between 15 and 45 degrees, and no axis is looked along.
+    The third axis stays upright: the elevation is between 15 and 45 degrees. No view is along an axis.
     """
     normal = np.linalg.eigh(np.cov((points / span).T))[1][:, 0] if len(points) > 1 else np.array([1.0, 1.0, 1.0])
     normal = -normal if normal[2] < 0 else normal
