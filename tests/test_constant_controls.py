@@ -18,12 +18,10 @@ from safetensors.torch import save_file
 
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.comparison import compare
-from ddco_pyro.comparison.shared import NotShared
+from ddco_pyro.comparison import CompareError, compare
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.export import TOLERANCE, export, runner
-from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.exporting import TOLERANCE, export, runner
+from ddco_pyro.fitting.fit import Fit, fit
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.spec import Spec, parse_spec, with_overrides
 
@@ -241,7 +239,7 @@ def test_runs_that_score_other_dimensions_are_not_compared(whole: Fit, tmp_path:
         rf"{runs[0].folder} and {runs[1].folder} score different things: control dimension 3 is in the likelihood of "
         rf"{runs[0].folder} and not in that of {runs[1].folder}; fit both to the same demonstrations, with the same ver"
     )
-    with pytest.raises(NotShared, match=message):
+    with pytest.raises(CompareError, match=message):
         compare([one.folder for one in runs])
     assert len(compare([whole.folder, whole.folder / "baselines" / "flat"]).rows) == 2
 

@@ -8,6 +8,7 @@ import json
 import shutil
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from ddco_pyro.drawing import words
 from ddco_pyro.evaluation.schema import read_metrics, read_successes
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.report import option_figures, plot_likelihood, sections, tables
+from ddco_pyro.report import agreement, header, likelihood, options, rollouts, training
 from ddco_pyro.training.data import demonstrations
 
 LINE = r"ddco-pyro: {path}: is damaged: "
@@ -154,16 +155,16 @@ def read_all(fit: Fit, metrics: dict[str, Any]) -> None:
 
 def _read_all(fit: Fit, metrics: dict[str, Any]) -> None:
     words.verdict(metrics), words.success(metrics)
-    sections.degeneracies(fit.spec, metrics), sections.header(fit, metrics), sections.particulars(fit, metrics)
-    sections.agreement(fit, metrics)
-    rows = plot_likelihood.likelihoods(metrics, {name: one.metrics for name, one in fit.baselines.items()})
-    tables.likelihood(rows)
-    tables.option_use(
-        ["option"], metrics["options"], sum(metrics["demonstrations"][part] for part in option_figures.PARTS)
-    )
+    again = replace(fit, metrics=metrics)
+    training.degeneracies(fit.spec, metrics), header(fit, metrics), training.particulars(again)
+    agreement.section(again)
+    rows = likelihood.likelihoods(metrics, {name: one.metrics for name, one in fit.baselines.items()})
+    likelihood.table(rows)
+    counts = metrics["demonstrations"]
+    options.use_table(["option"], metrics["options"], sum(counts[part] for part in ("train", "tune", "valid")))
     found = metrics.get("rollouts")
     if found:
-        tables.measures(found["methods"]), tables.against(found["methods"], metrics["model"])
+        rollouts.measures_table(found["methods"]), rollouts.paired_table(found["methods"], metrics["model"])
         console.successes(found, "ddco")
     console.log_likelihoods(metrics)
 

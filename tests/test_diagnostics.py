@@ -1,8 +1,7 @@
 import pytest
 import torch
 
-from ddco_pyro.evaluation.analysis import as_rows, option_use
-from ddco_pyro.evaluation.diagnostics import Finding, diagnose
+from ddco_pyro.evaluation.options import Finding, as_rows, diagnose, option_use
 from ddco_pyro.inference import Posterior
 
 

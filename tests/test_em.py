@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from ddco_pyro.data.control_parts import ControlPart
 from hierarchies import SHAPES, make_batch
 from scipy import optimize, stats
 from sklearn.linear_model import LogisticRegression
 
-from ddco_pyro.data.control_parts import ControlPart
-from ddco_pyro.training.em import Expectation, is_linear
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.spec import RidgeSpec, parse_spec
+from ddco_pyro.training.em import Expectation, is_linear
 
 EVERYTHING = ("levels.", "meta_policy.")
 LEARNED = {"learn": True, "floor": 0.01}
@@ -96,7 +96,7 @@ def penalised(model, batch, ridge):
                 value = value - 0.5 * ridge.gate * parameter[..., at:last].square().sum()
                 at = last
             for _ in part.dims if part.continuous else ():
-                if place in std.seen:
+                if place in std.of_state:
                     value = value - 0.5 * ridge.gate * parameter[..., at].square().sum()
                 else:
                     sigma = std().expand(parameter.shape[0], -1)[:, place]
@@ -104,8 +104,8 @@ def penalised(model, batch, ridge):
                     if place in (*std.own, *std.shared):
                         value = value - parameter.shape[1] * sigma.log().sum()
                 at, place = at + 1, place + 1
-        if std is not None and std.seen:
-            value = value - 0.5 * ridge.gate * parameter[..., -len(std.seen) :].square().sum()
+        if std is not None and std.of_state:
+            value = value - 0.5 * ridge.gate * parameter[..., -len(std.of_state) :].square().sum()
     return value
 
 

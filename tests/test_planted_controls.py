@@ -8,7 +8,7 @@ import torch
 from planted import make_spec, make_trainer, make_truth, plant, recovered
 
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.data.control_parts import ControlPart, control_parts
+from ddco_pyro.data.controls import ControlPart, control_parts
 from ddco_pyro.training.networks import Dimensions
 
 BOUND = 0.12

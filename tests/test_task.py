@@ -11,7 +11,7 @@ import toy_task
 
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.simulation.task import OutcomeError, UnknownTask, find_task
-from ddco_pyro.spec.types import TASKS
+from ddco_pyro.spec.base import TASKS
 
 
 def test_a_task_is_found_by_module_and_name():

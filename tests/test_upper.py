@@ -207,7 +207,7 @@ def test_constants_are_read_as_they_were_kept():
 
 
 def test_segments_need_a_lowest_level_found_before():
-    with pytest.raises(SpecError, match=r"training\.upper_levels: segments are those of a lowest level found before"):
+    with pytest.raises(SpecError, match=r"training\.upper_levels: segments needs the lowest level discovered first"):
         make_spec((2, 2), upper_levels="segments", layerwise=False)
 
 

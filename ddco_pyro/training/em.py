@@ -14,19 +14,18 @@ A step that lowers the penalised log-likelihood is halved.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Caller, Hierarchy
 from ddco_pyro.model.links import TERMINATION_BOUND, bounded
 from ddco_pyro.model.networks import Inputs
-from ddco_pyro.model.networks.mlp import Mlp
-from ddco_pyro.model.networks.stacked import StackedLinear
+from ddco_pyro.model.networks.perceptrons import Mlp, StackedLinear
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import RidgeSpec
@@ -47,7 +46,8 @@ Score = Callable[[Tables, Batch, Tensor], Tensor]
 def is_linear(model: Hierarchy) -> bool:
     """Whether every network of a hierarchy is linear in the observations, so that EM applies."""
     return model.trunk is None and all(
-        isinstance(network, Mlp) and len(network.layers) == 1 for network in model.networks().values()
+        isinstance(network, Mlp) and network.trunk_size is None and len(network.layers) == 1
+        for network in model.networks().values()
     )
 
 
@@ -209,6 +209,18 @@ class Expectation:
             yield f"levels.{number}.policy", level.policy
         yield "meta_policy", self.model.meta_policy
 
+    def states(self) -> dict[str, Tensor]:
+        """What a checkpoint keeps: the weights in float64, and those before the last step with their value."""
+        before = {f"before.{name}": value for name, value in (self._before or {}).items()}
+        return {**self._state(), **before, "value": torch.tensor(self.value, dtype=torch.float64)}
+
+    def load_states(self, states: Mapping[str, Tensor]) -> None:
+        """Go on from what :meth:`states` kept."""
+        self.value = float(states["value"])
+        self._before = {name.removeprefix("before."): one for name, one in states.items() if name.startswith("before.")}
+        self._before = self._before or None
+        self._restore(states)
+
     def step(self, batch: Batch) -> float:
         """One EM step over all demonstrations; their log-likelihood before the step, nats.
 
@@ -229,9 +241,12 @@ class Expectation:
             penalised = value + self._penalty()
         self.value, self._before = penalised, self._state()
         self._maximise(sums)
-        for part in (*self.networks.values(), *self.stds.values()):
-            if part.trained:
-                part.store()
+        for network in self.networks.values():
+            if network.trained:
+                network.store()
+        for std in self.stds.values():
+            if std.trained:
+                std.store()
         return value
 
     def _state(self) -> dict[str, Tensor]:
@@ -243,7 +258,7 @@ class Expectation:
         now = self._state()
         return ((item, now[item[0]]) for item in self._before.items())
 
-    def _restore(self, state: dict[str, Tensor]) -> None:
+    def _restore(self, state: Mapping[str, Tensor]) -> None:
         for name, network in self.networks.items():
             network.weight = state[name]
         for name, std in self.stds.items():
@@ -276,7 +291,7 @@ class Expectation:
         """The columns of means whose σ does not depend on the state, and the places of σ."""
         caller = dict(self._callers())[name]
         for group in _layout(caller, self.model):
-            if group.std and not set(group.std) & set(self.stds[name].module.seen):
+            if group.std and not set(group.std) & set(self.stds[name].module.of_state):
                 yield group.means, group.std
 
     def _expect(self, batch: Batch) -> tuple[float, dict[str, Sums]]:
@@ -295,9 +310,7 @@ class Expectation:
             xs.setdefault(key, network.features(piece.inputs))
             said[name] = network.outputs(xs[key]).requires_grad_()
         stds = {name: std.value.clone().requires_grad_() for name, std in self.stds.items()}
-        callers = {
-            name: caller.outputs(said[name], self.model.scaling, stds.get(name)) for name, caller in self._callers()
-        }
+        callers = {name: caller(said[name], self.model.scaling, stds.get(name)) for name, caller in self._callers()}
         named = [f"levels.{number}" for number in range(len(levels))]
         logits = [said[f"{name}.termination"].squeeze(-1) if f"{name}.termination" in said else None for name in named]
         top = callers["meta_policy"]
@@ -452,7 +465,7 @@ def _emitted(
     caller: Caller, model: Hierarchy, said: Tensor, std: Tensor, acting: Tensor, actions: Tensor
 ) -> Iterator[Information]:
     """What the posterior expects to learn of a caller's numbers, given how likely it acts, [N, T, K]."""
-    acting, seen = acting.double(), caller.std.seen if caller.std is not None else []
+    acting, seen = acting.double(), caller.std.of_state if caller.std is not None else []
     last = said.shape[-1] - len(seen)
     for part in _layout(caller, model):
         if part.kind == "continuous":
