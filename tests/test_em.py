@@ -57,7 +57,7 @@ def linear(counts, parts=None, emits=("options",), memoryless=(), **control):
     torch.manual_seed(0)
     return Hierarchy(
         parse_spec(
-            {"demonstrations": {"path": "unused"}, "observations": ["state"], "control": {"std": 0.7, **control}, **whole}
+            {"demonstrations": {"path": "unused"}, "observations": ["state"], "control": {"std": 0.7} | control} | whole
         ),
         SHAPES, 2, steps=9, parts=parts,
     )  # fmt: skip
@@ -135,8 +135,8 @@ def test_steps_never_lower_the_penalised_likelihood_and_end_where_its_gradient_i
     made, values = expectation(model, ridge, batch)
     assert np.diff(values).min() > -1e-9 * abs(values[-1])
     assert values[-1] > values[0] + 1
-    batch = Batch(Inputs({"state": batch.inputs.vectors["state"].double()}, {}, batch.inputs.time), batch.actions.double(),
-                  batch.lengths)  # fmt: skip
+    inputs = Inputs({"state": batch.inputs.vectors["state"].double()}, {}, batch.inputs.time)
+    batch = Batch(inputs, batch.actions.double(), batch.lengths)
     value = penalised(model, batch, ridge)
     free = [(name, one) for name, one in model.named_parameters() if "raw" not in name or not _at_floor(model, name)]
     gradients = torch.autograd.grad(value, [one for _, one in free])

@@ -56,8 +56,8 @@ class Information:
     """The information that the posterior expects of some outputs of a network.
 
     :param columns: the outputs.
-    :param weight: h of each output [N, T, K, n]; or [N, T, K]: that of all of them, times 1/σ² where they are means, and
-        times diag(p) - pp^T where they are logits of probabilities p.
+    :param weight: h of each output [N, T, K, n]. Or a weight of all outputs, [N, T, K]: h is the weight times 1/σ² for
+        means, and times diag(p) - pp^T for logits of probabilities p.
     :param probabilities: p, [N, T, K, n].
     :param std: the places of σ of these means; a σ that depends on the state is in ``weight`` instead.
     """
@@ -70,7 +70,7 @@ class Information:
 
 @dataclass
 class Sums:
-    """Of a network, over all steps: the gradient of W, [K, F, n], and the information, [K, ..., F, F], of each group."""
+    """Sums over all steps for one network: the gradient of W, [K, F, n], and the information of each group."""
 
     gradient: Tensor | float = 0.0
     groups: list[Information] = field(default_factory=list)
