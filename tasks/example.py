@@ -11,7 +11,7 @@ import dm_env
 import numpy as np
 from dm_env import specs
 
-from ddco_pyro.simulation.task import Task
+from ddco_pyro.simulation.task import Observation, Task
 
 STEPS, NEAR = 40, 0.15
 
@@ -65,7 +65,7 @@ class Supervisor:
         """Begin an episode."""
         self._noise = np.random.default_rng([seed, 1])
 
-    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+    def act(self, observation: Observation) -> np.ndarray:
         """The control [2]."""
         phase = int(observation["passed"][0])
         self.annotations = {"phase": phase}
