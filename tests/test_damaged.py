@@ -222,6 +222,8 @@ def test_damaged_rollouts(run: Path, monkeypatch: pytest.MonkeyPatch, content: b
     monkeypatch.chdir(run.parent)
     (run / "rollouts.csv").write_bytes(content)
     refused(run, COMMANDS["compare"], run / "rollouts.csv", "")
+    (run / "videos").mkdir(exist_ok=True)
+    (run / "videos" / "ddco-1000.mp4").touch()  # a film, whose outcome is in the table
     assert call("report", run).err.startswith(f"ddco-pyro: {run / 'rollouts.csv'}: is damaged: ")
 
 
