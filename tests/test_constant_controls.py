@@ -118,22 +118,6 @@ def test_what_they_are_comes_back_from_the_run(whole: Fit) -> None:
     assert dict(zip((1, 3), again.hierarchy.scaling.constant.tolist(), strict=True)) == STILL
 
 
-<<<<<<< HEAD
-=======
-def test_runs_of_before_have_every_dimension_in_them(reduced: Fit, tmp_path: Path) -> None:
-    """Their weights do not say which dimensions vary."""
-    run = shutil.copytree(reduced.folder, tmp_path / "run")
-    with safe_open(run / "model.safetensors", "pt") as file:
-        names = set(file.keys()) - {"scaling.varying", "scaling.constant"}
-        assert len(names) == len(file.keys()) - 2
-        tensors, metadata = {name: file.get_tensor(name) for name in names}, file.metadata()
-    del metadata["sha256"]
-    save_file(tensors, run / "model.safetensors", metadata)
-    again, demos = ddco_pyro.load(run), with_controls(make_demonstrations(), columns=FREE)
-    np.testing.assert_array_equal(again.log_likelihood(demos), reduced.log_likelihood(demos))
-
-
->>>>>>> upper
 # --- what acts --------------------------------------------------------------------------------------------------------
 
 
