@@ -78,7 +78,7 @@ DAMAGE: dict[str, tuple[Any, str]] = {
     "[]": (lambda text: "[]", "must be a mapping (key: value), got []"),
     "a string": (
         lambda text: text.replace('"parameters": ', '"parameters": "many", "was": '),
-        "parameters: must be a whole number, got 'many'",
+        "comparison.flat.parameters: must be a whole number, got 'many'",
     ),
     "a key less": (lambda text: text.replace('"comparison"', '"comparisons"'), "comparison: missing"),
 }
