@@ -337,14 +337,6 @@ def test_what_was_written_without_a_checksum_is_read(tmp_path: Path) -> None:
     assert same(read_tensors(tmp_path / "old"), read_tensors(tmp_path / "new"))
 
 
-def test_a_run_of_before_is_loaded(run: Path) -> None:
-    path = run / "model.safetensors"
-    tensors, metadata = read_tensors(path)
-    path.unlink()
-    save_file(tensors, path, metadata)
-    assert ddco_pyro.load(run).metrics["model"] == "ddco"
-
-
 # --- selections -------------------------------------------------------------------------------------------------------
 
 
