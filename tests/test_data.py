@@ -202,4 +202,4 @@ def test_only_what_the_spec_names_has_to_be_in_order(path):
 )
 def test_a_model_that_fills_the_memory_is_refused_before_it_is_made(toy_spec, overrides, message):
     with pytest.raises(SpecError, match=message):
-        build_hierarchy(with_overrides(toy_spec, overrides), Dimensions({"offsets": (4,), "visited": (1,)}, 2, 12))
+        check_networks(with_overrides(toy_spec, overrides), Dimensions({"offsets": (4,), "visited": (1,)}, 2, 12))

@@ -77,12 +77,6 @@ def test_selections_are_counted_where_an_option_is_used():
     assert found == [Finding("never_persisting", 1, 1, 1.0, selections=10.0)]
 
 
-def test_runs_of_before_do_not_say_how_often_an_option_is_selected_in_a_demonstration():
-    before = [{key: value for key, value in one.items() if key != "demonstrations"} for one in level(0.0, 0.5, 0.5)]
-    before[1]["duration"] = 1.0
-    assert diagnose([before]) == []
-
-
 def test_an_unused_option_is_not_also_said_to_be_short():
     found = diagnose([level(0.0, 0.001, 0.999 / 2, 0.999 / 2, durations=[None, 1.0, 5.0, 5.0])])
     assert [one.kind for one in found] == ["unused"]

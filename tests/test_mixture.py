@@ -186,7 +186,7 @@ def test_what_is_no_model_is_refused():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"hierarchy": None, "baseline": "mixture", "compare_with": []}, "baseline.count: missing; say how many"),
+        ({"hierarchy": None, "baseline": "mixture", "compare_with": []}, "baseline.count: missing; give the number"),
         ({"hierarchy": None, "baseline": "flat", "compare_with": ["mixture"]}, "compare_with.0: mixture takes its"),
         ({"compare_with": [{"kind": "mixture", "count": 3}]}, "compare_with.0.count: a mixture in compare_with has"),
         (

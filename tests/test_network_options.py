@@ -13,7 +13,7 @@ from torch import nn
 from ddco_pyro.model.networks import CLASSES, InputShape, build
 from ddco_pyro.spec import SpecError, network_spec, parse_spec
 from ddco_pyro.spec.networks import SETTINGS, Network
-from ddco_pyro.training.networks import Dimensions, check_networks
+from ddco_pyro.training.networks import Dimensions, check_models
 
 if TYPE_CHECKING:
     from collections.abc import Hashable
@@ -148,7 +148,7 @@ WRONG_OPTIONS = {"network": f"{__name__}:Typed", "options": {"width": "a", "gian
 def test_what_is_wrong_with_options_is_said_with_their_place_in_the_spec(wrong, place):
     spec = parse_spec({"task": "toy", "observations": ["pose"], "hierarchy": {"levels": [{"count": 2}]}}, wrong)
     with pytest.raises(SpecError) as caught:
-        check_networks(spec, Dimensions({"pose": (3,)}, control_size=2, steps=5))
+        check_models(spec, Dimensions({"pose": (3,)}, control_size=2, steps=5))
     width, gian = caught.value.problems
     assert width == f"{place}.options.width: must be a whole number, got 'a'"
     assert gian.startswith(f"{place}.options.gian: unknown option (did you mean 'gain'?); the class takes: width, ")

@@ -160,7 +160,7 @@ def test_where_nothing_is_left_the_first_reason_is_told(tmp_path, monkeypatch):
 
 
 def test_an_unexpected_error_is_told_and_tried_again_next_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(folds, "train", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(folds, "train_model", lambda *_, **__: 1 / 0)
     with pytest.raises(SelectionFailed, match="unexpected ZeroDivisionError: division by zero"):
         select(spec_at(tmp_path), tmp_path / "run", Told(), ONE)
     monkeypatch.undo()

@@ -215,6 +215,6 @@ def test_segments_need_a_lowest_level_found_before():
 def test_segments_need_callers_that_select(place):
     spec = make_spec((2, 2), upper_levels="segments")
     assert with_overrides(spec, {place: ["options", "control"]}).training.upper_levels == "segments"
-    with pytest.raises(SpecError, match=f"{place}: needs options") as caught:
+    with pytest.raises(SpecError, match=f"{place}: training.upper_levels: segments needs options here") as caught:
         with_overrides(spec, {place: ["control"]})
     assert len(caught.value.problems) == 1

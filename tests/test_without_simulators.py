@@ -27,7 +27,7 @@ main()
 def call(folder, *arguments):
     """The command line in a process that cannot import a simulator."""
     return subprocess.run(
-        [sys.executable, "-c", WITHOUT, *map(str, arguments)], cwd=folder, capture_output=True, text=True, timeout=500
+        [sys.executable, "-c", WITHOUT, *map(str, arguments)], cwd=folder, capture_output=True, text=True, timeout=1000
     )
 
 
@@ -46,10 +46,10 @@ def folder(tmp_path_factory):
 
 
 def test_from_a_file_to_an_export(folder):
-    quick = ("--set", "training.epochs=2", "--set", "training.restarts=1", "--set", "baseline_seeds=1")
+    quick = ("--set", "training.epochs=2", "--set", "training.restarts=1", "--set", "compare_with=[]")
     for command in (
         ("init", "mine.hdf5", "--out", "mine.yaml"),
-        ("fit", "mine.yaml", "--out", "run", *quick[:4]),
+        ("fit", "mine.yaml", "--out", "run", *quick),
         ("segment", "run", "mine.hdf5", "--html", "segments.html"),
         ("export", "run", "--out", "controller"),
         ("report", "run"),

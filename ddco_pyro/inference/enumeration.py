@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import pyro
 import torch
@@ -38,8 +39,10 @@ def log_likelihood(
     trace = traced.trace
     trace.compute_log_prob()
     trace.pack_tensors()
-    factors = [site["packed"]["log_prob"] for site in trace.nodes.values() if "log_prob" in site.get("packed", {})]
-    enumerated = set("".join(factor._pyro_dims for factor in factors)) - {*trace.plate_to_symbol.values()}  # type: ignore[attr-defined]
+    factors: list[Any] = [
+        site["packed"]["log_prob"] for site in trace.nodes.values() if "log_prob" in site.get("packed", {})
+    ]
+    enumerated = set("".join(factor._pyro_dims for factor in factors)) - {*trace.plate_to_symbol.values()}
     (parts,) = contract_tensor_tree(OrderedDict([(frozenset(), factors)]), enumerated).values()
     total: Tensor = sum(parts)
     return total.expand(len(lengths))

@@ -25,7 +25,12 @@ from ddco_pyro.spec.training import TrainingSpec
 
 
 class Spec(Model):
-    """Everything that determines a run."""
+    """Everything that determines a run.
+
+    >>> spec = ddco_pyro.load_spec("mine.yaml")
+    >>> spec.observations[0].key, spec.training.epochs, spec.hierarchy.levels[0].count
+    ('place', 12, 2)
+    """
 
     task: TaskName | None = None
     """Name of a registered task, or ``module:name``."""
