@@ -5,17 +5,23 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from ddco_pyro.data.control_parts import ControlPart
 from hierarchies import SHAPES, make_batch
+from planted import make_trainer
+from random_demonstrations import demonstrations
 from scipy import optimize, stats
 from sklearn.linear_model import LogisticRegression
 
+import ddco_pyro
+from ddco_pyro.data.controls import ControlPart
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
-from ddco_pyro.spec import RidgeSpec, parse_spec
+from ddco_pyro.spec import RidgeSpec, SpecError, parse_spec, with_overrides
+from ddco_pyro.training.checkpoint import Progress, Restart
 from ddco_pyro.training.em import Expectation, is_linear
+from ddco_pyro.training.loop import train
+from ddco_pyro.training.stages import effort
 
 EVERYTHING = ("levels.", "meta_policy.")
 LEARNED = {"learn": True, "floor": 0.01}
@@ -220,3 +226,53 @@ def test_a_dead_option_keeps_finite_weights():
     for _ in range(20):
         made.step(batch)
     assert all(bool(torch.isfinite(one).all()) for one in model.parameters())
+
+
+def small_spec(**training):
+    network = {"network": "linear"}
+    return parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.2},
+            "observations": ["pose"],
+            "control": {"std": {**LEARNED, "per_option": True}},
+            "hierarchy": {
+                "levels": [{"count": 2, "policy": network, "termination": network}],
+                "meta_policy": network,
+            },
+            "compare_with": ["mixture", {"kind": "flat", "policy": {"network": "mlp", "hidden": [4]}}],
+            "training": {"optimizer": {"name": "em"}, "epochs": 60, **training},
+        }
+    )
+
+
+def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
+    fit = ddco_pyro.fit(small_spec(), demonstrations(12))
+    trained = {"ddco": fit.metrics["training"]} | {
+        name: one["training"] for name, one in fit.metrics["comparison"].items()
+    }
+    assert {name: one["by_em"] for name, one in trained.items()} == {"ddco": True, "mixture": True, "flat": False}
+    assert trained["ddco"]["spent"]["gradient_steps"] == trained["ddco"]["spent"]["epochs"]
+    assert "(EM)" in effort(trained["ddco"])
+
+
+def test_a_fit_by_em_that_is_interrupted_has_the_same_bits(tmp_path):
+    spec, demos = small_spec(), demonstrations(12)
+    whole, cut = (make_trainer(spec, demos, tmp_path / name) for name in ("whole", "cut"))
+    expected = train(whole.data, Restart(Progress(0)))
+    path = tmp_path / "restart.safetensors"
+    restart = Restart(Progress(0))
+    for _ in range(1000):
+        restart = train(cut.data, restart, seconds=0.0)
+        if restart.progress.done:
+            break
+        restart.write(path)
+        restart = Restart.read(path)
+    assert restart.progress.history == expected.progress.history
+    for name, value in expected.states["best"].items():
+        assert torch.equal(restart.states["best"][name], value), name
+
+
+def test_a_spec_that_em_would_not_follow_is_refused():
+    for key, value in (("training.average", 0.9), ("training.clip_gradient", 1.0), ("training.optimizer.warmup", 2)):
+        with pytest.raises(SpecError, match=f"{key}: em"):
+            with_overrides(small_spec(), {key: value})

@@ -191,6 +191,8 @@ class Training(Record):
     converged: bool
     restarts: Restarts
     device: str
+    by_em: bool = False
+    """Whether the gradient steps are EM steps over all training demonstrations."""
 
 
 class Compared(Record):

@@ -24,8 +24,8 @@ class OptimizerSpec(Model):
     """The optimiser of the expectation-gradient steps."""
 
     name: Literal["adam", "adamw", "momentum", "em"] = "adam"
-    """``adam``, ``adamw``, ``momentum`` for gradient descent with momentum, or ``em`` for expectation-maximisation,
-    where every network is linear."""
+    """``adam``, ``adamw``, ``momentum`` for gradient descent with momentum, or ``em``: expectation-maximisation where
+    every network of a model is linear, ``adam`` for other models."""
     ridge: RidgeSpec = RidgeSpec()
     """Ridges (``em`` only)."""
     lr: Positive = 1e-3
@@ -139,6 +139,16 @@ class TrainingSpec(Model):
     """Labels that fix active options in some demonstrations; null: none."""
     duration: DurationSpec | None = None
     """A prior on option durations; null: none."""
+
+    @model_validator(mode="after")
+    def _em_has_no_gradient_steps(self) -> TrainingSpec:
+        if self.optimizer.name == "em":
+            unused = [name for name in ("average", "clip_gradient") if getattr(self, name) is not None]
+            unused += ["optimizer.warmup"] if self.optimizer.warmup else []
+            unused += ["optimizer.schedule"] if self.optimizer.schedule != "constant" else []
+            if unused:
+                raise invalid((unused[0], "em takes no gradient steps and would not use it; leave it out"))
+        return self
 
     @model_validator(mode="after")
     def _ends(self) -> TrainingSpec:

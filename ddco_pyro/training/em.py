@@ -36,6 +36,8 @@ HALVINGS = 10
 """How often a step that lowers the penalised log-likelihood is halved before it is given up."""
 ABOVE_FLOOR = 1e-4
 """A learned σ stays so far above its floor."""
+TOLERANCE = 1e-5
+"""EM has converged where a step gains less, in nats per step of the demonstrations."""
 BIAS = 1e-6
 """Ridge of biases: an option that is never active keeps its own."""
 
@@ -182,6 +184,7 @@ class Expectation:
     :param score: what is maximised of a piece of the demonstrations.
     :param discovering: d has levels 1 to d alone under a uniform meta-policy.
     :ivar value: the penalised log-likelihood of the weights that the last step began at.
+    :ivar gain: what the step before gained, nats per step.
     """
 
     def __init__(
@@ -202,7 +205,12 @@ class Expectation:
             if caller.std is not None:
                 self.stds[name] = Std(caller, f"{name}.".startswith(trained))
         self._before: dict[str, Tensor] | None = None
-        self.value = -math.inf
+        self.value, self.gain = -math.inf, math.inf
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last step gained less than :data:`TOLERANCE`."""
+        return self.gain < TOLERANCE
 
     def _callers(self) -> Iterator[tuple[str, Caller]]:
         for number, level in enumerate(self.model.option_levels()):
@@ -212,11 +220,13 @@ class Expectation:
     def states(self) -> dict[str, Tensor]:
         """What a checkpoint keeps: the weights in float64, and those before the last step with their value."""
         before = {f"before.{name}": value for name, value in (self._before or {}).items()}
-        return {**self._state(), **before, "value": torch.tensor(self.value, dtype=torch.float64)}
+        numbers = {"value": self.value, "gain": self.gain}
+        kept = {**self._state(), **before, **{name: torch.tensor(one).double() for name, one in numbers.items()}}
+        return {name: one.clone() for name, one in kept.items()}
 
     def load_states(self, states: Mapping[str, Tensor]) -> None:
         """Go on from what :meth:`states` kept."""
-        self.value = float(states["value"])
+        self.value, self.gain = float(states["value"]), float(states["gain"])
         self._before = {name.removeprefix("before."): one for name, one in states.items() if name.startswith("before.")}
         self._before = self._before or None
         self._restore(states)
@@ -239,7 +249,7 @@ class Expectation:
             self._restore(self._before)
             value, sums = self._expect(batch)
             penalised = value + self._penalty()
-        self.value, self._before = penalised, self._state()
+        self.gain, self.value, self._before = (penalised - self.value) / batch.steps, penalised, self._state()
         self._maximise(sums)
         for network in self.networks.values():
             if network.trained:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -72,7 +72,7 @@ def train(
                 last = now.stage == len(stages) - 1
                 cap = share(spec.epochs, now.spent, len(stages) - now.stage)
                 stage, begun = StageTraining(data, model, stages[now.stage], restart, ranks), now.epoch
-                while (cap is None or now.epoch < cap) and (spec.patience is None or now.stale < spec.patience):
+                while (cap is None or now.epoch < cap) and not stage.converged:
                     overdue = now.epoch > begun and time.monotonic() > deadline
                     if overdue or (last and until is not None and now.epoch >= until):
                         states |= stage.states()
@@ -123,6 +123,13 @@ class StageTraining:
             now.start, now.stale = self.objective.tune(model), 0
             now.best = now.start
             restart.states["best"] = copy_of(model)
+
+    @property
+    def converged(self) -> bool:
+        """Whether patience has run out, or EM gains nothing more."""
+        patience = self.spec.patience
+        out = patience is not None and self.restart.progress.stale >= patience
+        return out or (self.em is not None and self.em.converged)
 
     @property
     def kept(self) -> Hierarchy:
@@ -239,7 +246,10 @@ class StageTraining:
         """The best epoch is the model that the stage gives."""
         now = self.restart.progress
         self.model.load_state_dict(self.restart.states["best"])
-        now.ended.append(asdict(StageEnd.of(self.stage.name, cap, now.tune, self.spec.patience)))
+        end = StageEnd.of(self.stage.name, cap, now.tune, self.spec.patience)
+        if self.em is not None and self.em.converged:
+            end = replace(end, rising=0.0)  # at an optimum of the penalised likelihood
+        now.ended.append(asdict(end))
 
 
 def backward(objective: Objective, model: Hierarchy, batch: Batch, rows: Tensor, steps: int | None = None) -> float:

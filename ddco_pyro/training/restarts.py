@@ -38,7 +38,7 @@ from ddco_pyro.spec import Spec
 from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData
 from ddco_pyro.training.devices import described, device_of
 from ddco_pyro.training.labels import Labels
-from ddco_pyro.training.loop import train
+from ddco_pyro.training.loop import train, uses_em
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
 from ddco_pyro.training.processes import ALONE, Ranks, pool, results, useful_jobs
@@ -198,7 +198,8 @@ class Trainer:
     @property
     def summary(self) -> dict[str, Any]:
         """``training`` of ``metrics.json``: the budget, the best restart's stages, and the epochs of all restarts."""
-        best, updates = self.best, math.ceil(len(self.data.train) / self.spec.training.batch_size)
+        by_em = uses_em(self.spec.training.optimizer, self.hierarchy)
+        best, updates = self.best, 1 if by_em else math.ceil(len(self.data.train) / self.spec.training.batch_size)
         ends = [StageEnd(**end) for end in self.restarts[best].progress.ended]
         each = [
             {"epochs": len(restart.progress.history), "stopped": self.stopped.get(number)}
@@ -216,6 +217,7 @@ class Trainer:
             "converged": ends[-1].converged,  # the last stage trains what acts in the end
             "restarts": {"best": best, "spent": effort(len(self.history)), "each": each},
             "device": self.restarts[best].progress.device,
+            "by_em": by_em,
         }
 
     @property

@@ -111,7 +111,8 @@ def share(budget: int | None, spent: int, stages_left: int) -> int | None:
 
 
 def effort(training: Mapping[str, Any] | None) -> str:
-    """The gradient steps of training for tables, marked where training had not converged."""
+    """The gradient or EM steps of training for tables, marked where training had not converged."""
     if training is None:
         return "–"
-    return f"{training['spent']['gradient_steps']}{'' if training['converged'] else ', not converged'}"
+    by_em = " (EM)" if training.get("by_em") else ""
+    return f"{training['spent']['gradient_steps']}{by_em}{'' if training['converged'] else ', not converged'}"
