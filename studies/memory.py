@@ -38,8 +38,8 @@ from arena import TASKS
 from arena_results import nmi
 from cells import described, printed, some
 from ddco_tasks.pushing import environment as pushing_task
-from memory_results import MIXTURE, OPTIONS, checks, comparisons, draw, of_pages, page
-from provenance import Record, record, sentence, text
+from memory_results import MIXTURE, OPTIONS, checks, comparisons, draw, of_pages, page, short, with_table
+from provenance import ROOT, Record, record, sentence, text
 from threadpoolctl import threadpool_limits
 
 from ddco_pyro.acting.controller import Controller
@@ -265,7 +265,7 @@ def command(study: str, asked: Asked) -> str:
 
 
 def write_page(out: Path) -> str:
-    """``memory.md``, ``memory.json`` and ``memory.png`` beside the folder of the table; the page."""
+    """``memory.md``, ``.json`` and ``.png`` beside the folder of the table, and the table of README; the page."""
     rows, pages = read(out / "cells.csv"), of_pages()
     found = comparisons(rows, pages)
     records = json.loads((out / "cells.json").read_text())["provenance"]
@@ -274,6 +274,8 @@ def write_page(out: Path) -> str:
     write_text(out.with_suffix(".json"), text(found, records))
     write_text(out.with_suffix(".md"), shown)
     draw(found, out.with_suffix(".png"))
+    readme = ROOT / "README.md"
+    write_text(readme, with_table(readme.read_text(encoding="utf-8"), short(found)))
     return shown
 
 

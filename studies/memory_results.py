@@ -291,6 +291,47 @@ def page(found: Sequence[Row], again: Sequence[Row], missing: Sequence[str], mad
     return "\n".join(lines) + "\n"
 
 
+SHORT = {
+    ("needle", "success"),
+    ("pushing", "goals, marginal"),
+    ("arena", "success"),
+    ("arena", "NMI"),
+    ("bins", "success"),
+}
+"""The measures beside nats in the table of README."""
+
+
+def short(found: Sequence[Row]) -> str:
+    """The table of README: the two differences of each study, where options are fitted by the code of the mixtures, if
+    they are.
+    """
+    main = [*(one for one in found if one["study"] not in ("arena", "planted")), *over_tasks(found)]
+    lines = [
+        "| | demonstrations | measure | several policies (mixture − flat) | lasting (options − mixture) | seeds |",
+        "|---|---|---|---|---|---|",
+    ]
+    for one in sorted(main, key=_in_order):
+        acting = f", {one['acting'].replace('_', ' ')}" if one["study"] == "pushing" and one["acting"] else ""
+        measure = one["measure"] + acting
+        if one["measure"] != "nats" and (one["study"], measure) not in SHORT:
+            continue
+        seeds = len(one["seeds"])
+        again = one["study"] == "arena" or len(one["difference"][f"{AGAIN} - {MIXTURE}"].get("by_seed", ())) == seeds
+        name = NAMED[one["study"]] + (f", {one['task']}" if one["task"] != one["study"] else "")
+        cells = [name, str(one["demonstrations"]), measure.partition(",")[0], _difference(one, MIXTURE, FLAT)]
+        lines.append(f"| {' | '.join([*cells, _difference(one, AGAIN if again else OPTIONS, MIXTURE), str(seeds)])} |")
+    return "\n".join(lines)
+
+
+BEGIN, END = "<!-- begin: python studies/memory.py page -->\n", "\n<!-- end -->"
+
+
+def with_table(text: str, table: str) -> str:
+    """A text whose table between :data:`BEGIN` and :data:`END` is this one."""
+    before, _, rest = text.partition(BEGIN)
+    return f"{before}{BEGIN}{table}{END}{rest.partition(END)[2]}"
+
+
 # --- the figure -------------------------------------------------------------------------------------------------------
 
 COLOURS = {f"{MIXTURE} - {FLAT}": "#c08a30", f"{OPTIONS} - {MIXTURE}": "#1f3f70", f"{AGAIN} - {MIXTURE}": "#84a7d3"}

@@ -8,7 +8,8 @@ import memory
 import memory_results
 import pytest
 from memory import Asked, Cell, Measured, cells_of, missing, read, work
-from memory_results import checks, comparisons, draw, of_pages, over_tasks, page
+from memory_results import checks, comparisons, draw, of_pages, over_tasks, page, short, with_table
+from provenance import ROOT
 
 MADE_BY = {"command": "python studies/memory.py needle", "commit": "abcdef0", "dirty": False, "code": "x", "files": 1}
 
@@ -122,3 +123,11 @@ def test_the_page_and_the_figure_have_every_study(tmp_path):
     assert text.endswith("- `a command`: 3 of mixture\n")
     draw(found, tmp_path / "memory.png")
     assert (tmp_path / "memory.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_table_of_readme_is_that_of_the_page():
+    found = json.loads((ROOT / "docs" / "results" / "memory.json").read_text())["results"]
+    readme = (ROOT / "README.md").read_text()
+    assert with_table(readme, short(found)) == readme
+    assert short(found).count("\n") > 5
+    assert with_table(readme, "other") != readme
