@@ -5,7 +5,6 @@ The truth is a second file without those columns: fitted to it, the same numbers
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
