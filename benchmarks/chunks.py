@@ -11,9 +11,9 @@ import time
 
 import torch
 
-from ddco_pyro.inference import total_log_likelihood
+from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model import hierarchy as networks
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.spec import parse_spec
@@ -48,7 +48,7 @@ def gradient(hierarchy: Hierarchy, batch: Batch, chunks: int) -> float:
     networks.BYTES_AT_ONCE = hierarchy.step_bytes * -(-STEPS // chunks)
     hierarchy.zero_grad(set_to_none=True)
     start = time.process_time()
-    total_log_likelihood(hierarchy.tabulate(batch), batch.lengths).backward()
+    log_likelihood(hierarchy.tabulate(batch), batch.lengths).sum().backward()
     return time.process_time() - start
 
 

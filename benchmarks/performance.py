@@ -13,12 +13,13 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import peers
 import torch
 
-from ddco_pyro.inference import Engine, fused, total_log_likelihood
-from ddco_pyro.inference.structure import structure_of
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.inference import Engine, fused, log_likelihood
+from ddco_pyro.inference.kernel import Rows, Structure, any_levels, one_level
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import Tables, complete
@@ -85,7 +86,7 @@ def step(hierarchy: Hierarchy, batch: Batch, engine: Engine = "fused") -> Callab
     def run() -> None:
         optimizer.zero_grad()
         for _, piece in batch.pieces():
-            (-total_log_likelihood(hierarchy.tabulate(piece), piece.lengths, engine) / batch.steps).backward()
+            (-log_likelihood(hierarchy.tabulate(piece), piece.lengths, engine).sum() / batch.steps).backward()
         optimizer.step()
 
     return run
@@ -106,12 +107,20 @@ def funsor_step(hierarchy: Hierarchy, batch: Batch) -> Callable[[], None]:
 
 def kernel(tables: Tables, lengths: torch.Tensor) -> Callable[[], float]:
     """Our forward-backward with posteriors, from ready tables; log-likelihoods of scaled densities come out."""
-    rows = tuple(
-        torch.cat([table.flatten(2).double() for table in group], -1).exp()
+    rows = [
+        torch.cat([table.flatten(2).double() for table in group], -1).exp().numpy()
         for group in (tables.selection, tables.termination, tables.control)
-    )
-    nothing, structure = torch.empty(*rows[0].shape[:2], 0, dtype=torch.float64), structure_of(tables)
-    return lambda: float(fused.run(structure, rows, nothing, lengths)[0].sum())
+    ]
+    nothing, structure = np.empty((*rows[0].shape[:2], 0)), Structure.of(tuple(t.shape[-1] for t in tables.selection))
+    run = one_level if tables.depth == 1 else any_levels
+
+    def call() -> float:
+        value, exact = np.empty(len(lengths)), np.empty(len(lengths), dtype=np.bool_)
+        posteriors = Rows(*(np.empty_like(row) for row in rows), nothing)
+        run(Rows(*rows, nothing), lengths.numpy(), value, exact, posteriors, structure)
+        return float(value.sum())
+
+    return call
 
 
 def enumeration(tables: Tables, lengths: torch.Tensor) -> Callable[[], None]:
@@ -119,7 +128,7 @@ def enumeration(tables: Tables, lengths: torch.Tensor) -> Callable[[], None]:
 
     def run() -> None:
         leaves = [leaf.detach().requires_grad_() for leaf in tables.leaves() if leaf is not None]
-        total_log_likelihood(Tables.of(tables.depth, leaves), lengths, "enumerate").backward()
+        log_likelihood(Tables.of(tables.depth, leaves), lengths, "enumerate").sum().backward()
 
     return run
 

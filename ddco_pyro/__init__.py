@@ -8,42 +8,60 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ddco_pyro import encoding, inference
     from ddco_pyro.acting.controller import Controller
+    from ddco_pyro.acting.monitor import Monitor
+    from ddco_pyro.comparison import compare
     from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-    from ddco_pyro.fitting.fit import Fit, load
-    from ddco_pyro.fitting.run import fit
+    from ddco_pyro.exporting import export
+    from ddco_pyro.fitting.fit import Fit, fit, load
+    from ddco_pyro.inference.marginal import EliminatedAHMM
+    from ddco_pyro.segmenting import segment
+    from ddco_pyro.selection import select
     from ddco_pyro.spec import Spec, load_spec
+
+_PLACES = {
+    "Controller": "acting.controller",
+    "Demonstration": "data.demonstrations",
+    "Demonstrations": "data.demonstrations",
+    "EliminatedAHMM": "inference.marginal",
+    "Fit": "fitting.fit",
+    "Monitor": "acting.monitor",
+    "Spec": "spec",
+    "compare": "comparison",
+    "export": "exporting",
+    "fit": "fitting.fit",
+    "load": "fitting.fit",
+    "load_spec": "spec",
+    "segment": "segmenting",
+    "select": "selection",
+}
+_ROOMS = ("encoding", "inference")
 
 __all__ = [
     "Controller",
     "Demonstration",
     "Demonstrations",
+    "EliminatedAHMM",
     "Fit",
+    "Monitor",
     "Spec",
+    "compare",
     "encoding",
+    "export",
     "fit",
     "inference",
     "load",
     "load_spec",
+    "segment",
+    "select",
 ]
-
-_MODULES = {
-    "Controller": "acting.controller",
-    "Demonstration": "data.demonstrations",
-    "Demonstrations": "data.demonstrations",
-    "Fit": "fitting.fit",
-    "Spec": "spec",
-    "fit": "fitting.run",
-    "load": "fitting.fit",
-    "load_spec": "spec",
-}
 
 
 def __getattr__(name: str) -> Any:
-    """Imports what is asked for when it is asked for: torch takes seconds, and ``--help`` needs none of it."""
-    if name in ("encoding", "inference"):
+    """Import a public name on first use: torch takes seconds to import, and ``--help`` does not need it."""
+    if name in _ROOMS:
         return importlib.import_module(f"ddco_pyro.{name}")
-    if name in _MODULES:
-        return getattr(importlib.import_module(f"ddco_pyro.{_MODULES[name]}"), name)
+    if name in _PLACES:
+        return getattr(importlib.import_module(f"ddco_pyro.{_PLACES[name]}"), name)
     raise AttributeError(f"module 'ddco_pyro' has no attribute {name!r}")
 
 

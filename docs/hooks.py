@@ -124,7 +124,8 @@ def spec_page() -> str:
 
 def _section(name: str, model: dict[str, Any], definitions: dict[str, Any]) -> Iterator[str]:
     title = name.removesuffix("Spec") or "The whole spec"
-    yield f"\n## {title} {{#{name.lower() or 'whole'}}}\n\n{_cell(model.get('description', ''))}\n"
+    about = model.get("description", "").partition(">>>")[0]  # without the example
+    yield f"\n## {title} {{#{name.lower() or 'whole'}}}\n\n{_cell(about.strip())}\n"
     yield "| key | takes | default | |\n|---|---|---|---|"
     for key, field in model.get("properties", {}).items():
         default = "required" if key in model.get("required", ()) else _default(field)

@@ -42,11 +42,11 @@ from memory_results import MIXTURE, OPTIONS, checks, comparisons, draw, of_pages
 from provenance import Record, record, sentence, text
 from threadpoolctl import threadpool_limits
 
-from ddco_pyro.acting.lockstep import play
+from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.files import only_one, write_text
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fit import Fit, fit
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.simulation.episodes import play
 from ddco_pyro.spec import load_spec, with_overrides
 
 MEMORYLESS = {"hierarchy.levels.0.termination": "always"}
@@ -115,7 +115,9 @@ def pushing(cell: Cell, runs: Path) -> list[Measured]:
     first = pushing_cell.EVALUATION + 1000 * cell.seed
     for acting in ACTING:
         rollout = spec.rollout.model_copy(update={"options": acting})
-        episodes = play(pushing_task.task, hierarchy, rollout, range(first, first + pushing_cell.EPISODES))
+        episodes = play(
+            pushing_task.task, Controller.from_spec(hierarchy, rollout), range(first, first + pushing_cell.EPISODES)
+        )
         goals = pushing_cell.summary(episodes)["goals"]
         found.append(Measured(acting, "goals", sum(goals) / len(goals)))
     return found

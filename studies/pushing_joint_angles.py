@@ -24,11 +24,12 @@ from provenance import record, text
 from pushing_cell import EVALUATION, LABELS, Cell, fit_made_by, fitted, held_out, pool, spec_of
 from sklearn.metrics import normalized_mutual_info_score
 
-from ddco_pyro.acting.lockstep import play
+from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import whole_file, write_text
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.simulation.episodes import play
 
 EPISODES = 3
 SIDES = ("goal on the left (backhand)", "goal on the right (forehand)")
@@ -110,12 +111,15 @@ def main() -> None:
     cell = Cell("DDCO MLP", 2, arguments.demonstrations, arguments.seed)
     hierarchy, first = fitted(cell, arguments.runs, arguments.made_by), EVALUATION + 1000 * arguments.seed
     keep = ("joint_angles", "goal_from_box")
-    episodes = play(pushing.task, hierarchy, spec_of(cell).rollout, range(first, first + EPISODES), keep)
-    ours = [(one.observations["joint_angles"], one.choices[:, 0]) for one in episodes]
-    sides = np.concatenate([one.observations["goal_from_box"][:, 0] > 0 for one in episodes])
+    episodes = play(
+        pushing.task, Controller.from_spec(hierarchy, spec_of(cell).rollout), range(first, first + EPISODES), keep=keep
+    )
+    ours = [(one.record.observations["joint_angles"], one.choices[:, 0]) for one in episodes]
+    sides = np.concatenate([one.record.observations["goal_from_box"][:, 0] > 0 for one in episodes])
     options = np.concatenate([choices for _, choices in ours])
     demos = pool(arguments.runs, spec_of(cell))[: arguments.demonstrations]
-    shown = [(one.observations["joint_angles"], 1 + (one.observations["goal_from_box"][:, 0] > 0)) for one in demos]
+    goals = [(one.observations["joint_angles"], one.observations["goal_from_box"][:, 0] > 0) for one in demos]
+    shown = [(angles, 1 + right) for angles, right in goals]
     names = {number: f"option {number}" for number in np.unique(options)}
     figure = draw(
         {

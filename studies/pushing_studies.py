@@ -50,11 +50,12 @@ from pushing_cell import (
 )
 from pushing_results import grouped, write
 
-from ddco_pyro.acting.lockstep import play
+from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.simulation.episodes import play
 from ddco_pyro.spec import Spec
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 
@@ -134,7 +135,7 @@ def try_executions(name: str, number: int, seed: int, folder: Path) -> list[dict
     first, found = DEVELOPMENT_EPISODES + 1000 * seed, []
     for control, options in EXECUTIONS if cell.options else EXECUTIONS[::3]:
         rollout = spec.rollout.model_copy(update={"control": control, "options": options})
-        episodes = play(pushing.task, hierarchy, rollout, range(first, first + SWEPT_EPISODES))
+        episodes = play(pushing.task, Controller.from_spec(hierarchy, rollout), range(first, first + SWEPT_EPISODES))
         goals = float(np.mean(summary(episodes)["goals"]))
         found.append({"method": name, "control": control, "options": options, "seed": seed, "goals": goals})
     return found

@@ -28,10 +28,11 @@ from provenance import Record, is_kept, record, sentence, text
 from scipy import stats
 
 import ddco_pyro
-from ddco_pyro.acting.lockstep import play
+from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.files import write_text
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.inference.threads import one_thread
+from ddco_pyro.simulation.episodes import play
 from ddco_pyro.simulation.task import find_task
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 
@@ -154,7 +155,12 @@ def successes(fitted: Fit, spec: Spec, execution: str, episodes: int) -> int:
     """Of how many episodes a policy succeeds."""
     rollout = spec.rollout.model_copy(update={"options": execution})
     seeds = range(STARTS, STARTS + episodes)
-    return int(sum(one.outcome["success"] for one in play(find_task(str(spec.task)), fitted.hierarchy, rollout, seeds)))
+    return int(
+        sum(
+            one.outcome["success"]
+            for one in play(find_task(str(spec.task)), Controller.from_spec(fitted.hierarchy, rollout), seeds)
+        )
+    )
 
 
 def summarize(cells: list[Cell], seeds: list[int]) -> list[dict[str, Any]]:

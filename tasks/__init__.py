@@ -9,6 +9,3 @@ from .opengl import has_display
 # MuJoCo reads the variable once, when it is first imported, so it has to be set before any task is.
 if not has_display():
     os.environ.setdefault("MUJOCO_GL", "egl")
-
-# Before any task: dm-control looks for OpenGL when it is imported, and its own error does not say what to install.
-from . import rendering  # noqa: F401

@@ -27,6 +27,8 @@ _ERRORS = (ImportError, AttributeError, RuntimeError, OSError, ctypes.ArgumentEr
 
 try:
     from dm_control import mujoco
+except ModuleNotFoundError:
+    raise
 except _ERRORS as error:
     raise _no_opengl(error) from error
 

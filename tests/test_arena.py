@@ -25,7 +25,7 @@ from arena_results import draw, mean_success, page, summarize
 from arena_segments import MEASURES
 
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.export import write_numpy
+from ddco_pyro.exporting import write_numpy
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import parse_spec

@@ -12,20 +12,18 @@ from joblib import parallel_config
 from toy_task import DRAWN, watched
 
 import ddco_pyro
-from ddco_pyro.acting.lockstep import play
+from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import Pictures
 from ddco_pyro.data.sources.video import frames
-from ddco_pyro.encoding.encoder import About, Encoder
-from ddco_pyro.encoding.kinds import Drawn
-from ddco_pyro.encoding.networks import Convolutions
-from ddco_pyro.encoding.projection import Projection
+from ddco_pyro.encoding.autoencoder import Convolutions
+from ddco_pyro.encoding.encoder import About, Encoder, Extractor, Projection
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.report import write_report
 from ddco_pyro.simulation import collect as collecting
 from ddco_pyro.simulation.cameras import Encoded
 from ddco_pyro.simulation.environments import TaskEnvironment
-from ddco_pyro.simulation.episodes import run_episode
+from ddco_pyro.simulation.episodes import play, run_episode
 from ddco_pyro.spec import DemonstrationsSpec, RolloutSpec, parse_spec
 from ddco_pyro.training.data import dimensions
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
@@ -85,8 +83,10 @@ def test_an_encoder_stands_in_for_the_pictures():
     np.testing.assert_array_equal(told.observations["colour"], [*map(brightness, seen.observations["camera"])])
     policy = spec_of("colour")
     size = Dimensions({"colour": (3,)}, seen.actions.shape[1], len(seen))
-    (played,) = play(coded, build_hierarchy(policy, size), policy.rollout, [3], keep=["colour"])
-    np.testing.assert_array_equal(played.observations["colour"][0], brightness(seen.observations["camera"][0]))
+    hierarchy = build_hierarchy(policy, size)
+    controller = Controller.from_spec(hierarchy, policy.rollout)
+    (played,) = play(coded, controller, [3], hierarchy.encoder.shapes, keep=["colour"])
+    np.testing.assert_array_equal(played.record.observations["colour"][0], brightness(seen.observations["camera"][0]))
 
 
 def test_another_encoder_has_another_file():
@@ -95,7 +95,7 @@ def test_another_encoder_has_another_file():
     def path(scale, observed):
         network = Convolutions("random_conv", (48, 65, 3), seed=0)
         about = About(encoder="random_conv", observation="camera", picture=[48, 65, 3], features=4, size=4, seed=0)
-        encoder = Encoder(about, Drawn(network), Projection(np.zeros(4), scale * np.eye(4), 1.0))
+        encoder = Encoder(about, Extractor(network.encode, network), Projection(np.zeros(4), scale * np.eye(4), 1.0))
         coded = replace(watched, cameras={"colour": Encoded(watched.cameras["camera"], encoder, 4)})
         return collecting.cache_path(coded, TASK, DemonstrationsSpec(count=5), observed)
 
@@ -140,7 +140,9 @@ def test_a_spec_with_a_camera_is_checked_fitted_and_rolled_out(tmp_path):
     film, looks = (list(frames(fit.folder / "videos" / place / "flat-1000.mp4")) for place in ("", "saliency"))
     assert len(film) == len(looks) + 1  # the end is seen by nobody
     assert "<h2>What it looks at</h2>" in write_report(fit, fit.demonstrations).read_text()
-    alone = play(watched, fit.hierarchy, RolloutSpec(), range(1000, 1002))
+    alone = play(
+        watched, Controller.from_spec(fit.hierarchy, RolloutSpec()), range(1000, 1002), fit.hierarchy.encoder.shapes
+    )
     assert [one.outcome["success"] for one in alone].count(1.0) == measured["successes"]
 
 

@@ -12,9 +12,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from ddco_pyro.inference import total_log_likelihood
+from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model import hierarchy as chunking
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.spec import parse_spec
@@ -75,7 +75,7 @@ def batch(dtype: torch.dtype = torch.float64) -> Batch:
 def value_and_gradient(model: Hierarchy, seen: Batch, discovering: int | None) -> tuple[Tensor, Tensor]:
     """The log-likelihood, and its gradient in all parameters that it depends on."""
     torch.manual_seed(3)
-    value = total_log_likelihood(model.tabulate(seen, discovering), seen.lengths)
+    value = log_likelihood(model.tabulate(seen, discovering), seen.lengths).sum()
     used = list(model.parameters())
     gradients = torch.autograd.grad(value, used, allow_unused=True, materialize_grads=True)
     return value.detach(), torch.cat([gradient.flatten() for gradient in gradients])
@@ -131,7 +131,7 @@ def test_the_gradient_of_chunks_is_the_slope(monkeypatch: pytest.MonkeyPatch) ->
         with torch.no_grad():
             for parameter, part in zip(parameters, parts, strict=True):
                 parameter += step * part.view_as(parameter)
-            total = float(total_log_likelihood(model.tabulate(seen), seen.lengths))
+            total = float(log_likelihood(model.tabulate(seen), seen.lengths).sum())
             for parameter, part in zip(parameters, parts, strict=True):
                 parameter -= step * part.view_as(parameter)
         return total

@@ -22,9 +22,9 @@ from ddco_pyro.comparison import CompareError, Comparison, Row, compare, page
 from ddco_pyro.comparison.page import write
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing import words
-from ddco_pyro.fitting.fitted_to import OtherDemonstrations
+from ddco_pyro.fitting.digest import OtherDemonstrations
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.fitting.run import fit
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import with_overrides
 from ddco_pyro.training.data import demonstrations, parts

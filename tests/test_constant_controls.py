@@ -5,23 +5,19 @@ The truth is a second file without those columns: fitted to it, the same numbers
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from command_line import call
-from safetensors import safe_open
-from safetensors.torch import save_file
 
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.comparison import CompareError, compare
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.export import TOLERANCE, export, runner
-from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.exporting import TOLERANCE, export, runner
+from ddco_pyro.fitting.fit import Fit, fit
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.spec import Spec, parse_spec, with_overrides
 
@@ -120,19 +116,6 @@ def test_what_they_are_comes_back_from_the_run(whole: Fit) -> None:
     demos = make_demonstrations()
     np.testing.assert_array_equal(again.log_likelihood(demos), whole.log_likelihood(demos))
     assert dict(zip((1, 3), again.hierarchy.scaling.constant.tolist(), strict=True)) == STILL
-
-
-def test_runs_of_before_have_every_dimension_in_them(reduced: Fit, tmp_path: Path) -> None:
-    """Their weights do not say which dimensions vary."""
-    run = shutil.copytree(reduced.folder, tmp_path / "run")
-    with safe_open(run / "model.safetensors", "pt") as file:
-        names = set(file.keys()) - {"scaling.varying", "scaling.constant"}
-        assert len(names) == len(file.keys()) - 2
-        tensors, metadata = {name: file.get_tensor(name) for name in names}, file.metadata()
-    del metadata["sha256"]
-    save_file(tensors, run / "model.safetensors", metadata)
-    again, demos = ddco_pyro.load(run), with_controls(make_demonstrations(), columns=FREE)
-    np.testing.assert_array_equal(again.log_likelihood(demos), reduced.log_likelihood(demos))
 
 
 # --- what acts --------------------------------------------------------------------------------------------------------

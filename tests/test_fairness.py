@@ -18,14 +18,14 @@ import ddco_pyro
 from ddco_pyro.comparison import compare
 from ddco_pyro.comparison.page import write
 from ddco_pyro.drawing import words
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.fitting.run import fit
 from ddco_pyro.report import unconverged, write_report
 from ddco_pyro.selection import Workers, select
 from ddco_pyro.selection.choice import as_data, choose, markdown, table
 from ddco_pyro.spec import SpecError, dump_spec, with_overrides
 from ddco_pyro.training.data import demonstrations
-from ddco_pyro.training.widths import nearest_widths
+from ddco_pyro.training.networks import nearest_widths
 
 BASELINES = ["flat", "flat_equal", "per_timestep"]
 
@@ -79,11 +79,11 @@ def test_a_baseline_beside_trains_as_it_would_alone(toy_spec, tmp_path):
     [
         (
             {"compare_with": [OWN | {"optimizer": {"schedule": "cosine"}}], "training.epochs": None},
-            "compare_with.0.optimizer.schedule: cosine falls to 0 at the end of training.epochs, which is null",
+            "compare_with.0.optimizer.schedule: cosine ends at training.epochs, which is null",
         ),
         (
             {"hierarchy": None, "baseline": OWN, "compare_with": []},
-            "baseline.optimizer: is for baselines in compare_with; say it in training.optimizer",
+            "baseline.optimizer: is for baselines in compare_with; give it in training.optimizer",
         ),
     ],
 )

@@ -19,8 +19,6 @@ from ddco_pyro.model.tables import NEVER, complete
 DOOR = {
     "fused": lambda *given: inference.log_likelihood(*given, engine="fused"),
     "enumerate": lambda *given: inference.log_likelihood(*given, engine="enumerate"),
-    "total fused": lambda *given: inference.total_log_likelihood(*given, engine="fused"),
-    "total enumerate": lambda *given: inference.total_log_likelihood(*given, engine="enumerate"),
     "posterior": inference.posterior,
     "most_likely_path": inference.most_likely_path,
     "segment": inference.segment,
@@ -123,7 +121,7 @@ def test_the_gradient_of_the_evidence_is_that_of_differences(counts, levels):
     leaves = [own for own in evidence if own is not None]
     gradients = {}
     for engine in ("fused", "enumerate"):
-        value = inference.total_log_likelihood(replace(tables, evidence=evidence), lengths, engine)
+        value = inference.log_likelihood(replace(tables, evidence=evidence), lengths, engine).sum()
         gradients[engine] = torch.autograd.grad(value, leaves)
     step = 1e-5
     for number, leaf in enumerate(leaves):
@@ -133,7 +131,7 @@ def test_the_gradient_of_the_evidence_is_that_of_differences(counts, levels):
             for sign in (1, -1):
                 with torch.no_grad():
                     leaf[place] += sign * step
-                    sides.append(float(inference.total_log_likelihood(replace(tables, evidence=evidence), lengths)))
+                    sides.append(float(inference.log_likelihood(replace(tables, evidence=evidence), lengths).sum()))
                     leaf[place] -= sign * step
             differences[place] = (sides[0] - sides[1]) / (2 * step)
         for engine in gradients:

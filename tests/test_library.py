@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
-import importlib
 import json
 import math
 from collections import Counter
@@ -20,8 +18,8 @@ from selecting import DATA, data_at, two_skills
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.fit import RunError
 from ddco_pyro.fitting.rollouts import roll_out
+from ddco_pyro.fitting.run import RunError
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import SpecError, load_spec, parse_spec, with_overrides
 
@@ -185,7 +183,7 @@ def test_demonstrations_are_taken_as_they_are_needed(in_memory: ddco_pyro.Fit, m
 
 
 def test_evaluation_does_not_depend_on_the_pieces(in_memory: ddco_pyro.Fit, monkeypatch) -> None:
-    from ddco_pyro.fitting.metrics import evaluate
+    from ddco_pyro.evaluation.metrics import evaluate
     from ddco_pyro.training.data import parts
 
     demos = two_skills()
@@ -279,34 +277,3 @@ def test_a_spec_that_does_not_fit_is_refused_before_anything_is_written(commande
     with pytest.raises(BadInput, match=r"nowhere\.hdf5: there is no such file"):
         ddco_pyro.fit(spec, tmp_path / "nowhere.hdf5", out=tmp_path / "run")
     assert not any(tmp_path.iterdir())
-
-
-# --- examples ---------------------------------------------------------------------------------------------------------
-
-MINE = """
-demonstrations: {path: mine.hdf5}
-observations: [place]
-control: {std: 0.5}
-hierarchy:
-  levels: [{count: 2, policy: {network: linear}, termination: {network: linear}}]
-  meta_policy: {network: linear}
-training: {epochs: 12, optimizer: {lr: 0.05}}
-"""
-
-
-def test_the_examples_of_the_public_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("mine.yaml").write_text(MINE)
-    random = np.random.default_rng(0)
-    places = [random.normal(size=(10, 2)) for _ in range(6)]
-    turn = np.repeat([[-2.0], [2.0]], 5, 0)
-    demos = Demonstrations(tuple(Demonstration(f"demo_{n}", {"place": x}, turn * x) for n, x in enumerate(places)))
-    demos.write("mine.hdf5")
-    names = {"ddco_pyro": ddco_pyro, "demos": demos, "fit": ddco_pyro.fit("mine.yaml", demos, out="runs/mine")}
-    shown = []
-    for module in ("fitting.run", "fitting.fit", "data.demonstrations", "spec.reading"):
-        found = importlib.import_module(f"ddco_pyro.{module}")
-        for example in doctest.DocTestFinder().find(found, extraglobs=names):
-            shown += [example.name.rpartition(".")[2]] if example.examples else []
-            assert doctest.DocTestRunner().run(example).failed == 0
-    assert {"fit", "load", "infer", "log_likelihood", "segment", "Demonstrations", "load_spec"} <= {*shown}

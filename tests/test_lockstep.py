@@ -10,9 +10,8 @@ import torch
 import toy_task
 
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.acting.lockstep import play
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.simulation.episodes import run_episode
+from ddco_pyro.simulation.episodes import play, run_episode
 from ddco_pyro.spec import RolloutSpec, parse_spec
 
 SEEDS = (3, 4, 5, 6)
@@ -73,11 +72,13 @@ def test_together_as_alone(name, weights, actors, spec):
     task, acted, changes = ragged(toy_task.task), set(), 0
     for seed in weights:
         hierarchy = make(MODELS[name], seed, gain=3.0)
-        for found in play(task, hierarchy, spec, SEEDS, keep=("offsets",)):
+        for found in play(task, Controller.from_spec(hierarchy, spec), SEEDS, keep=("offsets",)):
             alone = run_episode(task, Controller.from_spec(hierarchy, spec), found.seed)
             assert found.outcome == pytest.approx(alone.outcome, abs=1e-5, nan_ok=True)
             np.testing.assert_array_equal(found.choices, alone.choices)
-            np.testing.assert_allclose(found.observations["offsets"], alone.record.observations["offsets"], atol=1e-5)
+            np.testing.assert_allclose(
+                found.record.observations["offsets"], alone.record.observations["offsets"], atol=1e-5
+            )
             acted |= {next((d for d, choice in enumerate(row) if choice), len(row)) for row in found.choices.tolist()}
             changes += (np.diff(found.choices, axis=0) != 0).any(1).sum()
     assert acted == actors
@@ -93,5 +94,5 @@ def test_environments_are_closed_when_one_fails():
 
     broken = replace(toy_task.task, load=load, outcome=lambda environment: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        play(broken, make(MODELS["flat"]), MEAN, SEEDS)
+        play(broken, Controller.from_spec(make(MODELS["flat"]), MEAN), SEEDS)
     assert [one.closed for one in made] == [True] * len(SEEDS)

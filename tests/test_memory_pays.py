@@ -27,9 +27,9 @@ import yaml
 from scipy import stats
 
 import ddco_pyro
-from ddco_pyro.acting.lockstep import play
+from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.simulation.episodes import paired_difference, rate, run_episode
+from ddco_pyro.simulation.episodes import paired_difference, play, rate, run_episode
 from ddco_pyro.spec import parse_spec
 
 SPEC = """
@@ -74,7 +74,10 @@ def fitted(name, observed):
     fit = ddco_pyro.fit(spec, demonstrations(name))
     starts = range(spec.rollout.seed, spec.rollout.seed + spec.rollout.episodes)
     played = [
-        [episode.outcome for episode in play(getattr(memory_tasks, name), hierarchy, spec.rollout, starts)]
+        [
+            episode.outcome
+            for episode in play(getattr(memory_tasks, name), Controller.from_spec(hierarchy, spec.rollout), starts)
+        ]
         for hierarchy in (fit.hierarchy, fit.baselines["mixture"].hierarchy)
     ]
     return fit, *played

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import brute_force
 
-from ddco_pyro.inference import fused, logspace, total_log_likelihood
-from ddco_pyro.inference.check import compare_engines
+from ddco_pyro.inference import log_likelihood, logspace
+from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.emissions import Gaussian
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import complete
@@ -44,8 +44,8 @@ def leaves(outputs):
     return [tensor for tensor in tensors if tensor.requires_grad]
 
 
-def log_likelihood(outputs, actions, lengths):
-    return fused.log_likelihood(outputs.tables(actions), lengths)
+def by_outputs(outputs, actions, lengths):
+    return log_likelihood(outputs.tables(actions), lengths)
 
 
 def random_actions(number=2, steps=4, seed=9, dtype=torch.float64):
@@ -65,7 +65,7 @@ def test_the_likelihood_is_the_sum_over_paths(counts, emits):
     lengths = torch.tensor([steps, 1])
     tables = outputs.tables(actions)
     truth = [brute_force(tables, n, int(length)).log_likelihood for n, length in enumerate(lengths)]
-    found = log_likelihood(outputs, actions, lengths).detach().numpy()
+    found = by_outputs(outputs, actions, lengths).detach().numpy()
     np.testing.assert_allclose(found, truth, atol=1e-9, rtol=0)
 
 
@@ -88,7 +88,7 @@ def test_the_compiled_pass_is_the_one_in_log_space(data):
     actions, lengths = random_actions(2, steps), torch.tensor([steps, data.draw(st.integers(1, steps))])
     weights = torch.tensor([1.0, -2.5], dtype=torch.float64)
     ways = (
-        log_likelihood(outputs, actions, lengths),
+        by_outputs(outputs, actions, lengths),
         logspace.log_likelihood(complete(outputs.tables(actions), lengths)),
     )
     torch.testing.assert_close(ways[0], ways[1], rtol=1e-9, atol=1e-9)
@@ -104,7 +104,7 @@ def test_what_cannot_be_reached_does_not_overflow_into_the_gradient():
     """The meta-policy always acts itself, and all the options below would have done far better."""
     outputs = random_outputs((1, 1, 1), ("options", "both", "control"), 2, 4, seed=2, sharp=10.0)
     actions, lengths = random_actions(2, 4), torch.tensor([4, 1])
-    value = fused.log_likelihood(outputs.tables(actions), lengths).sum()
+    value = log_likelihood(outputs.tables(actions), lengths).sum()
     for gradient in torch.autograd.grad(value, leaves(outputs), allow_unused=True, materialize_grads=True):
         assert gradient.isfinite().all()
 
@@ -113,8 +113,8 @@ def test_single_precision_stays_close():
     single = random_outputs((3, 2), ("both", "options"), 4, 50, dtype=torch.float32)
     actions, lengths = random_actions(4, 50, dtype=torch.float32), torch.full((4,), 50)
     double = single.map(torch.Tensor.double)
-    found = log_likelihood(single, actions, lengths)
-    expected = log_likelihood(double, actions.double(), lengths)
+    found = by_outputs(single, actions, lengths)
+    expected = by_outputs(double, actions.double(), lengths)
     torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
     (gradient,) = torch.autograd.grad(found.sum(), single.emissions[0].mean)
     assert gradient.dtype == torch.float32
@@ -122,10 +122,10 @@ def test_single_precision_stays_close():
 
 def test_what_lies_beyond_a_length_is_ignored():
     outputs, actions, lengths = random_outputs((2,), ("both",)), random_actions(), torch.tensor([4, 2])
-    expected = log_likelihood(outputs, actions, lengths)
+    expected = by_outputs(outputs, actions, lengths)
     with torch.no_grad():
         outputs.termination_logits[0][1, 2:], actions[1, 2:] = 50.0, 1e3
-    found = log_likelihood(outputs, actions, lengths)
+    found = by_outputs(outputs, actions, lengths)
     torch.testing.assert_close(found, expected)
     for gradient in torch.autograd.grad(found.sum(), [outputs.termination_logits[0], outputs.emissions[0].mean]):
         assert not gradient[1, 2:].any()
@@ -139,7 +139,7 @@ def test_underflow_is_left_to_log_space():
         outputs.termination_logits[0][:] = -60.0
         outputs.emissions[0].mean[:] = torch.tensor([[0.0], [1.0]]).expand(1, 4, 2, 2)
         actions[0] = torch.tensor([[0.0, 0], [1, 1], [0, 0], [1, 1]])
-    value = log_likelihood(outputs, actions, torch.tensor([4]))
+    value = by_outputs(outputs, actions, torch.tensor([4]))
     truth = brute_force(outputs.tables(actions), 0, 4).log_likelihood
     np.testing.assert_allclose(value.detach(), [truth], rtol=1e-9)
 
@@ -147,7 +147,7 @@ def test_underflow_is_left_to_log_space():
 def test_a_second_derivative_is_never_left_out_in_silence():
     """A gradient penalty: a sum of something that has a second derivative and of the refused one."""
     outputs, actions, lengths = random_outputs((2,), ("options",)), random_actions(), torch.tensor([4, 4])
-    value = log_likelihood(outputs, actions, lengths).sum()
+    value = by_outputs(outputs, actions, lengths).sum()
     ending = outputs.termination_logits[0]
     (gradient,) = torch.autograd.grad(value, ending, create_graph=True)
     with pytest.raises(RuntimeError, match="cannot differentiate again"):
@@ -158,7 +158,7 @@ def test_controls_that_want_a_gradient_get_it():
     """Through the tables: the gradient of a log-density with respect to the controls (a distribution's value)."""
     outputs, actions = random_outputs((2,), ("options",)), random_actions().requires_grad_()
     lengths = torch.tensor([4, 4])
-    (found,) = torch.autograd.grad(log_likelihood(outputs, actions, lengths).sum(), actions)
+    (found,) = torch.autograd.grad(by_outputs(outputs, actions, lengths).sum(), actions)
     tables = outputs.tables(actions)
-    (expected,) = torch.autograd.grad(total_log_likelihood(tables, lengths, "enumerate"), actions)
+    (expected,) = torch.autograd.grad(log_likelihood(tables, lengths, "enumerate").sum(), actions)
     torch.testing.assert_close(found, expected)

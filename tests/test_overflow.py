@@ -11,11 +11,11 @@ import torch
 from command_line import call
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.metrics import NotFinite, evaluate
-from ddco_pyro.fitting.run import TrainingError, fit
+from ddco_pyro.evaluation.metrics import NotFinite, evaluate
+from ddco_pyro.fitting.fit import Fit, fit
 from ddco_pyro.model.networks import Inputs, InputShape
 from ddco_pyro.spec import parse_spec
+from ddco_pyro.training.objective import TrainingError
 
 SPEC = """
 demonstrations: {{path: {path}}}

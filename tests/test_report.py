@@ -10,8 +10,8 @@ from moving_demonstrations import made, reaches, recorded
 
 from ddco_pyro.drawing import words
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
-from ddco_pyro.fitting.fit import load
-from ddco_pyro.fitting.run import fit, write_metrics
+from ddco_pyro.fitting.fit import fit, load
+from ddco_pyro.fitting.run import write_metrics
 from ddco_pyro.report import rollouts as rolling
 from ddco_pyro.report import write_report
 from ddco_pyro.report.activity import activity

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from command_line import call
 
+from ddco_pyro.data.checks import rounding
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
-from ddco_pyro.data.values import rounding
-from ddco_pyro.model.encoding import ObservationEncoder
+from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec
 
 SHAPES = {"resting": (4,), "half": (3,), "place": (2,), "distance": (1,), "settled": (1,)}

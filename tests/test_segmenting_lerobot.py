@@ -16,7 +16,7 @@ from command_line import call
 import ddco_pyro
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
 from ddco_pyro.segmenting.lerobot import FORMS, annotate
 from ddco_pyro.spec import parse_spec

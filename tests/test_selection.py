@@ -18,13 +18,14 @@ from selecting import Told, data_at, kept, score, spec_at, two_skills
 
 import ddco_pyro
 from ddco_pyro.errors import Failed
-from ddco_pyro.fitting.fit import Fit, RunError
-from ddco_pyro.fitting.fitted_to import OtherDemonstrations
-from ddco_pyro.fitting.run import train
+from ddco_pyro.fitting.digest import OtherDemonstrations
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.run import RunError
 from ddco_pyro.selection import SelectionFailed, Workers, check, final_spec, folds, select
 from ddco_pyro.selection.folds import BackendError, FoldError
 from ddco_pyro.spec import SpecError, with_overrides
 from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.restarts import train_model
 
 ONE = Workers(1)
 COMMAND = Path(sys.executable).with_name("ddco-pyro")
@@ -46,7 +47,7 @@ def test_a_score_is_that_of_a_fit_without_the_fold(finished):
     for row in made.choice.rows:
         names = made.folds.held_out[2]
         rest = demos.select([name for name in demos.names if name not in names])
-        trained = train(row.candidate.spec, Dimensions.of(demos), rest)
+        trained = train_model(row.candidate.spec, Dimensions.of(demos), rest)
         expected = Fit(row.candidate.spec, trained.hierarchy).log_likelihood(demos.select(names))
         np.testing.assert_array_equal(scores[row.candidate.number, 2]["log_likelihood"], expected)
 
@@ -57,9 +58,9 @@ def test_restarts_are_chosen_inside_the_training_part(tmp_path, monkeypatch):
 
     def spied(spec, dimensions, demos, held_out):
         seen.append(set(demos.names))
-        return train(spec, dimensions, demos, held_out=held_out)
+        return train_model(spec, dimensions, demos, held_out=held_out)
 
-    monkeypatch.setattr(folds, "train", spied)
+    monkeypatch.setattr(folds, "train_model", spied)
     made = select(spec, tmp_path / "run", Told(), ONE)
     assert [seen[fold] & set(made.folds.held_out[fold]) for fold in range(3)] == [set()] * 3
     assert [len(names) for names in seen] == [8, 8, 8]
@@ -159,7 +160,7 @@ def test_where_nothing_is_left_the_first_reason_is_told(tmp_path, monkeypatch):
 
 
 def test_an_unexpected_error_is_told_and_tried_again_next_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(folds, "train", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(folds, "train_model", lambda *_, **__: 1 / 0)
     with pytest.raises(SelectionFailed, match="unexpected ZeroDivisionError: division by zero"):
         select(spec_at(tmp_path), tmp_path / "run", Told(), ONE)
     monkeypatch.undo()

@@ -19,7 +19,7 @@ import ddco_pyro
 from ddco_pyro.comparison import compare
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import Pictures
-from ddco_pyro.export import export
+from ddco_pyro.exporting import export
 from ddco_pyro.report import write_report
 from ddco_pyro.selection import Workers, select
 from ddco_pyro.spec import parse_spec

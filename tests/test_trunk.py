@@ -6,7 +6,7 @@ import pytest
 import torch
 from hierarchies import SHAPES, make_batch
 
-from ddco_pyro.inference import total_log_likelihood
+from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import SpecError, parse_spec
 from ddco_pyro.training.stages import plan
@@ -37,7 +37,7 @@ def made(spec):
 
 def value_of(hierarchy):
     batch = make_batch(trajectories=3)
-    return total_log_likelihood(hierarchy.tabulate(batch), batch.lengths)
+    return log_likelihood(hierarchy.tabulate(batch), batch.lengths).sum()
 
 
 def first_layers(hierarchy):
@@ -90,7 +90,7 @@ def test_it_is_trained_with_the_lowest_level_and_with_all():
         ({"network": {"network": "conv"}}, "hierarchy.levels.0.policy.network: reads the trunk"),
         ({"own": {"network": "lstm"}}, "hierarchy.levels.0.trunk.network: reads the trunk"),
         ({"network": LINEAR | {"inputs": ["state"]}}, "hierarchy.levels.0.policy.inputs: the trunk reads the obs"),
-        ({"own": SEES | {"shared": True}}, "hierarchy.levels.0.trunk.shared: the hierarchy's trunk is what all opt"),
+        ({"own": SEES | {"shared": True}}, "hierarchy.levels.0.trunk.shared: all options share the hierarchy's trunk"),
     ],
 )
 def test_what_cannot_read_it_is_refused(changes, message):

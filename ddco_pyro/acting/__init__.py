@@ -1,1 +1,1 @@
-"""A fitted hierarchy that acts, and one that watches somebody else act."""
+"""Fitted hierarchies at run time: controllers, monitors and saliency maps."""

@@ -1,4 +1,4 @@
-"""A fitted hierarchy as an online policy: the AHMM run forward, one step for each observation (paper §3)."""
+"""Controllers: a fitted hierarchy as an online policy, the AHMM run forward one step for each observation (§3)."""
 
 from __future__ import annotations
 
@@ -12,26 +12,30 @@ from torch import Tensor
 
 from ddco_pyro.acting.window import Window
 from ddco_pyro.inference.logspace import arrive
-from ddco_pyro.model.actor import Acting
-from ddco_pyro.model.ahmm import Tabulated, choose
+from ddco_pyro.model.ahmm import Acting, Tabulated, choose
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks.state import States
+from ddco_pyro.model.networks import States
 from ddco_pyro.model.tables import Step, complete
 from ddco_pyro.spec import OptionExecution, RolloutSpec
 
 
 class Controller:
-    """Acts with a hierarchy: :meth:`reset`, then :meth:`act` with each observation.
+    """A policy from a fitted hierarchy: call :meth:`reset`, then :meth:`act` with each observation.
 
-    At each step the active options may terminate, new ones are selected, and the lowest of them gives the control.
-    After it ``choices`` says which options are active, and ``terminations`` how likely each is to end in a state like
-    the one just seen (ψ; 1 for choice 0), lowest level first.
+    At each step active options may terminate, new options are selected, and the lowest option emits the control.
+    After a step ``choices`` holds the active options, and ``terminations`` their ψ in the last state (1 for choice 0),
+    lowest level first. :meth:`reset_all` and :meth:`act_all` act in several episodes at once, with equal results.
 
-    With :meth:`reset_all` and :meth:`act_all` it acts in several episodes at once, in each as it would alone.
+    >>> controller = ddco_pyro.Controller(fit.hierarchy, options="most_likely")  # or fit.controller()
+    >>> controller.reset(seed=0)
+    >>> controller.act({"place": np.array([0.5, -1.0])}).shape, len(controller.choices)
+    ((2,), 1)
 
+    :param hierarchy: such as ``fit.hierarchy``.
     :param control: execute the ``mean`` control or a ``sample``.
     :param options: ``sample`` terminations and selections; take the ``most_likely`` of each; or take the choices with
-        the largest ``marginal`` p(h_t | s_0, ..., s_t), which adds up over steps how likely options are to have ended.
+        the largest ``marginal`` p(h_t | s_0, ..., s_t), which accumulates the probability that options have ended.
+    :param seed: of the first episode.
     """
 
     def __init__(
@@ -47,7 +51,7 @@ class Controller:
 
     @classmethod
     def from_spec(cls, hierarchy: Hierarchy, spec: RolloutSpec, seed: int = 0) -> Controller:
-        """The controller that a spec's ``rollout`` asks for."""
+        """The controller of a spec's ``rollout`` settings."""
         return cls(hierarchy, spec.control, spec.options, seed)
 
     def reset(self, seed: int = 0) -> None:
@@ -81,15 +85,15 @@ class Controller:
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
         """The control [A], in the control's own units.
 
-        :raises ObservationError: an observation is missing, is not finite, or has an unseen shape.
+        :raises ObservationError: an observation is missing, not finite, or of another shape than in training.
         """
         control: np.ndarray = self.act_all([observation])[0]
         return control
 
     def act_all(self, observations: Sequence[Mapping[str, np.ndarray]]) -> np.ndarray:
-        """The controls [N, A] in all episodes.
+        """The controls [N, A] of all episodes.
 
-        :raises ObservationError: an observation is missing, is not finite, or has an unseen shape.
+        :raises ObservationError: an observation is missing, not finite, or of another shape than in training.
         """
         generators = [np.random.default_rng([seed, self.time]) for seed in self.seeds]
         with torch.no_grad():
@@ -130,7 +134,7 @@ def _noise(generators: Sequence[np.random.Generator], size: int) -> Tensor:
 
 
 class MostLikely(Messenger):
-    """Every choice takes its most likely value instead of a sample."""
+    """Replace every sampled choice by its most likely value."""
 
     def _pyro_sample(self, message: dict[str, Any]) -> None:
         distribution: Tabulated = message["fn"]
@@ -139,7 +143,7 @@ class MostLikely(Messenger):
 
 
 class Drawn(Messenger):
-    """Every choice is drawn with numpy's random numbers, each episode's own, which an exported controller has too."""
+    """Draw every choice with numpy's generators, one for each episode, as exported controllers do."""
 
     def __init__(self, generators: Sequence[np.random.Generator]) -> None:
         super().__init__()

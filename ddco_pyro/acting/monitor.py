@@ -1,4 +1,4 @@
-"""A live monitor: which options are active now, given what has been observed and done so far."""
+"""Monitors: online beliefs over active options, given observations and controls so far."""
 
 from __future__ import annotations
 
@@ -11,13 +11,22 @@ from torch import Tensor
 from ddco_pyro.acting.window import ObservationError, Window
 from ddco_pyro.inference.filtering import Belief, Filter
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks.state import States
+from ddco_pyro.model.networks import States
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.model.tables import complete
 
 
 class Monitor:
-    """Watches somebody act: :meth:`step` with each observation and the control that was applied before it."""
+    """An online filter of another agent's options: call :meth:`step` with each observation and the previous control.
+
+    >>> monitor = ddco_pyro.Monitor(fit.hierarchy)
+    >>> demo = demos[0]
+    >>> belief = monitor.step({"place": demo.observations["place"][0]})
+    >>> for t in range(1, 4):
+    ...     belief = monitor.step({"place": demo.observations["place"][t]}, demo.actions[t - 1])
+    >>> belief.choices[0].shape, round(float(belief.choices[0].sum()), 6)  # control and two options
+    (torch.Size([1, 3]), 1.0)
+    """
 
     def __init__(self, hierarchy: Hierarchy) -> None:
         self.hierarchy = hierarchy.eval()
@@ -31,14 +40,14 @@ class Monitor:
 
     @property
     def log_likelihood(self) -> float:
-        """log-density of the controls so far, nats."""
+        """log p of the controls so far, nats."""
         return float(self._filter.log_likelihood)
 
     def step(self, observation: Mapping[str, np.ndarray], control: np.ndarray | None = None) -> Belief:
         """p(h_t, b_t | s_0..t, a_0..t-1) of every level.
 
         :param control: a_{t-1} [A], in the control's own units; None at the first step, and only there.
-        :raises ObservationError: an observation or the control is missing or has an unseen shape.
+        :raises ObservationError: an observation or the control is missing, or of another shape than in training.
         """
         with torch.no_grad():
             inputs = self._window.inputs([observation])

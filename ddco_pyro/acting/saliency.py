@@ -1,4 +1,4 @@
-"""What a policy looks at: how much the control of the active option changes with each pixel (Simonyan et al., 2014)."""
+"""Saliency maps: the gradient of the active option's control with respect to each pixel (Simonyan et al., 2014)."""
 
 from __future__ import annotations
 
@@ -12,22 +12,21 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.window import Window
 from ddco_pyro.drawing.colours import with_heat
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks import Inputs
-from ddco_pyro.model.networks.state import States
+from ddco_pyro.model.networks import Inputs, States
 
 
 class Look(NamedTuple):
-    """A picture [H, W, C] as networks see it, uint8, and how much the control changes with each pixel, [H, W]."""
+    """A picture as networks see it, uint8 [H, W, C], and the saliency of each pixel, [H, W]."""
 
     picture: np.ndarray
     saliency: np.ndarray
 
 
 class Saliency:
-    """Follows an episode: :meth:`step` with each observation and the options that are active then.
+    """Saliency maps of one episode: call :meth:`step` with each observation and its active options.
 
-    The saliency of a pixel is the norm of ∂μ/∂x over the numbers μ of the active caller's control, in scaled units, and
-    the colours x of the pixel, of all pictures that are seen together; what is remembered of earlier steps is constant.
+    The saliency of a pixel is the norm of ∂μ/∂x. Here μ are the numbers of the active caller's control, in scaled
+    units, and x the pixel's colours in all stacked pictures. The states of recurrent networks count as constant.
     """
 
     def __init__(self, hierarchy: Hierarchy) -> None:
@@ -40,7 +39,7 @@ class Saliency:
         self._states: States | None = None
 
     def step(self, observation: Mapping[str, np.ndarray], choices: Sequence[int]) -> dict[str, Look]:
-        """What is looked at, by the key of the pictures.
+        """The saliency map of each observed picture, by key.
 
         :param choices: the active choice of each level, lowest first; 0 for control by the caller.
         :raises ObservationError: an observation is missing or has an unseen shape.
@@ -65,12 +64,12 @@ class Saliency:
         }
 
     def _last(self, key: str, pictures: np.ndarray) -> np.ndarray:
-        """The newest of the pictures that are seen together."""
+        """The newest of the stacked pictures."""
         return pictures[..., -(pictures.shape[-1] // self.hierarchy.encoder.transforms[key].frames) :]
 
 
 class Looking:
-    """A controller that acts as it does, and whose ``frames`` show what it looks at, uint8 [H, W, 3] at each step."""
+    """A controller whose ``frames`` show its saliency maps over the pictures, uint8 [H, W, 3] for each step."""
 
     def __init__(self, controller: Controller) -> None:
         self._controller, self._saliency = controller, Saliency(controller.hierarchy)
@@ -84,6 +83,7 @@ class Looking:
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
         """The controller's control [A]."""
         control = self._controller.act(observation)
+
         looks = self._saliency.step(observation, self.choices)
         self.frames.append(np.hstack([with_heat(*look) for look in looks.values()]))
         return control

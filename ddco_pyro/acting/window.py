@@ -1,4 +1,4 @@
-"""Observations as they come in, one at a time, to what the networks see."""
+"""Network inputs from observations that arrive one at a time."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ import numpy as np
 import torch
 
 from ddco_pyro.errors import BadInput
-from ddco_pyro.model.encoding import ObservationEncoder
+from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.model.networks import Inputs
 
 
 class ObservationError(BadInput):
-    """An observation that is missing, or has another shape than the demonstrations had."""
+    """An observation that is missing, or of another shape than in the demonstrations."""
 
 
 class Window:
-    """The last observations are remembered for the encoder's differences and stacked pictures; ``time`` counts the
-    observations seen.
+    """A window over the last observations, for the encoder's differences and stacked pictures.
+
+    ``time`` counts the observations.
     """
 
     def __init__(self, encoder: ObservationEncoder) -> None:
@@ -29,7 +30,7 @@ class Window:
     def inputs(self, observations: Sequence[Mapping[str, np.ndarray]]) -> Inputs:
         """The networks' inputs for an observation of each of N episodes, T = 1.
 
-        :raises ObservationError: an observation is missing, has an unseen shape, or is not finite.
+        :raises ObservationError: an observation is missing, has another shape than in training, or is not finite.
         """
         now = [
             {key: self._checked(observation, key, shape) for key, shape in self.encoder.shapes.items()}

@@ -12,10 +12,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from ddco_pyro.data.control_dimensions import notes
-from ddco_pyro.data.control_parts import described
+from ddco_pyro.data.checks import LARGEST
+from ddco_pyro.data.controls import described, notes
 from ddco_pyro.data.hdf5 import printable
-from ddco_pyro.data.values import LARGEST
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.events import (
@@ -175,11 +174,11 @@ def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Se
 
 def _baseline(spec: Spec) -> str:
     """A baseline's name and, of a policy without options, the sizes of its hidden layers."""
-    from ddco_pyro.fitting.fit import model_name
+    from ddco_pyro.training.networks import model_name
 
     if spec.baseline is None:
         return model_name(spec)
-    hidden = list(spec.baseline.policy.hidden)
+    hidden = list(spec.baseline.policy.hidden_sizes)
     return f"{spec.baseline.kind}, {f'hidden: {hidden}' if hidden else spec.baseline.policy.network}"
 
 

@@ -45,16 +45,16 @@ def check(
     from ddco_pyro.cli import console
     from ddco_pyro.training.data import dimensions, in_file, outline, refuse_unfit
     from ddco_pyro.training.labels import used
-    from ddco_pyro.training.networks import baselines, check_networks
+    from ddco_pyro.training.networks import check_models
 
     demos = outline(loaded) if in_file(loaded) else None
     size = dimensions(loaded, demos)
-    hierarchy = check_networks(loaded, size)
+    (_, hierarchy), *baselines = check_models(loaded, size).values()
     if demos is not None:
         refuse_unfit(loaded, demos)
     labels = used(loaded, demos) if demos else None
     print(dump_spec(loaded), end="")
-    console.dimensions(loaded, size, hierarchy, baselines(loaded, size))
+    console.dimensions(loaded, size, hierarchy, baselines)
     console.control(size, hierarchy)
     console.device(loaded)
     console.labels(loaded, labels)
@@ -107,8 +107,8 @@ def _fit(
     :param workers: jobs, None for the default, and processes that share each gradient step.
     """
     jobs, processes = workers
+    import ddco_pyro
     from ddco_pyro.cli import console
-    from ddco_pyro.fitting.run import fit_run
     from ddco_pyro.fitting.seeds import check_seeds, repeat
     from ddco_pyro.report import write_report
 
@@ -121,7 +121,7 @@ def _fit(
     repeated = () if seeds is None else ("--seeds", str(seeds))
     again = command("fit", folder / "spec.yaml", "--out", folder, "--resume", *repeated, *_allowed(loaded))
     with _continued(again, folder), console.Progress() as progress:
-        fitted = fit_run(loaded, None, folder, progress, jobs, resume, processes=processes)
+        fitted = ddco_pyro.fit(loaded, None, folder, progress, jobs, processes, resume)
         if seeds is not None:
             fitted = repeat(fitted, seeds, progress, jobs)
     console.log_likelihoods(fitted.metrics)
@@ -154,12 +154,11 @@ def select(
     loaded = load_spec(spec, [*overrides, *number], allow_code)
     if (backend is Backend.DASK) != (scheduler is not None):
         raise SpecError("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
+    import ddco_pyro
     from ddco_pyro import selection
     from ddco_pyro.cli import console
-    from ddco_pyro.fitting.run import fit_run
     from ddco_pyro.report import write_report
     from ddco_pyro.selection.choice import table
-    from ddco_pyro.training.data import seen
 
     workers = selection.Workers(jobs, scheduler)
     folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -173,7 +172,7 @@ def select(
         progress.end()
         assert made.choice.chosen is not None  # or it would have failed
         final = selection.final_spec(made.choice.chosen.candidate)
-        fitted = fit_run(final, seen(final, made.demos), folder / "fit", progress, jobs)
+        fitted = ddco_pyro.fit(final, made.demos, folder / "fit", progress, jobs, keep=False)
     console.show(table(made.choice, "held-out log-likelihood by cross-validation, nats per step"))
     for note in made.choice.notes:
         console.say(f"note: {note}")

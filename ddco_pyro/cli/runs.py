@@ -251,7 +251,7 @@ def export(
     within four times the error of float32 in the run's networks where that
     is more. Otherwise nothing is written.
     """
-    from ddco_pyro.export import export as write
+    from ddco_pyro.exporting import export as write
     from ddco_pyro.fitting.fit import load
 
     check_outputs([Output("--out", out, "folder")], [run])

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.control_parts import difference
+from ddco_pyro.data.controls import difference
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import same
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import UNMATCHED
-from ddco_pyro.evaluation.analysis import paired
 from ddco_pyro.evaluation.schema import read_successes
+from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.fitting.fit import Fit, load
 from ddco_pyro.simulation.episodes import paired_difference, rate
 from ddco_pyro.training.data import parts
@@ -35,7 +35,7 @@ class CompareError(BadInput):
 class Row:
     """One run, in nats over all held-out trajectories.
 
-    Errors are :func:`ddco_pyro.evaluation.analysis.paired` times the steps: the variation over held-out demonstrations
+    Errors are :func:`ddco_pyro.evaluation.worth.paired` times the steps: the variation over held-out demonstrations
     for one fit of each run.
 
     :param total: Σ log p(ξ_n), and its standard error ``se``.
@@ -101,13 +101,18 @@ class Comparison:
         }
 
 
-def compare(folders: Sequence[Path], allow_code: bool = False) -> Comparison:
+def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
     """Compare runs; a run's ``baselines/NAME`` is a run, too.
+
+    >>> compared = ddco_pyro.compare(["runs/mine", "runs/mine/baselines/flat"])
+    >>> len(compared.rows), compared.rows[0].difference  # nats per step below the best
+    (2, 0.0)
 
     :param allow_code: import the user code that the specs name.
     :raises CompareError: there are fewer than two runs, one is named twice, or they held out different data.
     :raises RunError: a folder is not a finished run.
     """
+    folders = [Path(run) for run in runs]
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise CompareError("the same run is given twice; name each once")
     if len(folders) < 2:

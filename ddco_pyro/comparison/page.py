@@ -17,11 +17,11 @@ from ddco_pyro.drawing.figures import Interval, Panel, Picture, interval_plot, s
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, note
 from ddco_pyro.evaluation.agreement import UNMATCHED
 from ddco_pyro.evaluation.worth import worth
-from ddco_pyro.fitting.fit import HIERARCHY
 from ddco_pyro.report.likelihood import SHOWN
 from ddco_pyro.segmenting.agreement import measure_names
 from ddco_pyro.segmenting.page import anchor
-from ddco_pyro.training.convergence import effort
+from ddco_pyro.training.networks import HIERARCHY
+from ddco_pyro.training.stages import effort
 
 FILES = ("compare.png", "compare.json", "compare.md", "compare.html")
 """The files of a comparison."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import cv2
 import matplotlib
 import numpy as np
 from matplotlib import colormaps
@@ -58,6 +57,8 @@ def with_heat(picture: np.ndarray, values: np.ndarray) -> np.ndarray:
 
     Colours go from yellow to dark red on a scale of the picture's own; 0 has none.
     """
+    import cv2  # one's own vectors need none of it
+
     grey = 255 - (1 - FADED) * (255 - picture.astype(float).mean(-1, keepdims=True))
     most = np.percentile(values, PERCENTILE) or values.max() or 1.0
     share = np.clip(values / most, 0, 1)

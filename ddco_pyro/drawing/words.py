@@ -292,7 +292,8 @@ def spent(training: Mapping[str, Any]) -> str:
     took, allowed = training["spent"], training["budget"]
     beside = restarts(training)
     of = "" if allowed["epochs"] is None else f" of at most {allowed['epochs']} ({allowed['gradient_steps']})"
-    return f"{took['epochs']} epochs ({took['gradient_steps']} gradient steps){of}{'; ' * bool(beside)}{beside}"
+    steps = "EM" if training.get("by_em") else "gradient"
+    return f"{took['epochs']} epochs ({took['gradient_steps']} {steps} steps){of}{'; ' * bool(beside)}{beside}"
 
 
 def restarts(training: Mapping[str, Any]) -> str:

@@ -1,6 +1,7 @@
-"""Exact inference in the AHMM: two engines for one likelihood, and what follows from it.
+"""Exact inference in the AHMM: likelihoods by two engines, posteriors, and paths.
 
-Each function refuses tables and lengths that do not go together (:class:`BadTables`, a ``ValueError``).
+Each function here checks its tables and lengths, and raises :class:`BadTables` (a ``ValueError``) where they do not fit
+together. The library's own training and evaluation call the unchecked functions in the modules.
 """
 
 from __future__ import annotations
@@ -21,11 +22,9 @@ __all__ = [
     "posterior",
     "sample_paths",
     "segment",
-    "total_log_likelihood",
 ]
 
 log_likelihood = checked(engines.log_likelihood)
-total_log_likelihood = checked(engines.total_log_likelihood)
 posterior = checked(posteriors.posterior)
 most_likely_path = checked(paths.most_likely_path)
 sample_paths = checked(paths.sample_paths)

@@ -1,7 +1,6 @@
-"""What the public functions of inference accept: tables that go together, and the length of each trajectory.
+"""Checks of the arguments of public inference functions: tables of fitting shapes, and the length of each trajectory.
 
-The compiled engines index without bounds, so a wrong length or shape would read and write memory that is not theirs.
-:func:`checked` asks once, where a caller enters; the library's own training and evaluation call the functions within.
+The compiled engines index without bounds checks, so a wrong length or shape would read and write foreign memory.
 """
 
 from __future__ import annotations
@@ -18,22 +17,43 @@ from ddco_pyro.model.tables import Tables
 
 
 class BadTables(BadInput):
-    """Tables or lengths that are no trajectories of an AHMM, or trajectories that have no posterior."""
+    """Tables or lengths that do not describe trajectories of an AHMM, or trajectories without a posterior."""
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def checked(function: Function) -> Function:
-    """The same function of tables and lengths, which refuses what :func:`check_lengths` or :func:`check_tables` do."""
+    """The same function of tables and lengths, with its arguments checked."""
 
     @wraps(function)
     def guarded(tables: Tables, lengths: Tensor, *others: Any, **named: Any) -> Any:
-        steps = check_lengths(lengths, *check_tables(tables))
-        _check_values(tables, steps)
-        return function(tables, steps, *others, **named)
+        return function(tables, check(tables, lengths), *others, **named)
 
     return cast(Function, guarded)
+
+
+def check(tables: Tables, lengths: Tensor) -> Tensor:
+    """The lengths as int64, once tables have the shapes of :class:`ddco_pyro.model.tables.Tables` and fit the lengths.
+
+    :raises BadTables: a table is missing, has another shape or is not floating-point; a length is out of range; or a
+        log-probability within the lengths is NaN or +inf.
+    """
+    shapes = _shapes(tables)
+    number, steps = tables.control[-1].shape[:2]
+    for name, table in _named(tables):
+        expected = [number, steps, *shapes[name]]
+        if table is not None and (not table.is_floating_point() or list(table.shape) != expected):
+            raise BadTables(f"{name}: expected floating-point numbers {expected}; got {_described(table)}")
+    lengths = check_lengths(lengths, number, steps)
+    alive = torch.arange(steps, device=lengths.device) < lengths[:, None]
+    for name, table in _named(tables):
+        if table is not None:
+            bad = ~(table.detach() < torch.inf).flatten(2).all(-1) & alive  # NaN is not below either
+            if bool(bad.any()):
+                n, t = torch.nonzero(bad)[0].tolist()
+                raise BadTables(f"{name}: a log-probability of trajectory {n} at step {t} is NaN or +inf")
+    return lengths
 
 
 def check_lengths(lengths: Tensor, number: int, steps: int) -> Tensor:
@@ -51,10 +71,19 @@ def check_lengths(lengths: Tensor, number: int, steps: int) -> Tensor:
     return lengths.long()
 
 
-def check_tables(tables: Tables) -> tuple[int, int]:
-    """N and T of tables whose shapes are those that :class:`ddco_pyro.model.tables.Tables` documents.
+def refuse_impossible(possible: Tensor) -> None:
+    """Raise for a trajectory that is not ``possible`` [N].
 
-    :raises BadTables: a table is missing or has another shape, or is not of floating-point numbers.
+    :raises BadTables: there is such a trajectory.
+    """
+    for n in torch.nonzero(~possible).flatten().tolist():
+        raise BadTables(f"trajectory {n} has probability 0 whatever its options, so there is no posterior of its path")
+
+
+def _shapes(tables: Tables) -> dict[str, tuple[int, ...]]:
+    """The shape of each table at one step, by name; the number of choices follows from the selections.
+
+    :raises BadTables: a table is missing, or has no such shape that N, T and the numbers of choices can be read.
     """
     depth = tables.depth
     numbers = {"termination": depth, "control": depth + 1, "evidence": depth if tables.evidence else 0}
@@ -64,47 +93,17 @@ def check_tables(tables: Tables) -> tuple[int, int]:
     for level, table in enumerate(tables.selection):
         if table.dim() != 4 or table.shape[-1] < 2:
             raise BadTables(f"selection[{level}]: expected [N, T, callers, 1 + options]; got {_described(table)}")
-    first = tables.control[-1]
-    if first.dim() != 3 or not len(first):
-        raise BadTables(f"control[{depth}]: expected the shape [N, T, 1] with N at least 1; got {_described(first)}")
-    number, steps = first.shape[:2]
-    for (name, given), shape in zip(_named(tables), _shapes(tables), strict=True):
-        if given is not None and (not given.is_floating_point() or given.shape != (number, steps, *shape)):
-            expected = [number, steps, *shape]
-            raise BadTables(f"{name}: expected floating-point numbers {expected}; got {_described(given)}")
-    return number, steps
-
-
-def _shapes(tables: Tables) -> Iterator[tuple[int, ...]]:
-    """The shape of each table at one step, in the order of :meth:`Tables.leaves`: counts follow from selections."""
-    choices = [table.shape[-1] for table in tables.selection]
-    callers = [*(size - 1 for size in choices[1:]), 1][: len(choices)]
-    yield from zip(callers, choices, strict=True)
-    yield from ((size - 1, 2) for size in choices)
-    yield from ((size - 1,) for size in choices)
-    yield (1,)
-    yield from ((size,) for size in choices[: len(tables.evidence)])
-
-
-def _check_values(tables: Tables, lengths: Tensor) -> None:
-    """Within the lengths a logarithm is a number below +inf; -inf is what cannot happen."""
-    alive = torch.arange(tables.steps, device=lengths.device) < lengths[:, None]
-    for name, table in _named(tables):
-        if table is None:
-            continue
-        bad = ~(table.detach() < torch.inf).flatten(2).all(-1) & alive  # NaN is not below either
-        if bool(bad.any()):
-            n, t = torch.nonzero(bad)[0].tolist()
-            raise BadTables(f"{name}: a log-probability of trajectory {n} at step {t} is NaN or +inf")
-
-
-def refuse_impossible(possible: Tensor) -> None:
-    """Refuse a posterior of trajectories of which no path is ``possible`` [N]; their log-likelihood is -inf.
-
-    :raises BadTables: there is such a trajectory.
-    """
-    for n in torch.nonzero(~possible).flatten().tolist():
-        raise BadTables(f"trajectory {n} has probability 0 whatever its options, so there is no posterior of its path")
+    last = tables.control[-1]
+    if last.dim() != 3 or not len(last):
+        raise BadTables(f"control[{depth}]: expected the shape [N, T, 1] with N at least 1; got {_described(last)}")
+    options = [table.shape[-1] - 1 for table in tables.selection]
+    shapes: dict[str, tuple[int, ...]] = {f"control[{depth}]": (1,)}
+    for level, (own, callers) in enumerate(zip(options, [*options[1:], 1], strict=False)):
+        shapes[f"selection[{level}]"] = (callers, 1 + own)
+        shapes[f"termination[{level}]"] = (own, 2)
+        shapes[f"control[{level}]"] = (own,)
+        shapes[f"evidence[{level}]"] = (1 + own,)
+    return shapes
 
 
 def _named(tables: Tables) -> Iterator[tuple[str, Tensor | None]]:

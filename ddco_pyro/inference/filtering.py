@@ -1,4 +1,4 @@
-"""The online filter: what is known of the options while a demonstration, or a robot, still runs; O(D·S) a step."""
+"""The online filter: beliefs over options while a trajectory is still running; O(D·S) a step."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Belief(NamedTuple):
 
 
 class Filter:
-    """Alternate :meth:`predict`, once a step's observation is known, and :meth:`update`, once its control is."""
+    """An exact filter: call :meth:`predict` with each step's tables, then :meth:`update` with its control."""
 
     def __init__(self) -> None:
         self._before: Tensor | None = None
@@ -33,9 +33,9 @@ class Filter:
         """log p(a_0..t-1 | s) so far, [N] nats."""
 
     def predict(self, now: Step) -> Belief:
-        """The belief at step t; the control is not known yet.
+        """The belief at step t, before its control.
 
-        :raises BadTables: the step is of another number of demonstrations, or of other options, than those before.
+        :raises BadTables: the step has another number of demonstrations or of options than earlier steps.
         """
         if self._before is not None and self._before.shape != (expected := _joint(now)):
             raise BadTables(f"step: expected joint choices {list(self._before.shape)}; got {list(expected)}")
@@ -44,10 +44,9 @@ class Filter:
         return Belief(tuple(_marginals(arrival, level) for level in range(len(now.selection))))
 
     def update(self, emission: Tensor) -> None:
-        """Take in the control that was applied: its log-density given each joint choice, [N, C_D, ..., C_1].
+        """Condition on the applied control, given its log-density for each joint choice, [N, C_D, ..., C_1].
 
-        :raises ValueError: no step has been predicted, the control is impossible whatever the choice, or the shape is
-            another.
+        :raises ValueError: :meth:`predict` was not called, the control has probability 0, or the shape is wrong.
         """
         if self._now is None:
             raise ValueError("update() follows predict(): there is no step to which this control belongs")
@@ -76,7 +75,7 @@ def _marginals(arrival: Arrival, index: int) -> Tensor:
 
 
 def _onto(message: Tensor, above: int) -> Tensor:
-    """The probabilities of the choices that are ``above`` places above a message's lowest level, [N, C]."""
+    """The marginal of the level ``above`` levels higher than a message's lowest level, [N, C]."""
     own = message.dim() - 1 - above
     others = [dim for dim in range(1, message.dim()) if dim != own]
     return message.exp().sum(others) if others else message.exp()

@@ -1,272 +1,440 @@
-"""Forward-backward over the chain's joint choices in scaled probability space, compiled; O(D·S) a step.
+"""Forward-backward over the joint choices of a hierarchy in scaled probability space, compiled; O(D·S) a step.
 
-Trajectories are independent and go in parallel; within one, everything that a step needs lies close together, which
-matters more than the arithmetic. :class:`ddco_pyro.inference.structure.Structure` says what the index arrays mean.
+Trajectories run in parallel. Within one trajectory the arrays of a step lie close together in memory, which matters
+more than the arithmetic. :class:`Structure` defines how joint choices and messages are numbered.
 
-A trajectory's ``messages`` [1 + T, messages] hold, in row t, the filtered probabilities of the joint choices at t - 1
-(level 1's message), then the mass that goes up from them at t: what terminated at every level below 2, ..., D + 1.
-Its ``spread`` [T, messages] holds, for levels D + 1 to 2, what comes down again: what terminated, spread by the
-selections, and what was kept.
+Row t of ``messages`` [1 + T, messages] begins with the filtered probabilities of the joint choices at t - 1. Above
+level 1 the row holds the mass that goes up from them at t: the mass that terminated at every level below.
+Row t of ``spread`` [T, messages] holds the mass that comes down again, for levels D + 1 to 2: the terminated mass,
+spread by the selections, and the kept mass.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
 import numba
 import numpy as np
+import torch
 
 Array = np.ndarray
-Choices = tuple[int, ...]
-"""Tuples, not arrays: the compiler then knows the depth, and keeps them in registers."""
+
+IMPOSSIBLE = -1
+"""Marks a joint choice with an option below a choice 0, and a caller that is itself below a choice 0."""
 
 TOLERANCE = 1e-9
-"""Of Σ_s α_t(s) β_t(s), which rounding changes by less than 1e-12 over 10 000 steps."""
+"""Allowed error of Σ_s α_t(s) β_t(s) = 1. Rounding changes the sum by less than 1e-12 over 10 000 steps."""
 
-jit = numba.njit(cache=True, error_model="numpy")
+jit = numba.njit(cache=True, error_model="numpy", forceinline=True)
+parallel = numba.njit(cache=True, error_model="numpy", parallel=True)
+
+
+class Structure(NamedTuple):
+    """Index tables of D levels, lowest first. C_d = 1 + k_d counts a level's choices, control among them.
+
+    A joint choice is one index, with h^D as the slowest digit and h^1 as the fastest. A *message* of level d runs over
+    (h^D, ..., h^d). The messages of levels 1 to D + 1 stand one after the other; level D + 1 has a single entry.
+    Each row of a table holds the levels side by side. The tuples let the compiler unroll loops over levels.
+
+    :param sizes: C_d, [D].
+    :param starts: first index of each level's message, and the number of all entries, [D + 2].
+    :param ends: first column of each level in a row of terminations, where a level has [k_d, 2], [D].
+    :param callers: for each message entry, its first column in a row of selections as the caller of the level below,
+        where a level has [callers, C_d]; :data:`IMPOSSIBLE` for a caller below a choice 0.
+    :param actors: for each joint choice, the acting caller's column in a row of controls, [S]. A row has each level's
+        k_d options, then the meta-policy; the column is :data:`IMPOSSIBLE` where the joint choice is.
+    :param choices: for each joint choice, the columns of its choices in a row of marginals, [S, D].
+    """
+
+    sizes: tuple[int, ...]
+    starts: tuple[int, ...]
+    ends: tuple[int, ...]
+    callers: Array
+    actors: Array
+    choices: Array
+
+    @classmethod
+    @lru_cache
+    def of(cls, sizes: tuple[int, ...]) -> Structure:
+        """The structure of levels with these numbers of choices C_d, lowest first."""
+        depth = len(sizes)
+        messages = [int(np.prod(sizes[level:])) for level in range(depth + 1)]
+        digits = np.indices(sizes[::-1]).reshape(depth, -1)[::-1].T  # [S, D], lowest level first
+        callers = [np.full(messages[0], IMPOSSIBLE)]  # level 1 calls nobody
+        first = 0
+        for level, size in enumerate(sizes):
+            digit = np.arange(messages[level + 1]) % sizes[level + 1] if level + 1 < depth else np.ones(1, np.int64)
+            callers.append(np.where(digit > 0, first + (digit - 1) * size, IMPOSSIBLE))
+            first += size * (sizes[level + 1] - 1 if level + 1 < depth else 1)
+        controls = _offsets([size - 1 for size in sizes])
+        actors = np.full(len(digits), controls[-1])  # the meta-policy, where every choice is 0
+        for level in range(depth - 1, -1, -1):
+            chosen = digits[:, level] > 0
+            valid = (digits[chosen, level:] > 0).all(1)
+            actors[chosen] = np.where(valid, controls[level] + digits[chosen, level] - 1, IMPOSSIBLE)
+        return cls(
+            sizes=sizes,
+            starts=_offsets(messages),
+            ends=_offsets([2 * (size - 1) for size in sizes])[:-1],
+            callers=np.concatenate(callers),
+            actors=actors,
+            choices=np.ascontiguousarray(digits + np.array(_offsets(sizes)[:-1])),
+        )
+
+    def digits(self, joint: Array) -> tuple[Array, ...]:
+        """The choice of each level, lowest first, in joint choices of any shape."""
+        choices = []
+        for size in self.sizes:
+            choices.append(joint % size)
+            joint = joint // size
+        return tuple(choices)
+
+
+def _offsets(sizes: Sequence[int]) -> tuple[int, ...]:
+    """Where each of consecutive parts begins, and where the last one ends."""
+    return tuple(np.cumsum([0, *sizes]).tolist())
+
+
+class Rows(NamedTuple):
+    """Tables of all levels side by side, [N, T, ...], or [T, ...] for one trajectory.
+
+    :param selection: selection probabilities, [..., Σ callers·C_d].
+    :param termination: termination probabilities, [..., Σ 2·k_d].
+    :param control: densities of the controls, scaled at each step, [..., 1 + Σ k_d].
+    :param choice: factors of the joint choices, [..., S]; among posteriors, the marginals of the choices,
+        [..., Σ C_d]. The last dimension is 0 where there are none.
+    """
+
+    selection: Array
+    termination: Array
+    control: Array
+    choice: Array
+
+
+def match_torch_threads() -> None:
+    """Let compiled loops run on ``torch.get_num_threads()`` threads."""
+    threads = torch.get_num_threads()
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    torch.set_num_threads(threads)  # numba's first call sets OpenMP's number for the whole process
 
 
 @jit
-def _up(n: int, t: int, messages: Array, end: Array, sizes: Choices, starts: Choices, ends: Choices) -> None:
+def trajectory(rows: Rows, n: int, steps: int) -> Rows:
+    """The first ``steps`` of trajectory n."""
+    return Rows(rows.selection[n, :steps], rows.termination[n, :steps], rows.control[n, :steps], rows.choice[n, :steps])
+
+
+@jit
+def _up(t: int, rows: Rows, messages: Array, of: Structure) -> None:
     """Fill row t of ``messages`` for levels 2 to D + 1."""
-    for d in range(len(sizes)):
-        c = sizes[d]
-        below = starts[d]
-        for above in range(starts[d + 1], starts[d + 1] + (starts[d + 1] - starts[d]) // c):
+    for d in range(len(of.sizes)):
+        c, below = of.sizes[d], of.starts[d]
+        for above in range(of.starts[d + 1], of.starts[d + 2]):
             total = messages[t, below]  # choice 0 lasts one step
             for j in range(1, c):
-                total += messages[t, below + j] * end[n, t, ends[d] + 2 * j - 1]
+                total += messages[t, below + j] * rows.termination[t, of.ends[d] + 2 * j - 1]
             messages[t, above] = total
             below += c
 
 
 @jit
-def _down(
-    n: int, t: int, messages: Array, spread: Array, select: Array, end: Array, sizes: Choices, starts: Choices,
-    selects: Choices, ends: Choices,
-) -> None:  # fmt: skip
+def _down(t: int, rows: Rows, messages: Array, spread: Array, of: Structure) -> None:
     """Fill row t of ``spread`` for levels D + 1 to 2."""
-    depth = len(sizes)
-    spread[t, starts[depth]] = messages[t, starts[depth]]
+    depth = len(of.sizes)
+    spread[t, of.starts[depth]] = messages[t, of.starts[depth]]
     for d in range(depth - 1, 0, -1):
-        c = sizes[d]
-        callers = sizes[d + 1] if d + 1 < depth else 0
-        below, caller = starts[d], 0 if callers else 1
-        for above in range(starts[d + 1], starts[d + 1] + (starts[d + 1] - starts[d]) // c):
-            mass = spread[t, above]
-            if caller == 0:
+        c, below = of.sizes[d], of.starts[d]
+        for above in range(of.starts[d + 1], of.starts[d + 2]):
+            mass, first = spread[t, above], of.callers[above]
+            if first < 0:
                 spread[t, below] = mass
                 spread[t, below + 1 : below + c] = 0.0
             else:
-                row = selects[d] + (caller - 1) * c
-                spread[t, below] = mass * select[n, t, row]
+                spread[t, below] = mass * rows.selection[t, first]
                 for j in range(1, c):
-                    kept = messages[t, below + j] * end[n, t, ends[d] + 2 * j - 2]
-                    spread[t, below + j] = mass * select[n, t, row + j] + kept
+                    kept = messages[t, below + j] * rows.termination[t, of.ends[d] + 2 * j - 2]
+                    spread[t, below + j] = mass * rows.selection[t, first + j] + kept
             below += c
-            caller += 1
-            if caller >= callers:
-                caller = 0 if callers else 1
 
 
 @jit
-def _act(
-    n: int, t: int, messages: Array, spread: Array, select: Array, end: Array, emission: Array, weight: Array,
-    sizes: Choices, starts: Choices, actors: Array,
-) -> float:  # fmt: skip
-    """Fill level 1 of row t + 1 of ``messages``, not yet normalised; its sum. The last of :func:`_down`, times the
-    likelihood of the control.
+def _act(t: int, rows: Rows, messages: Array, spread: Array, of: Structure) -> float:
+    """Fill level 1 of row t + 1 of ``messages``, not yet normalised, and return its sum: the last step of
+    :func:`_down`, times the likelihood of the control.
     """
-    c, total = sizes[0], 0.0
-    weighted = weight.shape[2] > 0
-    callers = sizes[1] if len(sizes) > 1 else 0
-    below, caller = 0, 0 if callers else 1
-    for above in range(starts[1], starts[1] + starts[1] // c):
-        mass = spread[t, above]
-        first = mass * emission[n, t, actors[below]]
+    c, below, total = of.sizes[0], 0, 0.0
+    weighted = rows.choice.shape[1] > 0
+    for above in range(of.starts[1], of.starts[2]):
+        mass, first = spread[t, above], of.callers[above]
+        message = mass * rows.control[t, of.actors[below]]
         if weighted:
-            first *= weight[n, t, below]
-        if caller == 0:
+            message *= rows.choice[t, below]
+        if first < 0:
             messages[t + 1, below + 1 : below + c] = 0.0
         else:
-            row = (caller - 1) * c
-            first *= select[n, t, row]
+            message *= rows.selection[t, first]
             for j in range(1, c):
-                kept = messages[t, below + j] * end[n, t, 2 * j - 2]
-                message = (mass * select[n, t, row + j] + kept) * emission[n, t, j - 1]
+                kept = messages[t, below + j] * rows.termination[t, 2 * j - 2]
+                option = (mass * rows.selection[t, first + j] + kept) * rows.control[t, j - 1]
                 if weighted:
-                    message *= weight[n, t, below + j]
-                messages[t + 1, below + j] = message
-                total += message
-        messages[t + 1, below] = first
-        total += first
+                    option *= rows.choice[t, below + j]
+                messages[t + 1, below + j] = option
+                total += option
+        messages[t + 1, below] = message
+        total += message
         below += c
-        caller += 1
-        if caller >= callers:
-            caller = 0 if callers else 1
     return total
 
 
 @jit
 def _adjoint_act(
-    n: int, t: int, messages: Array, spread: Array, back: Array, select: Array, emission: Array, weight: Array,
-    scale: float, selected: Array, emitted: Array, sizes: Choices, starts: Choices, actors: Array,
-) -> float:  # fmt: skip
-    """Adjoint of :func:`_act` but for what was kept; Σ_s α_t(s) β_t(s).
+    t: int, rows: Rows, messages: Array, spread: Array, scale: float, back: Array, sums: Rows, of: Structure
+) -> float:
+    """Adjoint of :func:`_act` except for the kept mass; returns Σ_s α_t(s) β_t(s).
 
-    ``back`` holds β_t at level 1; there it becomes the adjoint of what came down, and at level 2 that of ``spread``.
+    ``back`` holds β_t at level 1. It becomes the adjoint of the mass that came down and, at level 2, of ``spread``.
     """
-    c, total = sizes[0], 0.0
-    weighted = weight.shape[2] > 0
-    callers = sizes[1] if len(sizes) > 1 else 0
-    below, caller = 0, 0 if callers else 1
-    for above in range(starts[1], starts[1] + starts[1] // c):
-        actor = actors[below]
+    c, below, total = of.sizes[0], 0, 0.0
+    weighted = rows.choice.shape[1] > 0
+    for above in range(of.starts[1], of.starts[2]):
+        actor, first = of.actors[below], of.callers[above]
         both = messages[t + 1, below] * back[below]
         total += both
-        emitted[actor] += both
-        first = back[below] * emission[n, t, actor] * scale
+        sums.control[actor] += both
+        over = back[below] * rows.control[t, actor] * scale
         if weighted:
-            first *= weight[n, t, below]
-        if caller > 0:
-            mass, row = spread[t, above], (caller - 1) * c
-            first *= select[n, t, row]
-            selected[row] += mass * first
+            over *= rows.choice[t, below]
+        if first >= 0:
+            mass = spread[t, above]
+            over *= rows.selection[t, first]
+            sums.selection[first] += mass * over
             for j in range(1, c):
                 both = messages[t + 1, below + j] * back[below + j]
                 total += both
-                emitted[j - 1] += both
-                here = back[below + j] * emission[n, t, j - 1] * scale
+                sums.control[j - 1] += both
+                here = back[below + j] * rows.control[t, j - 1] * scale
                 if weighted:
-                    here *= weight[n, t, below + j]
+                    here *= rows.choice[t, below + j]
                 back[below + j] = here
-                term = here * select[n, t, row + j]
-                first += term
-                selected[row + j] += mass * term
-        back[above] = first
+                term = here * rows.selection[t, first + j]
+                over += term
+                sums.selection[first + j] += mass * term
+        back[above] = over
         below += c
-        caller += 1
-        if caller >= callers:
-            caller = 0 if callers else 1
     return total
 
 
 @jit
-def _adjoint_down(
-    n: int, t: int, spread: Array, back: Array, select: Array, selected: Array, sizes: Choices, starts: Choices,
-    selects: Choices,
-) -> None:  # fmt: skip
+def _adjoint_down(t: int, rows: Rows, spread: Array, back: Array, sums: Rows, of: Structure) -> None:
     """Adjoint of the selections in :func:`_down`: ``back`` of levels 3 to D + 1 from level 2's."""
-    depth = len(sizes)
-    for d in range(1, depth):
-        c = sizes[d]
-        callers = sizes[d + 1] if d + 1 < depth else 0
-        below, caller = starts[d], 0 if callers else 1
-        for above in range(starts[d + 1], starts[d + 1] + (starts[d + 1] - starts[d]) // c):
-            total = back[below]
-            if caller > 0:
-                mass, row, total = spread[t, above], selects[d] + (caller - 1) * c, 0.0
+    for d in range(1, len(of.sizes)):
+        c, below = of.sizes[d], of.starts[d]
+        for above in range(of.starts[d + 1], of.starts[d + 2]):
+            first = of.callers[above]
+            if first < 0:
+                back[above] = back[below]
+            else:
+                mass, total = spread[t, above], 0.0
                 for j in range(c):
-                    term = back[below + j] * select[n, t, row + j]
+                    term = back[below + j] * rows.selection[t, first + j]
                     total += term
-                    selected[row + j] += mass * term
-            back[above] = total
+                    sums.selection[first + j] += mass * term
+                back[above] = total
             below += c
-            caller += 1
-            if caller >= callers:
-                caller = 0 if callers else 1
 
 
 @jit
-def _adjoint_up(
-    n: int, t: int, messages: Array, back: Array, end: Array, ended: Array, sizes: Choices, starts: Choices,
-    ends: Choices,
-) -> None:  # fmt: skip
-    """Adjoint of :func:`_up` and of what :func:`_down` keeps: ``back`` becomes the adjoint of row t of ``messages``."""
-    for d in range(len(sizes) - 1, -1, -1):
-        c = sizes[d]
-        below = starts[d]
-        for above in range(starts[d + 1], starts[d + 1] + (starts[d + 1] - starts[d]) // c):
+def _adjoint_up(t: int, rows: Rows, messages: Array, back: Array, sums: Rows, of: Structure) -> None:
+    """Adjoint of :func:`_up` and of the kept mass in :func:`_down`: ``back`` becomes that of row t of ``messages``."""
+    for d in range(len(of.sizes) - 1, -1, -1):
+        c, below = of.sizes[d], of.starts[d]
+        for above in range(of.starts[d + 1], of.starts[d + 2]):
             over = back[above]
             back[below] = over
             for j in range(1, c):
-                column = ends[d] + 2 * (j - 1)
+                column = of.ends[d] + 2 * (j - 1)
                 mass = messages[t, below + j]
-                keeping, stopping = back[below + j] * end[n, t, column], over * end[n, t, column + 1]
-                ended[column] += mass * keeping
-                ended[column + 1] += mass * stopping
+                keeping = back[below + j] * rows.termination[t, column]
+                stopping = over * rows.termination[t, column + 1]
+                sums.termination[column] += mass * keeping
+                sums.termination[column + 1] += mass * stopping
                 back[below + j] = keeping + stopping
             below += c
 
 
 @jit
-def _hand_out(sums: Array, n: int, t: int, rows: Array) -> None:
-    """Write what was summed up for a step where it belongs, and begin anew."""
+def _flush(sums: Array, row: Array) -> None:
+    """Write the sums of one step and reset them."""
     for column in range(len(sums)):
-        rows[n, t, column] = sums[column]
+        row[column] = sums[column]
         sums[column] = 0.0
 
 
 @jit
-def _marginals(alpha: Array, beta: Array, actors: Array, choices: Array, to_choice: Array) -> None:
-    """Fill ``to_choice`` [Σ C_d] with the choices' posterior probabilities at one step."""
-    to_choice[:] = 0.0
-    for s in range(len(actors)):
-        if actors[s] >= 0:
-            for d in range(choices.shape[1]):
-                to_choice[choices[s, d]] += alpha[s] * beta[s]
-
-
-@jit
-def _forward(
-    n: int, select: Array, end: Array, emission: Array, weight: Array, messages: Array, spread: Array, scale: Array,
-    sizes: Choices, starts: Choices, selects: Choices, ends: Choices, actors: Array,
-) -> float:  # fmt: skip
+def _forward(rows: Rows, messages: Array, spread: Array, scale: Array, of: Structure) -> float:
     """Fill ``messages``, ``spread`` and ``scale`` [T]; the log-likelihood, NaN where a step leaves no mass."""
     messages[0] = 0.0
-    messages[0, starts[-1]] = 1.0  # at t = 0 everything is selected: all mass has terminated, none is kept
+    messages[0, of.starts[len(of.sizes)]] = 1.0  # at t = 0 everything is selected
     value = 0.0
     for t in range(len(scale)):
         if t > 0:
-            _up(n, t, messages, end, sizes, starts, ends)
-        _down(n, t, messages, spread, select, end, sizes, starts, selects, ends)
-        total = _act(n, t, messages, spread, select, end, emission, weight, sizes, starts, actors)
+            _up(t, rows, messages, of)
+        _down(t, rows, messages, spread, of)
+        total = _act(t, rows, messages, spread, of)
         value += np.log(total) if total > 0.0 else np.nan
         scale[t] = 1.0 / total
-        for s in range(len(actors)):
+        for s in range(len(of.actors)):
             messages[t + 1, s] *= scale[t]
     return value
 
 
 @jit
-def _backward(
-    n: int, select: Array, end: Array, emission: Array, weight: Array, messages: Array, spread: Array, scale: Array,
-    to_select: Array, to_end: Array, to_emission: Array, to_choice: Array, sizes: Choices, starts: Choices,
-    selects: Choices, ends: Choices, actors: Array, choices: Array,
-) -> bool:  # fmt: skip
-    """Fill the posteriors; whether Σ_s α_t(s) β_t(s) = 1 at every step: so it is but for what underflow has lost."""
-    back = np.ones(starts[-1] + 1)  # level 1: β
-    selected, ended, emitted = np.zeros(select.shape[2]), np.zeros(end.shape[2]), np.zeros(emission.shape[2])
+def _backward(rows: Rows, messages: Array, spread: Array, scale: Array, posterior: Rows, of: Structure) -> bool:
+    """Fill the posteriors; whether Σ_s α_t(s) β_t(s) = 1 at every step, which only underflow can change."""
+    back = np.ones(messages.shape[1])  # level 1: β
+    none = np.zeros(0)
+    sums = Rows(
+        np.zeros(rows.selection.shape[1]), np.zeros(rows.termination.shape[1]), np.zeros(rows.control.shape[1]), none
+    )
     exact = True
     for t in range(len(scale) - 1, -1, -1):
-        if to_choice.shape[2]:
-            _marginals(messages[t + 1], back, actors, choices, to_choice[n, t])
-        total = _adjoint_act(
-            n, t, messages, spread, back, select, emission, weight, scale[t], selected, emitted, sizes, starts, actors
-        )
+        if posterior.choice.shape[1]:
+            posterior.choice[t] = 0.0
+            for s in range(len(of.actors)):
+                if of.actors[s] >= 0:
+                    for d in range(of.choices.shape[1]):
+                        posterior.choice[t, of.choices[s, d]] += messages[t + 1, s] * back[s]
+        total = _adjoint_act(t, rows, messages, spread, scale[t], back, sums, of)
         exact &= abs(total - 1.0) <= TOLERANCE  # NaN is not
-        _adjoint_down(n, t, spread, back, select, selected, sizes, starts, selects)
+        _adjoint_down(t, rows, spread, back, sums, of)
         if t > 0:
-            _adjoint_up(n, t, messages, back, end, ended, sizes, starts, ends)
-        _hand_out(selected, n, t, to_select)
-        _hand_out(ended, n, t, to_end)
-        _hand_out(emitted, n, t, to_emission)
-    for adjoint in back:  # at t = 0 nothing else would tell that it has overflowed
+            _adjoint_up(t, rows, messages, back, sums, of)
+        _flush(sums.selection, posterior.selection[t])
+        _flush(sums.termination, posterior.termination[t])
+        _flush(sums.control, posterior.control[t])
+    for adjoint in back:  # an overflow at t = 0 shows nowhere else
         exact &= np.isfinite(adjoint)
     return exact
 
 
+@parallel
+def any_levels(rows: Rows, lengths: Array, value: Array, exact: Array, posteriors: Rows, of: Structure) -> None:
+    """Fill log-likelihoods ``value`` [N], whether they are ``exact`` [N], and the posteriors of the rows."""
+    sizes, starts, ends, callers, actors, choices = of  # a parallel loop takes no tuple within a tuple
+    for n in numba.prange(len(lengths)):
+        steps, own_structure = lengths[n], Structure(sizes, starts, ends, callers, actors, choices)
+        messages, spread = np.empty((1 + steps, starts[-1])), np.empty((steps, starts[-1]))
+        scale, own = np.empty(steps), trajectory(rows, n, steps)
+        value[n] = _forward(own, messages, spread, scale, own_structure)
+        exact[n] = _backward(own, messages, spread, scale, trajectory(posteriors, n, steps), own_structure)
+        _clear(posteriors, n, steps)
+
+
 @jit
+def _clear(posteriors: Rows, n: int, steps: int) -> None:
+    posteriors.selection[n, steps:] = 0.0
+    posteriors.termination[n, steps:] = 0.0
+    posteriors.control[n, steps:] = 0.0
+    posteriors.choice[n, steps:] = 0.0
+
+
+# One level is the common case, and four times faster on its own: nothing goes up or comes down. Its ``messages``
+# [1 + T, C + 1] hold in row t the distribution of the choice at t - 1 before normalisation, so that a step need not
+# wait for the division. The last column is the mass that terminated at t.
+
+
+@jit
+def _likelihood(rows: Rows) -> Array:
+    """Each choice's likelihood of a step's control, [T, C]; the meta-policy acts where the choice is 0."""
+    steps, c = rows.control.shape
+    likelihood = np.empty((steps, c))
+    for t in range(steps):
+        likelihood[t, 0] = rows.control[t, c - 1]
+        for j in range(1, c):
+            likelihood[t, j] = rows.control[t, j - 1]
+        if rows.choice.shape[1]:
+            for j in range(c):
+                likelihood[t, j] *= rows.choice[t, j]
+    return likelihood
+
+
+@jit
+def _forward_one(rows: Rows, likelihood: Array, messages: Array, scale: Array) -> float:
+    """Fill ``messages`` and ``scale`` [T]; the log-likelihood, NaN where a step leaves no mass."""
+    select, end = rows.selection, rows.termination
+    steps, c = likelihood.shape
+    messages[0] = 0.0
+    messages[0, 0] = 1.0  # at t = 0 everything is selected
+    value, before = 0.0, 1.0
+    for t in range(steps):
+        mass = messages[t, 0]
+        for j in range(1, c):
+            mass += messages[t, j] * end[t, 2 * j - 1]
+        mass *= before
+        messages[t, c] = mass
+        total = mass * select[t, 0] * likelihood[t, 0]
+        messages[t + 1, 0] = total
+        for j in range(1, c):
+            kept = messages[t, j] * before * end[t, 2 * j - 2]
+            message = (mass * select[t, j] + kept) * likelihood[t, j]
+            messages[t + 1, j] = message
+            total += message
+        value += np.log(total) if total > 0.0 else np.nan
+        before = 1.0 / total
+        scale[t] = before
+    return value
+
+
+@jit
+def _backward_one(rows: Rows, likelihood: Array, messages: Array, scale: Array, posterior: Rows) -> bool:
+    """:func:`_backward` for one level."""
+    select, end = rows.selection, rows.termination
+    steps, c = likelihood.shape
+    back, exact = np.ones(c), True
+    for t in range(steps - 1, -1, -1):
+        mass, total, over = messages[t, c], 0.0, 0.0
+        for j in range(c):
+            beta = back[j] * scale[t]
+            both = messages[t + 1, j] * beta
+            total += both
+            posterior.control[t, j - 1 if j else c - 1] = both
+            if posterior.choice.shape[1]:
+                posterior.choice[t, j] = both
+            back[j] = beta * likelihood[t, j]
+            term = back[j] * select[t, j]
+            over += term
+            posterior.selection[t, j] = mass * term
+        exact &= abs(total - 1.0) <= TOLERANCE and np.isfinite(over)  # NaN is not
+        if t == 0:
+            posterior.termination[0] = 0.0
+            break
+        back[0] = over
+        for j in range(1, c):
+            known = messages[t, j] * scale[t - 1]
+            keeping, stopping = back[j] * end[t, 2 * j - 2], over * end[t, 2 * j - 1]
+            posterior.termination[t, 2 * j - 2] = known * keeping
+            posterior.termination[t, 2 * j - 1] = known * stopping
+            back[j] = keeping + stopping
+    return exact
+
+
+@parallel
+def one_level(rows: Rows, lengths: Array, value: Array, exact: Array, posteriors: Rows, _: Structure) -> None:
+    """:func:`any_levels` for one level."""
+    for n in numba.prange(len(lengths)):
+        steps, own = lengths[n], trajectory(rows, n, lengths[n])
+        messages, scale = np.empty((1 + steps, own.selection.shape[1] + 1)), np.empty(steps)
+        likelihood = _likelihood(own)
+        value[n] = _forward_one(own, likelihood, messages, scale)
+        exact[n] = _backward_one(own, likelihood, messages, scale, trajectory(posteriors, n, steps))
+        _clear(posteriors, n, steps)
+
+
+@numba.njit(cache=True, error_model="numpy")
 def subtract_largest(rows: Array, lengths: Array, shift: Array) -> None:
-    """Subtract from each step's log-densities the largest, if it is finite; ``shift`` [N] is what they sum to."""
+    """Subtract from each step's log-densities the largest, if it is finite; ``shift`` [N] becomes their sum."""
     for n in range(len(rows)):
         shift[n] = 0.0
         for t in range(rows.shape[1]):
@@ -278,35 +446,3 @@ def subtract_largest(rows: Array, lengths: Array, shift: Array) -> None:
                     rows[n, t, j] -= top
                 if t < lengths[n]:
                     shift[n] += top
-
-
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def forward_backward(
-    select: Array, end: Array, emission: Array, weight: Array, lengths: Array, value: Array, exact: Array,
-    to_select: Array, to_end: Array, to_emission: Array, to_choice: Array, sizes: Choices, starts: Choices,
-    selects: Choices, ends: Choices, actors: Array, choices: Array,
-) -> None:  # fmt: skip
-    """Fill log-likelihoods ``value`` [N], whether they are ``exact`` [N], and the posteriors ``to_...``.
-
-    :param select: selection probabilities [N, T, Σ callers·C_d].
-    :param end: termination probabilities [N, T, Σ 2·k_d].
-    :param emission: the controls' densities, scaled at each step, [N, T, 1 + Σ k_d].
-    :param weight: factors of the joint choices [N, T, S], or [N, T, 0] where there are none.
-    :param to_select: like ``select``; ``to_end`` and ``to_emission`` accordingly.
-    :param to_choice: the choices' marginals, [N, T, Σ C_d], or [N, T, 0] where they are not wanted.
-    """
-    for n in numba.prange(len(lengths)):
-        messages = np.empty((1 + lengths[n], starts[-1] + 1))
-        spread = np.empty((lengths[n], starts[-1] + 1))
-        scale = np.empty(lengths[n])
-        value[n] = _forward(
-            n, select, end, emission, weight, messages, spread, scale, sizes, starts, selects, ends, actors
-        )  # fmt: skip
-        exact[n] = _backward(
-            n, select, end, emission, weight, messages, spread, scale, to_select, to_end, to_emission, to_choice,
-            sizes, starts, selects, ends, actors, choices,
-        )  # fmt: skip
-        to_select[n, lengths[n] :] = 0.0
-        to_end[n, lengths[n] :] = 0.0
-        to_emission[n, lengths[n] :] = 0.0
-        to_choice[n, lengths[n] :] = 0.0

@@ -1,8 +1,8 @@
 """Elimination of the latents in one structured pass in log space, O(D·S) a step for S joint choices.
 
-The transition of DESIGN §4 is a mixture over how far up the terminations reach, so a forward step never builds the
-S × S matrix: going up, each level either keeps its choice or passes its mass on; going down, the mass that was
-passed on is spread by the selections and joins what was kept.
+The transition is a mixture over how far up the terminations reach, so a forward step never builds the S × S matrix.
+On the way up each level keeps its choice or passes its mass on. On the way down the selections spread the passed mass,
+which joins the kept mass.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ddco_pyro.model.tables import NEVER, Chain, Step
 
 
 def log_sum(values: Tensor) -> Tensor:
-    """log Σ exp over the last dimension; where nothing is possible the value is -inf and the gradient 0."""
+    """log Σ exp over the last dimension; where every term is -inf the value is -inf and the gradient 0."""
     possible = (values > NEVER).any(-1)
     finite = torch.where(possible.unsqueeze(-1), values, 0.0)
     return torch.where(possible, finite.logsumexp(-1), NEVER)
@@ -33,11 +33,11 @@ def log_likelihood(chain: Chain) -> Tensor:
 
 
 class Arrival(NamedTuple):
-    """What is expected at a step, before its control is seen.
+    """Predicted log-mass at a step, before its control.
 
-    :param message: log-mass over the joint choices, [N, C_D, ..., C_1].
-    :param kept: the part that kept its choice at level d, having terminated below it, [N, C_D, ..., C_d] for each.
-    :param selected: the part that selected a choice at level d, shapes likewise.
+    :param message: over the joint choices, [N, C_D, ..., C_1].
+    :param kept: the part that terminated below level d and kept its choice there, [N, C_D, ..., C_d] for each level.
+    :param selected: the part that selected a choice at level d, of the same shapes.
     """
 
     message: Tensor
@@ -46,7 +46,7 @@ class Arrival(NamedTuple):
 
 
 def arrive(message: Tensor | None, now: Step) -> Arrival:
-    """From the log-mass over the joint choices at t - 1 to what is expected at t; None: t = 0."""
+    """The prediction for step t from the log-mass over the joint choices at t - 1, None for t = 0."""
     kept: list[Tensor] = []
     if message is None:
         message = torch.zeros(len(now.alive), dtype=torch.float64, device=now.alive.device)  # everything is selected

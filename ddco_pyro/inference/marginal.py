@@ -1,4 +1,4 @@
-"""The AHMM with its latents eliminated, as a distribution: for Pyro models with priors and guides."""
+"""The AHMM with its latents eliminated, as a Pyro distribution for models with priors and guides."""
 
 from __future__ import annotations
 
@@ -21,13 +21,19 @@ from ddco_pyro.model.tables import complete
 class EliminatedAHMM(TorchDistribution):
     """The controls of N demonstrations given their observations: Σ_ζ p(ζ, a | s), without the dynamics (§4.1).
 
-    ``pyro.sample("controls", EliminatedAHMM(hierarchy(batch.inputs), batch.lengths), obs=batch.actions)`` in a plate
-    over demonstrations takes the place of the enumerated model :func:`ddco_pyro.model.ahmm.ahmm`. Its gradient is the
-    posterior; second derivatives are refused.
+    In a plate over demonstrations it replaces the enumerated model :func:`ddco_pyro.model.ahmm.ahmm`:
+    ``pyro.sample("controls", EliminatedAHMM(hierarchy(batch.inputs), batch.lengths), obs=batch.actions)``.
+    Its gradient is the posterior; second derivatives raise an error. The batch shape is [N], the event shape [T, A].
 
-    :param outputs: what the networks say about the observations; the batch shape is [N], the event shape [T, A].
-    :param lengths: steps of each demonstration, [N]; whatever a value holds beyond is ignored.
-    :raises BadTables: the lengths are no integers [N] from 1 to T, or controls have another shape or no number.
+    >>> from ddco_pyro.model.batch import encode
+    >>> batch = encode(demos, fit.hierarchy.encoder, fit.hierarchy.scaling)
+    >>> controls = ddco_pyro.EliminatedAHMM(fit.hierarchy(batch.inputs), batch.lengths)
+    >>> controls.log_prob(batch.actions).shape, controls.sample().shape
+    (torch.Size([6]), torch.Size([6, 10, 2]))
+
+    :param outputs: the networks' outputs for the observations.
+    :param lengths: steps of each demonstration, integers [N]; steps beyond are ignored.
+    :raises BadTables: the lengths are no integers [N] from 1 to T, or controls are NaN or of another shape.
     """
 
     arg_constraints: ClassVar = {}
@@ -48,7 +54,7 @@ class EliminatedAHMM(TorchDistribution):
         return log_likelihood(self.outputs.tables(value), self.lengths)
 
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> EliminatedAHMM:
-        """The same distribution: it is as large as its demonstrations."""
+        """The same distribution; no other batch shape is possible."""
         if torch.Size(batch_shape) != self.batch_shape:
             raise ValueError(
                 f"a batch of {len(self.lengths)} demonstrations cannot be expanded to {tuple(batch_shape)}"

@@ -1,23 +1,26 @@
-"""What the demonstrations say about the latents at each step: posterior marginals, the E-step of §4.1.
+"""Posterior marginals of the latents, the E-step of §4.1, and the log-likelihood that they decompose.
 
-They are a gradient: the derivative of log p(ξ) with respect to the logarithm of a table's entry is the posterior
+A posterior is a gradient: the derivative of log p(ξ) with respect to the logarithm of a table's entry is the posterior
 probability that the entry was used.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ddco_pyro.inference import fused
+from ddco_pyro.inference import fused, logspace
 from ddco_pyro.inference.arguments import refuse_impossible
-from ddco_pyro.model.tables import NEVER, Tables
+from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.outputs import Outputs
+from ddco_pyro.model.tables import NEVER, Tables, complete
 
 
 class Posterior(NamedTuple):
-    """Marginals of §4.1 for every level, lowest first, each [N, T, 1 + k_d] with control as choice 0; float64.
+    """Marginals of §4.1 for every level, lowest first, each float64 [N, T, 1 + k_d] with control as choice 0.
 
     ``u``: p(h_t = h | ξ). ``v``: p(b_t = 1, h_t = h | ξ). ``w``: p(h_t = h, b_{t+1} = 0 | ξ), 0 at the last step.
     Steps past a trajectory's length are 0.
@@ -29,9 +32,21 @@ class Posterior(NamedTuple):
 
 
 def posterior(tables: Tables, lengths: Tensor) -> Posterior:
-    """The E-step: u, v and w of every level (§4.1).
+    """u, v and w of every level: the E-step of §4.1.
 
+    :param lengths: steps of each trajectory, int64 [N].
     :raises BadTables: a trajectory has probability 0.
+
+    >>> import torch
+    >>> from ddco_pyro.inference import posterior
+    >>> from ddco_pyro.model.tables import Tables
+    >>> tables = Tables(
+    ...     selection=(torch.tensor([0.0, 0.5, 0.5]).log().expand(1, 1, 1, 3),),  # control, option 1, option 2
+    ...     termination=(torch.tensor([0.0, 1.0]).log().expand(1, 1, 2, 2),),  # 1 - ψ and ψ of both options
+    ...     control=(torch.tensor([1.0, 3.0]).log().expand(1, 1, 2), torch.full((1, 1, 1), -torch.inf)),
+    ... )
+    >>> posterior(tables, torch.tensor([1])).u
+    (tensor([[[0.0000, 0.2500, 0.7500]]], dtype=torch.float64),)
     """
     if not tables.depth:
         return Posterior((), (), ())
@@ -53,3 +68,45 @@ def _not_ending(u: Tensor, terminated: Tensor, lengths: Tensor) -> Tensor:
     w = torch.zeros_like(u)
     w[:, :-1, 1:] = (u[:, :-1, 1:] - terminated[:, 1:]) * followed
     return w
+
+
+class Decomposition(NamedTuple):
+    """log p(ξ) of N demonstrations in parts, float64 nats in the control's own units.
+
+    With the posterior q of the latents and their prior p(ζ), the product of selections and terminations,
+
+        log p(ξ) = Σ_d E_q[Σ_t log π(a_td)] − KL(q ‖ p(ζ)).
+
+    :param dimensions: E_q[Σ_t log π(a_td)] of the control dimensions in the model, [N, A'].
+    :param options: −KL(q ‖ p(ζ)), at most 0; 0 without options, [N].
+    """
+
+    dimensions: Tensor
+    options: Tensor
+
+    @classmethod
+    def joined(cls, parts: Iterable[Decomposition]) -> Decomposition:
+        """The decompositions of several groups of demonstrations, in their order."""
+        return cls(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
+
+def decompose(outputs: Outputs, batch: Batch) -> Decomposition:
+    """The parts of each demonstration's log-likelihood, given the networks' outputs for the batch."""
+    with torch.no_grad():
+        exact, actions = outputs.map(Tensor.double), batch.actions.double()
+        tables = exact.tables(actions)
+        if tables.depth:
+            elimination = fused.eliminate(tables, batch.lengths)
+            value, actors = elimination.value, elimination.tables.control
+        else:
+            value = logspace.log_likelihood(complete(tables, batch.lengths))
+            actors = (torch.ones_like(tables.control[-1]),)
+        alive = (batch.inputs.time < batch.lengths[:, None])[..., None, None]
+        dimensions = sum(
+            torch.where(alive, weight.unsqueeze(-1) * emission.by_dimension(actions), 0.0).sum((1, 2))
+            for emission, weight in zip(exact.emissions, actors, strict=True)
+            if emission is not None
+        )
+        assert isinstance(dimensions, Tensor)  # the lowest level emits the control
+        options = value - dimensions.sum(-1) if tables.depth else torch.zeros_like(value)
+        return Decomposition(dimensions, options)

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ddco_pyro.data.control_dimensions import ControlDimension
+from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
 from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, note
 from ddco_pyro.drawing.words import about, method, number, signed
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.segmenting.page import anchor
-from ddco_pyro.training.convergence import effort
+from ddco_pyro.training.stages import effort
 
 SHOWN = 20
 """Rows of the list of demonstrations that are not folded."""

@@ -11,8 +11,8 @@ import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
-from ddco_pyro.data.memory import INFERENCE, PROGRAM, Extent, refuse_too_much
-from ddco_pyro.data.sources import Recording, Source
+from ddco_pyro.data.memory import Extent, refuse_too_much
+from ddco_pyro.data.sources import Recording, Source, open_source
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.inferred import Inferred
 from ddco_pyro.evaluation.schema import option_labels
@@ -94,6 +94,21 @@ class Segmented:
         return len(self.segments)
 
 
+def segment(fit: Fit, path: str | Path) -> Segmented:
+    """The options of a run over every demonstration of a file or data set.
+
+    >>> segmented = ddco_pyro.segment(fit, "mine.hdf5")
+    >>> len(segmented), segmented.counts, segmented.segments[0].levels["option"].options.shape
+    (6, {'option': 2}, (10,))
+
+    :param path: an HDF5 file, or a Minari or LeRobot dataset.
+    :raises BadInput: the run has no options, or was fitted to other observations.
+    :raises DemonstrationsError: a demonstration cannot be used.
+    """
+    with open_source(Path(path)) as source:
+        return segments(fit, source)
+
+
 def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
     """The segments of every demonstration of a source, except those that the run's spec excludes from its file.
 
@@ -157,9 +172,7 @@ def _refuse_too_long(recording: Recording, fit: Fit, before: int) -> None:
     seen = {f"obs/{key}": known[key] for key in fit.hierarchy.encoder.shapes if key in known}
     extent = Extent.of([{"actions": recording.actions, **seen}])
     (steps,) = extent.lengths
-    each, networks = extent.step(fit.spec.seen) + INFERENCE, min(steps, fit.hierarchy.steps_in_memory)
-    needed = PROGRAM + extent.size + steps * each + networks * fit.hierarchy.step_bytes
-    needed += FOUND * fit.hierarchy.depth * (before + steps)
+    needed = extent.segmenting + FOUND * fit.hierarchy.depth * (before + steps)
     refuse_too_much(needed, f"{recording.name}: segmenting its {steps} steps", "divide it, or the file")
 
 

@@ -17,7 +17,7 @@ from sklearn.mixture import GaussianMixture
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput, nearest
-from ddco_pyro.model.encoding import ObservationEncoder
+from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec
 from ddco_pyro.training.initialization import block_means, distinct, joined
 

@@ -14,7 +14,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.errors import Failed
 from ddco_pyro.events import CandidateGivenUp, FoldScored, OnEvent, SelectionBegan, ignore
-from ddco_pyro.fitting.fitted_to import record
+from ddco_pyro.fitting.digest import record
 from ddco_pyro.fitting.run import claimed
 from ddco_pyro.selection import choice as choosing
 from ddco_pyro.selection import folds as dividing
@@ -72,7 +72,7 @@ def check(spec: Spec, workers: Workers = HERE, demos: Demonstrations | None = No
 
 def select(
     spec: Spec,
-    folder: Path,
+    folder: str | Path,
     on_event: OnEvent = ignore,
     workers: Workers = HERE,
     stop_early: bool = False,
@@ -84,6 +84,12 @@ def select(
     Scores that the folder holds are not computed again. The result depends on the spec, the demonstrations and
     ``stop_early`` alone, not on workers or interruptions.
 
+    >>> grid = "selection.grid.hierarchy.levels.0.count=[1, 2]"
+    >>> spec = ddco_pyro.load_spec("mine.yaml", [grid, "selection.folds=2", "training.epochs=2"])
+    >>> selection = ddco_pyro.select(spec, "runs/select")
+    >>> len(selection.choice.rows)  # a row for each candidate
+    2
+
     :param demos: :func:`known_demonstrations`, where they have been read.
     :param resume: whether a finished selection in the folder may be read again.
     :raises SelectionFailed: every candidate has failed in some fold.
@@ -91,6 +97,7 @@ def select(
     :raises OtherDemonstrations: the folder holds a selection by other demonstrations.
     :raises Busy: another process works on the folder.
     """
+    folder = Path(folder)
     with claimed(folder, spec, resume):
         demos = demos or data.demonstrations(grid.wide(spec), on_event)
         record(folder, demos)

@@ -19,7 +19,7 @@ from scipy import stats
 from ddco_pyro.drawing.figures import ACCENT, FAINT, INK, Interval, Panel, interval_plot, save, style
 from ddco_pyro.drawing.page import Page, Table, Text
 from ddco_pyro.drawing.words import number, signed
-from ddco_pyro.evaluation.analysis import paired
+from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.selection.folds import Score
 from ddco_pyro.selection.grid import Candidate
 

@@ -18,15 +18,14 @@ from sklearn.model_selection import KFold
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.evaluation.record_types import Record
-from ddco_pyro.evaluation.schema import read_record
+from ddco_pyro.evaluation.schema import Record, read_record
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import train
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.selection.grid import Candidate
-from ddco_pyro.training import jobs as processes
-from ddco_pyro.training.jobs import ALL_CORES, BackendError
+from ddco_pyro.training import processes
 from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.processes import ALL_CORES, BackendError
+from ddco_pyro.training.restarts import train_model
 
 CONNECT_SECONDS = 10
 """How long a dask scheduler may take to answer."""
@@ -135,12 +134,12 @@ def score(folds: Folds, candidate: Candidate, fold: int) -> Score:
     empty = Score(candidate.number, fold, held_out.names, held_out.lengths)
     try:
         with one_thread():
-            trained = train(candidate.spec, folds.dimensions, training, held_out=held_out)
+            trained = train_model(candidate.spec, folds.dimensions, training, held_out=held_out)
             values = tuple(Fit(candidate.spec, trained.hierarchy).log_likelihood(held_out).tolist())
         bad = [name for name, value in zip(held_out.names, values, strict=True) if not math.isfinite(value)]
         if bad:
             raise Failed(f"the held-out log-likelihood of {', '.join(bad)} is not finite")
-        steps, converged = trained.training["spent"]["gradient_steps"], trained.training["converged"]
+        steps, converged = trained.summary["spent"]["gradient_steps"], trained.summary["converged"]
         result = replace(empty, log_likelihood=values, gradient_steps=steps, converged=converged)
     except (BadInput, Failed) as error:
         result = replace(empty, failed=str(error))

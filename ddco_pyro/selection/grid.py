@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from ddco_pyro.data.control_parts import control_parts, difference
+from ddco_pyro.data.controls import control_parts, difference
 from ddco_pyro.spec import Spec, SpecError, with_overrides
-from ddco_pyro.spec.messages import show
-from ddco_pyro.training.networks import Dimensions, build_hierarchy, parameters
+from ddco_pyro.spec.base import show
+from ddco_pyro.training.networks import Dimensions, check_networks, parameters
 
 DATA = ("task", "demonstrations")
 """Keys that all candidates share, as they are compared on the same demonstrations."""
@@ -114,4 +114,4 @@ def _where(grid: Mapping[str, Any], values: tuple[Any, ...]) -> str:
 def _candidate(number: int, values: dict[str, Any], spec: Spec, dimensions: Dimensions) -> Candidate:
     alone: dict[str, Any] = {"selection.grid": {}, "compare_with": []}  # baselines are compared, not selected
     own = with_overrides(spec, alone | values)
-    return Candidate(number, values, own, parameters(build_hierarchy(own, dimensions)))
+    return Candidate(number, values, own, parameters(check_networks(own, dimensions)))

@@ -1,1 +1,1 @@
-"""Tasks in simulation: the protocol, episodes, collecting demonstrations, films, Gymnasium."""
+"""Tasks in simulation: their interface, episodes, collection of demonstrations, videos, Gymnasium."""

@@ -1,4 +1,4 @@
-"""A task's cameras: pictures that are drawn where an observation asks for them, and at no other time."""
+"""Cameras of a task, drawn only where a spec observes them."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from dm_env import specs
 class Camera:
     """An observation that is a picture.
 
-    :param size: height and width of its pictures, pixels.
-    :param draw: what it sees of an environment as it is now, uint8 [height, width, 3].
+    :param size: height and width, pixels.
+    :param draw: a picture of the environment's current state, uint8 [height, width, 3].
     """
 
     size: tuple[int, int]
     draw: Callable[[dm_env.Environment], np.ndarray]
 
     digest = ""
-    """What decides its pictures beside the sources of its task: nothing."""
+    """Identity of a picture beyond its task's sources: none."""
 
     def spec(self, name: str) -> specs.Array:
-        """What the observation is."""
+        """The spec of the observation."""
         return specs.BoundedArray((*self.size, 3), np.uint8, 0, 255, name)
 
 
 @dataclass(frozen=True)
 class Encoded:
-    """An observation that is what an encoder gives of a camera's picture.
+    """An observation that is an encoder's features of a camera's picture.
 
-    :param encoder: uint8 [height, width, 3] to float32 [features], such as :func:`ddco_pyro.encoding.load` gives.
-        Its attribute ``digest``, if it has one, is for what the sources of the task do not say, such as its weights.
+    :param encoder: uint8 [height, width, 3] to float32 [features], such as those of :func:`ddco_pyro.encoding.load`.
+        An optional attribute ``digest`` identifies what the task's sources do not hold, such as weights.
     """
 
     camera: Camera
@@ -44,20 +44,20 @@ class Encoded:
 
     @property
     def digest(self) -> str:
-        """What decides its features beside the sources of its task."""
+        """Identity of the features beyond the task's sources."""
         return str(getattr(self.encoder, "digest", ""))
 
     def draw(self, environment: dm_env.Environment) -> np.ndarray:
-        """The features of what the camera sees of an environment as it is now, float32 [features]."""
+        """The features of a picture of the environment's current state, float32 [features]."""
         return self.encoder(self.camera.draw(environment))
 
     def spec(self, name: str) -> specs.Array:
-        """What the observation is."""
+        """The spec of the observation."""
         return specs.Array((self.features,), np.float32, name)
 
 
 class Watched(dm_env.Environment):
-    """An environment whose observations have what ``cameras`` give too, by name; all else is as it was."""
+    """An environment with the pictures of ``cameras`` as further observations."""
 
     def __init__(self, environment: dm_env.Environment, cameras: Mapping[str, Camera | Encoded]) -> None:
         self._environment, self._cameras = environment, dict(cameras)
@@ -78,20 +78,20 @@ class Watched(dm_env.Environment):
         return step._replace(observation={**step.observation, **pictures})
 
     def observation_spec(self) -> dict[str, specs.Array]:
-        """What each observation is."""
+        """The spec of each observation."""
         pictures = {name: camera.spec(name) for name, camera in self._cameras.items()}
         return {**self._environment.observation_spec(), **pictures}
 
     def action_spec(self) -> Any:
-        """That of the environment."""
+        """See the wrapped environment."""
         return self._environment.action_spec()
 
     def reward_spec(self) -> Any:
-        """That of the environment."""
+        """See the wrapped environment."""
         return self._environment.reward_spec()
 
     def discount_spec(self) -> Any:
-        """That of the environment."""
+        """See the wrapped environment."""
         return self._environment.discount_spec()
 
     def close(self) -> None:

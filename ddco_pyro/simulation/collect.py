@@ -1,4 +1,4 @@
-"""Demonstrations collected from a task's supervisor, in parallel, kept by content and reused."""
+"""Collection of demonstrations from a task's supervisor, in parallel, with a cache."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from ddco_pyro.data.demonstrations import DemonstrationsError
 from ddco_pyro.data.hdf5 import opened
-from ddco_pyro.data.resumable import Parts, parts_of
+from ddco_pyro.data.sources.robomimic import Parts, parts_of
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.simulation.episodes import run_episodes, summarize
@@ -20,31 +20,29 @@ from ddco_pyro.spec import DemonstrationsSpec
 
 
 def cache_folder() -> Path:
-    """``$DDCO_PYRO_CACHE``, else ``ddco-pyro`` in the user's cache folder."""
+    """``$DDCO_PYRO_CACHE``, or ``ddco-pyro`` in the user's cache folder."""
     own = os.environ.get("DDCO_PYRO_CACHE")
     general = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(own) if own else Path(general) / "ddco-pyro"
 
 
 SIMULATORS = ("mujoco", "dm-control")
-"""Packages whose version can decide what a task's episodes are."""
-
+"""Packages whose version can change a task's episodes."""
 
 EPISODES_WITH_PICTURES = 8
-"""Episodes whose pictures are in memory at a time: they are compressed one after the other, more slowly than they are
-drawn."""
+"""Episodes with pictures in memory at a time. Compression is sequential and slower than drawing."""
 
 
 def cache_path(task: Task, name: str, spec: DemonstrationsSpec, observed: Collection[str] = ()) -> Path:
-    """Where demonstrations of this task, policy, number, seeds and cameras are kept.
+    """The cached file of demonstrations of this task, policy, number, seeds and cameras.
 
-    The name changes with the task's code, its encoders and package, and the simulators' versions.
+    Its name changes with the task's code, encoders and package version, and with the simulators' versions.
     """
     return cache_folder() / "demonstrations" / f"{task.name}-{_identity(task, name, spec, observed)[:16]}.hdf5"
 
 
 def _identity(task: Task, name: str, spec: DemonstrationsSpec, observed: Collection[str]) -> str:
-    """A digest of all that decides what is recorded."""
+    """A digest of everything that the recorded data depends on."""
     cameras = [[camera, task.cameras[camera].digest] for camera in task.seen_by_cameras(observed)]
     versions = [version_of(package) for package in (*SIMULATORS, package_of(name))]
     facts = [name, spec.supervisor, spec.count, spec.seed, cameras, versions]
@@ -61,15 +59,15 @@ def collect(
     on_event: OnEvent = ignore,
     observed: Collection[str] = (),
 ) -> Path:
-    """Record ``spec.count`` demonstrations, unless the file is there already; the path of the file.
+    """Record ``spec.count`` demonstrations into a file, unless the file exists; returns its path.
 
-    Each is kept as soon as it is recorded: after an interruption the next call goes on with those that are missing.
+    Each demonstration is saved at once. After an interruption the next call records the missing ones. The root
+    attribute ``supervisor`` holds the supervisor's own success rate, as JSON.
 
-    The root of the file says how often the supervisor succeeded itself (``supervisor``, as JSON).
-
-    :param observed: the spec's observations: of the task's cameras those among them are recorded.
+    :param path: the file; by default one in the cache.
+    :param observed: the spec's observations; the task's cameras among them are recorded.
     :raises DemonstrationsError: the task has no such scripted policy.
-    :raises BadInput: the file is there already and holds other demonstrations.
+    :raises BadInput: the file exists and holds other demonstrations.
     """
     task = find_task(task_name)
     if spec.supervisor not in task.policies:
@@ -95,7 +93,10 @@ def collect(
 
 
 def _refuse_others(path: Path, task: Task, spec: DemonstrationsSpec) -> None:
-    """:raises BadInput: a file holds other demonstrations than these."""
+    """Check that a file holds these demonstrations.
+
+    :raises BadInput: the file holds others.
+    """
     names = {f"demo_{seed}" for seed in range(spec.seed, spec.seed + spec.count)}
     with opened(path) as file:
         about = (file.attrs.get("task"), file.attrs.get("policy"))
@@ -110,7 +111,7 @@ def _slices(seeds: Sequence[int], size: int) -> Iterator[Sequence[int]]:
 
 
 def _summary(task: Task, parts: Parts) -> dict[str, Any]:
-    """How often the supervisor succeeded itself."""
+    """The supervisor's own measures over the recorded episodes."""
     facts = parts.attributes()
     return summarize(
         task,

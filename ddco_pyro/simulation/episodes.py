@@ -1,25 +1,32 @@
-"""Policies in a task: episodes, what came of them, and how sure one can be of that."""
+"""Episodes of policies in a task, and summaries of their outcomes with confidence intervals."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from joblib import Parallel, delayed
 from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration
-from ddco_pyro.simulation.task import Policy, Task, find_task
+from ddco_pyro.simulation.task import Observation, Policy, Task, find_task
+
+if TYPE_CHECKING:
+    import dm_env
 
 CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode: the ``record`` of observations and (intended) controls, the task's ``outcome``, the ``choices``
-    of each level at each step [T, D] where a controller acted, and ``frames`` uint8 [T + 1, H, W, 3] where filmed.
+    """One episode of T steps.
+
+    :param record: observations, intended controls and labels.
+    :param outcome: the task's measures.
+    :param choices: the active option of each level, lowest first, [T, D]; D is 0 for other policies than controllers.
+    :param frames: pictures of the scene, uint8 [H, W, 3]: T + 1 where the episode was filmed, otherwise none.
     """
 
     seed: int
@@ -27,6 +34,38 @@ class Episode:
     outcome: dict[str, float]
     choices: np.ndarray
     frames: list[np.ndarray] = field(default_factory=list)
+
+
+class Policies(Protocol):
+    """A policy of N episodes at once, such as :class:`ddco_pyro.acting.controller.Controller`.
+
+    ``all_choices`` [N, D] are the active options after :meth:`act_all`.
+    """
+
+    all_choices: Any
+
+    def reset_all(self, seeds: Sequence[int]) -> None:
+        """Begin N episodes. Equal seeds give equal episodes."""
+
+    def act_all(self, observations: Sequence[Observation]) -> Sequence[np.ndarray] | np.ndarray:
+        """The control of each episode, in the task's own units."""
+
+
+class _One:
+    """A policy of one episode as :class:`Policies`."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+
+    def reset_all(self, seeds: Sequence[int]) -> None:
+        self.policy.reset(*seeds)
+
+    def act_all(self, observations: Sequence[Observation]) -> list[np.ndarray]:
+        control = np.array(self.policy.act(observations[0]), dtype=np.float64)
+        self.all_choices = [getattr(self.policy, "choices", ())]
+        self.all_intended = [getattr(self.policy, "intended", control)]
+        self.all_annotations = [getattr(self.policy, "annotations", {})]
+        return [control]
 
 
 def run_episode(
@@ -37,39 +76,109 @@ def run_episode(
     observed: Collection[str] = (),
     keep: Collection[str] | None = None,
 ) -> Episode:
-    """Run one episode from the initial state that ``seed`` draws, with a policy or the task's scripted one so named.
+    """Run one episode from the initial state of a seed.
 
-    :param observed: what the policy or the record needs; of the task's cameras those named here are drawn.
+    :param policy: a policy, or the name of one of the task's scripted policies.
+    :param film: keep a frame of every step.
+    :param observed: observations that the policy or the record needs; cameras among them are drawn.
     :param keep: the observations to record; all of them if None.
     """
-    environment = task.watched(seed, observed)
-    try:
-        actor = task.policies[policy](environment) if isinstance(policy, str) else policy
-        actor.reset(seed)
-        step = environment.reset()
-        seen: list[Mapping[str, np.ndarray]] = []
-        controls, choices, labels, frames = [], [], [], []
-        while not step.last():
-            frames += [task.frame(environment)] if film else []
-            kept = step.observation.keys() if keep is None else step.observation.keys() & set(keep)
-            seen.append({key: np.array(step.observation[key]) for key in kept})
-            control = np.array(actor.act(step.observation), dtype=np.float64)
-            controls.append(np.array(getattr(actor, "intended", control), dtype=np.float64))
-            choices.append(getattr(actor, "choices", ()))
-            labels.append(dict(getattr(actor, "annotations", {})))
-            step = environment.step(control)
-        frames += [task.frame(environment)] if film else []
-        outcome = task.measured(environment)
-    finally:
-        environment.close()
-    record = Demonstration(
-        name=f"demo_{seed}",
-        observations={key: np.stack([observation[key] for observation in seen]) for key in seen[0]},
-        actions=np.stack(controls),
-        labels={key: np.array([annotation[key] for annotation in labels]) for key in labels[0]},
-        attributes={"seed": seed, **outcome},
+    (episode,) = _run(
+        task,
+        lambda environments: _One(task.policies[policy](environments[0]) if isinstance(policy, str) else policy),
+        [seed],
+        film,
+        observed,
+        keep,
     )
-    return Episode(seed, record, outcome, np.array(choices, dtype=int).reshape(len(controls), -1), frames)
+    return episode
+
+
+def play(
+    task: Task,
+    policies: Policies,
+    seeds: Sequence[int],
+    observed: Collection[str] = (),
+    keep: Collection[str] | None = (),
+) -> list[Episode]:
+    """Run one episode for each seed in lockstep: networks see all episodes in one pass for each step.
+
+    Each episode is the one that :func:`run_episode` gives for its seed.
+
+    :param observed: observations that the policies need; cameras among them are drawn.
+    :param keep: the observations to record; all of them if None.
+    """
+    return _run(task, lambda _: policies, seeds, False, observed, keep)
+
+
+def _run(
+    task: Task,
+    make: Callable[[list[dm_env.Environment]], Policies],
+    seeds: Sequence[int],
+    film: bool,
+    observed: Collection[str],
+    keep: Collection[str] | None,
+) -> list[Episode]:
+    environments = [task.watched(seed, observed) for seed in seeds]
+    try:
+        policies = make(environments)
+        policies.reset_all(seeds)
+        steps = [environment.reset() for environment in environments]
+        logs = [_Log() for _ in seeds]
+        while not all(step.last() for step in steps):
+            if film:
+                for log, environment in zip(logs, environments, strict=True):
+                    log.frames.append(task.frame(environment))
+            controls = policies.act_all([step.observation for step in steps])
+            intended = getattr(policies, "all_intended", controls)
+            annotations = getattr(policies, "all_annotations", [{}] * len(seeds))
+            for n, step in enumerate(steps):
+                if not step.last():
+                    logs[n].add(step.observation, keep, intended[n], policies.all_choices[n], annotations[n])
+                    steps[n] = environments[n].step(controls[n])
+        if film:
+            for log, environment in zip(logs, environments, strict=True):
+                log.frames.append(task.frame(environment))
+        outcomes = [task.measured(environment) for environment in environments]
+    finally:
+        for environment in environments:
+            environment.close()
+    return [log.episode(seed, outcome) for log, seed, outcome in zip(logs, seeds, outcomes, strict=True)]
+
+
+class _Log:
+    """The steps of one episode."""
+
+    def __init__(self) -> None:
+        self.observations: list[dict[str, np.ndarray]] = []
+        self.controls: list[np.ndarray] = []
+        self.choices: list[np.ndarray] = []
+        self.labels: list[dict[str, int]] = []
+        self.frames: list[np.ndarray] = []
+
+    def add(
+        self,
+        observation: Observation,
+        keep: Collection[str] | None,
+        control: np.ndarray,
+        choices: Sequence[int],
+        labels: Mapping[str, int],
+    ) -> None:
+        kept = observation.keys() if keep is None else observation.keys() & set(keep)
+        self.observations.append({key: np.array(observation[key]) for key in kept})
+        self.controls.append(np.array(control, dtype=np.float64))
+        self.choices.append(np.array(choices, dtype=int))
+        self.labels.append(dict(labels))
+
+    def episode(self, seed: int, outcome: dict[str, float]) -> Episode:
+        record = Demonstration(
+            name=f"demo_{seed}",
+            observations={key: np.stack([each[key] for each in self.observations]) for key in self.observations[0]},
+            actions=np.stack(self.controls),
+            labels={key: np.array([each[key] for each in self.labels]) for key in self.labels[0]},
+            attributes={"seed": seed, **outcome},
+        )
+        return Episode(seed, record, outcome, np.stack(self.choices), self.frames)
 
 
 def run_episodes(
@@ -81,10 +190,10 @@ def run_episodes(
     observed: Collection[str] = (),
     keep: Collection[str] | None = None,
 ) -> Iterable[Episode]:
-    """Episodes from each seed in turn, in parallel processes; the first ``film`` of them with frames.
+    """Episodes of each seed in turn, from parallel processes; the first ``film`` of them have frames.
 
-    :param task: the task's name, as :func:`ddco_pyro.simulation.task.find_task` takes it.
-    :param observed: as ``keep``, those of :func:`run_episode`.
+    :param task: the task's name for :func:`ddco_pyro.simulation.task.find_task`.
+    :param observed: see :func:`run_episode`, also for ``keep``.
     """
     calls = (
         delayed(_run_named)(task, policy, seed, number < film, observed, keep) for number, seed in enumerate(seeds)
@@ -98,9 +207,9 @@ def _run_named(task: str, *how: Any) -> Episode:
 
 
 def summarize(task: Task, outcomes: Sequence[Mapping[str, float]]) -> dict[str, dict[str, Any]]:
-    """Each measure over episodes: a rate with its Wilson 95 % interval, or a mean with Student's, as the task declares.
+    """Each measure over episodes: a rate with its Wilson 95 % interval, or a mean with Student's 95 % interval.
 
-    NaN (does not apply to this episode) is left out of ``trials``.
+    Episodes to which a measure does not apply (NaN) are not among its ``trials``.
     """
     summary = {}
     for name in dict.fromkeys(name for outcome in outcomes for name in outcome):
@@ -111,7 +220,7 @@ def summarize(task: Task, outcomes: Sequence[Mapping[str, float]]) -> dict[str, 
 
 
 def mean(values: np.ndarray) -> dict[str, Any]:
-    """A mean with its standard deviation and Student's 95 % interval, both of which take two values at least."""
+    """A mean with its standard deviation and Student's 95 % interval; both are None for less than two values."""
     trials = len(values)
     centre = float(values.mean()) if trials else None
     if centre is None or trials < 2:
@@ -135,7 +244,7 @@ def rate(successes: int, trials: int) -> dict[str, Any]:
 
 
 def paired_difference(ours: Sequence[float], theirs: Sequence[float]) -> dict[str, Any]:
-    """Successes on the same initial states: how often only one of the two succeeded, and McNemar's exact p-value."""
+    """Successes from the same initial states: counts of those of one policy alone, and McNemar's exact p-value."""
     only_ours = int(sum(a > b for a, b in zip(ours, theirs, strict=True)))
     only_theirs = int(sum(a < b for a, b in zip(ours, theirs, strict=True)))
     discordant = only_ours + only_theirs

@@ -1,11 +1,9 @@
-"""Films of episodes, with the active options written on each frame."""
+"""Videos of episodes with the active options written on each frame."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import av
-import cv2
 import numpy as np
 
 from ddco_pyro.data.files import whole_file
@@ -15,11 +13,13 @@ from ddco_pyro.simulation.episodes import Episode
 FRAMES_PER_SECOND = 3
 BORDER = 6
 QUALITY = "25"
-"""x264's constant rate factor: 0 keeps everything, 51 next to nothing."""
+"""x264's constant rate factor: 0 is lossless, 51 the coarsest."""
 
 
 def write_film(path: Path, episode: Episode) -> None:
-    """Write the episode's frames as an mp4 (H.264) that browsers play."""
+    """Write the episode's frames as an mp4 (H.264)."""
+    import av
+
     frames = [_even(captioned(episode, t)) for t in range(len(episode.frames))]
     with whole_file(path) as temporary, av.open(temporary, "w", format="mp4") as film:
         stream = film.add_stream("libx264", FRAMES_PER_SECOND, options={"crf": QUALITY})
@@ -30,25 +30,23 @@ def write_film(path: Path, episode: Episode) -> None:
 
 
 def captioned(episode: Episode, t: int) -> np.ndarray:
-    """Frame t with a border in the colour of the option active in it, and its name; uint8 [H, W, 3].
+    """Frame t with a border in the active option's colour, and its name; uint8 [H, W, 3].
 
-    The last frame shows the end, where nothing is active any more.
+    The last frame shows the end of the episode, without an active option.
     """
+    import cv2
+
     frame = np.array(episode.frames[t], order="C")
     active = episode.choices[t] if t < len(episode.choices) else episode.choices[:0].reshape(-1)
     if len(active):
         cv2.rectangle(frame, (0, 0), (frame.shape[1] - 1, frame.shape[0] - 1), option_rgb(active[0]), 2 * BORDER)
     text = "end" if t >= len(episode.choices) else f"t={t}" + "".join(f"  h{d}={h}" for d, h in enumerate(active, 1))
-    for across, down in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        _write(frame, text, (12 + across, 26 + down), (255, 255, 255))
-    _write(frame, text, (12, 26), (20, 20, 20))
+    white, black = (255, 255, 255), (20, 20, 20)
+    for right, down, colour in ((-1, 0, white), (1, 0, white), (0, -1, white), (0, 1, white), (0, 0, black)):
+        cv2.putText(frame, text, (12 + right, 26 + down), cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, 1, cv2.LINE_AA)
     return frame
 
 
-def _write(frame: np.ndarray, text: str, place: tuple[int, int], colour: tuple[int, int, int]) -> None:
-    cv2.putText(frame, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, 1, cv2.LINE_AA)
-
-
 def _even(frame: np.ndarray) -> np.ndarray:
-    """H.264 takes even sizes only."""
+    """The picture cut to an even height and width, which H.264 needs."""
     return frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]

@@ -1,7 +1,7 @@
-"""What a task offers to the library: an environment, scripted policies for it, and how success is measured.
+"""Interface of a task: an environment, scripted policies, and measures of success.
 
-The library never imports a task. It finds one by the name of an entry point in the group ``ddco_pyro.tasks``
-or by ``module:name``, and sees it only through :class:`Task`.
+The library never imports a task. :func:`find_task` resolves an entry point of the group ``ddco_pyro.tasks`` or
+``module:name`` to a :class:`Task`.
 """
 
 from __future__ import annotations
@@ -13,14 +13,17 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 
-import dm_env
 import numpy as np
 
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.simulation.cameras import Camera, Encoded, Watched
-from ddco_pyro.spec.types import TASKS
+from ddco_pyro.spec.base import TASKS
+
+if TYPE_CHECKING:  # one's own demonstrations need no simulator
+    import dm_env
+
+    from ddco_pyro.simulation.cameras import Camera, Encoded
 
 SUCCESS = "success"
 """The measure by which methods are compared."""
@@ -42,23 +45,22 @@ class Policy(Protocol):
 
 @dataclass(frozen=True)
 class Task:
-    """A task: ``load`` makes its environment, ``policies`` the scripted policies that act in it.
+    """A task with a dm_env environment; :meth:`from_gymnasium` makes one from a Gymnasium environment.
 
-    :param load: ``load(seed)`` gives a fresh environment; its first ``reset()`` depends on the seed alone.
-    :param policies: name to ``make(environment)``; a scripted policy may look at the environment's true state.
-        ``"supervisor"`` is the one whose demonstrations are collected. A policy may have an attribute
-        ``annotations`` (name to integer, for the step just decided): they are stored as ground-truth labels. One
-        whose moves are disturbed may have an attribute ``intended`` [A], the control without the disturbance: it is
-        recorded in place of the one that was executed (noise while collecting, clean labels).
-    :param outcome: measures of the episode that just ended, such as ``{"success": 1.0, "accuracy_mm": 2.1}``;
-        a measure that does not apply (the accuracy of an insertion that never happened) is NaN.
-    :param frame: a picture of the scene as it is now, uint8 [H, W, 3].
-    :param sources: the files whose contents decide what a demonstration looks like, for caching.
-    :param steps: the most control steps that an episode can have, where that is known; 1 otherwise.
+    :param load: ``load(seed)`` makes a fresh environment; its first ``reset()`` depends on the seed alone.
+    :param policies: ``make(environment)`` of each scripted policy, by name. Demonstrations are collected from the
+        ``"supervisor"``. A policy may look at the environment's true state. Its optional attribute ``annotations``
+        (name to integer, for the step just decided) is stored as ground-truth labels. With an optional attribute
+        ``intended`` [A] that control is recorded, and the disturbed control of ``act`` is executed.
+    :param outcome: measures of the episode that just ended, such as ``{"success": 1.0, "accuracy_mm": 2.1}``; NaN for
+        a measure that does not apply, such as the accuracy of an insertion that never happened.
+    :param frame: a picture of the current scene, uint8 [H, W, 3].
+    :param sources: files whose contents determine the demonstrations, for caching.
+    :param steps: the largest number of control steps in an episode; 1 where unknown.
     :param measures: the kind of each measure in ``outcome``: a ``"rate"`` is 0 or 1 in every episode, a ``"mean"`` any
-        number. Without it every measure is a mean but ``success``, which is always a rate.
-    :param cameras: observations that are pictures, or what an encoder gives of them, by name. One is drawn where a spec
-        observes it (:meth:`watched`), and nowhere else: a picture takes longer than a step of simulation.
+        number. By default ``success`` is a rate and every other measure a mean.
+    :param cameras: cameras, and encoders of their pictures, by the name of their observation. A camera is drawn only
+        where a spec observes it, because a picture takes longer than a step of simulation.
     :raises OutcomeError: ``measures`` has another kind, or calls ``success`` a mean.
     """
 
@@ -73,22 +75,51 @@ class Task:
     cameras: Mapping[str, Camera | Encoded] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse a wrong declaration."""
+        """Check the declared measures."""
         for name, kind in self.measures.items():
             if kind not in get_args(Kind):
                 raise self._wrong(f"{name} is declared a {kind!r}; it has to be a 'rate' or a 'mean'")
         if self.kind(SUCCESS) != "rate":
             raise self._wrong(f"{SUCCESS} is a rate, by which methods are compared; call the mean otherwise")
 
-    def watched(self, seed: int, observed: Collection[str]) -> dm_env.Environment:
-        """A fresh environment as ``load`` makes it, whose observations also have what the cameras among ``observed``
-        see.
+    @classmethod
+    def from_gymnasium(
+        cls,
+        id: str,
+        policies: Mapping[str, Callable[[dm_env.Environment], Policy]] | None = None,
+        sources: tuple[Path, ...] = (),
+        **options: Any,
+    ) -> Task:
+        """The task of a registered Gymnasium environment (``pip install 'ddco-pyro[gymnasium]'``).
+
+        Observations: a Box or Discrete space becomes ``state``, a Dict of them keeps its names. Controls: a Box is
+        flattened to [A] and clipped to its bounds; a Discrete action is a control [1], rounded to the nearest action.
+        Measures: ``success`` is ``info["is_success"]`` of the last step, or where there is none whether the episode
+        was terminated rather than truncated; ``return`` is the sum of rewards.
+
+        :param id: as in ``gymnasium.make``, such as ``"Pendulum-v1"`` or ``"module:Name-v0"``.
+        :param policies: scripted policies; they find the Gymnasium environment as ``environment.gymnasium``.
+        :param options: further arguments of ``gymnasium.make``; ``render_mode="rgb_array"`` is needed for films.
+        :raises BadInput: gymnasium or the environment's package cannot be imported, the environment is not
+            registered, or a space has another type.
         """
-        cameras = {name: self.cameras[name] for name in self.seen_by_cameras(observed)}
-        return Watched(self.load(seed), cameras) if cameras else self.load(seed)
+        try:
+            from ddco_pyro.simulation.environments import task_of
+        except ModuleNotFoundError as error:
+            raise BadInput(f"{id}: needs {error.name}; install it with: pip install 'ddco-pyro[gymnasium]'") from error
+        return task_of(id, policies or {}, sources, options)
+
+    def watched(self, seed: int, observed: Collection[str]) -> dm_env.Environment:
+        """A fresh environment of ``load``, with the pictures of the cameras among ``observed`` as observations."""
+        names = self.seen_by_cameras(observed)
+        if not names:
+            return self.load(seed)
+        from ddco_pyro.simulation.cameras import Watched
+
+        return Watched(self.load(seed), {name: self.cameras[name] for name in names})
 
     def seen_by_cameras(self, observed: Collection[str]) -> list[str]:
-        """Those of some observations that are pictures of this task's cameras."""
+        """The observations among ``observed`` that are pictures of this task's cameras."""
         return [name for name in self.cameras if name in observed]
 
     def kind(self, measure: str) -> Kind:
@@ -98,7 +129,7 @@ class Task:
     def measured(self, environment: dm_env.Environment) -> dict[str, float]:
         """The ``outcome`` of the episode that just ended.
 
-        :raises OutcomeError: it has other measures than were declared, or a rate that is not 0, 1 or NaN.
+        :raises OutcomeError: other measures than the declared ones, or a rate that is not 0, 1 or NaN.
         """
         outcome = {name: float(value) for name, value in self.outcome(environment).items()}
         if self.measures and outcome.keys() != self.measures.keys():
@@ -115,11 +146,11 @@ class Task:
 
 
 class OutcomeError(BadInput):
-    """What a task measures is not what it declares."""
+    """A task's measures differ from its declaration."""
 
 
 class UnknownTask(BadInput):
-    """No task of that name is registered, or ``module:name`` does not lead to a :class:`Task`."""
+    """A task's name that is not registered, cannot be imported, or does not lead to a :class:`Task`."""
 
 
 def package_of(name: str) -> str | None:
@@ -139,7 +170,7 @@ def version_of(package: str | None) -> str | None:
 def find_task(name: str) -> Task:
     """The task registered under ``name``, or the one that ``module:name`` holds.
 
-    :raises UnknownTask: names what is registered.
+    :raises UnknownTask: the name is not registered, or the task cannot be imported; names a missing package.
     """
     registered = {point.name: point for point in entry_points(group=TASKS)}
     if name not in registered and ":" not in name:
@@ -151,8 +182,12 @@ def find_task(name: str) -> Task:
         else:
             module, _, attribute = name.partition(":")
             task = getattr(importlib.import_module(module), attribute)
-    except Failed:  # the task says itself what this machine lacks
+    except Failed:  # such as missing OpenGL
         raise
+    except ModuleNotFoundError as error:
+        if str(error.name) in name.partition(":")[0]:
+            raise UnknownTask(f"task {name!r} cannot be loaded: {error}") from error
+        raise UnknownTask(f"task {name!r} needs the package {error.name!r}, which is not installed here") from error
     except Exception as error:  # whatever the task's code raises
         raise UnknownTask(f"task {name!r} cannot be loaded: {' '.join(str(error).split())}") from error
     if not isinstance(task, Task):

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from ddco_tasks.pushing import environment as pushing
 
-from ddco_pyro.acting.lockstep import play
+from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.fitting.run import fit
-from ddco_pyro.simulation.episodes import run_episode
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.simulation.episodes import play, run_episode
 from ddco_pyro.spec import Spec, load_spec
 from ddco_pyro.training.data import dimensions
 from ddco_pyro.training.networks import check_networks
@@ -53,12 +53,12 @@ def test_specs_fit_and_act(path: Path, demonstrations: Path, tmp_path: Path) -> 
     found = fit(short(path, demonstrations), out=tmp_path / "run")
     assert found.metrics["engine_check"]["value"] < 1e-6
     brief = replace(pushing.limited, load=lambda seed: pushing.load_single(seed), cameras=CAMERAS)
-    (episode,) = play(brief, found.hierarchy, found.spec.rollout, [0], keep=("tip",))
+    (episode,) = play(brief, Controller.from_spec(found.hierarchy, found.spec.rollout), [0], keep=("tip",))
     levels = LEVELS[path.stem.removeprefix("pushing_")]
-    assert episode.choices.shape == (len(episode.observations["tip"]), levels)
+    assert episode.choices.shape == (len(episode.record.observations["tip"]), levels)
     lowest = 0 if path.stem.endswith("hybrid") else 1
     assert not levels or episode.choices.min() >= lowest
-    assert np.ptp(episode.observations["tip"], axis=0).max() > 1e-3  # the arm moves
+    assert np.ptp(episode.record.observations["tip"], axis=0).max() > 1e-3  # the arm moves
 
 
 @pytest.mark.parametrize("path", SPECS, ids=lambda path: path.stem)

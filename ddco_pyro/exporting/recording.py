@@ -1,0 +1,137 @@
+"""Synthetic episodes for checking exports: the original's actions in them, and the tolerance of the comparison."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from ddco_pyro.acting.controller import Controller
+from ddco_pyro.exporting import runner
+from ddco_pyro.exporting.program import named
+from ddco_pyro.model.encoder import ObservationEncoder
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import Inputs, States
+from ddco_pyro.model.outputs import Outputs
+from ddco_pyro.spec import STEP
+
+EPISODES, STEPS = 3, 20
+"""Number and length of synthetic episodes. Without images the first one is a step longer than the longest
+demonstration, so that the comparison includes the networks of every time step."""
+
+FINEST = 48
+"""Largest number of squares across the shorter side of a synthetic picture."""
+
+ROUNDINGS = 4
+"""Allowed difference in units of the original's own rounding error. The rounding error is the largest difference
+between float32 and float64 outputs, over an episode in one pass and step by step, which add in different orders."""
+
+MOST = 1e-4
+"""Largest tolerance. Networks with a rounding error beyond a quarter of it are meaningless in float32."""
+
+
+def record(controller: Controller, hierarchy: Hierarchy) -> dict[str, np.ndarray]:
+    """Synthetic episodes: observations as large as the training data's, actions, options, and network outputs.
+
+    ``seeds``, and for each episode ``observation_<episode>_<key>`` [T, ...], ``controls_<episode>`` [T, A],
+    ``choices_<episode>`` [T, D], and the runner's outputs as ``<output>_<episode>`` [T, ...].
+    """
+    random = np.random.default_rng(0)
+    arrays: dict[str, np.ndarray] = {"seeds": np.arange(EPISODES)}
+    for episode in range(EPISODES):
+        steps = STEPS if episode or hierarchy.encoder.images else max(STEPS, hierarchy.steps + 1)
+        seen = _episode(hierarchy.encoder, steps, random)
+        controller.reset(episode)
+        acted = [
+            (controller.act({key: obs[step] for key, obs in seen.items()}), controller.choices) for step in range(steps)
+        ]
+        arrays |= {f"observation_{episode}_{key}": obs for key, obs in seen.items()}
+        arrays[f"controls_{episode}"] = np.stack([control for control, _ in acted])
+        arrays[f"choices_{episode}"] = np.array([choices for _, choices in acted], dtype=int).reshape(steps, -1)
+        said = _said(hierarchy, hierarchy.encoder.inputs([seen]))
+        arrays |= {f"{name}_{episode}": values for name, values in said.items()}
+    return arrays
+
+
+def tolerance(hierarchy: Hierarchy, episodes: Mapping[str, np.ndarray]) -> float:
+    """Allowed difference of a form from the original, in the units of :func:`~ddco_pyro.exporting.runner.difference`.
+
+    The tolerance is :data:`ROUNDINGS` times the original's rounding error in these recorded episodes, clipped to
+    :data:`~ddco_pyro.exporting.runner.TOLERANCE` and :data:`MOST`. The lower end applies to a user's networks that
+    cannot be evaluated in float64.
+    """
+    exact, largest = copy.deepcopy(hierarchy).double(), 0.0
+    for number in episodes["seeds"]:
+        inputs = hierarchy.encoder.inputs([runner.seen(episodes, number)])
+        vectors = {key: vector.double() for key, vector in inputs.vectors.items()}
+        try:
+            said = _said(exact, replace(inputs, vectors=vectors))
+        except RuntimeError:  # torch does not mix types
+            return runner.TOLERANCE
+        recorded = {name: episodes[f"{name}_{number}"] for name in said}
+        for rounded in (recorded, _said_stepwise(hierarchy, inputs)):
+            largest = max(largest, *(runner.difference({}, name, rounded[name], said[name]) for name in said))
+    return float(np.clip(ROUNDINGS * largest, runner.TOLERANCE, MOST))
+
+
+def _said(hierarchy: Hierarchy, inputs: Inputs) -> runner.Outputs:
+    """The outputs at every step, [T, ...], from one pass over the episode, as in training."""
+    with torch.no_grad():
+        return _arrays(hierarchy(inputs))
+
+
+def _said_stepwise(hierarchy: Hierarchy, inputs: Inputs) -> runner.Outputs:
+    """The outputs at every step, [T, ...], from one call for each step, as in a controller."""
+    each: list[runner.Outputs] = []
+    states: States | None = None
+    with torch.no_grad():
+        for step in inputs.chunks(1):
+            said, states = hierarchy.advance(step, states)
+            each.append(_arrays(said))
+    return {name: np.concatenate([one[name] for one in each]) for name in each[0]}
+
+
+def _arrays(said: Outputs) -> runner.Outputs:
+    """The outputs for one episode by the runner's names, [T, ...]."""
+    return {name: values[0].numpy() for name, values in named(said).items()}
+
+
+def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generator) -> dict[str, np.ndarray]:
+    """Random observations with the mean and spread of the training data, and of its differences where they are used."""
+    observations: dict[str, np.ndarray] = {}
+    at = 0
+    for spec, size in zip(encoder.specs, encoder.sizes, strict=True):
+        if spec.key == STEP:
+            at += size
+            continue
+        shape = encoder.shapes[spec.key]
+        mean, std = (statistic[at : at + size].numpy() for statistic in (encoder.mean, encoder.std))
+        length = int(np.prod(shape))
+        values = mean[:length] + std[:length] * random.normal(size=(steps, length))
+        if spec.differences:
+            own = slice(length, 2 * length)
+            differences = mean[own] + std[own] * random.normal(size=values.shape)
+            values = _walk(values[0], differences, mean[:length], std[:length])
+        observations[spec.key] = values.reshape(steps, *shape)
+        at += size
+    return observations | {key: _pictures(steps, encoder.shapes[key], random) for key in encoder.images}
+
+
+def _pictures(steps: int, shape: tuple[int, ...], random: np.random.Generator) -> np.ndarray:
+    """Noise [T, H, W, C]. Large pictures consist of squares, so that they compress to a small file."""
+    side = max(1, min(shape[:2]) // FINEST)
+    fewer = tuple(-(-size // side) for size in shape[:2])
+    noise = random.integers(0, 256, (steps, *fewer, *shape[2:]), dtype=np.uint8)
+    return noise.repeat(side, 1).repeat(side, 2)[:, : shape[0], : shape[1]]
+
+
+def _walk(start: np.ndarray, differences: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Values [T, F] that change by these differences [T, F], reflected at two standard deviations from the mean."""
+    values = [start]
+    for difference in differences[1:]:
+        ahead, back = values[-1] + difference, values[-1] - np.copysign(difference, values[-1] - mean)
+        values.append(np.where(np.abs(ahead - mean) > 2 * std, back, ahead))
+    return np.stack(values)

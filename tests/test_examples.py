@@ -1,0 +1,56 @@
+"""Every public function and class has an example that runs."""
+
+from __future__ import annotations
+
+import doctest
+import inspect
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ddco_pyro
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+
+MINE = """
+demonstrations: {path: mine.hdf5}
+observations: [place]
+control: {std: 0.5}
+hierarchy:
+  levels: [{count: 2, policy: {network: linear}, termination: {network: linear}}]
+  meta_policy: {network: linear}
+compare_with: [{kind: flat, policy: {network: linear}}]
+training: {epochs: 12, optimizer: {lr: 0.05}}
+"""
+ROOMS = ("encoding", "inference")
+PUBLIC = [name for name in ddco_pyro.__all__ if name not in ROOMS]
+INFERENCE = ["log_likelihood", "most_likely_path", "posterior", "sample_paths", "segment"]
+
+
+@pytest.fixture(scope="module")
+def names(tmp_path_factory):
+    """The names in examples; the working folder holds ``mine.yaml``, ``mine.hdf5`` and ``runs/mine``."""
+    before = Path.cwd()
+    os.chdir(tmp_path_factory.mktemp("examples"))
+    Path("mine.yaml").write_text(MINE)
+    random = np.random.default_rng(0)
+    places = [random.normal(size=(10, 2)) for _ in range(6)]
+    turn = np.repeat([[-2.0], [2.0]], 5, 0)
+    demos = Demonstrations(tuple(Demonstration(f"demo_{n}", {"place": x}, turn * x) for n, x in enumerate(places)))
+    demos.write("mine.hdf5")
+    yield {"ddco_pyro": ddco_pyro, "np": np, "demos": demos, "fit": ddco_pyro.fit("mine.yaml", demos, out="runs/mine")}
+    os.chdir(before)
+
+
+@pytest.mark.parametrize("name", [*PUBLIC, *(f"inference.{name}" for name in INFERENCE)])
+def test_the_example_runs(name, names):
+    found = ddco_pyro
+    for part in name.split("."):
+        found = getattr(found, part)
+    module = sys.modules[inspect.unwrap(found).__module__]
+    examples = doctest.DocTestFinder().find(inspect.unwrap(found), name, module, extraglobs=names)
+    assert examples[0].examples, f"{name} has no example"
+    for example in examples:
+        assert doctest.DocTestRunner().run(example).failed == 0

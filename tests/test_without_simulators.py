@@ -1,0 +1,73 @@
+"""One's own demonstrations need no simulator: the commands run where none can be imported."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+
+HIDDEN = ("cv2", "dm_control", "dm_env", "gymnasium", "mujoco", "ompl")
+WITHOUT = f"""
+import sys
+class Hidden:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {HIDDEN}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name.partition(".")[0])
+sys.meta_path.insert(0, Hidden())
+from ddco_pyro.cli.app import main
+sys.argv[0] = "ddco-pyro"
+main()
+"""
+
+
+def call(folder, *arguments):
+    """The command line in a process that cannot import a simulator."""
+    return subprocess.run(
+        [sys.executable, "-c", WITHOUT, *map(str, arguments)], cwd=folder, capture_output=True, text=True, timeout=1000
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a small file of demonstrations."""
+    folder, random = tmp_path_factory.mktemp("own"), np.random.default_rng(0)
+    demos = []
+    for number in range(12):
+        state = random.normal(size=(10, 3))
+        phase = (np.arange(10) >= 5)[:, None]
+        action = np.where(phase, state[:, :2], -state[:, :2]) + 0.1 * random.normal(size=(10, 2))
+        demos.append(Demonstration(f"demo_{number}", {"state": state}, action))
+    Demonstrations(tuple(demos)).write(folder / "mine.hdf5")
+    return folder
+
+
+def test_from_a_file_to_an_export(folder):
+    quick = ("--set", "training.epochs=2", "--set", "training.restarts=1", "--set", "compare_with=[]")
+    for command in (
+        ("init", "mine.hdf5", "--out", "mine.yaml"),
+        ("fit", "mine.yaml", "--out", "run", *quick),
+        ("segment", "run", "mine.hdf5", "--html", "segments.html"),
+        ("export", "run", "--out", "controller"),
+        ("report", "run"),
+    ):
+        done = call(folder, *command)
+        assert done.returncode == 0, (command, done.stderr)
+    assert (folder / "segments.html").exists()
+    assert (folder / "run" / "report.html").exists()
+    assert (folder / "controller" / "weights.npz").exists()
+
+
+@pytest.mark.parametrize("command", ["collect", "fit"])
+def test_a_task_names_the_missing_package(folder, command):
+    (folder / "task.yaml").write_text(
+        "task: needle\ndemonstrations: {count: 2}\nobservations: [gripper_pose]\nhierarchy: {levels: [{count: 2}]}\n"
+    )
+    done = call(folder, command, "task.yaml", "--out", f"{command}.out")
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "task 'needle' needs the package" in line
+    assert "which is not installed here" in line
