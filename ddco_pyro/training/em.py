@@ -144,7 +144,7 @@ class Linear:
 
 
 class Std:
-    """σ of a caller's continuous dimensions, [K, C] float64, but for what depends on the state."""
+    """σ of a caller's continuous dimensions, [K, C] float64, except where it depends on the state."""
 
     def __init__(self, caller: Caller, trained: bool) -> None:
         assert caller.std is not None
