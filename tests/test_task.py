@@ -41,7 +41,7 @@ def test_a_registered_task_is_found_by_its_name(monkeypatch):
 def test_a_registered_task_whose_packages_are_missing_is_one_line(monkeypatch):
     point = EntryPoint("needs", "no_such_package.of_mine:task", TASKS)
     monkeypatch.setattr("ddco_pyro.simulation.task.entry_points", lambda group: [point])
-    with pytest.raises(UnknownTask, match=r"^task 'needs' cannot be loaded: No module named 'no_such_package'$"):
+    with pytest.raises(UnknownTask, match=r"^task 'needs' needs the package 'no_such_package', which is not installed here$"):
         find_task("needs")
 
 
