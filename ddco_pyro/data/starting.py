@@ -184,5 +184,5 @@ def _left_out(inspection: Inspection, field: Field) -> str:
     if len(field.constant) == len(field.minimum):
         return "is constant"
     if len(field.constant + field.rounding) == len(field.minimum):
-        return "is constant but for rounding"
+        return "is constant up to rounding"
     return "is the control that a policy has to predict" if field.place in inspection.leaks else ""

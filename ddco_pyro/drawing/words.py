@@ -247,7 +247,7 @@ def _lasting(memory: Sequence[float]) -> str:
         return "So options that last are worth it on these demonstrations."
     if high < 0:
         return "So options that last explain these demonstrations worse than the same experts without memory."
-    return "So it is inconclusive whether options that last are worth anything here."
+    return "It is inconclusive whether options that last are worth anything here."
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float]:

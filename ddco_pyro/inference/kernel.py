@@ -62,7 +62,7 @@ class Structure(NamedTuple):
         depth = len(sizes)
         messages = [int(np.prod(sizes[level:])) for level in range(depth + 1)]
         digits = np.indices(sizes[::-1]).reshape(depth, -1)[::-1].T  # [S, D], lowest level first
-        callers = [np.full(messages[0], IMPOSSIBLE)]  # level 1 calls nobody
+        callers = [np.full(messages[0], IMPOSSIBLE)]  # level 1 calls no level
         first = 0
         for level, size in enumerate(sizes):
             digit = np.arange(messages[level + 1]) % sizes[level + 1] if level + 1 < depth else np.ones(1, np.int64)

@@ -59,7 +59,7 @@ class Dimensions:
 
 
 def build_hierarchy(spec: Spec, dimensions: Dimensions, seed: int | None = None) -> Hierarchy:
-    """The spec's networks for these dimensions, randomly initialised; torch's generator is left as it was.
+    """The spec's networks for these dimensions, randomly initialised; torch's generator keeps its state.
 
     :param seed: of the initial weights; None for the spec's.
     :raises SpecError: something in the spec does not fit the observations or the control.

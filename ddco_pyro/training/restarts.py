@@ -225,7 +225,7 @@ class Trainer:
         return [restart for restart in self.restarts if restart.progress.restart not in self.stopped]
 
     def _begun(self, number: int) -> Restart:
-        """A restart as it was kept, or as it begins.
+        """A restart from its checkpoint, or at its beginning.
 
         :raises Damaged: it does not hold what was written.
         """
