@@ -230,7 +230,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"control.scale": [1.0, 0.0]}, "control.scale.1: must be greater than 0, got 0.0"),
     (
         {"training.optimizer.name": "Adam"},
-        "training.optimizer.name: must be adam or adamw or momentum, got 'Adam' (did you mean 'adam'?)",
+        "training.optimizer.name: must be adam or adamw or momentum or em, got 'Adam' (did you mean 'adam'?)",
     ),
     ({"training.optimizer.lr": float("inf")}, "training.optimizer.lr: must be a finite number, got inf"),
     ({"training.layerwise": "yes"}, "training.layerwise: must be true or false, got 'yes'"),
