@@ -13,7 +13,7 @@ import torch
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model import hierarchy as networks
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.spec import parse_spec

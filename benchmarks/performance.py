@@ -19,7 +19,7 @@ import torch
 
 from ddco_pyro.inference import Engine, fused, log_likelihood
 from ddco_pyro.inference.kernel import Rows, Structure, any_levels, one_level
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import Tables, complete

@@ -22,7 +22,7 @@ from typing import Any
 from ddco_pyro.data.files import write_text
 from ddco_pyro.events import Event, FoldScored
 from ddco_pyro.fitting.run import claim
-from ddco_pyro.selection import Workers, folds, grid, scoring, select
+from ddco_pyro.selection import Workers, folds, grid, select
 from ddco_pyro.spec import load_spec
 from ddco_pyro.training.data import demonstrations
 
@@ -41,7 +41,7 @@ def one_fold() -> dict[str, Any]:
     seconds = {}
     for candidate in grid.candidates(spec, divided.dimensions):
         start = time.process_time()
-        scoring.score(divided, candidate, 0)
+        folds.score(divided, candidate, 0)
         seconds[candidate.name] = time.process_time() - start
         print(candidate.name, seconds[candidate.name], flush=True)
     return {"cpu_seconds": seconds, "sum": sum(seconds.values()), "folds": spec.selection.folds}

@@ -23,10 +23,9 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.pictures import Transform
-from ddco_pyro.data.reading import Job, Readers
+from ddco_pyro.data.pictures import Job, Readers, Transform
 from ddco_pyro.encoding import Encoding, encode
-from ddco_pyro.encoding.networks import Convolutions
+from ddco_pyro.encoding.autoencoder import Convolutions
 from ddco_pyro.events import EpochEnded, Event
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.spec import parse_spec
@@ -204,7 +203,7 @@ def epoch(demos: Demonstrations, workers: int = 0) -> float:
 
 def networks_alone(demos: Demonstrations) -> Callable[[], float]:
     """Forward and backward of the same networks with a sum as loss, Adam, and forward alone where an epoch tunes."""
-    material = trainer(demos).material
+    material = trainer(demos).data
     model = material.hierarchy(0).train()
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-3)
     networks = list(model.networks().values())

@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from ddco_pyro.comparison import compare
     from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
     from ddco_pyro.exporting import export
-    from ddco_pyro.fitting.fit import Fit, load
-    from ddco_pyro.fitting.run import fit
+    from ddco_pyro.fitting.fit import Fit, fit, load
     from ddco_pyro.inference.marginal import EliminatedAHMM
     from ddco_pyro.segmenting import segment
     from ddco_pyro.selection import select
@@ -29,7 +28,7 @@ _PLACES = {
     "Spec": "spec",
     "compare": "comparison",
     "export": "exporting",
-    "fit": "fitting.run",
+    "fit": "fitting.fit",
     "load": "fitting.fit",
     "load_spec": "spec",
     "segment": "segmenting",

@@ -1,4 +1,4 @@
-"""The bases of errors that tell a user what to change."""
+"""Base classes of user-facing errors."""
 
 from __future__ import annotations
 
@@ -9,19 +9,27 @@ from typing import Any
 
 
 class BadInput(ValueError):
-    """What was given cannot be used: one line that says what is wrong, where, and what to do (exit status 2)."""
+    """Unusable input: one line with the problem, the place and the remedy (exit status 2)."""
 
 
 class Failed(RuntimeError):
-    """What was asked for cannot be done, though the input is in order: one line as above (exit status 1)."""
+    """A failure with valid input: one line with the problem, the place and the remedy (exit status 1)."""
 
 
 def command(*words: object) -> str:
-    """A command of this program as a user types it, quoted for the shell."""
+    """A command of this program, quoted for the shell.
+
+    >>> command("inspect", "my demos.hdf5")
+    "ddco-pyro inspect 'my demos.hdf5'"
+    """
     return shlex.join(["ddco-pyro", *map(str, words)])
 
 
 def nearest(given: Any, names: Iterable[str]) -> str:
-    """A question whether the closest of the names was meant; nothing where none is close."""
+    """A question that suggests the closest name; empty if no name is close.
+
+    >>> nearest("flt", ["flat", "mixture"])
+    " (did you mean 'flat'?)"
+    """
     close = difflib.get_close_matches(str(given), list(names), n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""

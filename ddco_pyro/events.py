@@ -1,4 +1,4 @@
-"""What long work tells whoever watches it: one event at a time, to one callback."""
+"""Progress events passed to ``on_event``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class DemonstrationsDone:
-    """So many of the demonstrations have been collected, imported, segmented or encoded."""
+    """``done`` of ``total`` demonstrations are collected, imported, segmented or encoded."""
 
     done: int
     total: int
@@ -16,7 +16,7 @@ class DemonstrationsDone:
 
 @dataclass(frozen=True)
 class TrainingBegan:
-    """A model begins to be trained, for at most so many epochs in all; None for no limit."""
+    """Training of a model begins, with a budget of epochs; None for no limit."""
 
     model: str
     epochs: int | None
@@ -24,7 +24,7 @@ class TrainingBegan:
 
 @dataclass(frozen=True)
 class EpochEnded:
-    """A row of the history: log-likelihood per step, nats, of the training and the tuning demonstrations."""
+    """A row of the history: log-likelihood per step of training and tuning demonstrations, nats."""
 
     restart: int
     stage: str
@@ -35,7 +35,7 @@ class EpochEnded:
 
 @dataclass(frozen=True)
 class UpdatesDone:
-    """So many gradient steps are done; mean loss of the last ones."""
+    """``done`` gradient steps are done; ``loss`` is the mean over the latest steps."""
 
     done: int
     loss: float
@@ -43,7 +43,7 @@ class UpdatesDone:
 
 @dataclass(frozen=True)
 class RestartStopped:
-    """A restart has been stopped after so many epochs of its last stage: others are better."""
+    """Successive halving stopped a restart after ``epochs`` epochs of its last stage."""
 
     restart: int
     epochs: int
@@ -51,7 +51,7 @@ class RestartStopped:
 
 @dataclass(frozen=True)
 class RestartDiverged:
-    """A restart has ended because a log-likelihood became NaN or infinite: ``why`` names the place and the remedy."""
+    """A restart ended with a log-likelihood that is NaN or infinite; ``why`` has the place and the remedy."""
 
     restart: int
     why: str
@@ -59,14 +59,14 @@ class RestartDiverged:
 
 @dataclass(frozen=True)
 class TrainingEnded:
-    """A model has been trained."""
+    """Training of a model ended."""
 
     model: str
 
 
 @dataclass(frozen=True)
 class SelectionBegan:
-    """So many (candidate, fold) are to be scored in all, of which some were kept from before."""
+    """A selection of ``total`` (candidate, fold) pairs begins; ``kept`` of them are scored already."""
 
     total: int
     kept: int
@@ -74,7 +74,7 @@ class SelectionBegan:
 
 @dataclass(frozen=True)
 class FoldScored:
-    """A fold of a candidate has been scored, or has failed: why, else empty."""
+    """A fold of a candidate is scored, or failed for the reason ``failed``."""
 
     candidate: str
     fold: int
@@ -83,7 +83,7 @@ class FoldScored:
 
 @dataclass(frozen=True)
 class CandidateGivenUp:
-    """A candidate has been stopped early: so many of its folds need not be scored."""
+    """A candidate is given up; ``folds`` of its folds are not scored."""
 
     candidate: str
     folds: int
@@ -91,14 +91,14 @@ class CandidateGivenUp:
 
 @dataclass(frozen=True)
 class SeedFitted:
-    """The model and its baselines have been fitted with one more of ``total`` other training seeds."""
+    """The model and its baselines are fitted with another of ``total`` training seeds."""
 
     total: int
 
 
 @dataclass(frozen=True)
 class EpisodeEnded:
-    """One of ``total`` episodes, of the method so named, has ended."""
+    """One of ``total`` episodes of a method ended."""
 
     method: str
     total: int
@@ -122,4 +122,4 @@ OnEvent = Callable[[Event], None]
 
 
 def ignore(event: Event) -> None:
-    """Nobody watches."""
+    """Discard an event."""

@@ -28,7 +28,7 @@ warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widg
 from ddco_pyro import load_spec
 from ddco_pyro.cli.console import Progress
 from ddco_pyro.drawing import words
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.report import tables, write_report
 from ddco_pyro.training.data import demonstrations
 

@@ -30,7 +30,7 @@ warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widg
 from ddco_pyro import Demonstrations, load_spec
 from ddco_pyro.cli.console import Progress
 from ddco_pyro.drawing import words
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.report import write_report
 from ddco_pyro.simulation.collect import collect
 from ddco_pyro.spec import DemonstrationsSpec

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from arena_results import COLOURS, OURS
 
-from ddco_pyro.drawing.pictures import blank, keep, style
+from ddco_pyro.drawing.figures import blank, save, style
 
 Result = dict[str, Any]
 
@@ -92,4 +92,4 @@ def draw(results: Result, path: Path) -> None:
         for axes, count in zip(grid[0], results, strict=True):
             axes.set_title(f"{count} demonstrations", fontsize=8)
         grid[0, -1].legend(fontsize=6, frameon=False)
-        keep(figure, path, "Held-out likelihood, success and agreement by how much weights decay", "")
+        save(figure, path, "Held-out likelihood, success and agreement by how much weights decay", "")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from needle_success import over_seeds, spread
 
-from ddco_pyro.drawing.pictures import blank, keep, style
+from ddco_pyro.drawing.figures import blank, save, style
 
 SHOWN = ("nmi", "accuracy", "named", "f1_50", "edit", "boundary_f1_3")
 COLOURS = ("#1f3f70", "#c0a030", "#3d8a5a", "#a04050", "#7060a8", "#8a8a8a", "#d07020", "#2090a0", "#505050")
@@ -78,4 +78,4 @@ def draw(results: Result, path: Path) -> None:
             axes.set(ylabel=name, ylim=(0, 1.02))
             axes.grid(axis="y", color="#e4e4e4")
         axes.legend(fontsize=6, ncols=2, frameon=False, loc="lower right")
-        keep(figure, path, "Agreement with the expert's phases by number of labelled demonstrations", "")
+        save(figure, path, "Agreement with the expert's phases by number of labelled demonstrations", "")

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from needle_success import over_seeds, spread
 
-from ddco_pyro.drawing.pictures import blank, keep, style
+from ddco_pyro.drawing.figures import blank, save, style
 
 OURS = "ddco"
 RARE = 0.01
@@ -170,7 +170,7 @@ def draw(results: Result, path: Path) -> None:
         left.set_yticklabels(list(tasks))
         for axes in (left, middle, right):
             axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, fontsize=7, frameon=False)
-        keep(figure, path, "Agreement of options with the expert's phases, and success", "")
+        save(figure, path, "Agreement of options with the expert's phases, and success", "")
 
 
 def _agreement(axes: Axes, tasks: Result) -> None:

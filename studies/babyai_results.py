@@ -10,7 +10,7 @@ from babyai_cell import LABELS
 from babyai_labels import SUBGOALS
 from needle_success import over_seeds, spread
 
-from ddco_pyro.drawing.pictures import blank, keep, style
+from ddco_pyro.drawing.figures import blank, save, style
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 
 METHODS = ("flat", "flat_equal", "one", "two")
@@ -188,4 +188,4 @@ def draw(rows: list[Result], path: Path) -> None:
             axes.set(xlim=(-0.02, 1.02))
             axes.grid(axis="x", color="#e4e4e4")
             axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, fontsize=7, frameon=False)
-        keep(figure, path, "Success, and agreement of options with the bot's subgoals and instructions, by level", "")
+        save(figure, path, "Success, and agreement of options with the bot's subgoals and instructions, by level", "")

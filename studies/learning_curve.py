@@ -22,14 +22,14 @@ from provenance import Record, record, sentence, text
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
-from ddco_pyro.drawing.pictures import blank, keep, style
-from ddco_pyro.evaluation.analysis import paired
+from ddco_pyro.drawing.figures import blank, save, style
+from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import train
 from ddco_pyro.selection.folds import Folds, divide
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.networks import Dimensions, baseline_spec
+from ddco_pyro.training.restarts import train_model
 
 OUT = Path("docs/results")
 RUNS = Path("runs/learning_curve")
@@ -62,7 +62,7 @@ def run(own: argparse.Namespace, made_by: Record, fold: int, folds: Folds, count
     others, held_out = folds.split(fold)
     order = np.random.default_rng([spec.seed, fold]).permutation(len(others))[:count]
     used = Demonstrations(tuple(others[int(row)] for row in order))
-    hierarchy = train(spec, folds.dimensions, used).hierarchy
+    hierarchy = train_model(spec, folds.dimensions, used).hierarchy
     found = {
         "fold": fold,
         "count": count,
@@ -132,7 +132,7 @@ def draw(summary: dict[str, Any], path: Path) -> None:
         _lines(right, summary, ["ddco", "ddco, dropout"])
         left.set(title="Models (SM 1.3, figure A)", ylabel="held-out nats per step, ± se over folds")
         right.set(title=f"Dropout {RATE:g} (SM 2.5)")
-        keep(figure, path, "Cross-validated log-likelihood against the number of demonstrations", "")
+        save(figure, path, "Cross-validated log-likelihood against the number of demonstrations", "")
 
 
 def _lines(axes: Axes, summary: dict[str, Any], names: list[str]) -> None:

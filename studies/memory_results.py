@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from needle_success import over_seeds, spread
 from provenance import ROOT
 
-from ddco_pyro.drawing.pictures import FAINT, blank, keep, style
+from ddco_pyro.drawing.figures import FAINT, blank, save, style
 
 OPTIONS, MIXTURE, FLAT, EQUAL = "options", "mixture", "flat", "flat_equal"
 AGAIN = "options again"
@@ -315,7 +315,7 @@ def draw(found: Sequence[Row], path: Path) -> None:
         for axes in panels[len(groups) :]:
             axes.set_axis_off()
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
-        keep(figure, path, "What several policies are worth, and what it is worth that they last", "")
+        save(figure, path, "What several policies are worth, and what it is worth that they last", "")
 
 
 def _panel(axes: Axes, name: str, group: Sequence[Row]) -> None:

@@ -17,7 +17,7 @@ from joblib import Parallel, delayed
 from provenance import record, sentence, text
 
 from ddco_pyro.data.files import write_text
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import load_spec
 
 INITIALIZATIONS = ("random", "vq", "vq_controls")

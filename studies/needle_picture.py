@@ -14,12 +14,12 @@ import matplotlib
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ddco_pyro.drawing.pictures import STYLE, keep
+from ddco_pyro.drawing.colours import legend
+from ddco_pyro.drawing.figures import STYLE, save
 from ddco_pyro.fitting.fit import load
 from ddco_pyro.report.activity import Activity, activity
-from ddco_pyro.report.plot_rows import order
-from ddco_pyro.report.plot_trajectories import panel
-from ddco_pyro.report.strips import colour_image, legend
+from ddco_pyro.report.options import colour_image, row_order
+from ddco_pyro.report.trajectories import panel
 
 KEY = "gripper_pose"
 OUT = Path("docs/images/needle.png")
@@ -28,7 +28,7 @@ LARGE = {"font.size": 13, "axes.labelsize": 13, "legend.fontsize": 13, "xtick.la
 
 def draw(found: Activity, positions: list) -> Figure:
     """Left: gripper positions coloured by option. Right: the options of every demonstration over its steps."""
-    (level,), rows = found.levels, order(found)
+    (level,), rows = found.levels, row_order(found)
     figure = Figure(figsize=(9.2, 4.6))
     space = figure.add_axes((-0.02, 0.12, 0.5, 0.8), projection="3d", proj_type="ortho")
     panel(space, level, positions, KEY)
@@ -55,7 +55,7 @@ def main() -> None:
     demos = fit.demonstrations
     with matplotlib.rc_context({**STYLE, **LARGE, "figure.constrained_layout.use": False}):
         figure = draw(activity(fit, demos), [demo.observations[KEY][:, :3] for demo in demos])
-        keep(figure, OUT, "Gripper positions coloured by option, and the options of every demonstration over time", "")
+        save(figure, OUT, "Gripper positions coloured by option, and the options of every demonstration over time", "")
 
 
 if __name__ == "__main__":

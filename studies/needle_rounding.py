@@ -25,8 +25,8 @@ from provenance import Record, record, sentence, text
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.fitting.run import fit
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.spec import load_spec
 from ddco_pyro.training.data import demonstrations

@@ -36,7 +36,7 @@ from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plan
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.inference import log_likelihood, segment
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.batch import encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.training.upper import Constants, converged, fitted

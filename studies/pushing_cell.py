@@ -23,13 +23,13 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import train
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.simulation.episodes import Episode, play, run_episode
 from ddco_pyro.simulation.task import Task
-from ddco_pyro.spec import BaselineSpec, NetworkSpec, Spec, load_spec, with_overrides
+from ddco_pyro.spec import BaselineSpec, Spec, load_spec, network_spec, with_overrides
 from ddco_pyro.training.data import dimensions
 from ddco_pyro.training.networks import Dimensions, baseline_spec, build_hierarchy
+from ddco_pyro.training.restarts import train_model
 
 SETTINGS = Path(__file__).parent / "pushing_settings.json"  # written by the sweep
 POOL = 80  # demonstrations of a seed; a cell takes the first ones
@@ -111,7 +111,7 @@ def spec_of(cell: Cell, settings: Mapping[str, Any] | None = None) -> Spec:
 
 def _flat_equal(spec: Spec) -> Spec:
     """A flat perceptron with as many parameters as the spec's hierarchy."""
-    baseline = BaselineSpec(kind="flat_equal", policy=NetworkSpec(hidden=(64,)))
+    baseline = BaselineSpec(kind="flat_equal", policy=network_spec(hidden=[64]))
     return baseline_spec(spec, baseline, dimensions(spec))
 
 
@@ -143,7 +143,7 @@ def held_out(folder: Path, spec: Spec, development: bool = False) -> Demonstrati
 def fit(spec: Spec, demos: Demonstrations, checkpoints: Path) -> tuple[Hierarchy, float]:
     """The fitted hierarchy, and the seconds that it took."""
     start = time.perf_counter()
-    hierarchy = train(spec, Dimensions.of(demos), demos, checkpoints=checkpoints).hierarchy
+    hierarchy = train_model(spec, Dimensions.of(demos), demos, checkpoints=checkpoints).hierarchy
     shutil.rmtree(checkpoints, ignore_errors=True)
     return hierarchy, time.perf_counter() - start
 

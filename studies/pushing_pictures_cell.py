@@ -29,13 +29,13 @@ from ddco_pyro.data.pictures import MOVED, Transform, shifted
 from ddco_pyro.encoding.fitted import FittedReader, from_fit
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import Trained, train
 from ddco_pyro.simulation.cameras import Camera, Encoded
 from ddco_pyro.simulation.episodes import play, run_episode
 from ddco_pyro.simulation.task import Task
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.devices import device_of
 from ddco_pyro.training.networks import Dimensions, baseline_spec, parameters
+from ddco_pyro.training.restarts import Trainer, train_model
 
 SPECS = Path(__file__).parents[1] / "specs"
 SIZE, FINER, LARGE = (48, 64), 3, (480, 640)
@@ -116,7 +116,7 @@ class PictureCell(Cell):
         return {
             "log_likelihood_per_step": likelihood,
             "parameters": parameters(trained.hierarchy),
-            "steps": trained.training,
+            "steps": trained.summary,
             "unlimited": summary(episodes),
             "limited": summary(limited),
             "seconds": {"fit": fitted - begun, "fit_processor": cpu, "play": ended - fitted},
@@ -134,11 +134,11 @@ class PictureCell(Cell):
             return demos.select(demos.names[: self.count])
         return drawn(self.camera, TRAINING + 1000 * self.seed, self.count)
 
-    def fitted(self, settings: Settings, demos: Demonstrations, folder: Path) -> tuple[Spec, Trained]:
+    def fitted(self, settings: Settings, demos: Demonstrations, folder: Path) -> tuple[Spec, Trainer]:
         """The fit, which is done only once."""
         spec, size = spec_of(self, settings), Dimensions.of(demos)
         spec = spec if self.options else baseline_spec(spec, spec.compare_with[-1], size)
-        return spec, train(spec, size, demos, checkpoints=folder)
+        return spec, train_model(spec, size, demos, checkpoints=folder)
 
     def _reader(self, settings: Settings, folder: Path) -> FittedReader:
         """The convolutions of the flat policy of the same demonstrations, which is fitted as its own cell has it."""

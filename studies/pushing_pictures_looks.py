@@ -31,7 +31,7 @@ from ddco_pyro.acting.saliency import Looking
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.drawing.pictures import WIDTH, blank, keep
+from ddco_pyro.drawing.figures import WIDTH, blank, save
 from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.simulation.episodes import Episode, run_episode
@@ -133,7 +133,7 @@ def main() -> None:
     episodes = [first, *(played(acting, seed + number) for number in range(1, int(settings.values["episodes"])))]
     choices = first.choices[:, 0] if cell.options else np.zeros(len(looking.frames), int)
     caption = f"What {cell.method} looks at, and the option that is active; episode {seed}"
-    keep(draw(looking.frames, choices), OUT / "looks.png", caption, "")
+    save(draw(looking.frames, choices), OUT / "looks.png", caption, "")
     rows = [row_of(episode) for episode in episodes]
     found = phases(Fit(spec, trained.hierarchy), held_out(own.runs, cell.seed)) if cell.options else None
     write_text(OUT / "looks.json", text({"episodes": rows, "phases": found}, [made_by]))

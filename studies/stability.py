@@ -28,14 +28,19 @@ from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
-from ddco_pyro.drawing.pictures import FAINT, INK, blank, keep, style
-from ddco_pyro.evaluation.analysis import divergences, option_use
-from ddco_pyro.evaluation.diagnostics import DOMINATING_SHARE, HIGH_FITTING_SHARE, SMALLEST_DIVERGENCE
+from ddco_pyro.drawing.figures import FAINT, INK, blank, save, style
+from ddco_pyro.evaluation.options import (
+    DOMINATING_SHARE,
+    HIGH_FITTING_SHARE,
+    SMALLEST_DIVERGENCE,
+    divergences,
+    option_use,
+)
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import train
 from ddco_pyro.spec import Spec, load_spec
 from ddco_pyro.training.data import demonstrations, parts
 from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.restarts import train_model
 
 OUT = Path("docs/results")
 RUNS = Path("runs/stability")
@@ -83,7 +88,7 @@ def run(name: str, initialize: str, layerwise: bool, seed: int, changes: list[st
     start = time.process_time()
     spec = spec_of(name, initialize, layerwise, seed, changes)
     demos, divided = divide(spec)
-    hierarchy = train(spec, Dimensions.of(demos), divided["train"]).hierarchy
+    hierarchy = train_model(spec, Dimensions.of(demos), divided["train"]).hierarchy
     found = measure(Fit(spec, hierarchy), demos, divided)
     found |= {"spec": name, "setting": name_of(initialize, layerwise), "seed": seed, "changes": changes}
     found |= {"made_by": made_by}
@@ -209,7 +214,7 @@ def draw(summaries: dict[str, Any], path: Path) -> None:
             left.locator_params(axis="x", nbins=5)
             middle.set(xlabel="NMI of pairs of seeds", xlim=(-0.02, 1.02))
             right.set(xlabel="P(meta-policy selects an option)", xlim=(-0.02, 1.02))
-        keep(figure, path, "Quality and structure of fits from different seeds, for each way to train", "")
+        save(figure, path, "Quality and structure of fits from different seeds, for each way to train", "")
 
 
 def _dots(axes: Axes, place: int, values: list[float]) -> None:

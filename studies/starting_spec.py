@@ -17,7 +17,7 @@ from provenance import record, sentence, text
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import load_spec
 
 TUNED = Path("specs/metaworld_pick_place.yaml")

@@ -16,7 +16,7 @@ import yaml
 from dots import followed
 from hypothesis import settings
 
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
 
 HERE = Path(__file__).parent

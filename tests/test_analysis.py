@@ -9,7 +9,8 @@ import pytest
 import torch
 from oracle import brute_force, random_tables
 
-from ddco_pyro.evaluation.analysis import as_rows, divergences, option_use, paired
+from ddco_pyro.evaluation.options import as_rows, divergences, option_use
+from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.inference import Posterior, posterior
 from ddco_pyro.model.emissions import Gaussian
 from ddco_pyro.model.outputs import CallerOutputs, Outputs

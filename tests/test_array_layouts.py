@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from odd_files.kinds import NUMBER, ROWS, arrays
 
-from ddco_pyro.data.control_dimensions import number
+from ddco_pyro.data.controls import number
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.inspection import inspect

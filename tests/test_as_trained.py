@@ -9,7 +9,7 @@ import torch
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.window import Window
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.batch import encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import parse_spec
 

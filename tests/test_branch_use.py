@@ -69,7 +69,7 @@ def test_activations_are_the_mean_sizes_of_what_the_branches_give(fitted):
     u = piece.posterior.u[0][..., 1:]
     for column, branch in enumerate(network.of):
         with torch.no_grad():
-            units = branch(piece.batch.inputs).double().abs().mean(-1)
+            units = branch(piece.batch.inputs, branch.initial_state(4))[0].double().abs().mean(-1)
         expected = (u * units).sum((0, 1)) / u.sum((0, 1))
         np.testing.assert_allclose([row[column] for row in use["activation"]], expected, rtol=1e-6)
 

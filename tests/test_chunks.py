@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model import hierarchy as chunking
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.spec import parse_spec

@@ -25,6 +25,7 @@ from killing import HANGS, struck
 
 import ddco_pyro
 from ddco_pyro.cli.app import app
+from ddco_pyro.drawing import words
 from ddco_pyro.spec import dump_spec, load_spec
 
 ROOT = Path(__file__).parents[1]
@@ -126,7 +127,8 @@ def test_fit_writes_a_run_and_its_report(run):
     assert ended.out.splitlines()[-1] == f"report: {folder / 'report.html'}"
     for name, row in {"ddco": loaded.metrics, **loaded.metrics["comparison"]}.items():
         values = row["log_likelihood_per_step"]
-        assert re.search(rf"^ *{name} +│ +{values['train']:.3f} +│ +{values['valid']:.3f}", ended.out, re.MULTILINE)
+        valid, train = (words.number(values[part], 3) for part in ("valid", "train"))
+        assert re.search(rf"^ *{words.method(name)} +│ +{valid} +│ +{train}", ended.out, re.MULTILINE)
 
 
 def test_rollout_and_report(run):
@@ -136,7 +138,8 @@ def test_rollout_and_report(run):
     methods = ddco_pyro.load(folder).metrics["rollouts"]["methods"]
     assert list(methods) == ["open_loop", "supervisor", "flat", "ddco"]
     for name, one in methods.items():
-        assert re.search(rf"^ *{name} +│ +{one['measures']['success']['successes']}/2 \[", ended.out, re.MULTILINE)
+        successes = one["measures"]["success"]["successes"]
+        assert re.search(rf"^ *{words.method(name)} +│ +{successes} of 2 \(", ended.out, re.MULTILINE)
     assert len(list((folder / "videos").glob("*.mp4"))) == 8
     again = call("rollout", folder, "--episodes", 2, "--video", "--jobs", 1, "--resume")
     assert (again.status, again.out, again.err) == (0, ended.out, "")  # nothing is rolled out, so no progress is shown

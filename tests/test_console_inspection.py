@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ddco_pyro.cli.console_inspection import show
+from ddco_pyro.cli import console
 from ddco_pyro.data.inspection import inspect
 
 
@@ -22,7 +22,7 @@ def test_each_field_has_its_range_and_what_is_odd_about_it(tmp_path: Path, capsy
             group["obs/odd"] = np.where(steps == 1, [np.nan, np.inf][number], -steps)[:, None]
             group["obs/nothing"] = np.full((length, 1), np.nan)
             group["obs/camera"] = np.full((length, 8, 8, 3), 10 * number, np.uint8)
-    show(inspect(path))
+    console.inspection(inspect(path))
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].endswith("2 demonstrations of 4 to 6 steps (median 5, 10 in all)")
     assert lines[1] == "control frequency: not in the file"

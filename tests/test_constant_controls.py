@@ -5,25 +5,19 @@ The truth is a second file without those columns: fitted to it, the same numbers
 
 from __future__ import annotations
 
-import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from command_line import call
-from safetensors import safe_open
-from safetensors.torch import save_file
 
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.comparison import compare
-from ddco_pyro.comparison.shared import NotShared
+from ddco_pyro.comparison import CompareError, compare
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.exporting import TOLERANCE, export, runner
-from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.fit import Fit, fit
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.spec import Spec, parse_spec, with_overrides
 
@@ -122,24 +116,6 @@ def test_what_they_are_comes_back_from_the_run(whole: Fit) -> None:
     demos = make_demonstrations()
     np.testing.assert_array_equal(again.log_likelihood(demos), whole.log_likelihood(demos))
     assert dict(zip((1, 3), again.hierarchy.scaling.constant.tolist(), strict=True)) == STILL
-
-
-def test_runs_of_before_have_every_dimension_in_them(reduced: Fit, tmp_path: Path) -> None:
-    """Their weights do not say which dimensions vary."""
-    run = shutil.copytree(reduced.folder, tmp_path / "run")
-    with safe_open(run / "model.safetensors", "pt") as file:
-        names = set(file.keys()) - {"scaling.varying", "scaling.constant"}
-        assert len(names) == len(file.keys()) - 2
-        tensors, metadata = {name: file.get_tensor(name) for name in names}, file.metadata()
-    del metadata["sha256"]
-    save_file(tensors, run / "model.safetensors", metadata)
-    again, demos = ddco_pyro.load(run), with_controls(make_demonstrations(), columns=FREE)
-    np.testing.assert_array_equal(again.log_likelihood(demos), reduced.log_likelihood(demos))
-    metrics = json.loads((run / "metrics.json").read_text())
-    del metrics["log_likelihood_by_dimension"], metrics["control_dimensions"]
-    (run / "metrics.json").write_text(json.dumps(metrics))
-    assert call("report", run).status == 0
-    assert "by control dimension" not in (run / "report.html").read_text()
 
 
 # --- what acts --------------------------------------------------------------------------------------------------------
@@ -241,7 +217,7 @@ def test_runs_that_score_other_dimensions_are_not_compared(whole: Fit, tmp_path:
         rf"{runs[0].folder} and {runs[1].folder} score different things: control dimension 3 is in the likelihood of "
         rf"{runs[0].folder} and not in that of {runs[1].folder}; fit both to the same demonstrations, with the same ver"
     )
-    with pytest.raises(NotShared, match=message):
+    with pytest.raises(CompareError, match=message):
         compare([one.folder for one in runs])
     assert len(compare([whole.folder, whole.folder / "baselines" / "flat"]).rows) == 2
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ddco_pyro.data.control_dimensions import control_dimensions, notes
+from ddco_pyro.data.controls import control_dimensions, notes
 
 STEPS = 200
 

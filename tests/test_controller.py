@@ -13,7 +13,7 @@ from scipy import stats
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.window import ObservationError
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.batch import encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import parse_spec
 

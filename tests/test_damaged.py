@@ -8,6 +8,7 @@ import json
 import shutil
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from ddco_pyro.drawing import words
 from ddco_pyro.evaluation.schema import read_metrics, read_successes
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.report import option_figures, plot_likelihood, sections, tables
+from ddco_pyro.report import agreement, header, likelihood, options, rollouts, training
 from ddco_pyro.training.data import demonstrations
 
 LINE = r"ddco-pyro: {path}: is damaged: "
@@ -77,7 +78,7 @@ DAMAGE: dict[str, tuple[Any, str]] = {
     "[]": (lambda text: "[]", "must be a mapping (key: value), got []"),
     "a string": (
         lambda text: text.replace('"parameters": ', '"parameters": "many", "was": '),
-        "parameters: must be a whole number, got 'many'",
+        "comparison.flat.parameters: must be a whole number, got 'many'",
     ),
     "a key less": (lambda text: text.replace('"comparison"', '"comparisons"'), "comparison: missing"),
 }
@@ -154,16 +155,16 @@ def read_all(fit: Fit, metrics: dict[str, Any]) -> None:
 
 def _read_all(fit: Fit, metrics: dict[str, Any]) -> None:
     words.verdict(metrics), words.success(metrics)
-    sections.degeneracies(fit.spec, metrics), sections.header(fit, metrics), sections.particulars(fit, metrics)
-    sections.agreement(fit, metrics)
-    rows = plot_likelihood.likelihoods(metrics, {name: one.metrics for name, one in fit.baselines.items()})
-    tables.likelihood(rows)
-    tables.option_use(
-        ["option"], metrics["options"], sum(metrics["demonstrations"][part] for part in option_figures.PARTS)
-    )
+    again = replace(fit, metrics=metrics)
+    training.degeneracies(fit.spec, metrics), header(fit, metrics), training.particulars(again)
+    agreement.section(again)
+    rows = likelihood.likelihoods(metrics, {name: one.metrics for name, one in fit.baselines.items()})
+    likelihood.table(rows)
+    counts = metrics["demonstrations"]
+    options.use_table(["option"], metrics["options"], sum(counts[part] for part in ("train", "tune", "valid")))
     found = metrics.get("rollouts")
     if found:
-        tables.measures(found["methods"]), tables.against(found["methods"], metrics["model"])
+        rollouts.measures_table(found["methods"]), rollouts.paired_table(found["methods"], metrics["model"])
         console.successes(found, "ddco")
     console.log_likelihoods(metrics)
 
@@ -221,6 +222,8 @@ def test_damaged_rollouts(run: Path, monkeypatch: pytest.MonkeyPatch, content: b
     monkeypatch.chdir(run.parent)
     (run / "rollouts.csv").write_bytes(content)
     refused(run, COMMANDS["compare"], run / "rollouts.csv", "")
+    (run / "videos").mkdir(exist_ok=True)
+    (run / "videos" / "ddco-1000.mp4").touch()  # a film, whose outcome is in the table
     assert call("report", run).err.startswith(f"ddco-pyro: {run / 'rollouts.csv'}: is damaged: ")
 
 
@@ -332,14 +335,6 @@ def test_what_was_written_without_a_checksum_is_read(tmp_path: Path) -> None:
     save_file(tensors, tmp_path / "old", metadata)
     write_tensors(tmp_path / "new", tensors, metadata)
     assert same(read_tensors(tmp_path / "old"), read_tensors(tmp_path / "new"))
-
-
-def test_a_run_of_before_is_loaded(run: Path) -> None:
-    path = run / "model.safetensors"
-    tensors, metadata = read_tensors(path)
-    path.unlink()
-    save_file(tensors, path, metadata)
-    assert ddco_pyro.load(run).metrics["model"] == "ddco"
 
 
 # --- selections -------------------------------------------------------------------------------------------------------

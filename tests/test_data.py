@@ -10,7 +10,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, Demonst
 from ddco_pyro.events import DemonstrationsDone
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 from ddco_pyro.training.data import demonstrations, dimensions
-from ddco_pyro.training.networks import Dimensions, build_hierarchy, check_networks
+from ddco_pyro.training.networks import Dimensions, build_hierarchy, check_models, check_networks
 
 TASK = "toy_task:task"
 SIZE = Dimensions({"offsets": (4,), "camera": (8, 8, 3), "visited": (1,)}, control_size=2, steps=12)
@@ -46,7 +46,7 @@ def test_what_never_changes_is_constant(path):
         "takes two values, 1 and 2",
         "constant (-0.25): no part of the model, emitted as it is",
     ]
-    hierarchy = check_networks(spec(control={"kind": "gaussian", "scale": [4.0, 2.0, 8.0]}), found)
+    hierarchy = build_hierarchy(spec(control={"kind": "gaussian", "scale": [4.0, 2.0, 8.0]}), found)
     assert hierarchy.scaling.scale.tolist() == [4.0, 2.0]
     with pytest.raises(SpecError, match=r"control.scale: has 2 numbers, but the control has 3 dimensions"):
         check_networks(spec(control={"scale": [4.0, 2.0]}), found)
@@ -179,10 +179,11 @@ def test_a_spec_that_does_not_fit_says_where(changes, message):
 
 def test_the_networks_of_baselines_are_checked_too():
     fits = {"kind": "flat", "policy": {"network": "user_networks:Own"}}
-    assert check_networks(spec(compare_with=["per_timestep", fits]), SIZE).depth == 0
+    models = check_models(spec(compare_with=["per_timestep", fits]), SIZE)
+    assert [networks.depth for _, networks in models.values()] == [0, 0, 0]
     refused = spec(compare_with=["per_timestep", {"kind": "flat", "policy": WRONG}])
     with pytest.raises(SpecError, match=r"^compare_with\.1\.policy: network 'user_networks:Wrong' gives shape"):
-        check_networks(refused, SIZE)
+        check_models(refused, SIZE)
 
 
 def test_only_what_the_spec_names_has_to_be_in_order(path):
@@ -201,4 +202,4 @@ def test_only_what_the_spec_names_has_to_be_in_order(path):
 )
 def test_a_model_that_fills_the_memory_is_refused_before_it_is_made(toy_spec, overrides, message):
     with pytest.raises(SpecError, match=message):
-        build_hierarchy(with_overrides(toy_spec, overrides), Dimensions({"offsets": (4,), "visited": (1,)}, 2, 12))
+        check_networks(with_overrides(toy_spec, overrides), Dimensions({"offsets": (4,), "visited": (1,)}, 2, 12))

@@ -13,7 +13,7 @@ from scipy import stats
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.posteriors import decompose
-from ddco_pyro.model.encoding import Batch, encode
+from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.spec import parse_spec

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from random_demonstrations import demonstration, demonstrations
 
+from ddco_pyro.data.checks import LARGEST
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
-from ddco_pyro.data.values import LARGEST
 
 METAWORLD = Path(__file__).parents[2] / "shared" / "data" / "metaworld_pick_place.hdf5"
 

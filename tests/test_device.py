@@ -22,11 +22,12 @@ from ddco_pyro.exporting import export
 from ddco_pyro.model.networks.conv import _field_means
 from ddco_pyro.spec import Spec, parse_spec
 from ddco_pyro.training import devices
+from ddco_pyro.training.networks import build_hierarchy
 from ddco_pyro.training.restarts import OtherDevice
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*to a meta parameter:UserWarning")  # the double is called meta
 
-USERS = ("building", "material", "restarts", "training")
+USERS = ("networks", "checkpoint", "restarts", "loop")
 """Who asks for the device of a spec."""
 
 SPATIAL = {"network": "conv", "filters": 3, "kernel": 3, "pool": "spatial_softmax", "hidden": [5]}
@@ -92,10 +93,10 @@ def spec_of(level: dict[str, Any], **training: Any) -> Spec:
 
 
 def on(monkeypatch: pytest.MonkeyPatch, device: torch.device) -> None:
-    # it counts on the device that the double is named after
-    monkeypatch.setattr("ddco_pyro.training.networks._refuse_giants", lambda *_: None)
+    # networks are checked without weights on the device that the double is named after
+    monkeypatch.setattr("ddco_pyro.training.networks.check_networks", build_hierarchy)
     for module in USERS:
-        monkeypatch.setattr(f"ddco_pyro.fitting.{module}.device_of", lambda training: device)
+        monkeypatch.setattr(f"ddco_pyro.training.{module}.device_of", lambda training: device)
 
 
 def weights(fit: ddco_pyro.Fit) -> dict[str, np.ndarray]:
@@ -138,10 +139,10 @@ def test_pictures_stay_on_a_device_with_room(demos: Demonstrations, monkeypatch:
     spec = spec_of(OTHER["field means"])
     on(monkeypatch, THERE)
     read: list[int] = []
-    monkeypatch.setattr("ddco_pyro.data.reading.padded", lambda *given: read.append(1) or padded(*given))
+    monkeypatch.setattr("ddco_pyro.data.pictures.padded", lambda *given: read.append(1) or padded(*given))
     fits, asked = [], []
     for room in (float("inf"), 1.0):
-        monkeypatch.setattr("ddco_pyro.training.material.room", lambda device, room=room: room)
+        monkeypatch.setattr("ddco_pyro.training.checkpoint.room", lambda device, room=room: room)
         with Device():
             fits.append(weights(ddco_pyro.fit(spec, demos)))
         asked.append(len(read) - sum(asked))

@@ -1,8 +1,7 @@
 import pytest
 import torch
 
-from ddco_pyro.evaluation.analysis import as_rows, option_use
-from ddco_pyro.evaluation.diagnostics import Finding, diagnose
+from ddco_pyro.evaluation.options import Finding, as_rows, diagnose, option_use
 from ddco_pyro.inference import Posterior
 
 
@@ -76,12 +75,6 @@ def test_selections_are_counted_where_an_option_is_used():
     """One demonstration in ten flickers; that it is not in the others is no excuse."""
     found = diagnose(use([(1, 1)] * 10, *[[(2, 5), (3, 5)]] * 9))
     assert found == [Finding("never_persisting", 1, 1, 1.0, selections=10.0)]
-
-
-def test_runs_of_before_do_not_say_how_often_an_option_is_selected_in_a_demonstration():
-    before = [{key: value for key, value in one.items() if key != "demonstrations"} for one in level(0.0, 0.5, 0.5)]
-    before[1]["duration"] = 1.0
-    assert diagnose([before]) == []
 
 
 def test_an_unused_option_is_not_also_said_to_be_short():

@@ -12,12 +12,12 @@ from scipy import integrate, stats
 
 import ddco_pyro
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.batch import encode
 from ddco_pyro.model.links import log_termination
 from ddco_pyro.spec import DurationSpec
 from ddco_pyro.training.checkpoint import Progress
-from ddco_pyro.training.duration import log_duration_prior
-from ddco_pyro.training.objective import Objective
+from ddco_pyro.training.loop import backward
+from ddco_pyro.training.objective import Objective, log_duration_prior
 from ddco_pyro.training.stages import plan
 
 LENGTHS = torch.tensor([4, 3])
@@ -97,7 +97,7 @@ def test_all_training_demonstrations_together_have_it_once(demos, tmp_path):
     """Whatever the minibatches; the tuning demonstrations in the same proportion to their likelihood."""
     spec = make_spec((2,), duration={"mean": 20, "weight": 3})
     trainer = make_trainer(spec, demos, tmp_path)
-    material = trainer.material
+    material = trainer.data
     model, objective = material.hierarchy(0), Objective(material, Progress(0), plan(spec, 1)[-1])
     for batch in (material.train, material.tune):
         with torch.no_grad():
@@ -111,7 +111,7 @@ def test_all_training_demonstrations_together_have_it_once(demos, tmp_path):
             expected = likelihood / batch.steps + means / material.train.steps
             assert objective.tune(model) == pytest.approx(expected, rel=1e-6)
             continue
-        parts = [objective.ascend(model, rows) for rows in torch.arange(len(batch)).split(4)]
+        parts = [backward(objective, model, material.train, rows) for rows in torch.arange(len(batch)).split(4)]
         assert sum(parts) == pytest.approx(likelihood + means, rel=1e-6)
 
 

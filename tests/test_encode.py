@@ -20,12 +20,12 @@ from sklearn.linear_model import LinearRegression
 from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.encoding import Encoding, encode, load, training
-from ddco_pyro.encoding.projection import principal_components
+from ddco_pyro.encoding import Encoding, autoencoder, encode, load
+from ddco_pyro.encoding.encoder import principal_components
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, UpdatesDone
 from ddco_pyro.inference import segment
-from ddco_pyro.model.encoding import encode as prepare
+from ddco_pyro.model.batch import encode as prepare
 
 OWN = "user_encoders:"
 
@@ -122,14 +122,14 @@ def test_random_convolutions_written_out(few_dots, out):
     folder = encode(few_dots, out, Encoding("camera", seed=3)).folder
     weights, picture = load_file(folder / "encoder.safetensors"), together(Demonstrations.read(few_dots), "camera")[7]
     maps = torch.from_numpy(picture).permute(2, 0, 1)[None] / 255
-    for layer, stride, padding in (("convolutions.picture", 2, 2), ("deeper.picture.0", 1, 1)):
-        weight, bias = (weights[f"network/maps.{layer}.{name}"] for name in ("weight", "bias"))
+    for layer, stride, padding in (("0", 2, 2), ("1", 1, 1)):
+        weight, bias = (weights[f"network/maps.convolutions.0.{layer}.{name}"] for name in ("weight", "bias"))
         maps = torch.relu(torch.nn.functional.conv2d(maps, weight, bias, stride, padding))
     share = torch.exp(maps[0]) / torch.exp(maps[0]).sum((1, 2), keepdim=True)
     axis = torch.linspace(-1, 1, SIZE // 2)
     expected = torch.stack([(share.sum(2) * axis).sum(1), (share.sum(1) * axis).sum(1)], 1).flatten()
     assert expected.shape == (128,)
-    np.testing.assert_allclose(load(folder).kind(picture[None])[0], expected, atol=1e-6)
+    np.testing.assert_allclose(load(folder).extractor.encode(picture[None])[0], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [1, 4, 9])
@@ -219,7 +219,7 @@ def killed(path, out, encoding, kind, after):
 
 
 def test_killed_again_and_again(few_dots, tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "KEPT_EVERY", 2)
+    monkeypatch.setattr(autoencoder, "KEPT_EVERY", 2)
     encoding = Encoding("camera", "autoencoder", size=4, updates=9)
     encode(few_dots, tmp_path / "whole.hdf5", encoding)
     out, seen = tmp_path / "killed.hdf5", []

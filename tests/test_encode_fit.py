@@ -39,7 +39,7 @@ def options(trunk, whole=None, **policy):
 MODELS = {
     "a flat policy": (flat(BRANCHES), {}, lambda networks: networks["meta_policy"].of[0]),
     "cut pictures": (flat(BRANCHES), CUT, lambda networks: networks["meta_policy"].of[0]),
-    "options that share it": (options(SHARED), {}, lambda networks: networks["levels.0.trunk"].of[0].network),
+    "options that share it": (options(SHARED), {}, lambda networks: networks["levels.0.trunk"].of[0]),
     "read by all": (options(None, BRANCHES), {}, lambda networks: networks["trunk"].of[0]),
     "under an LSTM": (flat(LSTM), {}, lambda networks: networks["meta_policy"].over),
     "by itself": (flat(SEES | {"inputs": ["camera"]}), {}, lambda networks: networks["meta_policy"].layers[1]),
@@ -56,7 +56,9 @@ def fitted(few_dots, folder, model, camera=None):
 def within(fit, network, demo):
     """What the last hidden layer of a network of the fit gives at each step of a demonstration."""
     given = []
-    handle = network.register_forward_hook(lambda _, __, output: given.append(output))
+    handle = network.register_forward_hook(
+        lambda _, __, output: given.append(output[0] if isinstance(output, tuple) else output)
+    )
     with torch.no_grad():
         fit.hierarchy(fit.hierarchy.encoder.inputs([demo.observations]).loaded())
     handle.remove()

@@ -8,10 +8,12 @@ import torch
 from scipy import stats
 from sklearn.preprocessing import QuantileTransformer
 
-from ddco_pyro.data.control_parts import all_gaussian
+from ddco_pyro.data.controls import all_gaussian
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.model.encoding import ControlScaling, ObservationEncoder, encode
+from ddco_pyro.model.batch import encode
+from ddco_pyro.model.controls import ControlScaling
+from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import ControlSpec, ObservationSpec, parse_spec
 

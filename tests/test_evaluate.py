@@ -17,8 +17,8 @@ import toy_task
 import ddco_pyro
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.events import EpisodeEnded
-from ddco_pyro.fitting.fit import RunError
 from ddco_pyro.fitting.rollouts import policies, roll_out
+from ddco_pyro.fitting.run import RunError
 from ddco_pyro.simulation.episodes import run_episode, run_episodes
 from ddco_pyro.spec import with_overrides
 

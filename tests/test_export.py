@@ -17,7 +17,7 @@ import ddco_pyro
 import ddco_pyro.exporting as module
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.exporting import TOLERANCE, export, runner
-from ddco_pyro.model.networks import InputShape
+from ddco_pyro.model.networks import InputShape, UserNetwork
 
 LIKE_OTHERS = ("lstm", "conv", "three levels")
 """Their parts are those of others, together."""
@@ -238,9 +238,20 @@ def test_what_else_is_in_a_folder_is_not_lost(tmp_path):
 # --- a user's networks ------------------------------------------------------------------------------------------------
 
 
+class Inner(torch.nn.Module):
+    """A user's network that is a built-in one."""
+
+    def __init__(self, network):
+        super().__init__()
+        self.network = network
+
+    def forward(self, inputs):
+        return self.network(inputs)[0]
+
+
 def test_networks_that_numpy_cannot_evaluate_are_compared_as_a_program(tmp_path, damaged):
     fit = make("linear")
-    fit.hierarchy.meta_policy.network = torch.nn.Sequential(fit.hierarchy.meta_policy.network)
+    fit.hierarchy.meta_policy.network = UserNetwork(Inner(fit.hierarchy.meta_policy.network), 3, 1)
     assert list(export(fit, tmp_path / "out")) == ["torch"]
     assert len(compare(runner.Runner(tmp_path / "out", "torch"), fit.controller(), 10)) > 1
     with pytest.raises(ValueError, match="it has networks that numpy cannot evaluate: use "):
@@ -256,9 +267,9 @@ def test_a_users_state_is_carried_by_programs(place, tmp_path):
     fit = make(RECURRENT)
     meta_policy = fit.hierarchy.meta_policy
     if place == "network":
-        meta_policy.network = Remembering(InputShape({"all": 10}), 3, 1)
+        meta_policy.network = UserNetwork(Remembering(InputShape({"all": 10}), 3, 1), 3, 1)
     else:
-        meta_policy.network.over = Remembering(InputShape({"all": 10}), 6, 1)
+        meta_policy.network.over = UserNetwork(Remembering(InputShape({"all": 10}), 6, 1), 6, 1)
     assert list(export(fit, tmp_path / "out", onnx=True)) == ["torch", "onnx"]
     for form in ("torch", "onnx"):
         assert len(compare(runner.Runner(tmp_path / "out", form), fit.controller(), 10)) > 1
@@ -273,7 +284,7 @@ class Adding(torch.nn.Module):
 
 def test_a_network_that_acts_otherwise_than_it_was_trained_is_not_exported(tmp_path):
     fit = make("linear")
-    fit.hierarchy.meta_policy.network = Adding()
+    fit.hierarchy.meta_policy.network = UserNetwork(Adding(), 3, 1)
     with pytest.raises(Failed, match=r"^nothing was written: as torch it differs from the run by "):
         export(fit, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
@@ -290,7 +301,7 @@ class Branching(torch.nn.Module):
 
 def test_networks_that_no_program_can_be_made_of_leave_nothing_behind(tmp_path):
     fit = make("linear")
-    fit.hierarchy.meta_policy.network = Branching()
+    fit.hierarchy.meta_policy.network = UserNetwork(Branching(), 3, 1)
     with pytest.raises(Failed, match=r"^nothing was written: the networks cannot be exported: \w+: .*$"):
         export(fit, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []

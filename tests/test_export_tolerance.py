@@ -18,6 +18,7 @@ from ddco_pyro.exporting import export, runner
 from ddco_pyro.exporting.recording import record, tolerance
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import UserNetwork
 from ddco_pyro.spec import parse_spec
 
 HALF = 32
@@ -107,7 +108,8 @@ def test_networks_for_float32_alone_have_the_least_tolerance():
     fit = steep(STEEP)
     episodes = record(fit.controller(), fit.hierarchy)
     assert tolerance(fit.hierarchy, episodes) > 1e-6
-    fit.hierarchy.meta_policy.network = Single(fit.hierarchy.meta_policy.network)
+    network = fit.hierarchy.meta_policy.network
+    fit.hierarchy.meta_policy.network = UserNetwork(Single(network), network.features, 1)
     assert tolerance(fit.hierarchy, episodes) == 1e-6
 
 
@@ -119,7 +121,7 @@ class Single(torch.nn.Module):
         self.network = network
 
     def forward(self, inputs):
-        return self.network(inputs.map(torch.Tensor.float, inputs.time))
+        return self.network(inputs.map(torch.Tensor.float, inputs.time))[0]
 
 
 def test_large_pictures_are_compared_with_few_bytes(tmp_path, monkeypatch):

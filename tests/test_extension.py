@@ -83,7 +83,7 @@ def test_all_three_are_checked(task: str) -> None:
     Path("spec.yaml").write_text(SPEC.replace("TASK", task))
     ended = call("check", "spec.yaml", "--allow-code")
     assert ended.status == 0, ended.err
-    assert re.search(rf"hierarchy.levels.0.policy +│ {2 * 2 * (5 + 1) * 2 * 2 * 3 // 2} ", ended.out)
+    assert re.search(rf"hierarchy.levels.0.policy +│ +{2 * 2 * (5 + 1) * 2 * 2 * 3 // 2} ", ended.out)
     assert "hierarchy.levels.1.policy" in ended.out
     refused = call("check", "spec.yaml")
     assert refused.status == 2
@@ -97,7 +97,7 @@ def test_all_three_are_fitted_and_the_run_executes_its_network_only_if_allowed()
     assert ended.status == 0, ended.err
     ended = call("rollout", "run", "--jobs", 1, "--allow-code")
     assert ended.status == 0, ended.err
-    assert "/1 [" in ended.out
+    assert " of 1 (" in ended.out
     refused = call("rollout", "run", "--jobs", 1)
     assert (refused.status, refused.err.count("\n")) == (2, 1)
     assert "pass --allow-code if you trust it" in refused.err

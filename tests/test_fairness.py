@@ -15,16 +15,17 @@ from command_line import call
 from selecting import Told, candidate, score, spec_at
 
 import ddco_pyro
-from ddco_pyro.comparison import compare, write
+from ddco_pyro.comparison import compare
+from ddco_pyro.comparison.page import write
+from ddco_pyro.drawing import words
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.fitting.run import fit
 from ddco_pyro.report import unconverged, write_report
 from ddco_pyro.selection import Workers, select
-from ddco_pyro.selection.choice import as_data, choose
-from ddco_pyro.selection.table import HEAD, cells, markdown
+from ddco_pyro.selection.choice import as_data, choose, markdown, table
 from ddco_pyro.spec import SpecError, dump_spec, with_overrides
 from ddco_pyro.training.data import demonstrations
-from ddco_pyro.training.widths import nearest_widths
+from ddco_pyro.training.networks import nearest_widths
 
 BASELINES = ["flat", "flat_equal", "per_timestep"]
 
@@ -78,11 +79,11 @@ def test_a_baseline_beside_trains_as_it_would_alone(toy_spec, tmp_path):
     [
         (
             {"compare_with": [OWN | {"optimizer": {"schedule": "cosine"}}], "training.epochs": None},
-            "compare_with.0.optimizer.schedule: cosine falls to 0 at the end of training.epochs, which is null",
+            "compare_with.0.optimizer.schedule: cosine ends at training.epochs, which is null",
         ),
         (
             {"hierarchy": None, "baseline": OWN, "compare_with": []},
-            "baseline.optimizer: is for baselines in compare_with; say it in training.optimizer",
+            "baseline.optimizer: is for baselines in compare_with; give it in training.optimizer",
         ),
     ],
 )
@@ -185,7 +186,7 @@ def test_stages_that_needed_more_are_named_on_the_console(fitted):
     said = " ".join(ended.out.split())
     for name, row in {"ddco": run.metrics, **run.metrics["comparison"]}.items():
         assert not row["training"]["converged"]
-        assert re.search(rf" {name} │[^┃]*│ 27, not converged ", said)
+        assert re.search(rf" {words.method(name)} │[^┃]*│ 27, not converged ", said)
         for stage in row["training"]["stages"]:
             rise = f"{stage['rising']:.2f} nats per step over the last {stage['epochs']})"
             assert f"stage {stage['stage']} after {stage['epochs']} epochs (tuning log-likelihood up by {rise}" in said
@@ -216,7 +217,7 @@ def test_the_report_says_so_too(fitted):
         assert text in shown
         assert advice in shown
     assert shown.count("<td>27, not converged</td>") == 4
-    assert "DDCO, flat, flat of equal size and per-timestep had not converged: more epochs can change this." in shown
+    assert "Not converged: DDCO, flat, flat of equal size and per-timestep; more epochs may change this" in shown
 
 
 def test_where_nothing_rises_nothing_is_said(still, tmp_path):
@@ -237,7 +238,7 @@ def test_a_comparison_marks_them(fitted, tmp_path):
     found = compare([run.folder, run.folder / "baselines" / "flat"])
     text = write_markdown(found, tmp_path)
     assert text.count("| 27, not converged |") == 2
-    assert "A run that had not converged may rank higher with more epochs." in text
+    assert "Not converged: more epochs may change the rank of such a run." in text
     data = json.loads((tmp_path / "comparison" / "compare.json").read_text())
     assert [row["training"]["converged"] for row in data["rows"]] == [False, False]
     assert (tmp_path / "comparison" / "compare.html").read_text().count("27, not converged") == 2
@@ -249,9 +250,10 @@ def test_a_selection_counts_the_folds(tmp_path):
     found = choose([candidate(0), candidate(1)], scores, 3)
     data = as_data(found)
     assert [(row["gradient_steps"], row["not_converged"]) for row in data["candidates"]] == [(14.0, 2), (5.0, 0)]
-    assert cells(found.rows[0], found)[-3:] == ["14", "3", "not converged in 2"]
-    assert "not converged" not in cells(found.rows[1], found)[-1]
-    assert len(cells(found.rows[0], found)) == len(HEAD)
+    first, second = table(found).rows
+    assert first[-3:] == ["14", "3", "not converged in 2"]
+    assert "not converged" not in second[-1]
+    assert len(first) == len(table(found).head)
     text = markdown(found, {**data, "folds": 3, "demonstrations": 3, "stop_early": None})
     assert "| 14 | 3 | not converged in 2 |" in text
 

@@ -8,8 +8,8 @@ import pytest
 from gymnasium import spaces
 
 from ddco_pyro.errors import BadInput
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.fitting.run import fit
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.simulation.task import Task, find_task
 from ddco_pyro.spec import parse_spec

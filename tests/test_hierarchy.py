@@ -10,11 +10,10 @@ from oracle import brute_force
 from torch.distributions import Normal
 
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch
+from ddco_pyro.model.batch import STEPS_AT_ONCE, Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.links import TERMINATION_BOUND
 from ddco_pyro.model.networks import Inputs
-from ddco_pyro.model.networks.state import answer
 from ddco_pyro.spec import parse_spec
 
 
@@ -94,7 +93,7 @@ def test_policy_and_termination_read_the_trunk_of_their_option():
     hierarchy = make_hierarchy((3,), network="linear", trunk={"network": "lstm", "over": {"hidden": [5]}, "hidden": 4})
     batch, level = make_batch(), hierarchy.levels[0]
     outputs = hierarchy(batch.inputs)
-    features, _ = answer(level.trunk, batch.inputs)
+    features, _ = level.trunk(batch.inputs, level.trunk.initial_state(2))
     assert features.shape == (*batch.inputs.batch, 3, 4)
     for head, found in (
         (level.policy.network, outputs.callers[0].numbers),
@@ -174,18 +173,8 @@ def test_looking_at_the_memory_leaves_networks_as_they_were():
 
 
 def test_callers_that_emit_no_control_have_no_sigma():
-    """Neither as parameters, nor where an earlier version's tensors, which have them, are read."""
     hierarchy = make_hierarchy((2, 2), ("options",), std={"learn": True, "per_option": True})
     names = [name for name, _ in hierarchy.named_parameters() if ".std." in name]
     assert names == ["levels.0.policy.std.raw_own"]
     hybrid = make_hierarchy((2, 2), ("options", "control"), std={"learn": True, "per_option": True})
     assert sum(".std." in name for name, _ in hybrid.named_parameters()) == 3
-    whole = hierarchy.state_dict()
-    of_before = {f"{place}.std.{name}": torch.zeros(2) for place in ("levels.1.policy", "meta_policy")
-                 for name in ("raw_own",)}  # fmt: skip
-    again = make_hierarchy((2, 2), ("options",), seed=1, std={"learn": True, "per_option": True})
-    again.load_state_dict(whole | of_before)
-    for name, tensor in again.state_dict().items():
-        assert torch.equal(tensor, whole[name])
-    with pytest.raises(RuntimeError, match="Unexpected key"):
-        again.load_state_dict(whole | {"meta_policy.sdt.raw": torch.zeros(2)})

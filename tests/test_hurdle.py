@@ -10,8 +10,7 @@ from odd_files.atoms import ROWS, at_bounds, no_ops
 
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.data.control_dimensions import control_dimensions
-from ddco_pyro.data.control_parts import control_parts, described
+from ddco_pyro.data.controls import control_dimensions, control_parts, described
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.exporting import TOLERANCE, export, runner
 from ddco_pyro.spec import ControlSpec, SpecError, dump_spec, parse_spec, with_overrides

@@ -322,7 +322,7 @@ def stop_after(number: int):
 
 @pytest.mark.parametrize("number", [1, 2, 5])
 def test_an_interrupted_import_goes_on(out: Path, tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ddco_pyro.data.resumable.PART_BYTES", 8000)  # one or two demonstrations in a part
+    monkeypatch.setattr("ddco_pyro.data.sources.robomimic.PART_BYTES", 8000)  # one or two demonstrations in a part
     whole = tmp_path / "whole.hdf5"
     import_demonstrations(ROBOMIMIC, whole)
     with pytest.raises(Stopped):

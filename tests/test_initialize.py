@@ -11,7 +11,7 @@ from planted import make_trainer
 from sklearn.metrics import adjusted_rand_score
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.spec import parse_spec
@@ -114,7 +114,7 @@ def test_what_policies_of_options_do_not_read_does_not_begin_them(read, found):
             "training": {"initialize": "vq", "tune_fraction": 0.3},
         }
     )
-    material = make_trainer(spec, Demonstrations(demos), None).material
+    material = make_trainer(spec, Demonstrations(demos), None).data
     objective = Objective(material, Progress(0), plan(spec, 1)[0])
     known = [int(name.removeprefix("demo_")) for name in material.names]
     truths = np.concatenate([np.split(truth[found], cuts)[number] for number in known])

@@ -26,7 +26,7 @@ from random_demonstrations import demonstrations
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.tensors import read_tensors
-from ddco_pyro.fitting import fitted_to
+from ddco_pyro.fitting import digest
 
 
 def same_hdf5(one: Path, other: Path) -> None:
@@ -56,9 +56,9 @@ def same_run(one: Path, other: Path) -> None:
     for path in files:
         if path.suffix in (".safetensors", ".csv", ".yaml"):
             assert (one / path).read_bytes() == (other / path).read_bytes(), path
-        if path.name == fitted_to.NAME:
-            each = [fitted_to.recorded((folder / path).parent) for folder in (one, other)]
-            assert fitted_to.difference(*each) == "", path
+        if path.name == digest.NAME:
+            each = [digest.recorded((folder / path).parent) for folder in (one, other)]
+            assert digest.difference(*each) == "", path
     metrics = [json.loads((folder / "metrics.json").read_text()) for folder in (one, other)]
     aside = {"seconds": ...}
     assert metrics[0] | aside == metrics[1] | aside

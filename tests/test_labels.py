@@ -19,11 +19,12 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import segment
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.batch import encode
 from ddco_pyro.spec import SpecError, dump_spec, parse_spec
 from ddco_pyro.training.checkpoint import Progress
 from ddco_pyro.training.initialization import Clusters
 from ddco_pyro.training.labels import Labels
+from ddco_pyro.training.loop import backward
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.objective import Objective
 from ddco_pyro.training.restarts import Trainer
@@ -55,7 +56,7 @@ def labelled(level=1, counts=(2,), training=(), **own):
 
 def make(spec, demos):
     """What restarts are trained on."""
-    return Trainer(spec, Dimensions.of(demos), *demos.split(0.2, 0)).material
+    return Trainer(spec, Dimensions.of(demos), *demos.split(0.2, 0)).data
 
 
 def whole(material):
@@ -93,7 +94,9 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
                 if all(option in (-1, h[level - 1]) for option, h in zip(known, path, strict=True))
             )
             values[name] += math.log(total)
-    assert objective.ascend(model, torch.arange(len(material.train))) == pytest.approx(values["train"], abs=1e-5)
+    assert backward(objective, model, material.train, torch.arange(len(material.train))) == pytest.approx(
+        values["train"], abs=1e-5
+    )
     assert objective.tune(model) == pytest.approx(values["tune"] / STEPS, abs=1e-5)
 
 
@@ -106,14 +109,14 @@ def test_its_gradient_is_that_of_finite_differences():
     material = replace(material, train=replace(material.train, inputs=double))
     objective, rows = whole(material), torch.arange(len(material.train))
     parameter = model.levels[0].termination.layers[0].weight
-    objective.ascend(model, rows)
+    backward(objective, model, material.train, rows)
     gradients = parameter.grad.clone()
     for place in ((0, 0, 0), (1, 1, 0)):
         gradient, values = float(gradients[place]), []
         for step in (1e-4, -1e-4):
             with torch.no_grad():
                 parameter[place] += step
-            values.append(objective.ascend(model, rows))
+            values.append(backward(objective, model, material.train, rows))
             with torch.no_grad():
                 parameter[place] -= step
         assert gradient == pytest.approx(-(values[0] - values[1]) / 2e-4 / material.train.steps, rel=1e-5, abs=1e-9)

@@ -19,8 +19,8 @@ from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.memory import PROGRAM, allowed
 from ddco_pyro.errors import BadInput
-from ddco_pyro.spec import load_spec, parse_spec
-from ddco_pyro.training.data import demonstrations, memory_needed
+from ddco_pyro.spec import parse_spec
+from ddco_pyro.training.data import demonstrations
 
 GIGABYTE = 10**9
 LIMIT = 2 * GIGABYTE
@@ -117,87 +117,6 @@ def test_more_can_be_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     for said, meant in (("16", 16e9), ("2GB", 2e9), ("0.5 gb", 5e8), ("700MB", 7e8)):
         monkeypatch.setenv("DDCO_PYRO_MEMORY", said)
         assert allowed() == meant
-
-
-def vectors(path: Path, lengths: tuple[int, ...], size: int) -> Path:
-    """Demonstrations of so many steps, observations of so many numbers."""
-    random = np.random.default_rng(0)
-    with h5py.File(path, "w") as file:
-        for index, steps in enumerate(lengths):
-            file[f"data/demo_{index}/obs/seen"] = random.normal(size=(steps, size)).cumsum(0)
-            file[f"data/demo_{index}/actions"] = random.normal(size=(steps, 3))
-    return path
-
-
-def pictures(path: Path, lengths: tuple[int, ...], side: int) -> Path:
-    """Demonstrations of so many pictures of noise."""
-    random = np.random.default_rng(0)
-    with h5py.File(path, "w") as file:
-        for index, steps in enumerate(lengths):
-            file[f"data/demo_{index}/obs/seen"] = random.integers(0, 256, (steps, side, side, 3), dtype=np.uint8)
-            file[f"data/demo_{index}/actions"] = random.normal(size=(steps, 3))
-    return path
-
-
-LINEAR, WIDE = {"network": "linear"}, {"network": "mlp", "hidden": [200]}
-CONV = {"network": "conv", "filters": 16, "hidden": [8]}
-
-
-def fit_of(path: Path, network: dict[str, object]) -> Path:
-    """A spec that is soon fitted; with perceptrons in so many epochs that what freed tensors leave has settled."""
-    levels = [{"count": 2, "policy": network, "termination": network}]
-    data = {
-        "demonstrations": {"path": str(path), "valid_fraction": 0.2},
-        "observations": [{"key": "seen", "differences": network is not CONV}],
-        "hierarchy": {"levels": levels, "meta_policy": network},
-        "training": {"epochs": 10 if network is WIDE else 1, "layerwise": False, "initialize": "vq_controls"},
-    }
-    spec = path.with_suffix(".yaml")
-    spec.write_text(yaml.safe_dump(data))
-    return spec
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[float, float]:
-    """Bytes that a fit to next to nothing is estimated to take, and does."""
-    path = vectors(tmp_path_factory.mktemp("small") / "demos.hdf5", (9,) * 5, 2)
-    return estimated_and_measured(fit_of(path, LINEAR), path)
-
-
-def estimated_and_measured(spec: Path, path: Path) -> tuple[float, float]:
-    ended = measured("fit", spec, "--out", spec.with_suffix(""), DDCO_PYRO_MEMORY="8GB")
-    assert ended.status == 0, ended.err
-    return memory_needed(load_spec(spec), path), ended.peak
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("make", "lengths", "size", "network"),
-    [
-        pytest.param(pictures, (300, 300, 20, 20, 20), 84, CONV, id="long demonstrations of pictures"),
-        pytest.param(pictures, (30,) * 30, 84, CONV, id="many of them"),
-        pytest.param(vectors, (500,) * 60, 200, LINEAR, id="many observations"),
-        pytest.param(vectors, (20_000,) * 5, 4, WIDE, id="long demonstrations"),
-    ],
-)
-def test_a_fit_takes_what_was_estimated(
-    make: Callable[[Path, tuple[int, ...], int], Path],
-    lengths: tuple[int, ...],
-    size: int,
-    network: dict[str, object],
-    tmp_path: Path,
-    small: tuple[float, float],
-) -> None:
-    """No more than that, and not much less: neither in all, nor beyond what the smallest fit takes."""
-    path = make(tmp_path / "demos.hdf5", lengths, size)
-    estimate, peak = estimated_and_measured(fit_of(path, network), path)
-    more = peak - small[1]
-    print(
-        f"estimated {estimate / 1e6:.0f} MB, measured {peak / 1e6:.0f} MB, {more / 1e6:.0f} of them beyond the smallest"
-    )
-    assert more > 100e6  # or it would say nothing
-    assert peak <= estimate
-    assert more >= 0.6 * (estimate - small[0])
 
 
 def camera(path: Path, demonstrations: int, steps: int, height: int, width: int) -> Path:

@@ -16,7 +16,7 @@ from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.importing import Choice, import_demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.sources.metadata import check_keys, filled, inside
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
 
 SPEC = """

@@ -18,8 +18,8 @@ from selecting import DATA, data_at, two_skills
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.fit import RunError
 from ddco_pyro.fitting.rollouts import roll_out
+from ddco_pyro.fitting.run import RunError
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import SpecError, load_spec, parse_spec, with_overrides
 
@@ -183,7 +183,7 @@ def test_demonstrations_are_taken_as_they_are_needed(in_memory: ddco_pyro.Fit, m
 
 
 def test_evaluation_does_not_depend_on_the_pieces(in_memory: ddco_pyro.Fit, monkeypatch) -> None:
-    from ddco_pyro.fitting.metrics import evaluate
+    from ddco_pyro.evaluation.metrics import evaluate
     from ddco_pyro.training.data import parts
 
     demos = two_skills()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.drawing import words
 from ddco_pyro.fitting.merging import LABELS, MergeError, Pair, chosen, merge, merged_labels, merged_spec
 from ddco_pyro.spec import with_overrides
 from ddco_pyro.training.data import parts
@@ -135,7 +137,8 @@ def test_the_command_writes_a_run_and_goes_on_where_it_was(toy_run, tmp_path):
     assert ended.status == 0, ended.err
     values = [run.metrics["log_likelihood_per_step"]["valid"] for run in (toy_run, ddco_pyro.load(tmp_path / "merged"))]
     said = " ".join(ended.out.split())
-    assert f"are one: held out {values[0]:.3f} before, {values[1]:.3f} now" in said
+    before, after = map(words.number, values)
+    assert re.search(rf"Merged options 1 and 2 \([\d.]+ nats/step apart\): held-out {before} → {after} nats/step", said)
     spec = yaml.safe_load((tmp_path / "merged" / "spec.yaml").read_text())
     assert spec["hierarchy"]["levels"][0]["count"] == 1
     assert spec["training"]["labels"] == {"level": "option", "from": LABELS, "count": None, "hold": False}

@@ -19,18 +19,24 @@ import ddco_pyro
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.drawing import words
 from ddco_pyro.evaluation.worth import mean_run, worth
-from ddco_pyro.fitting.fit import model_name
 from ddco_pyro.inference import log_likelihood, posterior
 from ddco_pyro.inference.engines import compare_engines
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.batch import encode
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import always_ends
 from ddco_pyro.segmenting import LevelLabels
 from ddco_pyro.selection.grid import candidates
 from ddco_pyro.spec import DurationSpec, SpecError, dump_spec, load_spec, parse_spec, with_overrides
-from ddco_pyro.spec.reading import read_yaml
-from ddco_pyro.training.duration import log_duration_prior
-from ddco_pyro.training.networks import Dimensions, baseline_spec, build_hierarchy, named_baselines, parameters
+from ddco_pyro.spec.yaml import read_yaml
+from ddco_pyro.training.networks import (
+    Dimensions,
+    baseline_spec,
+    build_hierarchy,
+    model_name,
+    named_baselines,
+    parameters,
+)
+from ddco_pyro.training.objective import log_duration_prior
 from ddco_pyro.training.upper import Constants, fitted
 
 SPECS = Path(__file__).parent.parent / "specs"
@@ -180,7 +186,7 @@ def test_what_is_no_model_is_refused():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"hierarchy": None, "baseline": "mixture", "compare_with": []}, "baseline.count: missing; say how many"),
+        ({"hierarchy": None, "baseline": "mixture", "compare_with": []}, "baseline.count: missing; give the number"),
         ({"hierarchy": None, "baseline": "flat", "compare_with": ["mixture"]}, "compare_with.0: mixture takes its"),
         ({"compare_with": [{"kind": "mixture", "count": 3}]}, "compare_with.0.count: a mixture in compare_with has"),
         (
@@ -193,7 +199,7 @@ def test_what_is_no_model_is_refused():
         ),
         (
             {"hierarchy": {"levels": [{"count": 2, "termination": "always"}]}, "compare_with": ["mixture"]},
-            "compare_with.0: mixture is what the hierarchy is already",
+            "compare_with.0: the hierarchy is a mixture already",
         ),
         (
             {"hierarchy": {"levels": [{"count": 2, "termination": "alway"}]}, "compare_with": []},

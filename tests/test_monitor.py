@@ -11,7 +11,7 @@ from ddco_pyro.acting.monitor import Monitor
 from ddco_pyro.acting.window import ObservationError
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood, posterior
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.batch import encode
 
 
 def demonstration(steps):

@@ -11,9 +11,9 @@ from pydantic import Field
 from torch import nn
 
 from ddco_pyro.model.networks import CLASSES, InputShape, build
-from ddco_pyro.spec import NetworkSpec, SpecError, parse_spec
-from ddco_pyro.spec.networks import SETTINGS
-from ddco_pyro.training.networks import Dimensions, check_networks
+from ddco_pyro.spec import SpecError, network_spec, parse_spec
+from ddco_pyro.spec.networks import SETTINGS, Network
+from ddco_pyro.training.networks import Dimensions, check_models
 
 if TYPE_CHECKING:
     from collections.abc import Hashable
@@ -28,9 +28,8 @@ def test_every_built_in_network_takes_the_settings_that_a_spec_has_for_it():
     assert list(CLASSES) == list(SETTINGS)
     for name, built_in in CLASSES.items():
         parameters = inspect.signature(built_in).parameters
-        settings = [key for key in SETTINGS[name].model_fields if key not in ("network", "inputs", "shared")]
-        assert list(parameters) == ["shape", "outputs", "copies", *settings], name
-        assert all(one.default is inspect.Parameter.empty for one in parameters.values()), name  # the spec has them
+        settings = [key for key in SETTINGS[name].model_fields if key not in Network.model_fields]
+        assert list(parameters) == ["shape", "copies", *settings], name
 
 
 @pytest.mark.parametrize("name", CLASSES)
@@ -39,8 +38,8 @@ def test_the_settings_of_a_spec_reach_the_network(name):
     given = {key: value for key, value in other.items() if key in SETTINGS[name].model_fields}
     shape = InputShape({"state": 3}, {"camera": (6, 6, 3)} if name == "conv" else {}, 5)
     if name == "branches":
-        given["of"] = {"state": NetworkSpec(network="linear")}
-    network = build(NetworkSpec(network=name, **given), shape, 2, 4)
+        given["of"] = {"state": network_spec(network="linear")}
+    network = build(network_spec(network=name, **given), shape, 2, 4)
     if name == "lstm":
         assert [layer.recurrent.shape for layer in network.memory] == [(4, 7, 28), (4, 9, 36)]
         return
@@ -51,7 +50,7 @@ def test_the_settings_of_a_spec_reach_the_network(name):
     )
     assert sum(isinstance(layer, nn.ELU) for layer in network.layers) == len(given.get("hidden", []))
     if name == "conv":
-        assert network.convolutions["camera"].weight.shape == (2 * 4, 3, 3, 3)
+        assert network.convolutions[0][0].weight.shape == (2 * 4, 3, 3, 3)
 
 
 # --- a user's ---------------------------------------------------------------------------------------------------------
@@ -91,7 +90,7 @@ class Untyped(Typed):
 
 
 def made(options, name="Typed"):
-    return build(NetworkSpec(network=f"{__name__}:{name}", options=options), SHAPE, 2, 4)
+    return build(network_spec(network=f"{__name__}:{name}", options=options), SHAPE, 2, 4).module
 
 
 def test_options_are_of_the_types_that_the_class_says():
@@ -149,7 +148,7 @@ WRONG_OPTIONS = {"network": f"{__name__}:Typed", "options": {"width": "a", "gian
 def test_what_is_wrong_with_options_is_said_with_their_place_in_the_spec(wrong, place):
     spec = parse_spec({"task": "toy", "observations": ["pose"], "hierarchy": {"levels": [{"count": 2}]}}, wrong)
     with pytest.raises(SpecError) as caught:
-        check_networks(spec, Dimensions({"pose": (3,)}, control_size=2, steps=5))
+        check_models(spec, Dimensions({"pose": (3,)}, control_size=2, steps=5))
     width, gian = caught.value.problems
     assert width == f"{place}.options.width: must be a whole number, got 'a'"
     assert gian.startswith(f"{place}.options.gian: unknown option (did you mean 'gain'?); the class takes: width, ")

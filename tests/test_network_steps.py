@@ -6,11 +6,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stacked_networks import COPIES, SHAPE, assert_close, make, make_inputs, random_inputs, refused, separate
+from stacked_networks import COPIES, SHAPE, answer, assert_close, make, make_inputs, random_inputs, refused, separate
 from torch import nn
 
 from ddco_pyro.model.networks import CLASSES, InputShape
-from ddco_pyro.model.networks.state import answer
 
 
 def step_by_step(network, inputs):

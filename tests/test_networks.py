@@ -13,6 +13,7 @@ from stacked_networks import (
     OUTPUTS,
     PIXELS,
     SHAPE,
+    answer,
     assert_close,
     make,
     make_inputs,
@@ -25,31 +26,30 @@ from torch.utils.flop_counter import FlopCounterMode
 from user_networks import Stateful
 
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
-from ddco_pyro.model.networks.conv import POOLED, _module
-from ddco_pyro.model.networks.stacked import StackedLinear
-from ddco_pyro.model.networks.state import answer
-from ddco_pyro.spec import Activation, NetworkSpec
+from ddco_pyro.model.networks.conv import POOLED
+from ddco_pyro.model.networks.perceptrons import StackedLinear
+from ddco_pyro.spec import Activation, network_spec
 
 
 @pytest.mark.parametrize("settings", [{"network": "linear"}, {"hidden": [8]}, {"hidden": [8, 6], "dropout": 0.5}])
 def test_stacked_networks_are_separate_networks(settings):
     network, inputs = make(**settings), make_inputs()
     expected = torch.stack([separate(network.layers, k)(inputs.vector) for k in range(COPIES)], dim=2)
-    assert_close(network(inputs), expected)
+    assert_close(network(inputs)[0], expected)
 
 
 def test_a_linear_network_is_affine():
     network, one, other = make(network="linear"), make_inputs(), make_inputs()
     other.vector[:] = torch.randn(other.vector.shape, generator=torch.Generator().manual_seed(2))
     between = Inputs({"state": 0.3 * one.vector + 0.7 * other.vector}, {}, one.time)
-    assert_close(network(between), 0.3 * network(one) + 0.7 * network(other))
+    assert_close(network(between)[0], 0.3 * network(one)[0] + 0.7 * network(other)[0])
 
 
 def test_an_mlp_is_not_affine():
     network, one = make(hidden=[8]), make_inputs()
     twice = Inputs({"state": 2 * one.vector}, {}, one.time)
     nothing = Inputs({"state": 0 * one.vector}, {}, one.time)
-    assert not torch.allclose(network(twice) + network(nothing), 2 * network(one), atol=1e-3)
+    assert not torch.allclose(network(twice)[0] + network(nothing)[0], 2 * network(one)[0], atol=1e-3)
 
 
 ACTIVATIONS = {
@@ -71,12 +71,12 @@ def test_an_activation_follows_every_convolution_and_every_hidden_layer(name, ac
     shape = InputShape({}, {"camera": PIXELS})
     network, inputs = make(shape, network="conv", **settings), random_inputs(shape, 2, LONGEST, 0)
     values = inputs.images["camera"].flatten(0, 1).permute(0, 3, 1, 2) / 255
-    for layer, filters in zip((network.convolutions["camera"], *network.deeper["camera"]), (2, 3), strict=True):
+    for layer, filters in zip(network.convolutions[0], (2, 3), strict=True):
         values = activation(nn.functional.conv2d(values, layer.weight[:filters], layer.bias[:filters]))
     first, second, last = (layer for layer in network.layers if isinstance(layer, StackedLinear))
     values = activation(values.flatten(1) @ first.weight[0] + first.bias[0])
     expected = activation(values @ second.weight[0] + second.bias[0]) @ last.weight[0] + last.bias[0]
-    assert_close(network(inputs)[:, :, 0].flatten(0, 1), expected)
+    assert_close(network(inputs)[0][:, :, 0].flatten(0, 1), expected)
 
 
 def test_a_standardised_picture_is_seen_whatever_its_brightness_and_contrast():
@@ -90,15 +90,15 @@ def test_a_standardised_picture_is_seen_whatever_its_brightness_and_contrast():
     for seen in (picture, picture // 2, picture // 2 + 100):
         inputs = Inputs({}, {"camera": seen}, torch.zeros(1))
         of_floats = Inputs({}, {"camera": expected[None, None]}, torch.zeros(1))
-        torch.testing.assert_close(network(inputs), plain(of_floats), atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(network(inputs)[0], plain(of_floats)[0], atol=1e-5, rtol=1e-4)
 
 
 def test_a_picture_of_one_colour_is_standardised_to_nothing():
     shape = InputShape({}, {"camera": PIXELS})
     network = make(shape, network="conv", filters=3, pool="flatten", standardize=True)
     grey = torch.full((1, 1, *PIXELS), 100.0, requires_grad=True)
-    found = network(Inputs({}, {"camera": grey}, torch.zeros(1)))
-    assert_close(found, network(Inputs({}, {"camera": torch.zeros_like(grey)}, torch.zeros(1))))
+    found = network(Inputs({}, {"camera": grey}, torch.zeros(1)))[0]
+    assert_close(found, network(Inputs({}, {"camera": torch.zeros_like(grey)}, torch.zeros(1)))[0])
     (gradient,) = torch.autograd.grad(found.sum(), grey)
     assert gradient.isfinite().all()
 
@@ -109,22 +109,22 @@ def test_a_unit_below_0_for_all_that_is_observed_is_dead_only_where_it_is_rectif
     first = network.layers[0]
     with torch.no_grad():
         first.weight[:, :, 0], first.bias[:, :, 0] = 0, -3
-    network(make_inputs()).sum().backward()
+    network(make_inputs())[0].sum().backward()
     dead = first.bias.grad[:, 0, 0] == 0
     assert dead.tolist() == [name == "relu"] * COPIES
 
 
 def test_dropout_drops_only_while_training():
     network, inputs = make(hidden=[64], dropout=0.5), make_inputs()
-    quiet = network(inputs)
-    assert torch.equal(network(inputs), quiet)
-    assert not torch.equal(network.train()(inputs), quiet)
+    quiet = network(inputs)[0]
+    assert torch.equal(network(inputs)[0], quiet)
+    assert not torch.equal(network.train()(inputs)[0], quiet)
 
 
 @pytest.mark.parametrize("settings", [{"network": "linear"}, {"hidden": [8]}, {"network": "per_timestep"}])
 def test_no_option_is_trained_by_another_options_output(settings):
     network = make(**settings)
-    network(make_inputs())[:, :, 1].sum().backward()
+    network(make_inputs())[0][:, :, 1].sum().backward()
     for parameter in network.parameters():
         per_option = parameter.grad.reshape(-1, COPIES, *parameter.shape[1:]).abs().flatten(2).sum((0, 2))
         assert per_option[1] > 0
@@ -133,7 +133,7 @@ def test_no_option_is_trained_by_another_options_output(settings):
 
 def test_no_option_is_trained_by_another_options_images():
     network = make(InputShape({"state": FEATURES}, {"camera": PIXELS}), network="conv", filters=3, hidden=[8])
-    network(make_inputs(images=("camera",)))[:, :, 1].sum().backward()
+    network(make_inputs(images=("camera",)))[0][:, :, 1].sum().backward()
     for parameter in network.parameters():
         per_option = parameter.grad.reshape(COPIES, -1).abs().sum(1)
         assert per_option[1] > 0
@@ -159,14 +159,14 @@ def one_at_a_time(network, inputs):
 )
 def test_every_step_has_its_own_network(steps, start):
     network, inputs = make(network="per_timestep", hidden=[6]), make_inputs(steps=steps, start=start)
-    assert_close(network(inputs), one_at_a_time(network, inputs))
+    assert_close(network(inputs)[0], one_at_a_time(network, inputs))
 
 
 def test_networks_of_different_steps_differ():
     network = make(network="per_timestep", hidden=[])
     inputs = make_inputs()
     inputs.vector[:] = inputs.vector[:, :1]
-    found = network(inputs)
+    found = network(inputs)[0]
     assert all(not torch.allclose(found[:, t], found[:, 0]) for t in range(1, LONGEST))
 
 
@@ -177,7 +177,7 @@ def test_each_step_costs_one_network_however_many_there_are(trajectories, steps,
     width, longest = 16, 60
     network = make(InputShape({"state": FEATURES}, {}, longest), network="per_timestep", hidden=[width])
     with FlopCounterMode(display=False) as counter:
-        network(make_inputs(trajectories, steps, start))
+        network(make_inputs(trajectories, steps, start))[0]
     multiplications = COPIES * (FEATURES * width + width * OUTPUTS)
     assert counter.get_total_flops() == 2 * trajectories * steps * multiplications
 
@@ -188,8 +188,7 @@ def test_each_step_costs_one_network_however_many_there_are(trajectories, steps,
 def separate_conv(network, k, inputs, filters):
     """The k-th convolutional network, image by image, with ordinary torch layers."""
     columns = [inputs.vector.flatten(0, 1)]
-    for key, image in inputs.images.items():
-        stacked = network.convolutions[key]
+    for (stacked,), image in zip(network.convolutions, inputs.images.values(), strict=True):
         own = slice(k * filters, (k + 1) * filters)
         pixels = torch.stack([frame.permute(2, 0, 1) for frame in image.flatten(0, 1)]) / 255
         maps = nn.functional.conv2d(pixels, stacked.weight[own], stacked.bias[own], stride=2, padding=2)
@@ -203,15 +202,15 @@ def test_conv_networks_are_separate_networks(images):
     network = make(shape, network="conv", filters=filters, hidden=[8])
     inputs = make_inputs(images=images)
     expected = torch.stack([separate_conv(network, k, inputs, filters) for k in range(COPIES)], dim=2)
-    assert_close(network(inputs), expected)
+    assert_close(network(inputs)[0], expected)
 
 
 def test_conv_reads_images_without_any_vector():
     network = make(InputShape({}, {"camera": PIXELS}), network="conv", filters=2)
     inputs = make_inputs(images=("camera",))
     alone = Inputs({}, inputs.images, inputs.time)
-    assert network(alone).shape == (2, LONGEST, COPIES, OUTPUTS)
-    assert not torch.allclose(network(alone)[0, 0], network(alone)[0, 1])
+    assert network(alone)[0].shape == (2, LONGEST, COPIES, OUTPUTS)
+    assert not torch.allclose(network(alone)[0][0, 0], network(alone)[0][0, 1])
 
 
 POOLS = {
@@ -236,14 +235,14 @@ def test_several_convolutions_are_separate_networks(pool):
     network = make(shape, network="conv", layers=layers, pool=pool, pooled=3, hidden=[8])
     inputs = Inputs({}, make_inputs(images=("camera",)).images, torch.arange(LONGEST))
     pixels = inputs.images["camera"].flatten(0, 1).permute(0, 3, 1, 2) / 255
-    first, second = network.convolutions["camera"], network.deeper["camera"][0]
+    first, second = network.convolutions[0]
     expected = []
     for k in range(COPIES):
         a, b = slice(3 * k, 3 * (k + 1)), slice(2 * k, 2 * (k + 1))
         maps = nn.functional.conv2d(pixels, first.weight[a], first.bias[a], stride=2, padding=1).relu()
         maps = nn.functional.conv2d(maps, second.weight[b], second.bias[b]).relu()
         expected.append(separate(network.layers, k)(POOLS[pool](maps)).unflatten(0, inputs.batch))
-    assert_close(network(inputs), torch.stack(expected, dim=2))
+    assert_close(network(inputs)[0], torch.stack(expected, dim=2))
 
 
 def test_an_image_may_be_called_as_a_layer_is():
@@ -282,12 +281,12 @@ def test_a_network_reads_the_observations_that_it_is_to_read(settings):
     pose, goal = (torch.randn(2, LONGEST, size, generator=generator) for size in (2, 3))
     images = make_inputs(images=("camera",)).images
     torch.manual_seed(0)
-    network = build(NetworkSpec(**settings, inputs=("goal",)), shape, OUTPUTS, COPIES)
+    network = build(network_spec(**settings, inputs=("goal",)), shape, OUTPUTS, COPIES)
     torch.manual_seed(0)
-    alone = build(NetworkSpec(**settings), InputShape({"goal": 3}), OUTPUTS, COPIES)
+    alone = build(network_spec(**settings), InputShape({"goal": 3}), OUTPUTS, COPIES)
     time = torch.arange(LONGEST)
-    found = network(Inputs({"pose": pose, "goal": goal}, images, time))
-    assert_close(found, alone(Inputs({"goal": goal}, {}, time)))
+    found = network(Inputs({"pose": pose, "goal": goal}, images, time))[0]
+    assert_close(found, alone(Inputs({"goal": goal}, {}, time))[0])
 
 
 def test_all_vectors_are_read_in_the_order_of_the_spec():
@@ -295,7 +294,7 @@ def test_all_vectors_are_read_in_the_order_of_the_spec():
     generator = torch.Generator().manual_seed(1)
     b, a = (torch.randn(2, LONGEST, size, generator=generator) for size in (1, 2))
     expected = torch.stack([separate(network.layers, k)(torch.cat([b, a], -1)) for k in range(COPIES)], dim=2)
-    assert_close(network(Inputs({"b": b, "a": a}, {}, torch.arange(LONGEST))), expected)
+    assert_close(network(Inputs({"b": b, "a": a}, {}, torch.arange(LONGEST)))[0], expected)
 
 
 # --- a user's own -----------------------------------------------------------------------------------------------------
@@ -303,16 +302,16 @@ def test_all_vectors_are_read_in_the_order_of_the_spec():
 
 def test_a_network_of_ones_own():
     network, inputs = make(network="user_networks:Own", options={"gain": 2.0}), make_inputs()
-    assert_close(network(inputs)[:, :, 3, 1], 2 * inputs.vector.sum(-1))
+    assert_close(network(inputs)[0][:, :, 3, 1], 2 * inputs.vector.sum(-1))
 
 
 def test_trying_a_network_of_ones_own_leaves_no_trace():
     spec, shape = (
-        NetworkSpec(network="user_networks:Stateful"),
+        network_spec(network="user_networks:Stateful"),
         InputShape({"state": FEATURES}, {"camera": PIXELS}, steps=1),
     )
     torch.manual_seed(0)
-    network = build(spec, shape, OUTPUTS, COPIES)
+    network = build(spec, shape, OUTPUTS, COPIES).module
     drawn = torch.rand(3)
     torch.manual_seed(0)
     untried = Stateful(shape, OUTPUTS, COPIES)
@@ -378,7 +377,7 @@ def test_a_network_that_cannot_be_built_says_why(shape, settings, message):
         make(shape, **settings)
 
 
-@pytest.mark.parametrize("keys", [("cam.rgb", "values"), ("type", "cam%2Ergb"), ("%type", "training"), ("a", "b")])
+@pytest.mark.parametrize("keys", [("cam.rgb", "values"), ("type", "training"), ("b", "a")])
 @pytest.mark.parametrize("layers", [[], [{"filters": 2, "kernel": 3}] * 2])
 def test_a_picture_may_have_any_name(keys, layers):
     """A network for two pictures gives what one gives that has the same weights under plain names."""
@@ -389,14 +388,7 @@ def test_a_picture_may_have_any_name(keys, layers):
         return make(InputShape({}, dict.fromkeys(names, PIXELS)), network="conv", hidden=[4], **settings)
 
     def given(names):
-        return network_of(names)(Inputs({}, dict(zip(names, seen.images.values(), strict=True)), seen.time))
+        return network_of(names)(Inputs({}, dict(zip(names, seen.images.values(), strict=True)), seen.time))[0]
 
     assert torch.equal(given(keys), given(plain))
-    own = network_of(keys)
-    network_of(keys).load_state_dict(own.state_dict())
-    assert ("convolutions.a.weight" in own.state_dict()) == (keys[0] == "a")  # as runs have it
-
-
-def test_no_two_names_of_pictures_become_one():
-    names = ["cam.rgb", "%cam.rgb", "%cam%2Ergb", "cam%2Ergb", "%25cam", "%cam", "values", "%values", "."]
-    assert len({_module(name) for name in names}) == len(names)
+    network_of(keys).load_state_dict(network_of(plain).state_dict())

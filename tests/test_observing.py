@@ -8,7 +8,7 @@ import torch
 
 from ddco_pyro.acting.window import ObservationError, Window
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.model.encoding import ObservationEncoder
+from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec
 
 

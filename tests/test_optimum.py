@@ -11,7 +11,7 @@ import torch
 from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
 
 STD = 0.4  # of the control, in units of its spread

@@ -200,7 +200,7 @@ def test_another_file_is_replaced_only_where_that_is_said(toy_run, file: Path, t
     assert segment(toy_run.folder, other, copy).status == 0
     for there in (other, copy):
         before = there.read_bytes()
-        says = f"--out {there}: is there already and is not a labelled copy of {file}; choose another --out, or replace"
+        says = f"--out {there}: exists and is not a labelled copy of {file}; choose another --out, or replace"
         refused(segment(toy_run.folder, file, there), says)
         assert there.read_bytes() == before
         ended = segment(toy_run.folder, file, there, "--overwrite")

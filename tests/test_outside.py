@@ -15,11 +15,11 @@ from odd_files import Row
 from odd_files.hdf5 import ROWS, STEPS, changed, demonstrations, last_not_whole, linked, raw, virtual
 
 from ddco_pyro.data import memory
+from ddco_pyro.data.checks import usable
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.data.values import usable
 
 ELSEWHERE = {
     "raw": (changed(raw), ["actions.raw"]),

@@ -20,12 +20,12 @@ from killing import struck
 import ddco_pyro
 from ddco_pyro.acting.window import ObservationError, Window
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
-from ddco_pyro.data.pictures import Pictures, Transform, shifted
-from ddco_pyro.data.reading import Job, Readers, read
+from ddco_pyro.data.pictures import Job, Pictures, Readers, Transform, read, shifted
 from ddco_pyro.errors import Failed
 from ddco_pyro.exporting import runner, write_numpy
-from ddco_pyro.fitting.fitted_to import digest
-from ddco_pyro.model.encoding import Batch, ObservationEncoder
+from ddco_pyro.fitting.digest import digest
+from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec, SpecError, parse_spec, with_overrides
 
 HEIGHT, WIDTH = 12, 10

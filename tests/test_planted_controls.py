@@ -8,7 +8,7 @@ import torch
 from planted import make_spec, make_trainer, make_truth, plant, recovered
 
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.data.control_parts import ControlPart, control_parts
+from ddco_pyro.data.controls import ControlPart, control_parts
 from ddco_pyro.training.networks import Dimensions
 
 BOUND = 0.12
@@ -32,7 +32,7 @@ def test_options_with_saturated_controls_are_recovered(tmp_path):
     controls = np.concatenate([demo.actions for demo in demos])
     assert (np.abs(controls) == BOUND).mean() > 0.3
     auto = make_trainer(learned("auto", 3), demos, tmp_path / "auto")
-    assert [part.kind for part in auto.first.scaling.parts] == ["clipped"]
+    assert [part.kind for part in auto.hierarchy.scaling.parts] == ["clipped"]
     found = recovered(auto.run(), truth, *held_out)
     gaussian = recovered(make_trainer(learned("gaussian", 3), demos, tmp_path / "gaussian").run(), truth, *held_out)
     assert found["found nmi"][0] > 0.98 * found["truth nmi"][0]

@@ -24,17 +24,17 @@ from killing import struck
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.run import fit
-from ddco_pyro.model.encoding import STEPS_AT_ONCE
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.model.batch import STEPS_AT_ONCE
 from ddco_pyro.spec import dump_spec, parse_spec
 from ddco_pyro.training import restarts as restarting
-from ddco_pyro.training.checkpoint import Progress
+from ddco_pyro.training.checkpoint import Progress, Restart
 from ddco_pyro.training.launching import check_processes, launched, requested, together
+from ddco_pyro.training.loop import StageTraining
 from ddco_pyro.training.networks import Dimensions
-from ddco_pyro.training.objective import Objective, TrainingError
-from ddco_pyro.training.ranks import Ranks
+from ddco_pyro.training.objective import TrainingError
+from ddco_pyro.training.processes import ALONE, Ranks
 from ddco_pyro.training.restarts import Trainer
-from ddco_pyro.training.shards import ascend, cut
 from ddco_pyro.training.stages import plan
 
 DROPPING = {"network": "mlp", "hidden": [6], "dropout": 0.3}
@@ -77,21 +77,21 @@ def demos():
 @pytest.mark.parametrize("rows", [8, 3, 1])
 @pytest.mark.parametrize(("dtype", "close"), [(torch.float32, 1e-6), (torch.float64, 1e-12)])
 def test_the_gradient_of_four_shards_is_that_of_one(demos, rows, dtype, close):
-    material = Trainer(make_spec(), Dimensions.of(demos), *demos.split(0.2, 0)).material
-    model = material.hierarchy(0)
-    assert model.step_bytes > 0  # counted while it is as it was built
-    inputs = material.train.inputs.map(lambda array: array.to(dtype), material.train.inputs.time)
-    material, model = replace(material, train=replace(material.train, inputs=inputs)), model.to(dtype)
-    objective = Objective(material, Progress(0), plan(material.spec, 1)[-1])
-    parameters = list(model.parameters())
     minibatch, results = torch.randperm(8, generator=torch.Generator().manual_seed(rows))[:rows], []
-    steps = int(material.train.lengths[minibatch].sum())
     for count in (1, 4):
-        shards = cut(minibatch, count, int)
-        assert len(shards) == min(count, rows)
-        assert torch.cat([shard.rows for shard in shards]).tolist() == minibatch.tolist()
-        value = ascend(objective, model, parameters, shards, steps)
-        results.append((value, [parameter.grad.clone() for parameter in parameters]))
+        data = Trainer(make_spec(shards=count), Dimensions.of(demos), *demos.split(0.2, 0)).data
+        model = data.hierarchy(0)
+        assert model.step_bytes > 0  # counted while it is as it was built
+        batches = [
+            replace(batch, inputs=batch.inputs.map(lambda array: array.to(dtype), batch.inputs.time))
+            for batch in (data.train, data.tune)
+        ]
+        data, model = replace(data, train=batches[0], tune=batches[1]), model.to(dtype)
+        stage = StageTraining(data, model, plan(data.spec, 1)[-1], Restart(Progress(0)), ALONE)
+        assert [len(shard) > 0 for shard in stage._shards(minibatch)] == [True] * min(count, rows)
+        assert torch.cat(stage._shards(minibatch)).tolist() == minibatch.tolist()
+        value = stage.step(data.train, minibatch, 0)
+        results.append((value, [parameter.grad.clone() for parameter in stage.parameters]))
     (value, gradients), (other, others) = results
     assert other == pytest.approx(value, rel=close)
     largest = max(float(gradient.abs().max()) for gradient in gradients)
@@ -134,9 +134,9 @@ def test_three_processes_give_the_same_bits(demos, tmp_path):
     spoilt = {}
     for name in ("alone", "shared"):
         spoilt[name] = make(make_spec(shards=3, batch_size=8), demos, False)
-        train = spoilt[name].material.train
+        train = spoilt[name].data.train
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(spoilt[name].material.seed(0, 0, 0))  # restart, stage, epoch
+            torch.manual_seed(spoilt[name].data.seed(0, 0, 0))  # restart, stage, epoch
             train.actions[torch.randperm(len(train))[-1]] = torch.nan
 
     def share():
@@ -302,7 +302,7 @@ def test_what_went_wrong_in_another_process_is_said_by_the_first(whole, tmp_path
 
     spec, _ = whole
     first, other = under_torchrun(
-        tmp_path, "fit", spec, "--out", tmp_path / "run", other=lambda: setattr(restarting, "advance", fails)
+        tmp_path, "fit", spec, "--out", tmp_path / "run", other=lambda: setattr(restarting, "train", fails)
     )
     said = (
         "ddco-pyro: process 1, which trained together with this one, has failed: RuntimeError: no room on this device"
@@ -318,7 +318,7 @@ def test_a_process_that_is_killed_is_not_said_to_have_failed(whole, tmp_path):
 
     spec, _ = whole
     first, _ = under_torchrun(
-        tmp_path, "fit", spec, "--out", tmp_path / "run", other=lambda: setattr(restarting, "advance", dies)
+        tmp_path, "fit", spec, "--out", tmp_path / "run", other=lambda: setattr(restarting, "train", dies)
     )
     assert (first.status, first.err.count("\n")) == (1, 1)
     assert first.err.startswith("ddco-pyro: a process that trained together with this one was ended from outside")

@@ -1,6 +1,5 @@
 import html
 import re
-import shutil
 from html.parser import HTMLParser
 
 import h5py
@@ -11,9 +10,10 @@ from moving_demonstrations import made, reaches, recorded
 
 from ddco_pyro.drawing import words
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
-from ddco_pyro.fitting.fit import load
-from ddco_pyro.fitting.run import fit, write_metrics
-from ddco_pyro.report import film, write_report
+from ddco_pyro.fitting.fit import fit, load
+from ddco_pyro.fitting.run import write_metrics
+from ddco_pyro.report import rollouts as rolling
+from ddco_pyro.report import write_report
 from ddco_pyro.report.activity import activity
 from ddco_pyro.simulation.episodes import Episode, paired_difference, summarize
 from ddco_pyro.simulation.film import write_film
@@ -43,7 +43,7 @@ def run(folder, demos, **changes):
 def coarse():
     """Small pictures are drawn faster."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ddco_pyro.drawing.pictures.DOTS_PER_INCH", 40)
+        patch.setattr("ddco_pyro.drawing.figures.DOTS_PER_INCH", 40)
         yield
 
 
@@ -153,7 +153,7 @@ def test_a_baseline_has_no_options(labelled):
     page = write_report(found.baselines["flat"], demos).read_text()
     assert found.baselines["flat"].metrics == before
     assert ids(page) == ["likelihood", "demonstrations", "dimensions", "learning", "warnings", "particulars"]
-    assert "no other model was trained to compare with. Flat had not converged: more epochs can change this." in page
+    assert "no baseline was trained to compare with. Not converged: flat; more epochs may change this result." in page
     assert "<strong>Flat has not converged: " in page
     assert "sign of a degenerate solution" not in page
     assert 'href="#segments' not in page
@@ -235,8 +235,8 @@ def test_the_segments_are_those_of_the_most_likely_path(labelled):
 
 def test_a_long_list_is_folded_and_long_timelines_are_cut(labelled, monkeypatch):
     found, _, demos = labelled
-    monkeypatch.setattr("ddco_pyro.report.demonstration_list.SHOWN", 3)
-    monkeypatch.setattr("ddco_pyro.report.demonstration_list.MOST_BOXES", 1)
+    monkeypatch.setattr("ddco_pyro.report.likelihood.SHOWN", 3)
+    monkeypatch.setattr("ddco_pyro.report.options.MOST_SEGMENTS", 1)
     page = write_report(found, demos).read_text()
     seen, _, folded = page.partition("<details><summary>The other 5 demonstrations</summary>")
     listed = rows_of(page)
@@ -246,21 +246,6 @@ def test_a_long_list_is_folded_and_long_timelines_are_cut(labelled, monkeypatch)
     assert "ddco-pyro segment RUN FILE --html PAGE" in folded
 
 
-def test_runs_of_before_have_no_list_and_of_agreement_the_mutual_information(labelled, tmp_path):
-    found, _, demos = labelled
-    before = {key: value for key, value in found.metrics.items() if key != "demonstrations_by_likelihood"}
-    before["agreement"] = {"labels": "phase", "train": [0.123], "valid": [0.456]}
-    folder = shutil.copytree(found.folder, tmp_path / "before")
-    write_metrics(folder, before)
-    page = write_report(load(folder), demos).read_text()
-    assert ids(page) == ["likelihood", "dimensions", "learning", "options", "agreement", "warnings", "particulars"]
-    shown = " ".join(text(page).split())
-    assert "held out 0.46 – –" in shown
-    assert "training 0.12 – –" in shown
-    assert "Where each label" not in shown
-    assert 'href="#segments' not in page
-
-
 def test_words_of_the_method_are_explained_where_they_stand(labelled, deep):
     shown = " ".join(text(labelled[1]).split())
     for explained in (
@@ -268,8 +253,8 @@ def test_words_of_the_method_are_explained_where_they_stand(labelled, deep):
         "“From clusters” trains",
         "“Alone” trains",
         "vq-1, level-1, meta-policy, joint, policy",
-        "how likely an active option is to end at a step (its termination condition, ψ in the paper)",
-        "given the whole demonstration (u in the paper)",
+        "probability that an active option ends at a step (its termination condition, ψ in the paper)",
+        "Posterior probability of each option at each step",
         "A nat is the unit of log-likelihood",
     ):
         assert explained in shown
@@ -300,8 +285,9 @@ def test_films_begin_with_the_model(deep):
 
 def test_films_past_the_limit_are_links(deep, monkeypatch):
     size = (deep[0].folder / "videos" / "ddco-1000.mp4").stat().st_size
-    monkeypatch.setattr(film, "MOST_BYTES", size)
-    found = film.films(deep[0].folder, first="ddco")
+    monkeypatch.setattr(rolling, "MOST_BYTES", size)
+    paths = sorted((deep[0].folder / "videos").glob("*.mp4"))
+    found = rolling.films_of(deep[0].folder, paths)
     assert [one.uri is None for one in found] == [False, True, True]
     assert found[1].link == "videos/ddco-1001.mp4"
 
@@ -346,5 +332,5 @@ def test_the_spec_may_say_what_is_drawn(tmp_path, labelled):
     shown = " ".join(text(write_report(found, demos).read_text()).split())
     assert "first three numbers of observation “hand”, in its own units" in shown
     automatic = " ".join(text(labelled[1]).split())
-    assert "observation “place”, in its own units. Of those with three numbers or more it moves the most" in automatic
+    assert "observation “place”, in its own units. Among observations of three numbers or more, it moves" in automatic
     assert "report.trajectory in the spec names another" in automatic

@@ -5,10 +5,9 @@ import pytest
 from moving_demonstrations import made, reaches, recorded
 
 from ddco_pyro.report.activity import Activity, LevelActivity, bins
-from ddco_pyro.report.plot_likelihood import Likelihood, draw
-from ddco_pyro.report.plot_rows import order
-from ddco_pyro.report.plot_timing import shares, terminations
-from ddco_pyro.report.plot_trajectories import movement, position_key, view
+from ddco_pyro.report.likelihood import Likelihood, draw
+from ddco_pyro.report.options import row_order, shares, terminations
+from ddco_pyro.report.trajectories import movement, position_key, view
 
 
 def test_bins_are_steps_where_demonstrations_are_equally_long():
@@ -29,7 +28,7 @@ def test_shares_and_terminations_are_weighted_means():
     level = LevelActivity("option", active, np.zeros((2, 3), int), np.zeros((2, 3), int), termination)
     gathered = bins(np.array([3, 3]))
     np.testing.assert_allclose(shares(level, gathered), [[0, 1, 0], [0, 0.75, 0.25], [0, 0, 1]])
-    nan = np.nan  # nobody can end before the first step, and option 2 is not there before the last
+    nan = np.nan  # no option ends before the first step, and option 2 is not active before the last
     expected = [[nan, nan], [0.5, nan], [(0.5 + 0.5 * 0.9) / 1.5, 1.0]]
     np.testing.assert_allclose(terminations(level, gathered), expected)
 
@@ -44,7 +43,7 @@ def test_rows_are_sorted_by_length_then_by_the_first_change():
         LevelActivity(name, nothing, path, np.zeros_like(path), nothing)
         for name, path in (("low", low), ("high", high))
     )
-    found = order(Activity(levels, (low >= 0).sum(1)))
+    found = row_order(Activity(levels, (low >= 0).sum(1)))
     assert [paths[row] for row in found] == ["1----", "1222-", "1121-", "1111-", "12111", "11222", "11111"]
 
 
@@ -106,5 +105,5 @@ def test_a_model_alone_is_compared_with_nothing():
     for rows, panels in ([alone], 1), ([alone, other], 2):
         axes = draw(rows).axes
         assert len(axes) == panels
-        held_out = axes[0].collections[1].get_offsets()
-        np.testing.assert_allclose(held_out, [(row.valid, place) for place, row in enumerate(rows)])
+        shown = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes[0].lines]
+        np.testing.assert_allclose(shown, [(row.valid, place) for place, row in enumerate(rows)])

@@ -7,7 +7,7 @@ import pytest
 import toy_task
 
 from ddco_pyro.drawing import words
-from ddco_pyro.report import tables
+from ddco_pyro.report.rollouts import measures_table
 from ddco_pyro.simulation.episodes import summarize
 
 
@@ -32,7 +32,7 @@ def test_a_column_is_of_one_kind_whatever_was_seen():
         "flat": [{"topples": 0.0, "inserted": np.nan, "accuracy_mm": np.nan}] * 2,
         "ddco": [{"topples": 3.0, "inserted": 1.0, "accuracy_mm": 1.0}] * 2,
     }
-    found = tables.measures({name: {"measures": summarize(task, outcomes)} for name, outcomes in seen.items()})
+    found = measures_table({name: {"measures": summarize(task, outcomes)} for name, outcomes in seen.items()})
     assert found.head == ["Method", "Topples", "Inserted", "Accuracy (mm)"]
     assert found.rows == [
         ["flat", "0.00 ± 0.00 [0.00 to 0.00], n = 2", "0 of 0", "– (n = 0)"],

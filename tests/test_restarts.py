@@ -12,7 +12,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing import words
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import EpochEnded, RestartDiverged, RestartStopped
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.training import loop as training
 from ddco_pyro.training import restarts as restarting
@@ -151,7 +151,7 @@ class Scripted:
     def __init__(self, curves):
         self.curves = curves
 
-    def __call__(self, material, restart, until, seconds=0.0, checkpoint=None, on_event=None, ranks=None):
+    def __call__(self, data, restart, until, checkpoint=None, on_event=None, ranks=None):
         progress = restart.progress
         curve = self.curves[progress.restart]
         progress.start = curve[0]
@@ -162,8 +162,8 @@ class Scripted:
         progress.done = progress.epoch == len(curve) - 1
         if progress.done:
             progress.ended = [{"stage": "joint", "epochs": 1, "cap": 1, "rising": 0.0, "over": 1}]
-        restart.states = {"best": material.hierarchy(progress.restart).state_dict()}
-        return restart, True
+        restart.states = {"best": data.hierarchy(progress.restart).state_dict()}
+        return restart
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -171,7 +171,7 @@ def test_the_worse_half_is_stopped_at_each_rung(demos, tmp_path, monkeypatch, se
     random = np.random.default_rng(seed)
     number, first = int(random.integers(1, 10)), int(random.integers(1, 4))
     curves = [random.integers(0, 30, random.integers(2, 30)).astype(float).tolist() for _ in range(number)]  # with ties
-    monkeypatch.setattr(restarting, "advance", Scripted(curves))
+    monkeypatch.setattr(restarting, "train", Scripted(curves))
     told = []
     trainer = make_trainer(make_spec(restarts=number, halving=first), demos, tmp_path, told.append)
     model = trainer.run().state_dict()
@@ -186,7 +186,7 @@ def test_the_worse_half_is_stopped_at_each_rung(demos, tmp_path, monkeypatch, se
     tops = [max(curve[: count + 1]) for curve, count in zip(curves, made, strict=True)]
     best = trainer.summary["restarts"]["best"]
     assert tops[best] == max(tops)
-    expected = trainer.material.hierarchy(best).state_dict()
+    expected = trainer.data.hierarchy(best).state_dict()
     assert all(torch.equal(model[name], value) for name, value in expected.items())
 
 
@@ -199,8 +199,8 @@ def test_without_halving_all_are_trained_and_the_best_is_kept(demos, tmp_path, u
     assert not any(isinstance(event, RestartStopped) for event in told)
     alone = []
     for number in range(5):
-        restart, arrived = training.advance(trainer.material, Restart(Progress(number)), None)
-        assert arrived
+        restart = training.train(trainer.data, Restart(Progress(number)))
+        assert restart.progress.done
         alone.append(restart)
     rows = [row for restart in alone for row in restart.progress.history]
     assert trainer.history == rows
@@ -256,7 +256,7 @@ def with_diverging(request, demos, tmp_path_factory):
 def test_a_restart_that_diverges_ends_there_and_is_not_the_best(with_diverging):
     trainer, model, told, _ = with_diverging
     ended = diverged(trainer)
-    starts = [trainer.material.hierarchy(number).meta_policy.network.weight[0, 0] > 0 for number in range(6)]
+    starts = [trainer.data.hierarchy(number).meta_policy.network.module.weight[0, 0] > 0 for number in range(6)]
     passes = int(trainer.spec.baseline.policy.options["passes"])
     rows = [sum(row["restart"] == number for row in trainer.history) for number in range(6)]
     assert ended
@@ -268,7 +268,7 @@ def test_a_restart_that_diverges_ends_there_and_is_not_the_best(with_diverging):
     assert sorted(reasons) == ended
     assert all(f"epoch {passes + 1}: the log-likelihood of demo_" in why for why in reasons.values())
     assert f"; diverged: {', '.join(map(str, ended))}" in words.restarts(trainer.summary)
-    made = training.advance(trainer.material, Restart(Progress(best)), None)[0]
+    made = training.train(trainer.data, Restart(Progress(best)))
     if passes == 1:  # those that diverge in the first rung are worse than all others there
         assert ended == [number for number in range(6) if starts[number]]
     if passes == 10:  # the last one that was left: another goes on, which had been stopped

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from command_line import call
 
+from ddco_pyro.data.checks import rounding
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
-from ddco_pyro.data.values import rounding
-from ddco_pyro.model.encoding import ObservationEncoder
+from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec
 
 SHAPES = {"resting": (4,), "half": (3,), "place": (2,), "distance": (1,), "settled": (1,)}
@@ -79,8 +79,8 @@ def test_inspect_says_so(path: Path) -> None:
         assert found.fields[f"obs/{key}"].rounding == []
     assert found.fields["actions"].rounding == []
     rows = {line.split("│")[0].strip(): line.split("│")[-1].strip() for line in call("inspect", path).out.splitlines()}
-    assert rows["obs/resting"] == "constant but for rounding"
-    assert rows["obs/half"] == "constant but for rounding: 1"
+    assert rows["obs/resting"] == "constant up to rounding"
+    assert rows["obs/half"] == "constant up to rounding: 1"
     fields = {field["place"]: field for field in json.loads(call("inspect", path, "--json").out)["fields"]}
     assert fields["obs/resting"]["rounding"] == [1, 2, 3]
 

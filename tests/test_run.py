@@ -19,11 +19,12 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan, TrainingEnded
-from ddco_pyro.fitting.fit import RunError
-from ddco_pyro.fitting.run import claim, claimed, fit, train
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.run import RunError, claim, claimed
 from ddco_pyro.spec import dump_spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.restarts import train_model
 
 
 @pytest.fixture(scope="module")
@@ -302,10 +303,10 @@ def test_the_engines_are_compared_on_a_model_that_the_seed_decides(toy_spec, dem
     for seed in (1, 2):
         torch.manual_seed(seed)
         before = torch.get_rng_state()
-        checks.append(train(spec, Dimensions.of(demos), demos).check)
+        checks.append(train_model(spec, Dimensions.of(demos), demos).check)
         assert torch.equal(torch.get_rng_state(), before)
     assert checks[0] == checks[1]
-    assert checks[0] != train(with_overrides(spec, {"seed": 1}), Dimensions.of(demos), demos).check
+    assert checks[0] != train_model(with_overrides(spec, {"seed": 1}), Dimensions.of(demos), demos).check
 
 
 def test_a_finished_run_is_left_as_it_is(copied, toy_spec):

@@ -8,7 +8,7 @@ import torch
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking, Saliency
-from ddco_pyro.drawing.heat import HEIGHT, overlaid
+from ddco_pyro.drawing.colours import HEIGHT, with_heat
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import parse_spec
 
@@ -101,7 +101,7 @@ def test_colours_are_where_the_values_are():
     """Nothing, a half and all of a grey picture's pixels: pale grey, then the scale's middle and its end."""
     picture, values = np.full((12, 16, 3), 100, np.uint8), np.zeros((12, 16))
     values[:6, 8:], values[6:, 8:] = 0.5, 1.0
-    drawn = overlaid(picture, values)
+    drawn = with_heat(picture, values)
     assert drawn.shape == (240, 320, 3)
     assert (drawn[:, :160] == 255 - 155 // 2 - 1).all()
     red, green, _ = np.moveaxis(drawn[:, 160:].astype(int), -1, 0)
@@ -111,4 +111,4 @@ def test_colours_are_where_the_values_are():
 
 def test_nothing_at_all_is_drawn_as_it_is():
     picture = np.full((12, 16, 1), 255, np.uint8)
-    assert (overlaid(picture, np.zeros((12, 16))) == 255).all()
+    assert (with_heat(picture, np.zeros((12, 16))) == 255).all()

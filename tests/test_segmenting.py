@@ -119,7 +119,7 @@ def test_labels_from_elsewhere_are_never_replaced(toy_run, file):
     before = file.read_bytes()
     ended = call("segment", toy_run.folder, file, "--in-place")
     assert ended.status == 2
-    assert "demo_3: labels/option is there already and was not written by ddco-pyro segment" in ended.err
+    assert "demo_3: labels/option exists and was not written by ddco-pyro segment" in ended.err
     assert file.read_bytes() == before
 
 
@@ -180,7 +180,7 @@ def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy
     assert "Agreement with the label “phase”" in text
     assert f"<td>options, 3 held out</td><td>{scores['valid']:.2f}</td>" in text
     assert f"<td>options, 9 others</td><td>{scores['train']:.2f}</td>" in text
-    assert "3 of 12 demonstrations were held out when it was fitted" in text
+    assert "3 of 12 demonstrations were held out when the run was fitted" in text
 
 
 def test_baselines_stand_beside_the_options_on_what_was_held_out(toy_run, file, tmp_path):

@@ -16,10 +16,9 @@ from command_line import call
 import ddco_pyro
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
-from ddco_pyro.segmenting.lerobot import annotate
-from ddco_pyro.segmenting.lerobot_forms import FORMS
+from ddco_pyro.segmenting.lerobot import FORMS, annotate
 from ddco_pyro.spec import parse_spec
 
 LEROBOT = Path(__file__).parent / "fixtures" / "lerobot"
@@ -147,9 +146,9 @@ def test_a_copy_with_subtasks(lerobot_run, tmp_path, form, features, more):
     for wrong, message in (
         (
             [LEROBOT, "--lerobot", out, "--lerobot-format", form],
-            "annotated: is there already; choose another --lerobot",
+            "annotated: exists; choose another --lerobot",
         ),
-        ([LEROBOT, "--lerobot", out, "--level", "phase", "--lerobot-format", other], "annotated: is there already"),
+        ([LEROBOT, "--lerobot", out, "--level", "phase", "--lerobot-format", other], "annotated: exists"),
         ([out, "--lerobot", tmp_path / "twice"], "has subtasks already; name a dataset without them"),
         ([out, "--lerobot", tmp_path / "twice", "--lerobot-format", other], "has subtasks already; name a dataset"),
     ):

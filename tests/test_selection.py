@@ -18,14 +18,14 @@ from selecting import Told, data_at, kept, score, spec_at, two_skills
 
 import ddco_pyro
 from ddco_pyro.errors import Failed
-from ddco_pyro.fitting.fit import Fit, RunError
-from ddco_pyro.fitting.fitted_to import OtherDemonstrations
-from ddco_pyro.fitting.run import train
-from ddco_pyro.selection import SelectionFailed, Workers, check, final_spec, parallel, scoring, select
-from ddco_pyro.selection.folds import FoldError
-from ddco_pyro.selection.parallel import BackendError
+from ddco_pyro.fitting.digest import OtherDemonstrations
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.run import RunError
+from ddco_pyro.selection import SelectionFailed, Workers, check, final_spec, folds, select
+from ddco_pyro.selection.folds import BackendError, FoldError
 from ddco_pyro.spec import SpecError, with_overrides
 from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.restarts import train_model
 
 ONE = Workers(1)
 COMMAND = Path(sys.executable).with_name("ddco-pyro")
@@ -47,7 +47,7 @@ def test_a_score_is_that_of_a_fit_without_the_fold(finished):
     for row in made.choice.rows:
         names = made.folds.held_out[2]
         rest = demos.select([name for name in demos.names if name not in names])
-        trained = train(row.candidate.spec, Dimensions.of(demos), rest)
+        trained = train_model(row.candidate.spec, Dimensions.of(demos), rest)
         expected = Fit(row.candidate.spec, trained.hierarchy).log_likelihood(demos.select(names))
         np.testing.assert_array_equal(scores[row.candidate.number, 2]["log_likelihood"], expected)
 
@@ -58,9 +58,9 @@ def test_restarts_are_chosen_inside_the_training_part(tmp_path, monkeypatch):
 
     def spied(spec, dimensions, demos, held_out):
         seen.append(set(demos.names))
-        return train(spec, dimensions, demos, held_out=held_out)
+        return train_model(spec, dimensions, demos, held_out=held_out)
 
-    monkeypatch.setattr(scoring, "train", spied)
+    monkeypatch.setattr(folds, "train_model", spied)
     made = select(spec, tmp_path / "run", Told(), ONE)
     assert [seen[fold] & set(made.folds.held_out[fold]) for fold in range(3)] == [set()] * 3
     assert [len(names) for names in seen] == [8, 8, 8]
@@ -97,7 +97,7 @@ def test_the_file_is_what_the_scores_say(finished):
 def test_what_is_there_is_not_done_again(finished, monkeypatch):
     spec, folder, made, _ = finished
     before = (folder / "selection.json").read_bytes()
-    monkeypatch.setattr(parallel, "score", None)
+    monkeypatch.setattr(folds, "score", None)
     told = Told()
     again = select(spec, folder, told, ONE)
     assert (told.begun, told.pairs) == ([(8, 8)], [])
@@ -129,7 +129,7 @@ def test_the_final_fit_is_on_all_the_data(finished):
 def faked(values, calls=None):
     """Instead of training: the value of a candidate in a fold, or why it fails."""
 
-    def scored(folds, candidate, fold):
+    def scored(divided, candidate, fold):
         if calls is not None:
             calls.append((candidate.number, fold))
         value = values(candidate.number, fold)
@@ -153,14 +153,14 @@ def test_a_fold_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch):
 
 
 def test_where_nothing_is_left_the_first_reason_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(parallel, "score", faked(lambda c, f: "it diverged" if f == 1 else 1.0))
+    monkeypatch.setattr(folds, "score", faked(lambda c, f: "it diverged" if f == 1 else 1.0))
     with pytest.raises(SelectionFailed, match="every candidate has failed in some fold; the first reason: it diverged"):
         select(spec_at(tmp_path), tmp_path / "run", Told(), ONE)
     assert json.loads((tmp_path / "run" / "selection.json").read_text())["chosen"] is None
 
 
 def test_an_unexpected_error_is_told_and_tried_again_next_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(scoring, "train", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(folds, "train_model", lambda *_, **__: 1 / 0)
     with pytest.raises(SelectionFailed, match="unexpected ZeroDivisionError: division by zero"):
         select(spec_at(tmp_path), tmp_path / "run", Told(), ONE)
     monkeypatch.undo()
@@ -173,7 +173,7 @@ def hopeless_second(candidate, fold):
 
 def test_hopeless_candidates_are_given_up_only_if_asked(tmp_path, monkeypatch):
     spec, calls = spec_at(tmp_path, folds=6), []
-    monkeypatch.setattr(parallel, "score", faked(hopeless_second, calls))
+    monkeypatch.setattr(folds, "score", faked(hopeless_second, calls))
     whole = select(spec, tmp_path / "whole", Told(), ONE)
     assert len(calls) == 12
     assert [row.status for row in whole.choice.rows] == ["scored", "scored"]
@@ -191,7 +191,7 @@ def test_hopeless_candidates_are_given_up_only_if_asked(tmp_path, monkeypatch):
 def test_giving_up_does_not_depend_on_interruptions(tmp_path, monkeypatch):
     """Scores that are there already, of folds after the one in which a candidate is given up, do not count."""
     spec = spec_at(tmp_path, folds=6)
-    monkeypatch.setattr(parallel, "score", faked(hopeless_second))
+    monkeypatch.setattr(folds, "score", faked(hopeless_second))
     select(spec, tmp_path / "early", Told(), ONE, stop_early=True)
     select(spec, tmp_path / "whole", Told(), ONE)
     select(spec, tmp_path / "whole", Told(), ONE, stop_early=True)
@@ -242,7 +242,7 @@ def test_a_killed_selection_goes_on_and_gives_the_same(tmp_path):
         [COMMAND, *arguments, cut, "--jobs", "1", "--resume"], env=environment, capture_output=True, text=True
     )
     assert resumed.returncode == 0, resumed.stderr
-    assert f"({len(done)} of 8 kept from before)" in resumed.stderr
+    assert f"({len(done)} of 8 kept)" in resumed.stderr
     assert {path: path.read_bytes() for path in done} == done
     told = Told()
     select(ddco_pyro.load_spec(spec), tmp_path / "whole", told, ONE)
@@ -252,8 +252,8 @@ def test_a_killed_selection_goes_on_and_gives_the_same(tmp_path):
 
 
 def test_a_process_that_is_ended_from_outside_has_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr(parallel, "score", ending)
-    with pytest.raises(Failed, match=r"was ended from outside .* what was scored is kept: continue with --resume"):
+    monkeypatch.setattr(folds, "score", ending)
+    with pytest.raises(Failed, match=r"was ended from outside .* finished folds are kept: continue with --resume"):
         select(spec_at(tmp_path), tmp_path / "run", Told(), Workers(2))
 
 

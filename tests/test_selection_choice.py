@@ -9,26 +9,25 @@ import pytest
 from scipy import stats
 from selecting import DATA, candidate, score
 
-from ddco_pyro.selection.choice import as_data, choose, hopeless
-from ddco_pyro.selection.table import cells, markdown
+from ddco_pyro.selection.choice import as_data, choose, hopeless, markdown, table
 from ddco_pyro.spec import parse_spec
 
 
-def rows(table, lengths=(10,), parameters=None):
+def rows(values, lengths=(10,), parameters=None):
     """The choice among candidates with these log-likelihoods per step, one row each, one column per fold."""
-    scores = [score(c, f, value, lengths) for c, row in enumerate(table) for f, value in enumerate(row)]
-    sizes = parameters or [None] * len(table)
-    return choose([candidate(c, size) for c, size in enumerate(sizes)], scores, len(table[0]))
+    scores = [score(c, f, value, lengths) for c, row in enumerate(values) for f, value in enumerate(row)]
+    sizes = parameters or [None] * len(values)
+    return choose([candidate(c, size) for c, size in enumerate(sizes)], scores, len(values[0]))
 
 
 def test_means_and_standard_errors_are_those_of_the_folds():
-    table = np.array([[1.0, 2.0, 4.0, 1.0], [1.5, 2.0, 5.0, 1.5]])
-    found = rows(table.tolist(), lengths=(3, 7))
-    for row, values in zip(found.rows, table, strict=True):
+    each = np.array([[1.0, 2.0, 4.0, 1.0], [1.5, 2.0, 5.0, 1.5]])
+    found = rows(each.tolist(), lengths=(3, 7))
+    for row, values in zip(found.rows, each, strict=True):
         assert row.mean == pytest.approx(values.mean())
         assert row.error == pytest.approx(values.std(ddof=1) / 2)
         assert list(row.folds.values()) == pytest.approx(values.tolist())
-    difference = table[0] - table[1]
+    difference = each[0] - each[1]
     assert found.best is found.rows[1]
     assert found.rows[0].difference == pytest.approx((difference.mean(), difference.std(ddof=1) / 2))
     assert found.rows[1].difference == (0.0, 0.0)
@@ -74,7 +73,7 @@ def test_a_candidate_with_a_failed_fold_is_named_and_not_chosen():
     assert data["failed"] == [{"candidate": 0, "name": "count = 1", "fold": 1, "reason": "it diverged"}]
     text = markdown(found, {**data, "folds": 2, "demonstrations": 2, "stop_early": None})
     assert "**Failed:** count = 1, fold 1: it diverged" in text
-    assert cells(found.rows[0], found)[-1] == "failed"
+    assert table(found).rows[0][-1] == "failed"
 
 
 def test_where_all_have_failed_there_is_no_choice():

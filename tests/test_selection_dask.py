@@ -16,7 +16,7 @@ from killing import HANGS
 from selecting import Told, data_at, kept, spec_at
 
 from ddco_pyro.selection import Workers, select
-from ddco_pyro.selection.parallel import BackendError
+from ddco_pyro.selection.folds import BackendError
 
 distributed = pytest.importorskip("distributed")
 
@@ -91,7 +91,7 @@ def test_the_command_runs_on_the_cluster(cluster, tmp_path):
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr("ddco_pyro.selection.parallel.CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr("ddco_pyro.selection.folds.CONNECT_SECONDS", 0.5)
     with pytest.raises(BackendError, match=r"^--scheduler tcp://127.0.0.1:9: no dask scheduler answers there within"):
         Workers(scheduler="tcp://127.0.0.1:9").check()
 

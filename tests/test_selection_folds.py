@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from selecting import two_skills
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.selection.folds import FoldError, assign, divide, keep
+from ddco_pyro.selection.folds import FoldError, assign, divide, keep_folds
 
 
 @given(st.data())
@@ -60,10 +60,10 @@ def test_what_its_author_set_apart_is_in_no_fold():
 def test_other_folds_are_refused(tmp_path):
     path = tmp_path / "folds.json"
     folds = divide(two_skills(6), 3, 0)
-    keep(folds, path)
+    keep_folds(folds, path)
     before = path.read_bytes()
     assert json.loads(before)["folds"] == [list(names) for names in folds.held_out]
-    keep(folds, path)
+    keep_folds(folds, path)
     with pytest.raises(FoldError, match=r"folds\.json: another version divided these .*; choose another --out"):
-        keep(divide(two_skills(6), 3, 1), path)
+        keep_folds(divide(two_skills(6), 3, 1), path)
     assert path.read_bytes() == before

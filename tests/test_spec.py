@@ -17,14 +17,14 @@ from ddco_pyro.spec import (
     HierarchySpec,
     LearnedStd,
     LevelSpec,
-    NetworkSpec,
     SpecError,
     dump_spec,
     load_spec,
+    network_spec,
     parse_spec,
     with_overrides,
 )
-from ddco_pyro.spec.reading import read_yaml
+from ddco_pyro.spec.yaml import read_yaml
 
 
 def write(folder: Path, text: str | bytes) -> Path:
@@ -54,7 +54,7 @@ def test_defaults() -> None:
     assert (spec.inference.engine, spec.rollout.seed, spec.baseline, spec.compare_with) == ("fused", 1000, None, ())
     assert spec.hierarchy is not None
     assert spec.hierarchy.levels[0].termination.network == "linear"
-    assert spec.hierarchy.levels[0].termination.hidden == ()
+    assert spec.hierarchy.meta_policy.emits == ("options",)
 
 
 def test_higher_levels_select_from_below_unless_told_otherwise() -> None:
@@ -211,7 +211,7 @@ def test_ordinary_aliases_and_merge_keys_are_read(tmp_path: Path) -> None:
     )
     spec = load_spec(write(tmp_path, anchored))
     assert spec.hierarchy is not None
-    assert spec.compare_with[0].policy == NetworkSpec(network="mlp", hidden=(64,), dropout=0.0)
+    assert spec.compare_with[0].policy == network_spec(network="mlp", hidden=(64,), dropout=0.0)
     assert spec.hierarchy.meta_policy.hidden == (64,)
 
 
@@ -273,7 +273,7 @@ def test_another_network_drops_the_settings_of_the_old_one() -> None:
     path = "hierarchy.levels.0.policy"
     linear = with_overrides(parse_spec(data), {f"{path}.network": "linear"})
     assert linear.hierarchy is not None
-    assert linear.hierarchy.levels[0].policy.hidden == ()
+    assert linear.hierarchy.levels[0].policy.hidden_sizes == ()
     with pytest.raises(SpecError, match="hidden: does not apply to network 'linear'"):
         with_overrides(parse_spec(data), {f"{path}.hidden": [3], f"{path}.network": "linear"})
 

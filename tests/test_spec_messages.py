@@ -45,7 +45,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"hierarchy.levels.0.cuont": 5},
         "hierarchy.levels.0.cuont: unknown key; did you mean hierarchy.levels.0.count?",
     ),
-    ({"epochs": 3}, "epochs: unknown key; did you mean training.epochs?"),
+    ({"sed": 3}, "sed: unknown key; did you mean seed?"),
     (
         {"inference.xyz": 3},
         "inference.xyz: unknown key; valid here: engine",
@@ -93,24 +93,27 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"control.parts": [{"name": "jaw", "dims": [0], "kind": "binary", "scale": [1.0]}]},
-        "control.parts.0.scale: is of no use to kind: binary; leave it out",
+        "control.parts.0.scale: does not apply to kind: binary; leave it out",
     ),
     (
         {"training.optimizer": {"name": "adam", "momentum": 0.5}},
-        "training.optimizer.momentum: is for name: momentum, and adam would not use it; leave it out",
+        "training.optimizer.momentum: is for name: momentum, and adam does not use it; leave it out",
     ),
-    ({"observations": ["step"]}, "observations: step alone says nothing of the state; name an observation beside it"),
+    (
+        {"observations": ["step"]},
+        "observations: step alone says nothing about the state; name an observation beside it",
+    ),
     (
         {"observations": ["state", {"key": "step", "differences": True}]},
         "observations.1.differences: step grows by the same at each step; leave it out",
     ),
     (
         {"hierarchy.meta_policy": {"network": "conv", "kernel": 3, "layers": [{"filters": 2, "kernel": 3}]}},
-        "hierarchy.meta_policy.kernel: stands beside layers, which say it of each; leave it out",
+        "hierarchy.meta_policy.kernel: each of layers has its own; leave it out",
     ),
     (
         {"hierarchy.meta_policy": {"network": "lstm", "hidden": []}},
-        "hierarchy.meta_policy.hidden: lstm has one layer at least; give its size",
+        "hierarchy.meta_policy.hidden: must have at least 1 item(s), got []",
     ),
     (
         {"hierarchy.meta_policy": {"network": "lstm", "horizon": 0}},
@@ -126,7 +129,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"hierarchy.meta_policy": {"network": "branches"}},
-        "hierarchy.meta_policy.of: missing; name an observation and its network, such as {state: {network: mlp}}",
+        "hierarchy.meta_policy.of: missing; it has to be given",
     ),
     (
         {"hierarchy.meta_policy": {"network": "lstm", "over": {"network": "mlp", "hiden": [8]}}},
@@ -145,7 +148,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"hierarchy": None}, "hierarchy: missing; declare a hierarchy, or a baseline in its place"),
     (
         {"baseline": "flat"},
-        "baseline: stands beside hierarchy; keep one of them (compare_with takes baselines to train beside)",
+        "baseline: stands beside hierarchy; keep one of the two (compare_with takes baselines to compare)",
     ),
     (
         {"compare_with": ["flt"]},
@@ -162,7 +165,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"training.epochs": None, "training.patience": None},
-        "training.epochs: null trains until training.patience, which is null too; give one of them",
+        "training.epochs: epochs and training.patience are both null; give one of them",
     ),
     (
         {"training.labels": {"level": "optoin", "from": "phase"}},
@@ -179,11 +182,11 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"hierarchy.meta_policy.emits": ["control"], "training.labels": {"level": "option", "from": "phase"}},
-        "training.labels.level: nothing selects the options of 'option'; let what is above emit options",
+        "training.labels.level: no policy selects the options of 'option'; let the policies above emit options",
     ),
     (
         {"training": {"initialize": "random", "labels": {"level": "option", "from": "phase", "hold": False}}},
-        "training.labels.hold: false uses labels in initialisation alone, which is random; say vq there",
+        "training.labels.hold: false uses labels in initialisation alone, and that is random; say vq there",
     ),
     (
         {"training.duration.mean": 0.5},

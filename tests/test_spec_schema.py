@@ -19,7 +19,8 @@ from ddco_pyro.spec import (
     parse_spec,
     spec_schema,
 )
-from ddco_pyro.spec.keypaths import edited
+from ddco_pyro.spec.networks import SETTINGS, UserNetworkSpec
+from ddco_pyro.spec.spec import edited
 
 counts = st.integers(1, 10**6)
 positive = st.floats(1e-300, 1e30)
@@ -152,25 +153,20 @@ def test_the_schema_refuses_networks_that_are_refused(place: str, network: dict[
     assert not validator.is_valid(wrong)
 
 
-def test_the_schema_says_which_networks_have_a_setting() -> None:
-    for name in ("NetworkSpec", "PolicySpec", "MetaPolicySpec"):
-        properties = spec_schema()["$defs"][name]["properties"]
-        assert properties["network"]["anyOf"][0] == {
-            "enum": ["linear", "mlp", "per_timestep", "conv", "lstm", "branches"]
-        }
-        assert properties["filters"]["description"].endswith(" For ``conv``.")
-        assert properties["horizon"]["description"].endswith(" For ``lstm``.")
-        assert properties["hidden"]["description"].endswith(
-            " For ``mlp``, ``per_timestep``, ``conv``, ``lstm``, ``branches``."
-        )
-        assert properties["hidden"]["default"] == [64]
+def test_the_schema_has_a_definition_for_each_network() -> None:
+    definitions = spec_schema()["$defs"]
+    names = [f"#/$defs/{kind.__name__}" for kind in (*SETTINGS.values(), UserNetworkSpec)]
+    assert [one["$ref"] for one in definitions["HierarchySpec"]["properties"]["meta_policy"]["oneOf"]] == names
+    assert "horizon" in definitions["LstmSpec"]["properties"]
+    assert "horizon" not in definitions["MlpSpec"]["properties"]
+    assert definitions["MlpSpec"]["properties"]["hidden"]["default"] == [64]
 
 
 def described(schema: dict[str, Any]) -> list[str]:
     """The names of the properties without a description."""
     models = [schema, *schema["$defs"].values()]
     fields = [(name, field) for model in models for name, field in model["properties"].items()]
-    return [name for name, field in fields if not {"description", "$ref"} & set(field)]  # "$ref" leads to one
+    return [name for name, field in fields if not {"description", "$ref", "const"} & set(field)]
 
 
 def test_the_schema_knows_the_keys_of_the_example() -> None:

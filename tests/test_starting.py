@@ -239,6 +239,6 @@ def test_a_file_that_is_there_is_not_replaced_unasked(path: Path, tmp_path: Path
     spec.write_text("mine")
     ended = call("init", path, "--out", spec)
     assert ended.status == 2
-    assert ended.err == f"ddco-pyro: {spec}: is there already; choose another --out, or replace it with --force\n"
+    assert ended.err == f"ddco-pyro: {spec}: exists; choose another --out, or replace it with --force\n"
     assert call("init", path, "--out", spec, "--force").status == 0
     assert spec.read_text() != "mine"

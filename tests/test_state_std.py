@@ -251,15 +251,15 @@ BOTH = {"learn": True, "per_option": True, "per_state": True}
     [
         (
             {"control": {"std": BOTH}},
-            "control.std.per_option: per_state gives each option a σ of its own already; leave per_option out",
+            "control.std.per_option: per_state gives each option its own σ already; leave per_option out",
         ),
         (
             {"control": {"parts": [{"name": "a", "dims": [0], "std": BOTH}]}},
-            "control.parts.0.std.per_option: per_state gives each option a σ of its own already; leave per_option out",
+            "control.parts.0.std.per_option: per_state gives each option its own σ already; leave per_option out",
         ),
         (
             {"baseline": {"kind": "flat", "std": OF_STATE}},
-            "baseline.std: is for baselines in compare_with; say it in control.std",
+            "baseline.std: is for baselines in compare_with; give it in control.std",
         ),
         (
             {"control": {"std": 0.1}, "compare_with": [{"kind": "flat", "std": OF_STATE}]},

@@ -13,12 +13,10 @@ from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plan
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.spec import parse_spec, with_overrides
-from ddco_pyro.training.averaging import Average
 from ddco_pyro.training.checkpoint import Progress, Restart
-from ddco_pyro.training.convergence import RISING, StageEnd
-from ddco_pyro.training.loop import advance
+from ddco_pyro.training.loop import StageTraining, backward, train
 from ddco_pyro.training.objective import Objective, TrainingError
-from ddco_pyro.training.stages import plan
+from ddco_pyro.training.stages import RISING, StageEnd, plan
 
 
 def random_demonstrations(number=10, steps=8, seed=0):
@@ -72,7 +70,7 @@ def lines(**training):
     line = np.linspace(-1, 1, 12)[:, None] * [1.0, 0.0] + np.random.default_rng(0).normal(0, 0.02, (10, 12, 2))
     demos = Demonstrations(tuple(Demonstration(f"demo_{n}", {"state": one}, one) for n, one in enumerate(line)))
     own = {"initialize": "equal_parts", "layerwise": False, "optimizer": {"lr": 0.1}, "epochs": 800, "patience": None}
-    return make_trainer(make_spec((3,), **own, **training), demos, None).material
+    return make_trainer(make_spec((3,), **own, **training), demos, None).data
 
 
 def test_a_meta_policy_that_nothing_trains_before_all_are_begins_with_its_options():
@@ -80,7 +78,7 @@ def test_a_meta_policy_that_nothing_trains_before_all_are_begins_with_its_option
     knows it, and options last. Of when it would act itself parts say nothing.
     """
     material, restart = lines(), Restart(Progress(0))
-    advance(material, restart, until=0)
+    train(material, restart, until=0)
     model = material.hierarchy(0)
     model.load_state_dict(restart.states["model"])
     with torch.no_grad():
@@ -121,13 +119,17 @@ def test_what_is_said_of_levels_and_meta_policy_trained_apart_is_the_mean_of_bot
     stage, model, rows = plan(material.spec, 1)[0], material.hierarchy(0), torch.arange(len(material.train))
     each = stage, replace(stage, discovering=1, selecting=False), replace(stage, selecting=False)
     both, levels, whole = (Objective(material, Progress(0), one) for one in each)
+
+    def ascended(objective):
+        return backward(objective, model, material.train, rows)
+
     assert both.tune(model) == pytest.approx((levels.tune(model) + whole.tune(model)) / 2)
-    assert both.ascend(model, rows) == pytest.approx((levels.ascend(model, rows) + whole.ascend(model, rows)) / 2)
+    assert ascended(both) == pytest.approx((ascended(levels) + ascended(whole)) / 2)
 
 
 def gradients(model, objective, rows):
     model.zero_grad()
-    objective.ascend(model, rows)
+    backward(objective, model, objective.data.train, rows)
     return {name: each.grad.clone() for name, each in model.named_parameters() if each.grad is not None}
 
 
@@ -239,15 +241,16 @@ def test_the_running_mean_of_the_weights_is_evaluated_and_kept(tmp_path, monkeyp
     """By its closed form, from the weights after each gradient step of the stage."""
     decay, steps, shown = 0.7, [], []
 
-    def update(self, model, old=Average.update):
-        old(self, model)
-        steps.append({name: value.detach().clone() for name, value in model.named_parameters()})
+    def step(self, *arguments, old=StageTraining.step):
+        value = old(self, *arguments)
+        steps.append({name: value.detach().clone() for name, value in self.model.named_parameters()})
+        return value
 
     def tune(self, model, old=Objective.tune):
         shown.append({name: value.detach().clone() for name, value in model.named_parameters()})
         return float(len(shown))  # every epoch is the best so far
 
-    monkeypatch.setattr(Average, "update", update)
+    monkeypatch.setattr(StageTraining, "step", step)
     monkeypatch.setattr(Objective, "tune", tune)
     spec = flat(average=decay, epochs=3, batch_size=4)
     final = make_trainer(spec, random_demonstrations(), tmp_path).run()
@@ -330,9 +333,7 @@ def test_both_engines_train_to_the_same_model(tmp_path):
 
 def test_what_is_not_finite_names_the_demonstration(tmp_path):
     trainer = make_trainer(make_spec(), random_demonstrations(), tmp_path)
-    trainer.material.train.actions[trainer.material.names.index("demo_0")] *= (
-        1e30  # its square is more than float32 can hold
-    )
+    trainer.data.train.actions[trainer.data.names.index("demo_0")] *= 1e30  # its square is more than float32 can hold
     with pytest.raises(TrainingError, match=r"demo_0 is not finite"):
         trainer.run()
 

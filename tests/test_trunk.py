@@ -90,7 +90,7 @@ def test_it_is_trained_with_the_lowest_level_and_with_all():
         ({"network": {"network": "conv"}}, "hierarchy.levels.0.policy.network: reads the trunk"),
         ({"own": {"network": "lstm"}}, "hierarchy.levels.0.trunk.network: reads the trunk"),
         ({"network": LINEAR | {"inputs": ["state"]}}, "hierarchy.levels.0.policy.inputs: the trunk reads the obs"),
-        ({"own": SEES | {"shared": True}}, "hierarchy.levels.0.trunk.shared: the hierarchy's trunk is what all opt"),
+        ({"own": SEES | {"shared": True}}, "hierarchy.levels.0.trunk.shared: all options share the hierarchy's trunk"),
     ],
 )
 def test_what_cannot_read_it_is_refused(changes, message):

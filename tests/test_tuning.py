@@ -48,7 +48,7 @@ def per_step(model, batch):
 def test_the_median_is_over_demonstrations_and_per_step_of_each(planted, tmp_path, number):
     """Of five, and of six."""
     spec = make_spec((2,), tune_by="median")
-    material = make_trainer(spec, cut(planted.select(planted.names[:number])), tmp_path).material
+    material = make_trainer(spec, cut(planted.select(planted.names[:number])), tmp_path).data
     model, batch = material.hierarchy(0), material.tune
     assert len(batch) == number // 5
     with torch.no_grad():
@@ -63,6 +63,6 @@ def test_an_odd_demonstration_among_six_does_not_stop_training(planted, tmp_path
     demos, kept = odd(planted, tune[0].name), {}
     for tune_by in ("mean", "median"):
         trainer = make_trainer(make_spec((2,), control=LEARNT, tune_by=tune_by, **TRAINING), demos, tmp_path / tune_by)
-        assert tune[0].name not in trainer.material.names
-        kept[tune_by] = per_step(trainer.run(), trainer.material.train)
+        assert tune[0].name not in trainer.data.names
+        kept[tune_by] = per_step(trainer.run(), trainer.data.train)
     assert kept["median"] > kept["mean"] + 0.5

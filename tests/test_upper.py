@@ -207,7 +207,7 @@ def test_constants_are_read_as_they_were_kept():
 
 
 def test_segments_need_a_lowest_level_found_before():
-    with pytest.raises(SpecError, match=r"training\.upper_levels: segments are those of a lowest level found before"):
+    with pytest.raises(SpecError, match=r"training\.upper_levels: segments needs the lowest level discovered first"):
         make_spec((2, 2), upper_levels="segments", layerwise=False)
 
 
@@ -215,6 +215,6 @@ def test_segments_need_a_lowest_level_found_before():
 def test_segments_need_callers_that_select(place):
     spec = make_spec((2, 2), upper_levels="segments")
     assert with_overrides(spec, {place: ["options", "control"]}).training.upper_levels == "segments"
-    with pytest.raises(SpecError, match=f"{place}: needs options") as caught:
+    with pytest.raises(SpecError, match=f"{place}: training.upper_levels: segments needs options here") as caught:
         with_overrides(spec, {place: ["control"]})
     assert len(caught.value.problems) == 1

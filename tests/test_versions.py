@@ -19,7 +19,8 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, Demonst
 from ddco_pyro.data.pictures import shifted
 from ddco_pyro.encoding import Encoding, encode, load
 from ddco_pyro.errors import BadInput
-from ddco_pyro.model.encoding import Batch, ObservationEncoder
+from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import SpecError, parse_spec
 
 VERSIONS = 3
@@ -187,7 +188,7 @@ def test_versions_of_another_shape(observation: dict[str, Any], message: str) ->
 def test_versions_that_are_not_there() -> None:
     with pytest.raises(DemonstrationsError, match=r"no obs/place_mov \(did you mean 'place_moved'\?\)"):
         ddco_pyro.fit(parse_spec(spec_of({"key": "place", "augment": {"versions": "place_mov"}})), demonstrations())
-    with pytest.raises(SpecError, match=r"observations.1.augment: step is made from nothing"):
+    with pytest.raises(SpecError, match=r"observations.1.augment: step is computed and has no versions"):
         parse_spec(spec_of("place", {"key": "step", "augment": {"versions": "place_moved"}}))
 
 

@@ -12,10 +12,9 @@ from torch import Tensor
 
 from ddco_pyro.acting.window import Window
 from ddco_pyro.inference.logspace import arrive
-from ddco_pyro.model.actor import Acting
-from ddco_pyro.model.ahmm import Tabulated, choose
+from ddco_pyro.model.ahmm import Acting, Tabulated, choose
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks.state import States
+from ddco_pyro.model.networks import States
 from ddco_pyro.model.tables import Step, complete
 from ddco_pyro.spec import OptionExecution, RolloutSpec
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from ddco_pyro.acting.window import ObservationError, Window
 from ddco_pyro.inference.filtering import Belief, Filter
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks.state import States
+from ddco_pyro.model.networks import States
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.model.tables import complete
 

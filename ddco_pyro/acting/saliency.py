@@ -10,9 +10,9 @@ import torch
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.window import Window
+from ddco_pyro.drawing.colours import with_heat
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks import Inputs
-from ddco_pyro.model.networks.state import States
+from ddco_pyro.model.networks import Inputs, States
 
 
 class Look(NamedTuple):
@@ -83,10 +83,9 @@ class Looking:
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
         """The controller's control [A]."""
         control = self._controller.act(observation)
-        from ddco_pyro.drawing.heat import overlaid  # imports cv2
 
         looks = self._saliency.step(observation, self.choices)
-        self.frames.append(np.hstack([overlaid(*look) for look in looks.values()]))
+        self.frames.append(np.hstack([with_heat(*look) for look in looks.values()]))
         return control
 
     @property

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ddco_pyro.errors import BadInput
-from ddco_pyro.model.encoding import ObservationEncoder
+from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.model.networks import Inputs
 
 

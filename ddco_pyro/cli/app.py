@@ -1,7 +1,7 @@
-"""The command line: ``ddco-pyro check | collect | fit | select | merge | compare | rollout | report``.
+"""The command line ``ddco-pyro``.
 
-Every command ends with 0 (done), 1 (failed) or 2 (bad input), and says in one line what is wrong, where, and what to
-do; ``--debug`` shows the traceback. A file for each group of commands; they import what they need when they are called.
+The exit status is 0 (done), 1 (failed) or 2 (bad input). An error is one line: the problem, its place and the remedy;
+``--debug`` shows the traceback. Commands import what they need when they are called.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ddco_pyro.cli import demos, fits, outputs, runs
+from ddco_pyro.cli import demos, fits, runs
 from ddco_pyro.errors import BadInput, Failed
 
 app = typer.Typer(
@@ -41,8 +41,8 @@ EXAMPLES: dict[Callable[..., None], str] = {
     demos.init: "init mine.hdf5 --out mine.yaml",
     demos.import_: "import pusht --out demos.hdf5",
     demos.encode: "encode demos.hdf5 --observation camera --encoder random_conv --out encoded.hdf5",
-    outputs.segment: "segment runs/mine mine.hdf5 --html segments.html",
-    outputs.export: "export runs/mine --out controller --onnx",
+    runs.segment: "segment runs/mine mine.hdf5 --html segments.html",
+    runs.export: "export runs/mine --out controller --onnx",
 }
 """Every command, in the order of ``--help``."""
 
@@ -57,7 +57,7 @@ def _print_version(asked: bool) -> None:
 def top(
     _: Annotated[
         bool,
-        typer.Option("--version", help="Say which version this is.", is_eager=True, callback=_print_version),
+        typer.Option("--version", help="Print the version.", is_eager=True, callback=_print_version),
     ] = False,
 ) -> None:
     """Options that need no command."""
@@ -76,11 +76,11 @@ def main() -> None:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """SIGTERM, by which schedulers preempt, does what Ctrl-C does, and neither is lost."""
+    """While the context lasts, SIGTERM (preemption by a scheduler) interrupts like Ctrl-C, even in finalizers."""
     before, hook = signal.signal(signal.SIGTERM, signal.default_int_handler), sys.unraisablehook
 
     def again(ignored: Any) -> None:
-        """Python ignores what is raised in a finalizer: a moment later it is raised elsewhere."""
+        """Interrupt again a moment later: Python ignores exceptions in finalizers."""
         if isinstance(ignored.exc_value, KeyboardInterrupt):
             threading.Timer(0.01, signal.pthread_kill, [threading.main_thread().ident, signal.SIGTERM]).start()
         else:
@@ -98,14 +98,14 @@ def _run() -> int:
     """The exit status of the command line."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a name may have what the terminal's encoding lacks
+            stream.reconfigure(errors="backslashreplace")  # for characters that the terminal's encoding lacks
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     if "--allow-code" in arguments:
         sys.path.append(os.getcwd())  # where a user's module:name lies
     try:
         status = app(arguments or ["--help"], prog_name="ddco-pyro", standalone_mode=False)
         sys.stdout.flush()
-    except BrokenPipeError:  # who read it, such as head, has seen enough
+    except BrokenPipeError:  # the reader, such as head, has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = 1
     except Exception as error:
@@ -121,14 +121,14 @@ def _run() -> int:
 
 
 INTERRUPTED = 130
-"""What typer makes of Ctrl-C."""
+"""Typer's status after Ctrl-C."""
 
 UsageError: Any = typer.BadParameter.__base__
-"""A wrong argument or option: click's own error, which typer does not name."""
+"""Click's error for a wrong argument or option, which typer does not export."""
 
 
 def _explain(error: Exception) -> tuple[int, list[str]]:
-    """The exit status, and a line for each thing that is wrong."""
+    """The exit status, and a line for each problem."""
     if isinstance(error, UsageError):
         command = error.ctx.command_path if error.ctx else "ddco-pyro"
         return 2, [f"{error.format_message().rstrip('.')}; see {command} --help"]

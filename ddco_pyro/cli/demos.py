@@ -1,4 +1,4 @@
-"""What comes in: ``collect``, ``inspect``, ``init``, ``import`` and ``encode``."""
+"""Commands on demonstrations: ``collect``, ``inspect``, ``init``, ``import`` and ``encode``."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli.options import AllowCode, AllowExternal, Overrides, SpecPath, out_file, written
+from ddco_pyro.cli import AllowCode, AllowExternal, Overrides, SpecPath, out_file, written
+from ddco_pyro.data.files import Output, check_outputs, write_text
 from ddco_pyro.errors import BadInput, command
 from ddco_pyro.spec import SpecError, load_spec
 
 
 class FormatName(StrEnum):
-    """What a file or folder was written by."""
+    """Formats of demonstrations."""
 
     robomimic = "robomimic"
     minari = "minari"
@@ -34,7 +35,7 @@ SourcePath = Annotated[
     ),
 ]
 FormatOption = Annotated[
-    FormatName | None, typer.Option("--format", help="What wrote it; recognised unless given.", show_default=False)
+    FormatName | None, typer.Option("--format", help="The format; recognised unless given.", show_default=False)
 ]
 
 
@@ -44,12 +45,11 @@ def collect(
     overrides: Overrides = [],  # noqa: B006
     allow_code: AllowCode = False,
 ) -> None:
-    """Record demonstrations of the task's supervisor, unless they are there already."""
+    """Record demonstrations of the task's supervisor, unless they exist."""
     loaded = load_spec(spec, overrides, allow_code)
     if loaded.demonstrated_task is None:
         raise SpecError(f"{spec}: names no task, so there is no supervisor to record")
     from ddco_pyro.cli import console
-    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.simulation.collect import collect as record
 
     own = loaded.demonstrations.path
@@ -65,7 +65,7 @@ def inspect(
     form: FormatOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print all of it as JSON.")] = False,
 ) -> None:
-    """Say what is in a file: keys, shapes, lengths, ranges, NaN, constant dimensions, masks, a spec to start with."""
+    """Print the contents of a file: keys, shapes, lengths, ranges, NaN, constant dimensions, masks, a starting spec."""
     from ddco_pyro.data.hdf5 import DemonstrationsError
     from ddco_pyro.data.inspection import inspect as look
     from ddco_pyro.data.starting import starting_spec
@@ -74,9 +74,9 @@ def inspect(
     if as_json:
         print(json.dumps(facts.as_json(), indent=1))
         return
-    from ddco_pyro.cli.console_inspection import show
+    from ddco_pyro.cli import console
 
-    show(facts)
+    console.inspection(facts)
     if facts.format != "robomimic":
         print(f"\nto fit to it, import it first: {command('import', file, '--out', 'demos.hdf5')}")
         return
@@ -91,14 +91,13 @@ def init(
     out: Annotated[Path, written(out_file, "Where to write the spec.")] = Path("spec.yaml"),
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
 ) -> None:
-    """Write a commented spec for a file of demonstrations that fits as it is."""
-    from ddco_pyro.data.files import Output, check_outputs, write_text
+    """Write a commented spec for a file of demonstrations, ready to fit."""
     from ddco_pyro.data.inspection import inspect as look
     from ddco_pyro.data.starting import starting_spec
 
     check_outputs([Output("--out", out)], [file])
     if out.exists() and not force:
-        raise BadInput(f"{out}: is there already; choose another --out, or replace it with --force")
+        raise BadInput(f"{out}: exists; choose another --out, or replace it with --force")
     facts = look(file)
     if facts.format != "robomimic":
         raise BadInput(f"{file}: is a {facts.format} dataset; first: {command('import', file, '--out', 'demos.hdf5')}")
@@ -113,20 +112,19 @@ def import_(
     form: FormatOption = None,
     observations: Annotated[
         list[str], typer.Option("--observation", metavar="KEY", help="Import only this one; repeatable.")
-    ] = [],  # noqa: B006 (typer reads the default, nobody changes it)
+    ] = [],  # noqa: B006 (typer reads the default, which never changes)
     mask: Annotated[str | None, typer.Option(help="Import only the demonstrations of this mask (filter key).")] = None,
     videos: Annotated[bool, typer.Option("--videos", help="Decode the videos of a LeRobot dataset too.")] = False,
     image_size: Annotated[
         int | None, typer.Option(min=8, max=4096, help="Scale pictures to so many pixels in height and width.")
     ] = None,
     skip_broken: Annotated[
-        bool, typer.Option("--skip-broken", help="Leave out demonstrations that cannot be used, and say which.")
+        bool, typer.Option("--skip-broken", help="Leave out demonstrations that cannot be used, and list them.")
     ] = False,
     allow_external: AllowExternal = False,
 ) -> None:
-    """Write somebody else's demonstrations into this project's layout; goes on where it was interrupted."""
+    """Write demonstrations of another format into this project's layout; an interrupted import is continued."""
     from ddco_pyro.cli import console
-    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.data.importing import Choice, import_demonstrations
     from ddco_pyro.events import DemonstrationsDone
 
@@ -161,22 +159,21 @@ def encode(
     ] = None,
     updates: Annotated[int, typer.Option(min=1, help="Gradient steps of the autoencoder.")] = 2000,
     moved: Annotated[
-        int, typer.Option(min=0, help="Versions of each demonstration to write besides, with pictures moved.")
+        int, typer.Option(min=0, help="Further versions of each demonstration, with shifted pictures.")
     ] = 0,
-    shift: Annotated[int, typer.Option(min=0, help="Pixels by which they are moved, at most.")] = 0,
+    shift: Annotated[int, typer.Option(min=0, help="Largest shift of a picture, in pixels.")] = 0,
     seed: Annotated[
-        int, typer.Option(min=0, max=2**32 - 2, help="Of weights, of the order of pictures, and of how they are moved.")
+        int, typer.Option(min=0, max=2**32 - 2, help="Seed of weights, order of pictures, and shifts.")
     ] = 0,
     allow_code: Annotated[
         bool, typer.Option("--allow-code", help="Import the user code that --encoder names.")
     ] = False,
 ) -> None:
-    """Write demonstrations with features, a vector, in the place of pictures; goes on where it was interrupted.
+    """Write demonstrations with a vector of features in place of pictures; an interrupted command is continued.
 
-    The encoder is written beside, in OUT.encoder: ddco_pyro.encoding.load reads it for acting.
+    The encoder is written to OUT.encoder; ddco_pyro.encoding.load reads it for acting.
     """
     from ddco_pyro.cli import console
-    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.encoding import Encoding
     from ddco_pyro.encoding import encode as write
     from ddco_pyro.encoding.writing import encoder_folder

@@ -1,4 +1,4 @@
-"""From a spec to a fit: ``check``, ``fit``, ``select`` and ``merge``."""
+"""Commands that fit: ``check``, ``fit``, ``select`` and ``merge``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli.options import AllowCode, Overrides, RunPath, SpecPath, out_folder, written
+from ddco_pyro.cli import AllowCode, Overrides, RunPath, SpecPath, out_folder, written
+from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import command
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Backend(StrEnum):
-    """Where folds are trained."""
+    """Backends of ``select``."""
 
     LOKY = "loky"
     DASK = "dask"
@@ -30,7 +31,7 @@ class Backend(StrEnum):
 
 def check(
     spec: Annotated[Path | None, typer.Argument(metavar="[SPEC]", help="The spec, a YAML file.")] = None,
-    overrides: Overrides = [],  # noqa: B006 (typer reads the default, nobody changes it)
+    overrides: Overrides = [],  # noqa: B006 (typer reads the default, which never changes)
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON Schema of specs instead.")] = False,
     allow_code: AllowCode = False,
 ) -> None:
@@ -44,16 +45,16 @@ def check(
     from ddco_pyro.cli import console
     from ddco_pyro.training.data import dimensions, in_file, outline, refuse_unfit
     from ddco_pyro.training.labels import used
-    from ddco_pyro.training.networks import baselines, check_networks
+    from ddco_pyro.training.networks import check_models
 
     demos = outline(loaded) if in_file(loaded) else None
     size = dimensions(loaded, demos)
-    hierarchy = check_networks(loaded, size)
+    (_, hierarchy), *baselines = check_models(loaded, size).values()
     if demos is not None:
         refuse_unfit(loaded, demos)
     labels = used(loaded, demos) if demos else None
     print(dump_spec(loaded), end="")
-    console.dimensions(loaded, size, hierarchy, baselines(loaded, size))
+    console.dimensions(loaded, size, hierarchy, baselines)
     console.control(size, hierarchy)
     console.device(loaded)
     console.labels(loaded, labels)
@@ -73,9 +74,11 @@ def fit(
     ] = None,
     seeds: Annotated[
         int | None,
-        typer.Option(min=2, help="Fit with so many training seeds in all, and say how much they differ."),
+        typer.Option(min=2, help="Fit with so many training seeds in all, and report their variation."),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Where --out holds this run whole, show it again.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Where --out holds this run, finished, show it again.")
+    ] = False,
     allow_code: AllowCode = False,
 ) -> None:
     """Fit the spec's hierarchy and its baselines; write the run folder with its report.
@@ -104,8 +107,8 @@ def _fit(
     :param workers: jobs, None for the default, and processes that share each gradient step.
     """
     jobs, processes = workers
+    import ddco_pyro
     from ddco_pyro.cli import console
-    from ddco_pyro.fitting.run import fit_run
     from ddco_pyro.fitting.seeds import check_seeds, repeat
     from ddco_pyro.report import write_report
 
@@ -118,7 +121,7 @@ def _fit(
     repeated = () if seeds is None else ("--seeds", str(seeds))
     again = command("fit", folder / "spec.yaml", "--out", folder, "--resume", *repeated, *_allowed(loaded))
     with _continued(again, folder), console.Progress() as progress:
-        fitted = fit_run(loaded, None, folder, progress, jobs, resume, processes=processes)
+        fitted = ddco_pyro.fit(loaded, None, folder, progress, jobs, processes, resume)
         if seeds is not None:
             fitted = repeat(fitted, seeds, progress, jobs)
     console.log_likelihoods(fitted.metrics)
@@ -142,7 +145,7 @@ def select(
     scheduler: Annotated[str | None, typer.Option(help="Address of the dask scheduler, tcp://HOST:PORT.")] = None,
     allow_code: AllowCode = False,
 ) -> None:
-    """Choose among the candidates of the spec's grid by cross-validation; then fit what was chosen to all the data.
+    """Choose among the candidates of the spec's grid by cross-validation; then fit the chosen one to all the data.
 
     With --stop-early, after each fold from the third on, a candidate is given up where the paired t-test over the folds
     so far puts it below the best so far (one-sided, p < 0.001), or where a fold of it has failed.
@@ -151,12 +154,11 @@ def select(
     loaded = load_spec(spec, [*overrides, *number], allow_code)
     if (backend is Backend.DASK) != (scheduler is not None):
         raise SpecError("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
+    import ddco_pyro
     from ddco_pyro import selection
     from ddco_pyro.cli import console
-    from ddco_pyro.fitting.run import fit_run
     from ddco_pyro.report import write_report
-    from ddco_pyro.selection.table import HEAD, cells
-    from ddco_pyro.training.data import seen
+    from ddco_pyro.selection.choice import table
 
     workers = selection.Workers(jobs, scheduler)
     folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -170,8 +172,10 @@ def select(
         progress.end()
         assert made.choice.chosen is not None  # or it would have failed
         final = selection.final_spec(made.choice.chosen.candidate)
-        fitted = fit_run(final, seen(final, made.demos), folder / "fit", progress, jobs)
-    console.selection(made.choice, HEAD, [cells(row, made.choice) for row in made.choice.rows])
+        fitted = ddco_pyro.fit(final, made.demos, folder / "fit", progress, jobs, keep=False)
+    console.show(table(made.choice, "held-out log-likelihood by cross-validation, nats per step"))
+    for note in made.choice.notes:
+        console.say(f"note: {note}")
     _warn(fitted)
     print(f"selection: {folder / 'selection.json'}")
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
@@ -188,12 +192,11 @@ def merge(
     jobs: Annotated[int, typer.Option(help="Processes that train restarts; -1 is one for each core.")] = -1,
     allow_code: AllowCode = False,
 ) -> None:
-    """Make two options of a run one, and fit again from its segments; write a run folder of its own.
+    """Merge two options of a run and fit again from its segments, into another run folder.
 
-    Called again, an unfinished one is continued.
+    An unfinished one is continued.
     """
     from ddco_pyro.cli import console
-    from ddco_pyro.data.files import Output, check_outputs
     from ddco_pyro.fitting import merging
     from ddco_pyro.fitting.fit import load
     from ddco_pyro.report import write_report
@@ -213,16 +216,14 @@ def merge(
 
 
 def _check_folder(folder: Path, spec: Path, loaded: Spec) -> None:
-    """See that the folder of a fit or a selection may be written."""
-    from ddco_pyro.data.files import Output, check_outputs
-
+    """Check that the folder of a fit or a selection may be written."""
     own = loaded.demonstrations.path
     check_outputs([Output("--out", folder, "folder")], [spec, *([Path(own)] if own else [])])
 
 
 @contextmanager
 def _continued(again: str, folder: Path) -> Iterator[None]:
-    """Ctrl-C ends with 1 and the command that continues, where there is something to continue."""
+    """On Ctrl-C, print the command that continues and exit with 1, where a run has begun."""
     try:
         yield
     except KeyboardInterrupt:
@@ -233,7 +234,7 @@ def _continued(again: str, folder: Path) -> Iterator[None]:
 
 
 def _warn(fitted: Fit) -> None:
-    """Signs of too short a training, and of a degenerate solution."""
+    """Warn of too short a training and of a degenerate solution."""
     from ddco_pyro.cli import console
     from ddco_pyro.report import degeneracies, unconverged
 
@@ -241,5 +242,5 @@ def _warn(fitted: Fit) -> None:
 
 
 def _allowed(spec: Spec) -> list[str]:
-    """The option that lets the user code of this spec be imported again."""
+    """``--allow-code`` where the spec names user code."""
     return ["--allow-code"] if user_code(spec) else []

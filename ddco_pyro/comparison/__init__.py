@@ -1,41 +1,115 @@
 """Runs compared on the demonstrations that all of them held out, and on rollouts from the same initial states.
 
-The form is that of arviz's ``compare``: rank, total, standard error, difference to the best, its standard error; with
-the held-out log-likelihood of a trajectory where arviz has the elpd of an observation.
+The table follows arviz's ``compare``: rank, total, standard error, difference to the best, its standard error. The
+held-out log-likelihood of a trajectory takes the place of an observation's elpd.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ddco_pyro.comparison import page, plot
-from ddco_pyro.comparison.agreement import agreements
-from ddco_pyro.comparison.rollouts import paired_rollouts
-from ddco_pyro.comparison.shared import Held, held_out
-from ddco_pyro.comparison.table import CompareError, Comparison, Row
-from ddco_pyro.data.files import json_text, write_text
-from ddco_pyro.evaluation.analysis import paired
-from ddco_pyro.fitting.fit import load
+from ddco_pyro.data.controls import difference
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.pictures import same
+from ddco_pyro.errors import BadInput
+from ddco_pyro.evaluation.agreement import UNMATCHED
+from ddco_pyro.evaluation.schema import read_successes
+from ddco_pyro.evaluation.worth import paired
+from ddco_pyro.fitting.fit import Fit, load
+from ddco_pyro.simulation.episodes import paired_difference, rate
+from ddco_pyro.training.data import parts
 
-__all__ = ["FILES", "CompareError", "Comparison", "Row", "compare", "write"]
+__all__ = ["CompareError", "Comparison", "Row", "compare"]
 
-FILES = ("compare.png", "compare.json", "compare.md", "compare.html")
-"""What a comparison is written as."""
+
+class CompareError(BadInput):
+    """Runs that cannot be compared; one line with the runs and the reason."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run, in nats over all held-out trajectories.
+
+    Errors are :func:`ddco_pyro.evaluation.worth.paired` times the steps: the variation over held-out demonstrations
+    for one fit of each run.
+
+    :param total: Σ log p(ξ_n), and its standard error ``se``.
+    :param difference: the best run's total minus this one's, and its standard error ``dse``. The trajectories are the
+        same, so ``dse`` is smaller than the two ``se`` suggest.
+    :param each: log p(ξ_n) of every trajectory.
+    :param training: the entry ``training`` of the run's ``metrics.json``.
+    """
+
+    rank: int
+    name: str
+    model: str
+    parameters: int
+    total: float
+    se: float
+    difference: float
+    dse: float
+    per_step: float
+    each: tuple[float, ...]
+    training: Mapping[str, Any] | None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A comparison of runs.
+
+    :param rows: the runs, the best first.
+    :param trajectories: the held-out trajectories, and the ``steps`` of each.
+    :param agreement: agreement of options with labels, a dict for each level of each run.
+    :param rollouts: success paired by initial state, a dict for each pair of runs.
+    :param sorted_by: the run whose likelihood sorts the trajectories: the best with options, or the best.
+    """
+
+    rows: Sequence[Row]
+    trajectories: Sequence[str]
+    steps: Sequence[int]
+    agreement: Sequence[dict[str, Any]]
+    rollouts: Sequence[dict[str, Any]]
+    sorted_by: str
+
+    @property
+    def worst_first(self) -> list[dict[str, Any]]:
+        """Every trajectory with its log-likelihood per step under each run, the least likely first."""
+        listed = [
+            {
+                "name": name,
+                "steps": steps,
+                "log_likelihood_per_step": {row.name: row.each[place] / steps for row in self.rows},
+            }
+            for place, (name, steps) in enumerate(zip(self.trajectories, self.steps, strict=True))
+        ]
+        return sorted(listed, key=lambda demonstration: demonstration["log_likelihood_per_step"][self.sorted_by])
+
+    def as_data(self) -> dict[str, Any]:
+        """The comparison as plain data for ``compare.json``."""
+        return {
+            "trajectories": list(self.trajectories),
+            "steps": sum(self.steps),
+            "demonstrations": self.worst_first,
+            "rows": [asdict(row) for row in self.rows],
+            "agreement": list(self.agreement),
+            "rollouts": list(self.rollouts),
+        }
 
 
 def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
-    """The runs in these folders (a run's ``baselines/NAME`` is a run too), the best first.
+    """Compare runs; a run's ``baselines/NAME`` is a run, too.
 
     >>> compared = ddco_pyro.compare(["runs/mine", "runs/mine/baselines/flat"])
     >>> len(compared.rows), compared.rows[0].difference  # nats per step below the best
     (2, 0.0)
 
-    :param allow_code: import the user code that their specs name.
-    :raises CompareError: there are less than two, or one twice.
-    :raises NotShared: they were not held out on the same data.
+    :param allow_code: import the user code that the specs name.
+    :raises CompareError: there are fewer than two runs, one is named twice, or they held out different data.
     :raises RunError: a folder is not a finished run.
     """
     folders = [Path(run) for run in runs]
@@ -44,38 +118,143 @@ def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
     if len(folders) < 2:
         raise CompareError("one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat")
     fits = [load(folder, allow_code) for folder in folders]
-    held_runs = held_out(fits)
-    values = np.stack([held.values for held in held_runs])
-    best = int(values.sum(1).argmax())
-    rows = [_row(0, held, values[best]) for held in held_runs]
-    ranked = sorted(rows, key=lambda row: row.difference)
-    order = [row.name for row in ranked]
-    with_options = {held.run for held in held_runs if held.fit.spec.hierarchy}
-    return Comparison(
-        [Row(**vars(row) | {"rank": rank}) for rank, row in enumerate(ranked)],
-        held_runs[0].names,
-        held_runs[0].steps,
-        agreements(fits, order),
-        paired_rollouts(fits, order),
-        next((row.name for row in ranked if row.name in with_options), ranked[0].name),
+    demos = _shared(fits)
+    values = [_log_likelihoods(fit, own) for fit, own in zip(fits, demos, strict=True)]
+    best = max(values, key=np.sum)
+    order = sorted(range(len(fits)), key=lambda run: -float(values[run].sum()))
+    rows = [_row(rank, fits[run], values[run], best, demos[0].lengths) for rank, run in enumerate(order)]
+    ranked = [fits[run] for run in order]
+    agreement = [level for fit in ranked for level in _agreement(fit)]
+    sorted_by = next((str(fit) for fit in ranked if fit.spec.hierarchy), str(ranked[0]))
+    return Comparison(rows, demos[0].names, demos[0].lengths, agreement, _paired_rollouts(ranked), sorted_by)
+
+
+def _row(rank: int, fit: Fit, values: np.ndarray, best: np.ndarray, lengths: Sequence[int]) -> Row:
+    steps = np.array(lengths, dtype=float)
+    own, apart = paired(values, np.zeros(len(steps)), steps), paired(best, values, steps)
+    return Row(
+        rank,
+        str(fit),
+        fit.name,
+        int(fit.metrics["parameters"]),
+        total=float(values.sum()),
+        se=own["standard_error"] * sum(lengths),
+        difference=float((best - values).sum()),
+        dse=apart["standard_error"] * sum(lengths),
+        per_step=own["nats_per_step"],
+        each=tuple(values.tolist()),
+        training=fit.metrics.get("training"),
     )
 
 
-def _row(rank: int, held: Held, best: np.ndarray) -> Row:
-    steps = np.array(held.steps, dtype=float)
-    own, apart = paired(held.values, np.zeros(len(steps)), steps), paired(best, held.values, steps)
-    return Row(
-        rank, held.run, held.fit.name, int(held.fit.metrics["parameters"]), float(held.values.sum()),
-        own["standard_error"] * sum(held.steps), float((best - held.values).sum()),
-        apart["standard_error"] * sum(held.steps), own["nats_per_step"], tuple(held.values.tolist()),
-        held.fit.metrics.get("training"),
-    )  # fmt: skip
+def _shared(fits: Sequence[Fit]) -> list[Demonstrations]:
+    """The held-out demonstrations of each run, which are the same ones in the same order.
+
+    :raises CompareError: they differ, or the runs score other dimensions of the control.
+    """
+    own = [parts(fit.spec, fit.demonstrations).get("valid") for fit in fits]
+    shared: list[Demonstrations] = []
+    for fit, demos in zip(fits, own, strict=True):
+        if demos is None:
+            raise CompareError(
+                f"{fit}: held nothing out (demonstrations.valid_fraction: 0); there is nothing to compare"
+            )
+        if shared:
+            _check_same(fits[0], shared[0], fit, demos)
+            _check_measure(fits[0], fit)
+        shared.append(demos.select(shared[0].names) if shared else demos)
+    return shared
 
 
-def write(compared: Comparison, folder: Path) -> Path:
-    """Write ``compare.json``, ``.md``, ``.html`` and ``.png`` into a folder; the path of the page."""
-    picture = plot.write(compared, folder / "compare.png")
-    write_text(folder / "compare.json", json_text(compared.as_data()))
-    write_text(folder / "compare.md", page.markdown(compared))
-    write_text(folder / "compare.html", page.html(compared, picture, folder))
-    return folder / "compare.html"
+def _check_same(first: Fit, ours: Demonstrations, second: Fit, theirs: Demonstrations) -> None:
+    """Held-out demonstrations have the same names, controls, and observations where both runs see them."""
+    lead = f"{first} and {second} were not held out on the same data"
+    only = sorted(set(ours.names) ^ set(theirs.names))
+    if only:
+        where = first if only[0] in ours.names else second
+        remedy = "fit both with the same demonstrations, valid_fraction and seed"
+        raise CompareError(f"{lead}: {only[0]} was held out by {where} alone; {remedy}")
+    for mine, yours in zip(ours, theirs.select(ours.names), strict=True):
+        if different := _different(mine, yours):
+            raise CompareError(f"{lead}: {mine.name} has other {different}; fit both to the same demonstrations")
+
+
+def _different(mine: Demonstration, yours: Demonstration) -> str:
+    """The arrays that differ, among those of both demonstrations; empty where none does."""
+    both = [key for key in mine.observations if key in yours.observations]
+    arrays = {f"obs/{key}": (mine.observations[key], yours.observations[key]) for key in both}
+    arrays["actions"] = (mine.actions, yours.actions)
+    return ", ".join(key for key, (left, right) in arrays.items() if not same(left, right))
+
+
+def _check_measure(first: Fit, second: Fit) -> None:
+    """Both likelihoods are of the same control dimensions (constant ones are in no model), in one measure."""
+    ours, theirs = (set(fit.hierarchy.scaling.varying.tolist()) for fit in (first, second))
+    if ours != theirs:
+        dimension = min(ours ^ theirs)
+        scored, left = (first, second) if dimension in ours else (second, first)
+        raise CompareError(
+            f"{first} and {second} score different things: control dimension {dimension} is in the "
+            f"likelihood of {scored} and not in that of {left}; fit both to the same demonstrations, "
+            "with the same version"
+        )
+    if different := difference(first.hierarchy.scaling.parts, second.hierarchy.scaling.parts):
+        raise CompareError(
+            f"{first.folder} and {second.folder} measure different things: {different}; densities and probabilities "
+            "cannot be ranked, so fit both with the same control.kind"
+        )
+
+
+def _log_likelihoods(fit: Fit, demos: Demonstrations) -> np.ndarray:
+    """log p(ξ) of each demonstration.
+
+    :raises CompareError: a value is not the one in ``metrics.json``.
+    """
+    values = fit.log_likelihood(demos)
+    for name, value in zip(demos.names, values, strict=True):
+        if not fit.was_held_out(name, float(value)):
+            raise CompareError(f"{fit}: {name} has changed since this run was fitted to it; fit it again")
+    return values
+
+
+def _agreement(fit: Fit) -> Iterator[dict[str, Any]]:
+    """For each level of options: the measures that need no matching, and ``accuracy`` with options matched globally.
+
+    A measure is None where no label is known.
+    """
+    record = fit.metrics.get("agreement")
+    if not record or fit.spec.hierarchy is None:
+        return
+    for level, labels, scores in zip(fit.spec.hierarchy.levels, record["labels"], record["valid"], strict=True):
+        found = {key: (scores or {}).get(key) for key in UNMATCHED}
+        accuracy = (scores or {}).get("matched_globally", {}).get("accuracy")
+        yield {"run": str(fit), "level": level.name, "labels": labels, **found, "accuracy": accuracy}
+
+
+def _paired_rollouts(fits: Sequence[Fit]) -> list[dict[str, Any]]:
+    """Success of each run against the first one that was rolled out in the task, on the initial states of both.
+
+    ``p_value`` is McNemar's exact one.
+    """
+    known = [(fit, outcomes) for fit in fits if (outcomes := _outcomes(fit))]
+    pairs = []
+    for fit, theirs in known[1:]:
+        first, ours = known[0]
+        seeds = sorted(ours.keys() & theirs.keys())
+        if fit.spec.task == first.spec.task and seeds:
+            left, right = [ours[seed] for seed in seeds], [theirs[seed] for seed in seeds]
+            rates = {"rate": rate(int(sum(left)), len(left)), "other_rate": rate(int(sum(right)), len(right))}
+            pairs.append({"run": str(first), "other": str(fit), **paired_difference(left, right), **rates})
+    return pairs
+
+
+def _outcomes(fit: Fit) -> dict[int, float]:
+    """Success (1) or not (0) by the seed of the initial state; a baseline's are in the folder of its run, too."""
+    folder = fit.run_folder.resolve()
+    run = folder.parent.parent
+    tables = [(folder, fit.name), *([(run, folder.name)] if folder.parent == run / "baselines" else [])]
+    for place, name in tables:
+        own = {seed: value for (method, seed), value in read_successes(place).items() if method == name}
+        if own:
+            return own
+    return {}

@@ -1,4 +1,4 @@
-"""A comparison as Markdown and as a page of its own."""
+"""A comparison as a page, in Markdown and as a figure."""
 
 from __future__ import annotations
 
@@ -8,65 +8,113 @@ from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from ddco_pyro.comparison.table import Comparison, Row
+from ddco_pyro.comparison import Comparison, Row
+from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.drawing import words
-from ddco_pyro.drawing.pictures import Picture
-from ddco_pyro.drawing.templates import render
+from ddco_pyro.drawing.figures import Interval, Panel, Picture, interval_plot, save, style
+from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, note
+from ddco_pyro.evaluation.agreement import UNMATCHED
 from ddco_pyro.evaluation.worth import worth
-from ddco_pyro.fitting.fit import HIERARCHY
-from ddco_pyro.report.demonstration_list import SHOWN
-from ddco_pyro.segmenting.timeline import anchor
-from ddco_pyro.training.convergence import effort
+from ddco_pyro.report.likelihood import SHOWN
+from ddco_pyro.segmenting.agreement import measure_names
+from ddco_pyro.segmenting.page import anchor
+from ddco_pyro.training.networks import HIERARCHY
+from ddco_pyro.training.stages import effort
 
-HEAD = ("rank", "run", "model", "parameters", "total", "se", "diff", "dse", "nats/step", "gradient steps")
-AGREEMENT_HEAD = ("run", "level", "labels", "NMI", "MoF", "boundary F1 ±1", "±3", "±5")
-ROLLOUT_HEAD = ("run", "succeeds", "other", "succeeds", "only run", "only other", "states", "p")
+FILES = ("compare.png", "compare.json", "compare.md", "compare.html")
+"""The files of a comparison."""
 
 AGREEMENT = (
-    "Agreement of options with labels on the same trajectories, 1 where it is perfect; no run is ranked by it. NMI: "
-    "normalised mutual information; MoF: mean over frames, steps that agree where each option stands for one label; "
-    "boundary F1: where segments begin, within so many steps."
+    "Agreement of options with labels on the same trajectories, 1 where it is perfect; runs are not ranked by it. NMI: "
+    "normalised mutual information. ARI: adjusted Rand index, 0 by chance. Boundary F1: the steps at which segments "
+    "begin, within so many steps. Accuracy: share of steps that agree where each option stands for one label."
 )
 
 
-def cells(row: Row) -> list[str]:
-    """A run's row."""
-    numbers = [words.number(value, 1) for value in (row.total, row.se, row.difference, row.dse)]
-    if row.rank == 0:
-        numbers[2:] = ["0", "0"]
-    per_step = words.number(row.per_step, 3)
-    return [str(row.rank), row.name, row.model, str(row.parameters), *numbers, per_step, effort(row.training)]
+def write(compared: Comparison, folder: Path) -> Path:
+    """Write ``compare.json``, ``.md``, ``.html`` and ``.png`` into a folder.
+
+    :returns: the path of the page.
+    """
+    picture = write_figure(compared, folder / "compare.png")
+    whole = page(compared, picture, folder)
+    write_text(folder / "compare.json", json_text(compared.as_data()))
+    write_text(folder / "compare.md", whole.markdown())
+    write_text(folder / "compare.html", whole.html())
+    return folder / "compare.html"
 
 
-def agreement_cells(compared: Comparison) -> list[list[str]]:
-    """The rows of the agreement with labels."""
-    measures = ("nmi", "accuracy", "boundary_f1_1", "boundary_f1_3", "boundary_f1_5")
-    return [
+def page(compared: Comparison, picture: Picture, folder: Path) -> Page:
+    """A page for ``folder``. Its only links are to segments in a run's report."""
+    likelihood: list[Block] = [run_table(compared), note(_explanation(compared)), picture]
+    sections = [Section("likelihood", "Held-out log-likelihood", likelihood)]
+    if agreement := agreement_table(compared):
+        sections.append(Section("agreement", "Agreement with labels", [agreement, note(AGREEMENT)]))
+    links = _links(compared, folder)
+    listed = (
+        "All of them were held out by every run. Nats per step, the least likely under "
+        f"{compared.sorted_by} first.{' A name leads to the segments in the report of that run.' if links else ''}"
+    )
+    blocks = [note(listed), *demonstration_table(compared, links).folded(SHOWN, "demonstrations")]
+    sections.append(Section("demonstrations", "Every held-out demonstration", blocks))
+    if rollouts := rollout_table(compared):
+        rates = "Rates with Wilson 95 % intervals. p: McNemar’s exact test, two-sided, not corrected for the number of "
+        title = "Success in rollouts from the same initial states"
+        sections.append(Section("rollouts", title, [rollouts, note(f"{rates}comparisons.")]))
+    return Page(f"Comparison of {len(compared.rows)} runs", [Text(verdict(compared), "verdict")], sections)
+
+
+def run_table(compared: Comparison) -> Table:
+    """A row for each run, the best first."""
+    head = ["rank", "run", "model", "parameters", "total", "se", "diff", "dse", "nats/step", "gradient steps"]
+    rows = []
+    for row in compared.rows:
+        numbers = [words.number(value, 1) for value in (row.total, row.se, row.difference, row.dse)]
+        if row.rank == 0:
+            numbers[2:] = ["0", "0"]
+        first = [str(row.rank), row.name, row.model, str(row.parameters)]
+        rows.append([*first, *numbers, words.number(row.per_step, 3), effort(row.training)])
+    return Table(head, rows, {0, 1, 2})
+
+
+def agreement_table(compared: Comparison) -> Table | None:
+    """A row for each level of each run with labels; None where there is none."""
+    measures = (*UNMATCHED, "accuracy")
+    rows = [
         [row["run"], row["level"], row["labels"], *(words.number(row[measure], 3) for measure in measures)]
         for row in compared.agreement
     ]
+    head = ["run", "level", "labels", *measure_names(measures)]
+    return Table(head, rows, {0, 1, 2}, "agreement with labels, held out") if rows else None
 
 
-def rollout_cells(compared: Comparison) -> list[list[str]]:
-    """The rows of the paired rollouts."""
-    return [
-        [
-            pair["run"],
-            words.rate(pair["rate"]),
-            pair["other"],
-            words.rate(pair["other_rate"]),
-            str(pair["only_ours"]),
-            str(pair["only_theirs"]),
-            str(pair["trials"]),
-            words.p_value(pair["p_value"]),
-        ]
-        for pair in compared.rollouts
-    ]
+def demonstration_table(compared: Comparison, links: dict[str, str] | None = None) -> Table:
+    """Every demonstration, nats per step, the least likely first.
+
+    :param links: names to addresses.
+    """
+    head, rows = ["demonstration", "steps", *(row.name for row in compared.rows)], []
+    for row in compared.worst_first:
+        values = [words.number(value) for value in row["log_likelihood_per_step"].values()]
+        rows.append([Cell(row["name"], link=(links or {}).get(row["name"], "")), str(row["steps"]), *values])
+    return Table(head, rows)
+
+
+def rollout_table(compared: Comparison) -> Table | None:
+    """A row for each pair of runs that were rolled out; None where there is none."""
+    rows = []
+    for pair in compared.rollouts:
+        runs = [pair["run"], words.rate(pair["rate"]), pair["other"], words.rate(pair["other_rate"])]
+        counts = [str(pair["only_ours"]), str(pair["only_theirs"]), str(pair["trials"])]
+        rows.append([*runs, *counts, words.p_value(pair["p_value"])])
+    head = ["run", "succeeds", "other", "succeeds", "only run", "only other", "states", "p"]
+    return Table(head, rows, {0, 1, 2, 3}) if rows else None
 
 
 def verdict(compared: Comparison) -> str:
-    """Which run is the best, by how much, and whether that is more than its error: the report's first sentence."""
+    """The best run, its lead and whether the lead is significant, as in the report's first sentence."""
     best, *others = compared.rows
     steps = sum(compared.steps)
     differences = {
@@ -78,33 +126,15 @@ def verdict(compared: Comparison) -> str:
 
 
 def _worth(compared: Comparison) -> str:
-    """What several experts and options that last are worth, where one run of each model says so."""
+    """The worth of several experts and of options that last, where there is one run of each model."""
     models = [row.model for row in compared.rows]
     alone = {row.model: np.array(row.each) for row in compared.rows if models.count(row.model) == 1}
     found = worth(HIERARCHY, alone, compared.steps) if HIERARCHY in alone else {}
     return words.worth(found, words.method(HIERARCHY), len(compared.trajectories)) if found else ""
 
 
-def list_head(compared: Comparison) -> list[str]:
-    """The columns of the list of demonstrations."""
-    return ["demonstration", "steps", *(row.name for row in compared.rows)]
-
-
-def list_cells(compared: Comparison) -> list[list[str]]:
-    """The rows of the list of demonstrations, nats per step, the least likely first."""
-    return [
-        [row["name"], str(row["steps"]), *(words.number(value) for value in row["log_likelihood_per_step"].values())]
-        for row in compared.worst_first
-    ]
-
-
-def list_note(compared: Comparison) -> str:
-    """What the list of demonstrations is."""
-    return f"All of them were held out by every run. Nats per step, the least likely under {compared.sorted_by} first."
-
-
 def _links(compared: Comparison, folder: Path) -> dict[str, str]:
-    """Demonstrations to the address, from a page in ``folder``, of their segments in a run's report, if it has them."""
+    """Addresses of the demonstrations' segments in the report of the run that sorts them, relative to ``folder``."""
     report = Path(compared.sorted_by) / "report.html"
     text = report.read_text(encoding="utf-8") if report.exists() else ""
     address = quote(Path(os.path.relpath(report, folder)).as_posix())
@@ -112,45 +142,35 @@ def _links(compared: Comparison, folder: Path) -> dict[str, str]:
     return {name: f"{address}#{place}" for name, place in places.items() if f'id="{place}"' in text}
 
 
-def explanation(compared: Comparison) -> str:
-    """What the columns are."""
-    more = " A run that had not converged may rank higher with more epochs."
+def _explanation(compared: Comparison) -> str:
+    more = " Not converged: more epochs may change the rank of such a run."
     rising = any(row.training and not row.training["converged"] for row in compared.rows)
     return (
-        f"Held-out log-likelihood of {len(compared.trajectories)} trajectories ({sum(compared.steps)} steps), in nats. "
-        "total: sum over trajectories; se: its standard error; diff: the best's total minus this one's, trajectory by "
-        f"trajectory; dse: the standard error of that difference. Errors are over trajectories, for one fit of each "
-        f"run; the verdict has the same per step.{more if rising else ''}"
+        f"Held-out log-likelihood of {len(compared.trajectories)} trajectories ({sum(compared.steps)} steps), in nats: "
+        "one nat more per step means that the control of a step is e = 2.7 times as probable. total: sum over "
+        "trajectories; se: its standard error. diff: the best's total minus this one's, trajectory by trajectory; dse: "
+        "the standard error of that difference. Errors are over trajectories, for one fit of each run. The verdict has "
+        f"the same numbers per step.{more if rising else ''}"
     )
 
 
-def markdown(compared: Comparison) -> str:
-    """The verdict and tables in Markdown."""
-    lines = [verdict(compared), "", explanation(compared), "", *_table(HEAD, [cells(row) for row in compared.rows])]
-    if compared.agreement:
-        lines += ["", AGREEMENT, "", *_table(AGREEMENT_HEAD, agreement_cells(compared))]
-    listed = list_cells(compared)
-    lines += ["", list_note(compared), "", *_table(list_head(compared), listed[:SHOWN])]
-    if len(listed) > SHOWN:
-        lines += ["", f"The other {len(listed) - SHOWN} are in `compare.json`."]
-    if compared.rollouts:
-        lines += ["", "Success in rollouts from the same initial states; p: McNemar's exact test, two-sided.", ""]
-        lines += _table(ROLLOUT_HEAD, rollout_cells(compared))
-    return "\n".join(lines) + "\n"
+def write_figure(compared: Comparison, path: Path) -> Picture:
+    """Draw the comparison as PNG."""
+    alt = "; ".join(f"{row.name}: {row.total:.1f} nats held out" for row in compared.rows)
+    caption = (
+        f"Left: held-out log-likelihood of {len(compared.trajectories)} trajectories, ± one standard error. Right: "
+        "each run's minus the best's, ± one standard error of the paired difference."
+    )
+    with style():
+        return save(draw(compared.rows), path, alt, caption)
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    return [f"| {' | '.join(head)} |", "|" + "---|" * len(head), *(f"| {' | '.join(row)} |" for row in rows)]
-
-
-def html(compared: Comparison, picture: Picture, folder: Path) -> str:
-    """A self-contained page for ``folder``; only its links to segments lead elsewhere, to a run's report."""
-    listed = list_cells(compared)
-    values = {
-        "verdict": verdict(compared), "explanation": explanation(compared), "head": HEAD,
-        "rows": [cells(row) for row in compared.rows], "list_head": list_head(compared),
-        "agreement_head": AGREEMENT_HEAD, "agreement": agreement_cells(compared), "agreement_note": AGREEMENT,
-        "list_note": list_note(compared), "first": listed[:SHOWN], "rest": listed[SHOWN:], "picture": picture,
-        "rollout_head": ROLLOUT_HEAD, "rollouts": rollout_cells(compared), "links": _links(compared, folder),
-    }  # fmt: skip
-    return render("report/compare.html.j2", values)
+def draw(rows: Sequence[Row]) -> Figure:
+    """Totals and paired differences to the best, with their errors."""
+    totals = [Interval.around(row.total, row.se) for row in rows]
+    differences = [Interval.around(-row.difference, row.dse) if row.rank else None for row in rows]
+    panels = [
+        Panel("Each run", "held-out log-likelihood (nats)", totals, line=rows[0].total),
+        Panel("Minus the best", "nats above the best, same trajectories", differences, line=0),
+    ]
+    return interval_plot([row.name for row in rows], panels)

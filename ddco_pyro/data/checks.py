@@ -1,4 +1,4 @@
-"""Whether demonstrations can be used and go together: by shapes and types, which headers tell, and by values."""
+"""Checks of demonstrations: shapes and types, values, masks, and whether there are enough to fit to."""
 
 from __future__ import annotations
 
@@ -7,112 +7,65 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.control_dimensions import number
+from ddco_pyro.data.controls import number
 from ddco_pyro.data.hdf5 import DemonstrationsError, natural
 from ddco_pyro.data.pictures import PICTURE_DIMENSIONS
 from ddco_pyro.data.sources.recording import Column, Recording
-from ddco_pyro.data.values import LARGEST, NUMBERS, usable
 from ddco_pyro.errors import nearest
 
-LEAST = 3
-"""Demonstrations that a fit needs: to train, to stop early, and to validate."""
+# --- values -----------------------------------------------------------------------------------------------------------
+
+NUMBERS = "fiub"
+"""Kinds of numpy types that are real numbers."""
+
+LARGEST = 1e30
+"""Largest usable number: networks are float32, which ends at 3e38, and variances are float64, which ends at 1e308."""
 
 
-def check(recording: Recording) -> None:
-    """See that a demonstration has steps, and that its arrays hold numbers for each of them; no value is read.
+def usable(values: np.ndarray) -> np.ndarray:
+    """Whether each real number is finite and at most :data:`LARGEST` in size."""
+    if values.dtype.kind != "f":
+        return np.ones(values.shape, dtype=bool)
+    return np.abs(values) <= min(LARGEST, float(np.finfo(values.dtype).max))  # false for NaN
 
-    :raises DemonstrationsError: it has not, or they do not.
+
+RESOLUTION = 1e-9
+"""A dimension is treated as constant if its range is below RESOLUTION × its largest magnitude, or for coarser types
+:data:`LAST_PLACES` units in the last place."""
+
+LAST_PLACES = 4
+
+SETTLED = 256 * float(np.finfo(np.float32).eps)
+"""A dimension is treated as constant if its range is below SETTLED (3e-5) × the observation's largest magnitude, at
+most 1. Simulators round all components of a vector alike in every step: components of a quaternion at rest vary by 6e-7
+to 1.6e-5 in Meta-World's files. The bound of 1 is for mixed units, where one dimension may be in the thousands."""
+
+
+def rounding(low: np.ndarray, high: np.ndarray, dtype: np.dtype[Any]) -> np.ndarray:
+    """The largest range of each dimension that counts as rounding, [D]; wider dimensions vary.
+
+    :param low: the smallest value of each dimension of an observation [D]; ``high`` the largest. Values that are not
+        finite give NaN.
+    :param dtype: the type of the values in the file; whole numbers are not rounded.
     """
-    name, shape = recording.name, recording.actions.shape
-    for place, column in recording.columns():
-        if column.dtype.kind not in NUMBERS:
-            raise DemonstrationsError(f"{name}: {place} holds {column.dtype}, it has to hold real numbers")
-    if problem := problem_of_controls(shape[1:], recording.actions.dtype):
-        raise DemonstrationsError(f"{name}: actions {problem}")
-    if not shape[0]:
-        raise DemonstrationsError(f"{name}: actions has no steps; remove this demonstration")
-    for place, column in recording.columns():
-        check_steps(name, place, column, shape[0])
-
-
-def problem_of_controls(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
-    """What is wrong with controls whose steps have this shape; nothing where nothing is."""
-    if len(shape) == 1 and shape[0]:
-        return ""
-    if shape:
-        return f"has shape {list(shape)} at each step, it has to be [dimensions]"
-    return (
-        f"is {dtype} of shape [steps]; store discrete actions as integers (astype(int)), and anything else as "
-        "[steps, 1] (actions[:, None])"
-    )
-
-
-def problem_of_pictures(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
-    """What is wrong with pictures whose steps have this shape; nothing where nothing is, or they are none."""
-    if len(shape) != PICTURE_DIMENSIONS or dtype == np.uint8:
-        return ""
-    return (
-        f"is {dtype} of shape {list(shape)} at each step: pictures have to be uint8; scale the range that "
-        "matters to it, such as (255 * (depth / far).clip(0, 1)).astype('uint8')"
-    )
-
-
-def problem_of_labels(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
-    """What is wrong with labels whose steps have this shape; nothing where nothing is."""
-    if dtype.kind in "iub" and not shape:
-        return ""
-    had = "text" if dtype.kind in "OSU" else str(dtype)
-    return f"is {had} of shape [{', '.join(map(str, ('steps', *shape)))}], it has to be integers of shape [steps]"
-
-
-def check_steps(name: str, place: str, column: Column, steps: int) -> None:
-    """See that an array of a demonstration has as many steps as its controls.
-
-    :raises DemonstrationsError: it has not.
-    """
-    if column.shape[:1] != (steps,):
-        had = column.shape[0] if column.shape else "no"
-        raise DemonstrationsError(f"{name}: {place} has {had} steps, but actions has {steps}")
-
-
-def check_alike(recording: Recording, first: Recording) -> None:
-    """See that a demonstration has the same arrays as the first one, with steps of the same shapes.
-
-    :raises DemonstrationsError: it has not.
-    """
-    ours, theirs = dict(recording.columns()), dict(first.columns())
-    missing, more = sorted(theirs.keys() - ours.keys()), sorted(ours.keys() - theirs.keys())
-    if missing:
-        raise DemonstrationsError(f"{recording.name}: {', '.join(missing)} is missing, which {first.name} has")
-    if more:
-        raise DemonstrationsError(
-            f"{recording.name}: {', '.join(more)} is not in {first.name}; all demonstrations need the same"
-        )
-    for place, column in ours.items():
-        check_shape(f"{recording.name}: {place}", column, theirs[place].shape[1:], first.name)
-
-
-def check_shape(where: str, column: Column, expected: tuple[int, ...], first: str) -> None:
-    """See that a step of an array has the shape that it has in the first demonstration.
-
-    :raises DemonstrationsError: it has another one.
-    """
-    if column.shape[1:] != expected:
-        raise DemonstrationsError(
-            f"{where} has shape {column.shape[1:]} at each step, but {expected} in {first}; "
-            "all demonstrations need the same"
-        )
+    sizes = np.maximum(np.abs(np.asarray(low, np.float64)), np.abs(np.asarray(high, np.float64)))
+    finite = np.isfinite(sizes)
+    if dtype.kind != "f":
+        return np.where(finite, 0.0, np.nan)
+    own = max(RESOLUTION, LAST_PLACES * float(np.finfo(dtype).eps)) * np.maximum(sizes, RESOLUTION)
+    largest = min(1.0, float(sizes.max(initial=0.0, where=finite)))
+    return np.where(finite, np.maximum(own, SETTLED * largest), np.nan)
 
 
 def check_values(recording: Recording, remedy: str = "repair it") -> None:
-    """See that every number of a demonstration can be used, block by block.
+    """Refuse a demonstration with a number that is not :func:`usable`; arrays are read block by block.
 
-    :param remedy: what to do where one cannot.
-    :raises DemonstrationsError: one is NaN, infinite or beyond :data:`ddco_pyro.data.values.LARGEST`.
+    :param remedy: what the user can do.
+    :raises DemonstrationsError: a number is NaN, infinite or too large.
     """
     for place, column in recording.columns():
         if column.dtype.kind != "f":
-            continue  # whole numbers can all be used
+            continue  # whole numbers are usable
         before = 0
         for block in column.blocks():
             good = usable(block)
@@ -127,12 +80,107 @@ def check_values(recording: Recording, remedy: str = "repair it") -> None:
             before += len(block)
 
 
+# --- shapes and types -------------------------------------------------------------------------------------------------
+
+
+def check(recording: Recording) -> None:
+    """Refuse a demonstration without steps, or with arrays that are not numbers for each step; no value is read.
+
+    :raises DemonstrationsError: it is such a demonstration.
+    """
+    name, shape = recording.name, recording.actions.shape
+    for place, column in recording.columns():
+        if column.dtype.kind not in NUMBERS:
+            raise DemonstrationsError(f"{name}: {place} holds {column.dtype}, it has to hold real numbers")
+    if problem := problem_of_controls(shape[1:], recording.actions.dtype):
+        raise DemonstrationsError(f"{name}: actions {problem}")
+    if not shape[0]:
+        raise DemonstrationsError(f"{name}: actions has no steps; remove this demonstration")
+    for place, column in recording.columns():
+        check_steps(name, place, column, shape[0])
+
+
+def problem_of_controls(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+    """The problem with controls whose steps have this shape, in words; empty without a problem."""
+    if len(shape) == 1 and shape[0]:
+        return ""
+    if shape:
+        return f"has shape {list(shape)} at each step, it has to be [dimensions]"
+    return (
+        f"is {dtype} of shape [steps]; store discrete actions as integers (astype(int)), and anything else as "
+        "[steps, 1] (actions[:, None])"
+    )
+
+
+def problem_of_pictures(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+    """The problem with pictures whose steps have this shape; empty without a problem, and for other arrays."""
+    if len(shape) != PICTURE_DIMENSIONS or dtype == np.uint8:
+        return ""
+    return (
+        f"is {dtype} of shape {list(shape)} at each step: pictures have to be uint8; scale the range that "
+        "matters to it, such as (255 * (depth / far).clip(0, 1)).astype('uint8')"
+    )
+
+
+def problem_of_labels(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+    """The problem with labels whose steps have this shape; empty without a problem."""
+    if dtype.kind in "iub" and not shape:
+        return ""
+    had = "text" if dtype.kind in "OSU" else str(dtype)
+    return f"is {had} of shape [{', '.join(map(str, ('steps', *shape)))}], it has to be integers of shape [steps]"
+
+
+def check_steps(name: str, place: str, column: Column, steps: int) -> None:
+    """Refuse an array that has another number of steps than the controls.
+
+    :raises DemonstrationsError: it has.
+    """
+    if column.shape[:1] != (steps,):
+        had = column.shape[0] if column.shape else "no"
+        raise DemonstrationsError(f"{name}: {place} has {had} steps, but actions has {steps}")
+
+
+def check_alike(recording: Recording, first: Recording) -> None:
+    """Refuse a demonstration whose arrays, or their shapes at one step, differ from those of the first demonstration.
+
+    :raises DemonstrationsError: they differ.
+    """
+    ours, theirs = dict(recording.columns()), dict(first.columns())
+    missing, more = sorted(theirs.keys() - ours.keys()), sorted(ours.keys() - theirs.keys())
+    if missing:
+        raise DemonstrationsError(f"{recording.name}: {', '.join(missing)} is missing, which {first.name} has")
+    if more:
+        raise DemonstrationsError(
+            f"{recording.name}: {', '.join(more)} is not in {first.name}; all demonstrations need the same"
+        )
+    for place, column in ours.items():
+        check_shape(f"{recording.name}: {place}", column, theirs[place].shape[1:], first.name)
+
+
+def check_shape(where: str, column: Column, expected: tuple[int, ...], first: str) -> None:
+    """Refuse an array whose shape at one step differs from the first demonstration.
+
+    :raises DemonstrationsError: it differs.
+    """
+    if column.shape[1:] != expected:
+        raise DemonstrationsError(
+            f"{where} has shape {column.shape[1:]} at each step, but {expected} in {first}; "
+            "all demonstrations need the same"
+        )
+
+
+# --- training and validation ------------------------------------------------------------------------------------------
+
+LEAST = 3
+"""Fewest demonstrations for a fit: to train, to stop early, and to validate."""
+
+
 def divided(names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The demonstrations to train with and those to validate with, as the masks ``train`` and ``valid`` say.
+    """Training and validation demonstrations by the masks ``train`` and ``valid``.
 
-    One of the masks alone leaves the rest to the other.
+    If one of the masks is missing, it has all other demonstrations.
 
-    :raises DemonstrationsError: the masks overlap, or leave nothing to one of the two.
+    :raises DemonstrationsError: the masks overlap, or one of the two parts is empty.
     """
     given = {mask: dict.fromkeys(masks[mask]) for mask in ("train", "valid") if mask in masks}
     train = given["train"] if "train" in given else _without(names, given.get("valid", ()))
@@ -152,9 +200,9 @@ def _without(names: Sequence[str], others: Collection[str]) -> dict[str, None]:
 
 
 def check_division(names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> None:
-    """See that demonstrations are enough to train, to stop early, and to validate, by masks or drawn at random.
+    """Refuse demonstrations that are too few for a fit, by the masks or for a random split.
 
-    :raises DemonstrationsError: they are not, a mask names a stranger, or the masks overlap.
+    :raises DemonstrationsError: they are too few, a mask names an unknown demonstration, or the masks overlap.
     """
     for problem in problems_of_masks(masks, names):
         raise DemonstrationsError(problem)
@@ -168,9 +216,9 @@ def check_division(names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> 
 
 
 def check_trained(train: Sequence[str]) -> None:
-    """See that the demonstrations to train with can be divided once more.
+    """Refuse training demonstrations that leave none to stop early.
 
-    :raises DemonstrationsError: there is one only.
+    :raises DemonstrationsError: there is only one.
     """
     if len(train) < LEAST - 1:
         raise DemonstrationsError(
@@ -180,7 +228,7 @@ def check_trained(train: Sequence[str]) -> None:
 
 
 def problems_of_masks(masks: Mapping[str, Sequence[str]], names: Sequence[str]) -> Iterator[str]:
-    """A line for each mask that names a demonstration that is not there."""
+    """A line for each mask that names an unknown demonstration."""
     for mask, members in masks.items():
         missing = sorted(set(members) - set(names))
         if missing:
@@ -188,5 +236,5 @@ def problems_of_masks(masks: Mapping[str, Sequence[str]], names: Sequence[str]) 
 
 
 def unknown(name: str, names: Sequence[str]) -> str:
-    """What is wrong where no demonstration has this name."""
+    """The problem with an unknown demonstration, in words."""
     return f"there is no demonstration {name!r}{nearest(name, names)}"

@@ -1,4 +1,4 @@
-"""Demonstrations, checked, in memory but for the pictures of files; files are HDF5 of robomimic's layout."""
+"""Demonstrations: checked, in memory except for pictures in files, read from and written to robomimic's layout."""
 
 from __future__ import annotations
 
@@ -33,14 +33,13 @@ class Demonstration:
     >>> len(demo), demo.actions.dtype, demo.labels["phase"].shape
     (10, dtype('float64'), (10,))
 
-    :param observations: key to [T, ...]; uint8 stays as it is, other numbers become float64. Pictures uint8
-        [T, C, H, W] or [T, H, W] become [T, H, W, C]. Pictures of a file are
-        :class:`~ddco_pyro.data.pictures.Pictures`: slices of them are read when they are asked for.
-    :param actions: the controls [T, A], float64; whole numbers, of which [T] is enough, become int64.
+    :param observations: key to [T, ...]; uint8 stays, other numbers become float64. Pictures uint8 [T, C, H, W] or
+        [T, H, W] become [T, H, W, C]. Pictures in files are lazy :class:`~ddco_pyro.data.pictures.Pictures`.
+    :param actions: the controls [T, A], float64; whole numbers [T] or [T, A] become int64.
     :param labels: ground-truth segments by name, [T] or [T, 1], int64.
-    :param attributes: what is known of the whole demonstration, such as its seed.
-    :raises DemonstrationsError: no steps, unequal lengths, anything but numbers, or numbers that are NaN, infinite or
-        beyond :data:`ddco_pyro.data.values.LARGEST`.
+    :param attributes: facts about the demonstration, such as its seed.
+    :raises DemonstrationsError: no steps, unequal lengths, other values than numbers, or numbers that are NaN, infinite
+        or beyond :data:`ddco_pyro.data.checks.LARGEST`.
     """
 
     name: str
@@ -70,16 +69,16 @@ class Demonstration:
 
     @classmethod
     def of(cls, recording: Recording) -> Demonstration:
-        """A recording, read; pictures stay in their file where that can be.
+        """The demonstration in a recording; pictures stay in an HDF5 file.
 
-        :raises DemonstrationsError: its file is damaged, or it cannot be used.
+        :raises DemonstrationsError: the file is damaged, or the recording cannot be used.
         """
         observations = {key: column.observed() for key, column in recording.observations.items()}
         labels = {key: column.array() for key, column in recording.labels.items()}
         return cls(recording.name, observations, recording.actions.array(), labels, recording.attributes)
 
     def recording(self) -> Recording:
-        """The same as a recording, to be written."""
+        """The demonstration as a recording, for writing."""
         observations = {key: of_array(values) for key, values in self.observations.items()}
         labels = {key: of_array(values) for key, values in self.labels.items()}
         return Recording(self.name, observations, of_array(self.actions), labels, self.attributes)
@@ -89,7 +88,6 @@ class Demonstration:
 
 
 def _numbers(values: Any) -> Observed:
-    """As float64, or as they are if uint8."""
     if isinstance(values, Pictures):
         return values
     array = np.asarray(values)
@@ -98,7 +96,7 @@ def _numbers(values: Any) -> Observed:
 
 @dataclass(frozen=True, eq=False)
 class Demonstrations(Sequence[Demonstration]):
-    """Demonstrations that go together: the same observations, of the same shapes, and controls of the same size.
+    """Demonstrations with the same observations, of the same shapes, and controls of the same size.
 
     >>> demos = ddco_pyro.Demonstrations.read("mine.hdf5")
     >>> len(demos), demos.names[0], demos.observation_shapes, demos.control_size
@@ -108,8 +106,9 @@ class Demonstrations(Sequence[Demonstration]):
     (3, 3)
 
     :param masks: name to names of demonstrations, such as ``{"valid": ("demo_3", "demo_7")}``.
-    :param attributes: what is known of all of them.
-    :raises DemonstrationsError: none at all, a name given twice, they do not go together, a mask names an unknown one.
+    :param attributes: facts about all of them.
+    :raises DemonstrationsError: there are none, a name occurs twice, their arrays differ, or a mask names an unknown
+        demonstration.
     """
 
     demonstrations: tuple[Demonstration, ...]
@@ -138,11 +137,10 @@ class Demonstrations(Sequence[Demonstration]):
     ) -> Demonstrations:
         """The demonstrations in an HDF5 file, ``demo_2`` before ``demo_10``.
 
-        :param observations: the keys to read; all of them if None, which is not none of them, ``()``.
+        :param observations: keys to read; all if None, and none if empty.
         :param labels: names of the ground-truth labels to read; likewise.
-        :param exclude: names of demonstrations that are left out, of masks too; nothing of them is read.
-        :raises DemonstrationsError: the file cannot be read, does not hold what was asked for, or holds more than fits
-            into memory.
+        :param exclude: names of demonstrations that are not read and are removed from masks.
+        :raises DemonstrationsError: the file cannot be read, lacks something asked for, or does not fit into memory.
         """
         with open_robomimic(Path(path)) as source:
             needed = PROGRAM + _extent(source, observations, labels, exclude).size
@@ -172,12 +170,12 @@ class Demonstrations(Sequence[Demonstration]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Their names, in order."""
+        """Names of the demonstrations, in order."""
         return tuple(demo.name for demo in self.demonstrations)
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        """Their numbers of steps."""
+        """Number of steps of each demonstration."""
         return tuple(len(demo) for demo in self.demonstrations)
 
     @property
@@ -191,9 +189,9 @@ class Demonstrations(Sequence[Demonstration]):
         return int(self.demonstrations[0].actions.shape[1])
 
     def select(self, names: Iterable[str]) -> Demonstrations:
-        """The demonstrations of these names, in that order, without masks: those speak of the whole.
+        """The demonstrations of these names, in this order, without masks.
 
-        :raises DemonstrationsError: there is none of that name.
+        :raises DemonstrationsError: a name is unknown.
         """
         by_name = {demo.name: demo for demo in self.demonstrations}
         chosen = tuple(names)
@@ -205,25 +203,24 @@ class Demonstrations(Sequence[Demonstration]):
     def split(self, valid_fraction: float, seed: int) -> tuple[Demonstrations, Demonstrations]:
         """Training and validation demonstrations, at least one each.
 
-        The masks ``train`` and ``valid`` decide if there are any; one of them alone leaves the rest to the other.
-        Otherwise ``valid_fraction`` of the demonstrations are drawn with ``seed``.
+        The split follows the masks ``train`` and ``valid``; one mask leaves the rest to the other. Without these masks,
+        ``valid_fraction`` of the demonstrations are drawn with ``seed`` for validation.
 
-        :raises DemonstrationsError: there is only one, a mask leaves nothing, or the masks overlap.
+        :raises DemonstrationsError: one part is empty, or the masks overlap.
         """
-        drawn = {} if self.masks.keys() & {"train", "valid"} else {"valid": self._draw(valid_fraction, seed)}
-        train, valid = divided(self.names, {**self.masks, **drawn})
+        masks = self.masks
+        if not masks.keys() & {"train", "valid"}:
+            number = min(max(round(valid_fraction * len(self)), 1), len(self) - 1)
+            drawn = np.random.default_rng(seed).permutation(len(self))[:number]
+            masks = {"valid": tuple(self.names[index] for index in sorted(drawn))}
+        train, valid = divided(self.names, masks)
         return self.select(train), self.select(valid)
-
-    def _draw(self, fraction: float, seed: int) -> tuple[str, ...]:
-        number = min(max(round(fraction * len(self)), 1), len(self) - 1)
-        drawn = np.random.default_rng(seed).permutation(len(self))[:number]
-        return tuple(self.names[index] for index in sorted(drawn))
 
 
 def extent(path: str | Path, observations: Sequence[str], exclude: Sequence[str] = ()) -> Extent:
-    """How much there is of these observations and of the controls, by the file's headers alone.
+    """The size of these observations and of the controls, by the file's headers alone.
 
-    :raises DemonstrationsError: the file cannot be read or does not hold them.
+    :raises DemonstrationsError: the file cannot be read, or lacks an observation.
     """
     with open_robomimic(Path(path)) as source:
         return _extent(source, observations, (), exclude)
@@ -238,7 +235,6 @@ def _extent(
 def _recordings(
     source: Robomimic, observations: Sequence[str] | None, labels: Sequence[str] | None, exclude: Sequence[str]
 ) -> Iterator[Recording]:
-    """The demonstrations of a file, in order, without those that are left out."""
     for name in exclude:
         if name not in source.names:
             raise DemonstrationsError(f"demonstrations.exclude: {unknown(name, source.names)}")

@@ -1,4 +1,4 @@
-"""Where a command may write, and files that are written whole or not at all, by one process at a time."""
+"""Files: checks of output places, atomic writes, folder locks, and JSON."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ _FORBIDDEN = {
 
 
 class NoSpace(Failed):
-    """There is no room for a file; what was there before is as it was."""
+    """The disk is full; existing files are unchanged."""
 
 
 class NotWritable(BadInput):
-    """A place where nothing may be written."""
+    """A place that cannot be written."""
 
 
 class Damaged(BadInput):
-    """A file does not hold what was written into it."""
+    """A file whose contents differ from what was written."""
 
     def __init__(self, path: Path, what: str, remedy: str) -> None:
         super().__init__(path, what, remedy)
@@ -48,16 +48,16 @@ class Damaged(BadInput):
 
 
 class Busy(BadInput):
-    """Another process is writing there."""
+    """A folder that another process is writing."""
 
 
 @dataclass(frozen=True)
 class Output:
     """A place that a command writes to.
 
-    :param option: what names it in messages, such as ``--html``.
-    :param kind: ``folder``; ``file``; or ``stream``, a file that is written from its beginning to its end, so that a
-        character device such as ``/dev/null`` takes it too.
+    :param option: its name in messages, such as ``--html``.
+    :param kind: ``folder``; ``file``; or ``stream``, a file written from start to end, which may be a character device
+        such as ``/dev/null``.
     """
 
     option: str
@@ -66,20 +66,20 @@ class Output:
 
     @property
     def place(self) -> Path:
-        """The path without links."""
+        """The path with all links resolved."""
         return Path(os.path.realpath(self.path))
 
     def refused(self, why: str, remedy: str = "choose another place") -> NotWritable:
-        """The error for it."""
+        """The error that refuses the place."""
         return NotWritable(f"{self.option} {self.path}: {why}; {remedy}")
 
 
 def check_outputs(outputs: Sequence[Output], inputs: Sequence[Path] = ()) -> None:
-    """See that a command may write its outputs, before it does any work. Nothing is changed.
+    """Refuse outputs that cannot be written, before a command starts to work. Nothing is changed.
 
-    :param inputs: files and folders that the command reads. No output may be one of them, or lie in one of them.
-    :raises NotWritable: an output has an impossible name, is of another kind, cannot be written, is an input, or is
-        another output.
+    :param inputs: files and folders that the command reads; no output may be or lie in one of them.
+    :raises NotWritable: an output has an impossible name, is of another kind, cannot be written, is an input, or
+        coincides with another output.
     :raises NoSpace: the disk is full.
     """
     for number, output in enumerate(outputs):
@@ -104,7 +104,7 @@ def check_outputs(outputs: Sequence[Output], inputs: Sequence[Path] = ()) -> Non
 
 
 def _same(one: Path, other: Path) -> bool:
-    """Whether two paths lead to one file, by links too; where a file is missing, whether they would."""
+    """Whether two paths lead to one file, existing or not."""
     if one.exists() and other.exists():
         return one.samefile(other)
     return os.path.realpath(one) == os.path.realpath(other)
@@ -117,11 +117,11 @@ def _check_name(output: Output) -> None:
 
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
-"""How an HDF5 file begins."""
+"""The signature of HDF5 files."""
 
 
 def _check_kind(output: Output) -> None:
-    """See that what is there already can be replaced by what is written."""
+    """Refuse an existing file or folder that the output cannot replace."""
     try:
         mode = output.path.stat().st_mode
     except FileNotFoundError:
@@ -143,7 +143,7 @@ def _is_hdf5(path: Path) -> bool:
 
 
 def _check_writable(output: Output) -> None:
-    """See that files can be made there, with the names that are needed: permissions alone do not tell."""
+    """Refuse a place in which a file of the longest temporary name cannot be made."""
     place = output.place
     if _is_device(output.path) or place.is_file():
         if not os.access(output.path, os.W_OK):
@@ -157,7 +157,7 @@ def _check_writable(output: Output) -> None:
     try:
         with tempfile.TemporaryFile(dir=there):
             pass
-    except FileNotFoundError as error:  # /proc says so
+    except FileNotFoundError as error:  # as in /proc
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES)) from error
 
 
@@ -167,9 +167,9 @@ def _is_device(path: Path) -> bool:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A temporary name beside ``path``, which takes the place of ``path`` once the block has ended without an error.
+    """A temporary file that replaces ``path`` when the block ends without an error.
 
-    A link stays, and the file that it leads to is replaced. A character device is written into.
+    Behind a link, the target is replaced. A character device is written to.
 
     :raises NoSpace: the disk is full.
     :raises NotWritable: nothing may be written there.
@@ -195,13 +195,12 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def _target(path: Path) -> Path:
-    """What a link leads to; the path itself where it is no link."""
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 @contextmanager
 def _poured_into(device: Path) -> Iterator[Path]:
-    """A temporary file whose contents go into a device at the end."""
+    """A temporary file that is copied to a device at the end."""
     with tempfile.TemporaryDirectory() as folder:
         temporary = Path(folder) / "file"
         temporary.touch()
@@ -214,22 +213,21 @@ _TEMPORARY = ".tmp"
 
 
 def _flush(path: Path) -> None:
-    """See that what was written is on the disk."""
     if path.is_file():
         with path.open("rb") as written:
             os.fsync(written.fileno())
 
 
 _REPLACED = f"-replaced{_TEMPORARY}"
-"""How the name of a folder ends while another takes its place."""
+"""Suffix of the name of a folder that is being replaced."""
 
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder beside ``path``, which takes the place of ``path`` once the block has ended without an error.
+    """A temporary folder that replaces ``path`` when the block ends without an error.
 
-    A folder takes the place of another in two steps. Of a process that was killed between them, the folder that was
-    there stays under a temporary name, and comes back when the next process writes there.
+    The replacement takes two renames. If a process is killed between them, the old folder keeps a temporary name until
+    the next process that writes there restores it.
 
     :raises NoSpace: the disk is full.
     :raises NotWritable: nothing may be written there.
@@ -253,16 +251,15 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 
 def _put_back(replaced: Path, place: Path) -> None:
-    """Give a folder its name again, where nothing has taken its place."""
     if replaced.exists() and not place.exists():
         replaced.rename(place)
 
 
 def _prepared(place: Path) -> str:
-    """How temporary names of this process beside ``place`` begin.
+    """The prefix of this process's temporary names beside ``place``, after cleaning up.
 
-    What a process of this machine, killed while it wrote this very file or folder, has left is removed; but the folder
-    that it was replacing is put back.
+    Temporary files that killed processes of this machine left for ``place`` are removed; a folder that one of them was
+    replacing is restored.
     """
     place.parent.mkdir(parents=True, exist_ok=True)
     prefix = _prefix(place)
@@ -280,18 +277,18 @@ def _prefix(place: Path) -> str:
 
 
 def _temporary_name(place: Path) -> str:
-    """A temporary name as long as they come."""
+    """A temporary name of the greatest length."""
     return f"{_prefix(place)}{os.getpid()}-{'x' * 8}{_REPLACED}"
 
 
 def leftovers(folder: Path) -> list[Path]:
-    """What processes that were killed left of files they were writing in this folder."""
+    """Temporary files that killed processes left in a folder."""
     return [path for path in folder.glob(f".*{_TEMPORARY}") if path.is_file()]
 
 
 @contextmanager
 def _explained(path: Path) -> Iterator[None]:
-    """What the system says of a place, in words."""
+    """Translate OSError into a user-facing error."""
     try:
         yield
     except OSError as error:
@@ -305,12 +302,12 @@ def _explained(path: Path) -> Iterator[None]:
 
 @contextmanager
 def only_one(folder: Path, wait: bool = False) -> Iterator[None]:
-    """Nobody else writes in this folder, which is made where it is missing, while the block lasts.
+    """Lock a folder for the block; a missing folder is made.
 
-    The lock is the system's: it ends with the process, however that ends, and leaves no file behind.
+    The system releases the lock when the process ends, and no lock file is left.
 
-    :param wait: wait for another process to end rather than refuse.
-    :raises Busy: another process holds the folder.
+    :param wait: wait for another process rather than refuse.
+    :raises Busy: another process holds the lock.
     :raises NotWritable: the folder cannot be made.
     """
     handle = _locked(folder, wait)
@@ -332,11 +329,14 @@ def _locked(folder: Path, wait: bool) -> int:
             raise Busy(f"{folder}: another process is at work on it; wait for it, or choose another place") from None
         if folder.exists() and os.path.samestat(os.fstat(handle), folder.stat()):
             return handle
-        os.close(handle)  # who held it has removed it meanwhile
+        os.close(handle)  # the last holder has removed the folder
 
 
 def json_text(data: Any) -> str:
-    """Plain data as JSON that ends with a new line. NaN, which JSON has not, is null; infinities are a ValueError."""
+    """Plain data as JSON that ends with a new line.
+
+    :raises ValueError: a number is infinite. NaN becomes null.
+    """
     return json.dumps(_without_nan(data), indent=1, allow_nan=False) + "\n"
 
 

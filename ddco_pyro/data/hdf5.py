@@ -1,4 +1,4 @@
-"""Reading and writing HDF5: what is missing or damaged in a file is one clear line."""
+"""HDF5 files: reading with one-line errors about missing or damaged parts, and writing that survives a full disk."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from ddco_pyro.errors import BadInput, Failed, nearest
 
 Attribute = float | int | str | bool
 
-# What h5py raises for a damaged file.
 DAMAGE = (OSError, RuntimeError, ValueError, TypeError, KeyError, MemoryError)
+"""The errors of h5py about damaged files."""
 
 
 class DemonstrationsError(BadInput):
-    """Demonstrations that cannot be used; one line with the file, the demonstration and the key."""
+    """Unusable demonstrations: one line with the file, the demonstration and the key."""
 
     def __str__(self) -> str:
         return printable(super().__str__())
 
 
 def printable(text: str) -> str:
-    """A text as one line that does nothing to a terminal: names in a file can hold anything."""
+    """A text as one line without control characters, which names in a file can contain."""
     return "".join(character if character.isprintable() else repr(character)[1:-1] for character in text)
 
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[h5py.File]:
-    """The file, open for reading; whatever is wrong with it is said with its path.
+    """Open a file for reading; errors in the block name the file.
 
-    :raises DemonstrationsError: there is no such file, it is no HDF5, or it is damaged.
+    :raises DemonstrationsError: the file is missing, not HDF5, or damaged.
     """
     if os.path.exists(path) and not os.path.isfile(path):
         raise DemonstrationsError(f"{path}: is no regular file; name an HDF5 file")
@@ -58,10 +58,7 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
 
 
 class _Disk(io.RawIOBase):
-    """A file that keeps the first error of writing to itself: HDF5 can crash the process where a write fails.
-
-    From then on nothing is written any more, and ``error`` says why.
-    """
+    """A file that stops writing at the first error and keeps it in ``error``: HDF5 may crash when a write fails."""
 
     def __init__(self, path: Path, mode: Literal["w+", "r+"]) -> None:
         super().__init__()
@@ -69,7 +66,7 @@ class _Disk(io.RawIOBase):
         self.error: OSError | None = None
 
     def write(self, data: Any) -> int:
-        """Write all of it."""
+        """Write all data."""
         rest = memoryview(data).cast("B")
         size = len(rest)
         while rest and self.error is None:
@@ -80,22 +77,22 @@ class _Disk(io.RawIOBase):
         return size
 
     def readinto(self, buffer: Any) -> int:
-        """Read what is there, and zeros for what could not be written."""
+        """Read the file, with zeros in place of data that could not be written."""
         view = memoryview(buffer).cast("B")
         done = self._file.readinto(view) or 0
         view[done:] = bytes(len(view) - done)
         return len(view)
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """Go to a place."""
+        """Move to an offset."""
         return self._file.seek(offset, whence)
 
     def tell(self) -> int:
-        """Where it is."""
+        """The current offset."""
         return self._file.tell()
 
     def truncate(self, size: int | None = None) -> int:
-        """Cut it, or make it longer."""
+        """Change the size of the file."""
         try:
             return self._file.truncate(size) if self.error is None else 0
         except OSError as error:
@@ -103,16 +100,16 @@ class _Disk(io.RawIOBase):
             return 0
 
     def close(self) -> None:
-        """Close it."""
+        """Close the file."""
         self._file.close()
         super().close()
 
 
 @contextmanager
 def written(path: Path, mode: Literal["w", "r+"] = "w") -> Iterator[h5py.File]:
-    """An HDF5 file, open for writing; where a write fails, that is raised when all has been closed.
+    """Open an HDF5 file for writing; the first failed write is raised after closing.
 
-    :param mode: ``w`` for a new file, ``r+`` for changing one.
+    :param mode: ``w`` for a new file, ``r+`` to change a file.
     """
     with closing(_Disk(path, "w+" if mode == "w" else "r+")) as disk:
         try:
@@ -124,25 +121,25 @@ def written(path: Path, mode: Literal["w", "r+"] = "w") -> Iterator[h5py.File]:
 
 
 def natural(name: str) -> list[tuple[int, str]]:
-    """Sorts ``demo_2`` before ``demo_10``."""
+    """A sort key that puts ``demo_2`` before ``demo_10``."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 DEEPEST = 32
-"""Most groups within groups, links behind links, and virtual datasets of virtual datasets."""
+"""Deepest nesting of groups, of links to links, and of virtual datasets in virtual datasets."""
 
 MOST_LINKS = 2_000
-"""Most links below a group: where two lead to each of 32 groups there are four thousand million paths."""
+"""Most links below a group: with two links to each of 32 nested groups there are 4 · 10⁹ paths."""
 
 PACKED, SMALL = 5_000, 10**9
-"""A filtered dataset claims at most so many bytes for each stored byte, or this size in all; deflate reaches 1032."""
+"""Most bytes that a filtered dataset claims for each stored byte (deflate reaches 1032), or in all."""
 
 
 def datasets(group: h5py.Group, where: str = "", external: bool = False) -> list[str]:
-    """The names of all datasets below a group, links to datasets among them; dm_control's own keys have a / in them.
+    """The names of all datasets below a group, linked datasets included; keys of dm_control contain ``/``.
 
     :param external: whether links to other files are followed.
-    :raises DemonstrationsError: a link leads nowhere or to another file; groups are nested too deeply.
+    :raises DemonstrationsError: a link is broken or leads to another file, or groups are nested too deeply.
     """
     names: list[str] = []
     groups, links = [("", group, 1)], 0
@@ -164,12 +161,12 @@ def datasets(group: h5py.Group, where: str = "", external: bool = False) -> list
 
 
 def dataset_at(group: h5py.Group, key: str, where: str, external: bool = False, left: int = DEEPEST) -> h5py.Dataset:
-    """The dataset at ``key``, once every value of it is known to be stored; no value is read.
+    """The dataset at ``key``, all of whose values are stored; no value is read.
 
-    :param external: whether it may lie in other files.
-    :param left: how many virtual datasets may stand between it and what is stored.
-    :raises DemonstrationsError: it is missing, no array, or in another file, or a part is not stored: HDF5 would fill
-        in zeros.
+    :param external: whether the dataset may be in other files.
+    :param left: how many virtual datasets may be nested.
+    :raises DemonstrationsError: the dataset is missing, not an array, in another file, or partly not stored, where HDF5
+        would read zeros.
     """
     dataset = member(group, key, h5py.Dataset, where, external)
     where = f"{where}{key}"
@@ -188,7 +185,7 @@ def dataset_at(group: h5py.Group, key: str, where: str, external: bool = False, 
 
 
 def _check_stored(dataset: h5py.Dataset, where: str) -> None:
-    """See that a dataset claims no more than its file holds."""
+    """Refuse a dataset that claims more than its file holds."""
     stored = dataset.id.get_storage_size()
     filtered = stored and dataset.id.get_create_plist().get_nfilters()
     if dataset.nbytes > (max(PACKED * stored, SMALL) if filtered else stored):
@@ -201,7 +198,7 @@ def _check_stored(dataset: h5py.Dataset, where: str) -> None:
 
 
 def _check_external(dataset: h5py.Dataset, where: str) -> None:
-    """See that the raw files of a dataset hold what it claims."""
+    """Refuse a dataset whose raw files hold less than it claims."""
     claimed = dataset.nbytes
     for name, offset, size in dataset.external:
         path, part = Path(os.path.abspath(name)), min(size, claimed)
@@ -211,7 +208,7 @@ def _check_external(dataset: h5py.Dataset, where: str) -> None:
 
 
 def _check_sources(dataset: h5py.Dataset, where: str, external: bool, left: int) -> None:
-    """See that all of a virtual dataset is mapped, and that every source is there."""
+    """Refuse a virtual dataset with an unmapped part or a missing source."""
     if not left:
         raise DemonstrationsError(f"{where} is virtual, and so are its sources, in a circle; write it as an array")
     sources = dataset.virtual_sources()
@@ -242,7 +239,7 @@ def _check_sources(dataset: h5py.Dataset, where: str, external: bool, left: int)
 
 
 def _boxes(space: Any) -> Iterator[tuple[tuple[int, ...], ...]]:
-    """The parts of a selection: start, stride, count and block of each."""
+    """Start, stride, count and block of each part of a selection."""
     if space.get_select_type() == h5py.h5s.SEL_ALL:
         yield (0,) * len(space.shape), (1,) * len(space.shape), space.shape, (1,) * len(space.shape)
     elif space.is_regular_hyperslab():
@@ -253,7 +250,7 @@ def _boxes(space: Any) -> Iterator[tuple[tuple[int, ...], ...]]:
 
 
 def _outside(dataset: h5py.Dataset) -> list[str]:
-    """The other files that a dataset's values are in."""
+    """The other files that hold values of a dataset."""
     if dataset.is_virtual:
         names = {source.file_name for source in dataset.virtual_sources()} - {"."}
         return sorted(str(_beside(dataset, name)) for name in names)
@@ -261,12 +258,10 @@ def _outside(dataset: h5py.Dataset) -> list[str]:
 
 
 def _beside(item: h5py.HLObject, name: str) -> Path:
-    """A file that is named in the file of this object."""
     return Path(os.path.abspath(item.file.filename)).parent / name
 
 
 def _elsewhere(where: str, files: Sequence[str], file: h5py.File) -> DemonstrationsError:
-    """What is wrong where something lies in other files."""
     return DemonstrationsError(
         f"{where} lies in another file: {', '.join(files)}; where you trust that, copy it into one file: "
         f"ddco-pyro import {quote(file.filename)} --allow-external --out whole.hdf5"
@@ -274,9 +269,9 @@ def _elsewhere(where: str, files: Sequence[str], file: h5py.File) -> Demonstrati
 
 
 def outside_files(path: Path) -> list[str]:
-    """The other files that an HDF5 file names as parts of it, whether they are there or not.
+    """The other files that an HDF5 file names as parts of itself; they need not exist.
 
-    They are the targets of external links, external storage, and the sources of virtual datasets.
+    These are targets of external links, external storage, and sources of virtual datasets.
 
     :raises DemonstrationsError: the file cannot be read.
     """
@@ -299,7 +294,7 @@ def outside_files(path: Path) -> list[str]:
 
 
 def named(group: h5py.Group, key: str) -> bool:
-    """Whether a group has a link of this name, wherever it leads."""
+    """Whether a group has a link of this name, possibly broken."""
     return group.get(key, getlink=True) is not None
 
 
@@ -323,11 +318,11 @@ def member(group: h5py.Group, key: str, kind: type, where: str, external: bool =
 
 
 def _linked(group: h5py.Group, key: str, where: str, external: bool, left: int = DEEPEST) -> h5py.HLObject:
-    """What a path leads to, link by link, so that none is followed out of the file before that is allowed.
+    """The object at a path, resolved link by link, so that no link to another file is followed unless allowed.
 
-    :param left: soft links that may be followed.
-    :raises KeyError: a group on the way has no link of that name.
-    :raises DemonstrationsError: a link leads nowhere, or to another file, or what it leads to cannot be opened.
+    :param left: how many soft links may be followed.
+    :raises KeyError: a link is missing.
+    :raises DemonstrationsError: a link is broken or leads to another file, or its target cannot be opened.
     """
     item: Any = group
     for part in filter(None, key.split("/")):
@@ -357,7 +352,7 @@ def _linked(group: h5py.Group, key: str, where: str, external: bool, left: int =
 
 
 def attributes_of(owner: h5py.HLObject) -> dict[str, Attribute]:
-    """The attributes that hold one number or text. Others are not even read: a damaged one can claim any size."""
+    """The attributes that hold one number or text. Other attributes are not read, because they can claim any size."""
     kinds = {name: owner.attrs.get_id(name) for name in owner.attrs}
     single = [name for name, kind in kinds.items() if kind.shape == () and _is_number_or_text(kind.dtype)]
     values = {name: owner.attrs[name] for name in single}

@@ -1,4 +1,4 @@
-"""Other libraries' demonstrations into one HDF5 file of this project's layout, block by block and resumable."""
+"""Import of other libraries' demonstrations into one HDF5 file of this project's layout, resumable."""
 
 from __future__ import annotations
 
@@ -8,33 +8,31 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from ddco_pyro.data.checks import check, check_alike, check_values
+from ddco_pyro.data.checks import NUMBERS, check, check_alike, check_values
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, opened
-from ddco_pyro.data.resumable import Parts, discard, parts_of
+from ddco_pyro.data.pictures import resized
 from ddco_pyro.data.sources import Column, Format, Recording, Source, open_source
-from ddco_pyro.data.sources.robomimic import FREQUENCY
-from ddco_pyro.data.values import NUMBERS
+from ddco_pyro.data.sources.robomimic import FREQUENCY, Parts, discard, parts_of
 from ddco_pyro.errors import BadInput, nearest
 
 IDENTITY = "imported"
-"""Attribute of a file: what decided its contents."""
+"""Attribute of a file: digest of the source and the choice."""
 
 OnRecording = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What of a source is imported.
+    """The part of a source that is imported.
 
-    :param observations: keys; all that hold numbers, without pictures from videos, if empty.
-    :param mask: only the demonstrations of this mask (robomimic: filter key).
-    :param videos: decode the videos too.
-    :param image_size: height and width to which pictures are scaled; as they are if None.
-    :param skip_broken: leave out demonstrations that cannot be used rather than refuse them.
-    :param allow_external: read the parts of an HDF5 file that lie in other files.
+    :param observations: keys; if empty, all observations that hold numbers, without videos.
+    :param mask: import only the demonstrations of this mask (robomimic: filter key).
+    :param videos: whether videos are decoded, too.
+    :param image_size: height and width to which pictures are scaled; None for no scaling.
+    :param skip_broken: whether unusable demonstrations are left out rather than refused.
+    :param allow_external: whether parts of an HDF5 file may be in other files.
     """
 
     observations: tuple[str, ...] = ()
@@ -47,7 +45,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Imported:
-    """What an import did: the demonstrations in the file, and those left out, with the reason."""
+    """The result of an import: the demonstrations in the file, and the reason for each that was left out."""
 
     path: Path
     names: tuple[str, ...]
@@ -61,12 +59,12 @@ def import_demonstrations(
     choice: Choice = Choice(),
     on_recording: OnRecording = lambda done, total: None,
 ) -> Imported:
-    """Write the demonstrations of a file or folder into ``out``; what an interrupted import has done is kept.
+    """Write the demonstrations of a file or folder into ``out``, continuing an interrupted import.
 
-    Memory holds one block of an array at a time, whatever the size of the files.
+    Memory holds one block of an array at a time.
 
     :raises DemonstrationsError: the source cannot be read, or a demonstration cannot be used.
-    :raises BadInput: ``out`` is there already and is something else, or another process is writing it.
+    :raises BadInput: ``out`` exists and is not this import, or another process is writing it.
     """
     with open_source(source, form, choice.allow_external) as opened_source:
         identity = _identity(opened_source, choice)
@@ -85,7 +83,7 @@ def import_demonstrations(
 
 
 def _keep(source: Source, choice: Choice, parts: Parts, on_recording: OnRecording) -> dict[str, str]:
-    """Add every demonstration that is not there yet; those that had to be left out, with the reason."""
+    """Add all missing demonstrations; the reason for each that is left out."""
     names = _names(source, choice)
     left_out: dict[str, str] = {}
     first: Recording | None = None
@@ -110,10 +108,7 @@ def _keep(source: Source, choice: Choice, parts: Parts, on_recording: OnRecordin
 
 
 def _check_headers(source: Source, names: Sequence[str], choice: Choice) -> None:
-    """See that demonstrations can be used, as far as headers say, before the first of them is written.
-
-    :raises DemonstrationsError: one cannot.
-    """
+    """Refuse unusable demonstrations by their headers, before anything is written."""
     first: Recording | None = None
     try:
         for name in names:
@@ -130,7 +125,7 @@ def _refused(error: DemonstrationsError) -> DemonstrationsError:
 
 
 def _identity(source: Source, choice: Choice) -> str:
-    """What decides the contents of an import."""
+    """What determines the contents of an import."""
     files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in source.files]
     return json.dumps({"format": source.format, "files": files, "choice": asdict(choice)})
 
@@ -159,7 +154,6 @@ def _names(source: Source, choice: Choice) -> tuple[str, ...]:
 
 
 def _masks(source: Source, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """The masks, of those demonstrations that were imported."""
     present = set(names)
     imported = {mask: tuple(name for name in members if name in present) for mask, members in source.masks.items()}
     return {mask: members for mask, members in imported.items() if members}
@@ -167,12 +161,12 @@ def _masks(source: Source, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 def _attributes(source: Source, path: str | Path, identity: str) -> dict[str, Attribute]:
     frequency = {FREQUENCY: source.frequency} if source.frequency else {}
-    said = {"source": Path(path).name, "source_format": source.format, IDENTITY: _digest(identity)}
-    return {**source.attributes, **frequency, **said}
+    facts = {"source": Path(path).name, "source_format": source.format, IDENTITY: _digest(identity)}
+    return {**source.attributes, **frequency, **facts}
 
 
 def _chosen(recording: Recording, choice: Choice) -> Recording:
-    """The recording with the observations that are wanted."""
+    """The recording with the chosen observations, scaled."""
     known = recording.observations
     for key in choice.observations:
         if key not in known:
@@ -194,10 +188,6 @@ def _scaled(column: Column, size: tuple[int, int] | None) -> Column:
 
     def blocks() -> Iterator[np.ndarray]:
         for block in column.blocks():
-            yield np.stack([_resized(frame, size) for frame in block])
+            yield resized(block, size)
 
     return Column((column.shape[0], *size, column.shape[3]), column.dtype, blocks)
-
-
-def _resized(frame: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    return cv2.resize(frame, size[::-1], interpolation=cv2.INTER_AREA).reshape(*size, frame.shape[-1])

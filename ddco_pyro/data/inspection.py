@@ -1,10 +1,11 @@
-"""What is in a file of demonstrations: keys, shapes, lengths, ranges, and what would be in the way of a fit."""
+"""Inspection of demonstrations: keys, shapes, lengths, ranges, unusual controls, and problems for a fit."""
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,40 +13,41 @@ import h5py
 import numpy as np
 
 from ddco_pyro.data.checks import (
+    LARGEST,
+    NUMBERS,
     check_division,
     check_shape,
     check_steps,
+    divided,
     problem_of_controls,
     problem_of_labels,
     problem_of_pictures,
     problems_of_masks,
+    rounding,
+    usable,
 )
-from ddco_pyro.data.coincidences import Coincidences
-from ddco_pyro.data.control_dimensions import ControlDimension, ControlStatistics, notes
-from ddco_pyro.data.control_parts import control_parts, described
+from ddco_pyro.data.controls import ControlDimension, ControlStatistics, control_parts, described, listed, notes, number
 from ddco_pyro.data.hdf5 import DemonstrationsError, outside_files
 from ddco_pyro.data.pictures import MOVED
 from ddco_pyro.data.sources import Column, Format, Source, open_source
-from ddco_pyro.data.values import LARGEST, NUMBERS, rounding, usable
 from ddco_pyro.spec import ControlSpec
 
 
 @dataclass
 class Field:
-    """One array over all demonstrations that have it: ``actions``, ``obs/<key>`` or ``labels/<name>``.
+    """Statistics of one array over the demonstrations that have it: ``actions``, ``obs/<key>`` or ``labels/<name>``.
 
     :param shape: of one step.
-    :param minimum: smallest finite value of each dimension, flattened, of the array's own type; empty where there is
-        none, infinite where none is finite.
+    :param minimum: the smallest finite value of each flattened dimension, in the array's type; empty without values,
+        infinite without finite values. ``maximum`` likewise.
     :param nan: number of NaN.
     :param infinite: number of infinite values.
-    :param huge: number of finite values that are larger than any that can be used.
-    :param first: demonstration and step of the first value that cannot be used; None where all can.
-    :param affected: names of the demonstrations with such values.
-    :param constant: dimensions (flattened) that have one value in the whole file.
-    :param still: whether it never changes within a demonstration.
-    :param demonstrations: how many demonstrations have it.
-    :param video: whether it lies in videos, which are not looked into.
+    :param huge: number of finite values beyond the largest usable number.
+    :param first: demonstration and step of the first unusable value; None if all values are usable.
+    :param affected: names of the demonstrations with unusable values.
+    :param still: whether the array is constant within every demonstration.
+    :param demonstrations: number of demonstrations that have the array.
+    :param video: whether the array is in video files, which are not decoded.
     """
 
     place: str
@@ -64,22 +66,22 @@ class Field:
 
     @property
     def key(self) -> str:
-        """Its name without the folder."""
+        """The name without the folder."""
         return self.place.partition("/")[2] or self.place
 
     @property
     def image(self) -> bool:
-        """Whether a step of it is a picture, uint8 [H, W, C]."""
+        """Whether a step is a picture, uint8 [H, W, C]."""
         return self.dtype == "uint8" and len(self.shape) == 3
 
     @property
     def numeric(self) -> bool:
-        """Whether it holds real numbers."""
+        """Whether the array holds real numbers."""
         return np.dtype(self.dtype).kind in NUMBERS
 
     @property
     def problem(self) -> str:
-        """What is wrong with its shape or type; nothing where nothing is."""
+        """The problem with the shape or type, in words; empty without a problem."""
         if self.place == "actions":
             return problem_of_controls(self.shape, np.dtype(self.dtype))
         ask = problem_of_labels if self.place.startswith("labels/") else problem_of_pictures
@@ -87,12 +89,12 @@ class Field:
 
     @property
     def constant(self) -> list[int]:
-        """Dimensions that never change in the whole file."""
+        """Flattened dimensions that have one value in the whole file."""
         return [int(index) for index in np.flatnonzero(self.minimum == self.maximum)]
 
     @property
     def rounding(self) -> list[int]:
-        """Dimensions of an observation that change, but by :func:`~ddco_pyro.data.values.rounding` alone."""
+        """Dimensions of an observation that vary by :func:`~ddco_pyro.data.checks.rounding` alone."""
         if not self.place.startswith("obs/") or not self.numeric:
             return []
         spread = self.maximum.astype(np.float64) - self.minimum
@@ -101,63 +103,57 @@ class Field:
 
     @property
     def unusable(self) -> str:
-        """How many values cannot be used, in words; empty where all can."""
+        """The number of unusable values, in words; empty without any."""
         if not self.affected:
             return ""
         huge = f" and {self.huge} beyond ±{LARGEST:g}" if self.huge else ""
         return f"{self.nan} NaN and {self.infinite} infinite values{huge}"
 
-    def add(self, column: Column, name: str) -> None:
-        """Take in the values of the demonstration of this name."""
-        self.demonstrations += 1
-        self.video = self.video or column.video
-        if column.video or column.dtype.kind not in NUMBERS:
-            return
-        first: np.ndarray | None = None
-        step = 0
-        for block in column.blocks():
-            values = block.reshape(len(block), -1)
-            first = values[:1] if first is None and len(values) else first
-            self._take(values)
-            self._look_for_unusable(values, name, step)
-            self.still = self.still and (first is None or bool((values == first).all()))
-            step += len(values)
+    def add(self, values: np.ndarray, name: str, step: int, first: np.ndarray) -> None:
+        """Add a block of a demonstration.
 
-    def _look_for_unusable(self, values: np.ndarray, name: str, step: int) -> None:
-        """Where values [steps, dimensions] from this step on cannot be used."""
+        :param values: [steps, dimensions], at least one step.
+        :param step: number of the first step.
+        :param first: the demonstration's first step, [1, dimensions].
+        """
+        low = high = values
+        if values.dtype.kind == "f":
+            nan, infinite = np.isnan(values), np.isinf(values)
+            self.nan, self.infinite = self.nan + int(nan.sum()), self.infinite + int(infinite.sum())
+            low, high = np.where(nan | infinite, np.inf, values), np.where(nan | infinite, -np.inf, values)
+        low, high = low.min(0), high.max(0)
+        self.minimum = np.minimum(self.minimum, low) if len(self.minimum) else low
+        self.maximum = np.maximum(self.maximum, high) if len(self.maximum) else high
         bad = ~usable(values)
         if bad.any():
             self.huge += int((bad & np.isfinite(values)).sum())
             self.first = self.first or (name, step + int(bad.any(1).argmax()))
             self.affected += [name] if name not in self.affected[-1:] else []
+        self.still = self.still and bool((values == first).all())
 
-    def _take(self, values: np.ndarray) -> None:
-        if values.dtype.kind == "f":
-            nan, infinite = np.isnan(values), np.isinf(values)
-            self.nan, self.infinite = self.nan + int(nan.sum()), self.infinite + int(infinite.sum())
-            bad = nan | infinite
-            low, high = np.where(bad, np.inf, values), np.where(bad, -np.inf, values)
-        else:
-            low = high = values
-        if len(values):
-            low, high = low.min(0), high.max(0)
-            self.minimum = np.minimum(self.minimum, low) if len(self.minimum) else low
-            self.maximum = np.maximum(self.maximum, high) if len(self.maximum) else high
+    def as_json(self) -> dict[str, Any]:
+        """The statistics as plain data."""
+        data = asdict(self)
+        ends = {
+            name: [float(value) if np.isfinite(value) else None for value in data[name]]
+            for name in ("minimum", "maximum")
+        }
+        return data | ends | {"shape": list(self.shape), "constant": self.constant, "rounding": self.rounding}
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """What is in a file of demonstrations.
+    """The contents of a file of demonstrations.
 
-    :param lengths: steps of each demonstration by name.
-    :param problems: what a fit would refuse, one line each.
-    :param frequency: control steps in a second, Hz, where the file says it.
-    :param control: what each dimension of the control does.
-    :param coincidences: what is the same where it should not be, one line for each kind.
-    :param leaks: the observations, ``obs/<key>``, that hold nothing but the controls that a policy has to predict.
-    :param excluded: names of demonstrations that were not looked at.
+    :param lengths: number of steps of each demonstration by name.
+    :param problems: a line for each problem that a fit refuses.
+    :param frequency: control steps per second, Hz; None if unknown.
+    :param control: statistics of each control dimension.
+    :param coincidences: a line for each kind of suspicious equality.
+    :param leaks: observations, ``obs/<key>``, that hold nothing but controls still to be predicted.
+    :param excluded: names of demonstrations that were skipped.
     :param unreadable: names of demonstrations that could not be read.
-    :param external: other files that the HDF5 file names as parts of it; they are not read.
+    :param external: other files that the HDF5 file names as parts of itself; they are not read.
     """
 
     path: Path
@@ -176,14 +172,14 @@ class Inspection:
 
     @property
     def notes(self) -> list[str]:
-        """What is odd about the control and about what coincides, one line each."""
+        """A line for each unusual control dimension, each coincidence, and each kind of control."""
         auto = control_parts(ControlSpec(), self.control) if self.control else ()
         kinds = (f"{line}, by control.kind: auto" for line in described(auto))
         return [*notes(self.control), *self.coincidences, *kinds]
 
     @property
     def affected(self) -> list[str]:
-        """Names of the demonstrations in which some value cannot be used, in order."""
+        """Names of the demonstrations with unusable values, in order."""
         names = {name for array in self.fields.values() for name in array.affected}
         return [name for name in self.lengths if name in names]
 
@@ -204,7 +200,7 @@ class Inspection:
 
     @property
     def versions(self) -> dict[str, str]:
-        """Keys of vectors of which the file has other versions, of moved pictures, with the keys of those."""
+        """Key of each vector that has versions from shifted pictures, and the key of these versions."""
         pairs = ((field, self.fields.get(f"obs/{field.key}{MOVED}")) for field in self.observations)
         return {
             field.key: other.key
@@ -217,14 +213,14 @@ class Inspection:
         return array.demonstrations == len(self.lengths)
 
     def as_json(self) -> dict[str, Any]:
-        """The same as plain data."""
+        """The inspection as plain data."""
         return {
             "path": str(self.path),
             "format": self.format,
             "demonstrations": dict(self.lengths),
             "control_frequency": self.frequency,
             "masks": {name: list(names) for name, names in self.masks.items()},
-            "fields": [_as_json(array) for array in self.fields.values()],
+            "fields": [array.as_json() for array in self.fields.values()],
             "control_dimensions": [dimension.as_data() for dimension in self.control],
             "external": list(self.external),
             "notes": self.notes,
@@ -232,116 +228,104 @@ class Inspection:
         }
 
 
-def _as_json(array: Field) -> dict[str, Any]:
-    data = asdict(array)
-    ends = {name: [float(value) if np.isfinite(value) else None for value in data[name]] for name in _ENDS}
-    return data | ends | {"shape": list(array.shape), "constant": array.constant, "rounding": array.rounding}
-
-
-_ENDS = ("minimum", "maximum")
-
-
 def inspect(path: str | Path, form: Format | None = None, exclude: Sequence[str] = ()) -> Inspection:
-    """Look at every array of a file or folder once, in blocks.
+    """Read every array of a file or folder once, in blocks.
 
-    :param exclude: names of demonstrations that are not looked at.
-    :raises DemonstrationsError: it cannot be read, or holds no demonstrations.
+    :param exclude: names of demonstrations to skip.
+    :raises DemonstrationsError: the source cannot be read, or holds no demonstrations.
     """
     with open_source(path, form) as source:
-        return _inspect(Path(path), source, tuple(exclude))
+        return _Inspector(source, tuple(exclude)).inspection(Path(path))
 
 
-def _inspect(path: Path, source: Source, exclude: tuple[str, ...]) -> Inspection:
-    lengths: dict[str, int] = {}
-    fields: dict[str, Field] = {}
-    problems = _Problems()
-    unreadable: list[str] = []
-    places: dict[str, Collection[str]] = {}
-    control, coincidences = ControlStatistics(), Coincidences()
-    names = [name for name in source.names if name not in exclude]
-    for name in names:
-        try:
-            recording = source.recording(name)
-            lengths[name] = recording.actions.shape[0] if recording.actions.shape else 0
-            coincidences.begin(name, lengths[name])
-            for place, column in recording.columns():
-                watched = coincidences.watched(place, column)
-                watched = _watched(watched, control) if place == "actions" else watched
-                _add(fields, place, watched, name, lengths[name], problems)
-            places[name] = {place for place, _ in recording.columns()}
-        except DemonstrationsError as error:
-            problems.add("unreadable", str(error), re.sub(r"\d+", "", str(error).removeprefix(name)))
-            unreadable.append(name)
-            coincidences.forget(name)
-    for name, there in places.items():
-        for place in (place for place in fields if place not in there):
-            problems.add("missing", f"{name}: {place} is missing", place)
-    masks = {mask: tuple(name for name in members if name not in exclude) for mask, members in source.masks.items()}
-    external = sorted({name for file in source.files if h5py.is_hdf5(file) for name in outside_files(file)})
-    dimensions = control.dimensions()
-    varying = [dimension.number for dimension in dimensions if not dimension.constant]
-    return Inspection(
-        path,
-        source.format,
-        lengths,
-        fields,
-        masks,
-        source.frequency,
-        [*problems.lines(), *_problems_of_division(source, names, masks), *_problems(fields, lengths)],
-        dimensions,
-        tuple(coincidences.notes(masks, varying)),
-        tuple(place for place, array in fields.items() if coincidences.leaks(place, varying, array.constant)),
-        exclude,
-        tuple(unreadable),
-        tuple(external),
-    )
+class _Inspector:
+    """One pass over all arrays of a source, which feeds every statistic."""
 
+    def __init__(self, source: Source, exclude: tuple[str, ...]) -> None:
+        self.source, self.exclude = source, exclude
+        self.fields: dict[str, Field] = {}
+        self.lengths: dict[str, int] = {}
+        self.problems: dict[tuple[str, str], list[str]] = {}  # messages by kind and subject
+        self.control, self.coincidences = ControlStatistics(), _Coincidences()
 
-class _Problems:
-    """Problems of demonstrations, of which each kind is told once."""
+    def inspection(self, path: Path) -> Inspection:
+        """Read everything."""
+        source, exclude, fields = self.source, self.exclude, self.fields
+        unreadable: list[str] = []
+        places: dict[str, Collection[str]] = {}
+        names = [name for name in source.names if name not in exclude]
+        for name in names:
+            try:
+                places[name] = self._read(name)
+            except DemonstrationsError as error:
+                self._problem("unreadable", str(error), re.sub(r"\d+", "", str(error).removeprefix(name)))
+                unreadable.append(name)
+                self.coincidences.forget(name)
+        for name, there in places.items():
+            for place in (place for place in fields if place not in there):
+                self._problem("missing", f"{name}: {place} is missing", place)
+        masks = {mask: tuple(name for name in members if name not in exclude) for mask, members in source.masks.items()}
+        dimensions = self.control.dimensions()
+        varying = [dimension.number for dimension in dimensions if not dimension.constant]
+        found = self.problems.values()
+        kinds = (each[0] if len(each) == 1 else f"{each[0]}; the first of {len(each)} such" for each in found)
+        external = {name for file in source.files if h5py.is_hdf5(file) for name in outside_files(file)}
+        return Inspection(
+            path=path,
+            format=source.format,
+            lengths=self.lengths,
+            fields=fields,
+            masks=masks,
+            frequency=source.frequency,
+            problems=[*kinds, *_problems_of_division(source, names, masks), *_problems(fields, self.lengths)],
+            control=dimensions,
+            coincidences=tuple(self.coincidences.notes(masks, varying)),
+            leaks=tuple(p for p, array in fields.items() if self.coincidences.leaks(p, varying, array.constant)),
+            excluded=exclude,
+            unreadable=tuple(unreadable),
+            external=tuple(sorted(external)),
+        )
 
-    def __init__(self) -> None:
-        self._first: dict[tuple[str, str], str] = {}
-        self._number: dict[tuple[str, str], int] = {}
+    def _read(self, name: str) -> set[str]:
+        """Read a demonstration; the places of its arrays."""
+        recording = self.source.recording(name)
+        steps = self.lengths[name] = recording.actions.shape[0] if recording.actions.shape else 0
+        self.coincidences.begin(name, steps)
+        for place, column in recording.columns():
+            try:
+                check_steps(name, place, column, steps)
+                none, shape = np.zeros(0), tuple(column.shape[1:])
+                array = self.fields.setdefault(place, Field(place, shape, str(column.dtype), none, none))
+                check_shape(f"{name}: {place}", column, array.shape, "the first")
+            except DemonstrationsError as error:
+                self._problem("shape", str(error), place)
+            else:
+                array.demonstrations += 1
+                array.video = array.video or column.video
+                if not column.video and column.dtype.kind in NUMBERS:
+                    self._read_column(array, column, name)
+        return {place for place, _ in recording.columns()}
 
-    def add(self, kind: str, message: str, about: str) -> None:
-        """A problem of a kind about something, such as a place in the file."""
-        self._first.setdefault((kind, about), message)
-        self._number[kind, about] = self._number.get((kind, about), 0) + 1
-
-    def lines(self) -> list[str]:
-        """The first problem of each kind, with the number of all."""
-        numbers = ((message, self._number[key]) for key, message in self._first.items())
-        return [message if number == 1 else f"{message}; the first of {number} such" for message, number in numbers]
-
-
-def _watched(column: Column, control: ControlStatistics) -> Column:
-    """The same column, whose values are gathered when they are read."""
-
-    def blocks() -> Iterator[np.ndarray]:
+    def _read_column(self, array: Field, column: Column, name: str) -> None:
+        step, first = 0, np.zeros(0)
+        self.coincidences.begin_column(array.place)
         for block in column.blocks():
-            if block.dtype.kind in NUMBERS:
-                control.add(block)
-            yield block
+            if not len(block):
+                continue
+            values = block.reshape(len(block), -1)
+            first = first if step else values[:1].copy()
+            if array.place == "actions":
+                self.control.add(block)
+            self.coincidences.add(array.place, values, step, column.image)
+            array.add(values, name, step, first)
+            step += len(values)
+        self.coincidences.end_column()
 
-    return replace(column, blocks=blocks)
-
-
-def _add(fields: dict[str, Field], place: str, column: Column, name: str, steps: int, problems: _Problems) -> None:
-    """Take in an array of a demonstration, unless its shape is wrong."""
-    none, shape = np.zeros(0), tuple(column.shape[1:])
-    try:
-        check_steps(name, place, column, steps)
-        known = fields.setdefault(place, Field(place, shape, str(column.dtype), none, none))
-        check_shape(f"{name}: {place}", column, known.shape, "the first")
-    except DemonstrationsError as error:
-        problems.add("shape", str(error), place)
-    else:
-        known.add(column, name)
+    def _problem(self, kind: str, message: str, about: str) -> None:
+        self.problems.setdefault((kind, about), []).append(message)
 
 
 def _problems_of_division(source: Source, names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> Iterator[str]:
-    """What keeps demonstrations from being divided into those to train with and those to validate with."""
     strangers = list(problems_of_masks(source.masks, source.names))
     yield from strangers
     if not strangers:
@@ -351,22 +335,225 @@ def _problems_of_division(source: Source, names: Sequence[str], masks: Mapping[s
             yield str(error)
 
 
-def _problems(fields: Mapping[str, Field], lengths: Mapping[str, int]) -> list[str]:
-    """What is wrong with arrays, of whatever demonstration."""
-    problems = []
+def _problems(fields: Mapping[str, Field], lengths: Mapping[str, int]) -> Iterator[str]:
     for array in fields.values():
         if not array.numeric:
-            problems.append(f"{array.place} holds {array.dtype}, not numbers")
+            yield f"{array.place} holds {array.dtype}, not numbers"
         elif problem := array.problem:
-            problems.append(f"{array.place} {problem}")
+            yield f"{array.place} {problem}"
         if array.first is not None:
             name, step = array.first
-            number = len(array.affected)
-            problems.append(
+            affected = len(array.affected)
+            yield (
                 f"{array.place} has {array.unusable}, the first in {name} at step {step}; "
-                f"{number} of {array.demonstrations} demonstrations {'is' if number == 1 else 'are'} affected"
+                f"{affected} of {array.demonstrations} demonstrations {'is' if affected == 1 else 'are'} affected"
             )
     empty = [name for name, steps in lengths.items() if steps == 0]
     if empty:
-        problems.append(f"{', '.join(empty[:3])}{' ...' if len(empty) > 3 else ''}: no steps")
-    return problems
+        yield f"{', '.join(empty[:3])}{' ...' if len(empty) > 3 else ''}: no steps"
+
+
+# --- coincidences -----------------------------------------------------------------------------------------------------
+
+LOOKED_AT = 1000
+"""Steps of each demonstration in which observations are compared with controls."""
+
+WIDEST = 10_000
+"""Largest observation, in numbers per step, that is compared with controls."""
+
+FEW = 3
+"""Number of values of a switch with padding."""
+
+SHIFTS = {0: "at the same step", 1: "of the next step", -1: "of the step before"}
+"""Steps by which a control follows the observation that equals it."""
+
+
+@dataclass
+class _Demonstration:
+    """What is known of one demonstration.
+
+    :param tails: for each array, the number of equal last steps.
+    :param commands: the first controls [T, A].
+    :param values: the values of each control dimension; from :data:`FEW` + 1 values on, not all of them.
+    :param ends: for each control dimension, the number of steps up to the last nonzero value.
+    :param zeros: for each control dimension, the number of steps with value 0.
+    """
+
+    name: str
+    steps: int
+    digest: bytes = b""
+    tails: list[int] = field(default_factory=list)
+    commands: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+    values: list[frozenset[float]] = field(default_factory=list)
+    ends: list[int] = field(default_factory=list)
+    zeros: list[int] = field(default_factory=list)
+
+    @property
+    def tail(self) -> int:
+        """Number of last steps in which no array changes."""
+        return min(self.tails, default=0)
+
+    def add_controls(self, controls: np.ndarray, first: int) -> None:
+        """Add controls [T, A] from step ``first`` on."""
+        if not first:
+            self.commands = controls[:LOOKED_AT].copy()
+            self.values = [frozenset()] * controls.shape[1]
+            self.ends, self.zeros = [0] * controls.shape[1], [0] * controls.shape[1]
+        for dimension, column in enumerate(controls.T):
+            known = self.values[dimension]
+            if len(known) <= FEW:
+                self.values[dimension] = known | frozenset(np.unique(column)[: FEW + 1].tolist())
+            (moved,) = np.nonzero(column)
+            self.zeros[dimension] += len(column) - len(moved)
+            if len(moved):
+                self.ends[dimension] = first + int(moved[-1]) + 1
+
+
+class _Coincidences:
+    """Suspicious equalities: padded ends, copied demonstrations, and controls among the observations."""
+
+    def __init__(self) -> None:
+        self._demos: list[_Demonstration] = []
+        self._equal: dict[str, np.ndarray] = {}  # by place, for each shift, [D, A]: whether they are always equal
+        self._compared: dict[str, np.ndarray] = {}  # number of compared steps, for each shift
+        self._place, self._tail, self._last, self._digest = "", 0, np.empty(0), hashlib.sha256()
+
+    def begin(self, name: str, steps: int) -> None:
+        """Begin a demonstration, whose controls come first."""
+        self._demos.append(_Demonstration(name, steps))
+
+    def forget(self, name: str) -> None:
+        """Drop a demonstration that could not be read to its end."""
+        self._demos = [demo for demo in self._demos if demo.name != name]
+
+    def begin_column(self, place: str) -> None:
+        """Begin an array of the demonstration."""
+        self._place, self._tail, self._digest = place, 0, hashlib.sha256(place.encode())
+
+    def add(self, place: str, rows: np.ndarray, first: int, image: bool) -> None:
+        """Add rows [T, D] of the array from step ``first`` on."""
+        if place.startswith("labels/"):
+            return
+        demo = self._demos[-1]
+        (others,) = np.nonzero((rows != rows[-1]).any(1))
+        tail = len(rows) - (int(others[-1]) + 1 if len(others) else 0)
+        continues = first and tail == len(rows) and np.array_equal(rows[0], self._last)
+        self._tail, self._last = tail + (self._tail if continues else 0), rows[-1].copy()
+        self._digest.update(np.ascontiguousarray(rows).tobytes())
+        if place == "actions":
+            demo.add_controls(rows, first)
+        elif len(demo.commands) and not first and not image and rows.shape[1] <= WIDEST:
+            self._compare(place, rows[: len(demo.commands)], demo.commands)
+
+    def end_column(self) -> None:
+        """End the array."""
+        if not self._place.startswith("labels/"):
+            self._demos[-1].tails.append(self._tail)
+            self._demos[-1].digest += self._digest.digest()
+
+    def _compare(self, place: str, rows: np.ndarray, commands: np.ndarray) -> None:
+        """Update which numbers of an observation [T, D] equal controls [T, A] of the same or a neighbouring step."""
+        commands = commands[: len(rows)]
+        floats = [array.dtype for array in (rows, commands) if array.dtype.kind == "f"]
+        coarser = min(floats, key=lambda dtype: dtype.itemsize, default=np.dtype(np.float64))
+        with np.errstate(over="ignore"):
+            rows, commands = rows.astype(coarser), commands.astype(coarser)
+        shape = (len(SHIFTS), rows.shape[1], commands.shape[1])
+        equal = self._equal.setdefault(place, np.ones(shape, dtype=bool))
+        compared = self._compared.setdefault(place, np.zeros(len(SHIFTS), dtype=int))
+        for at, shift in enumerate(SHIFTS):
+            own = rows[max(-shift, 0) : max(len(rows) - max(shift, 0), 0)]
+            ahead = commands[max(shift, 0) :][: len(own)]
+            compared[at] += len(own)
+            for dimension in np.flatnonzero(equal[at].any(0)):
+                equal[at, :, dimension] &= (own == ahead[:, [dimension]]).all(0)
+
+    def notes(self, masks: Mapping[str, Sequence[str]], varying: Sequence[int]) -> list[str]:
+        """A line for each kind of coincidence, with a count and the first place.
+
+        :param varying: the control dimensions that are not constant.
+        """
+        return [*self._switches(varying), *self._padding(), *self._copies(masks), *self._observed(varying)]
+
+    def leaks(self, place: str, varying: Sequence[int], still: Sequence[int]) -> bool:
+        """Whether an observation holds nothing but controls that are still to be predicted.
+
+        :param still: the constant dimensions of the observation.
+        """
+        if place not in self._equal:
+            return False
+        found = [self._controls(place, shift, varying)[0] for shift in (0, 1)]
+        rest = set(range(self._equal[place].shape[1])) - set(still)
+        return bool(rest) and rest <= {*found[0], *found[1]}
+
+    def _controls(self, place: str, shift: int, varying: Sequence[int]) -> tuple[list[int], list[int]]:
+        """The dimensions of an observation that equal controls ``shift`` steps later, and those control dimensions."""
+        at = list(SHIFTS).index(shift)
+        if not self._compared[place][at]:
+            return [], []
+        equal = self._equal[place][at][:, list(varying)]
+        own, controls = np.flatnonzero(equal.any(1)).tolist(), np.flatnonzero(equal.any(0)).tolist()
+        return own, [varying[column] for column in controls]
+
+    def _observed(self, varying: Sequence[int]) -> Iterator[str]:
+        for place in self._equal:
+            for shift, when in SHIFTS.items():
+                own, controls = self._controls(place, shift, varying)
+                if own:
+                    effect = "tend to repeat it" if shift < 0 else "see what they have to predict"
+                    yield (
+                        f"{place}: {listed(own)} = control {listed(controls)} {when}, in all {len(self._demos)} "
+                        f"demonstrations, the first {self._demos[0].name}: policies {effect}"
+                    )
+
+    def _padding(self) -> Iterator[str]:
+        padded = [demo for demo in self._demos if demo.tail > 1]
+        if len(padded) > 1:
+            first = padded[0]
+            yield (
+                f"the last steps are the same in {len(padded)} of {len(self._demos)} demonstrations, the first "
+                f"{first.name} from step {first.steps - first.tail} on: cut them off if they are padding"
+            )
+
+    def _copies(self, masks: Mapping[str, Sequence[str]]) -> Iterator[str]:
+        known: dict[bytes, str] = {}
+        each = [(known.setdefault(demo.digest, demo.name), demo.name) for demo in self._demos]
+        pairs = [(first, again) for first, again in each if first != again]
+        effect = "one of two that are the same may be trained on and the other held out"
+        if masks.keys() & {"train", "valid"}:
+            try:
+                valid = set(divided([demo.name for demo in self._demos], masks)[1])
+            except DemonstrationsError:
+                return  # reported as a problem
+            pairs = [pair for pair in pairs if (pair[0] in valid) != (pair[1] in valid)]
+            effect = "one of them is trained on and the other held out"
+        if pairs:
+            first, again = pairs[0]
+            yield (
+                f"{len(pairs)} of {len(self._demos)} demonstrations equal another one, the first {again}, which equals "
+                f"{first}: {effect}"
+            )
+
+    def _switches(self, varying: Sequence[int]) -> Iterator[str]:
+        """Dimensions that are switches except for padding, or under two conventions."""
+        for dimension in varying:
+            each = [demo for demo in self._demos if dimension < len(demo.values)]
+            whole = frozenset[float]().union(*(demo.values[dimension] for demo in each))
+            if len(whole) != FEW or 0.0 not in whole:
+                continue
+            padded = [demo for demo in each if demo.zeros[dimension]]
+            if all(demo.ends[dimension] + demo.zeros[dimension] == demo.steps for demo in padded):
+                low, high = map(number, sorted(whole - {0.0}))
+                yield (
+                    f"control dimension {dimension}: {low} or {high}, and 0 at the end of {len(padded)} of {len(each)} "
+                    f"demonstrations, the first {padded[0].name} from step {padded[0].ends[dimension]} on: cut the "
+                    "ends off if they are padding, and it is a switch"
+                )
+            signs = [demo for demo in each if demo.values[dimension] == {-1.0, 1.0}]
+            bits = [demo for demo in each if demo.values[dimension] == {0.0, 1.0}]
+            if signs and bits and not any({-1.0, 0.0} <= demo.values[dimension] for demo in each):
+                yield (
+                    f"control dimension {dimension}: -1 or 1 in {len(signs)} demonstrations, the first "
+                    f"{signs[0].name}, and 0 or 1 in {len(bits)}, the first {bits[0].name}: write all of them in one "
+                    "way, and it is a switch"
+                )

@@ -1,40 +1,47 @@
-"""Pictures that stay in their file, are read where they are needed, and are cut to what networks see."""
+"""Pictures: lazy arrays in files, crops and scaling, padded batches, and prefetching by other processes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from types import TracebackType
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from ddco_pyro.data.hdf5 import DAMAGE, DemonstrationsError, opened
-from ddco_pyro.errors import BadInput
+from ddco_pyro.errors import BadInput, Failed
 
 BLOCK_BYTES = 16 * 2**20
-"""Most bytes of an array that are read at a time where all of it goes by, one step at least."""
+"""Most bytes of an array that are read at a time in a pass over the whole array; one step at least."""
 
 PICTURE_DIMENSIONS = 3
 """A step of pictures is [H, W, C]."""
 
-
 CHANNELS = (1, 3, 4)
-"""Grey; red, green and blue; those with transparency or depth."""
+"""Grey; red, green and blue; three colours with transparency or depth."""
 
 MOVED = "_moved"
-"""What the key of features of pictures that were moved ends with, behind that of the features themselves."""
+"""Suffix of the key that holds features of shifted pictures."""
 
 
 class TransformError(BadInput):
-    """Pictures cannot be cut or scaled as asked."""
+    """Pictures cannot be cropped or scaled as asked."""
 
 
 def channels_last(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...]:
-    """The shape [T, H, W, C] of pictures that are stored as [T, C, H, W] or [T, H, W]; any other shape as it is.
+    """The shape [T, H, W, C] of pictures stored as [T, C, H, W] or [T, H, W]; any other shape unchanged.
 
-    Arrays of 8 or 16 bits without a sign are pictures: the first has 1, 3 or 4 channels before sides that are longer,
-    the second is grey. A side of a picture is longer than its channels are many.
+    Arrays of unsigned 8 or 16 bits are pictures if both sides are longer than 4 pixels and channels, if any, number 1,
+    3 or 4. Pictures without a channel axis are grey.
     """
     sides, most = shape[-2:], max(CHANNELS)
     if dtype not in (np.uint8, np.uint16) or min(sides, default=0) <= most:
@@ -47,21 +54,24 @@ def channels_last(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ..
 
 
 def turned(array: np.ndarray) -> np.ndarray:
-    """Pictures with their channels last, :func:`channels_last`; any other array as it is."""
+    """Pictures with their channels last (:func:`channels_last`); any other array unchanged."""
     shape = channels_last(array.shape, array.dtype)
     if shape == array.shape:
         return array
     return array[..., None] if array.ndim == PICTURE_DIMENSIONS else np.ascontiguousarray(np.moveaxis(array, 1, -1))
 
 
+# --- in files ---------------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Pictures:
-    """Pictures uint8 [T, H, W, C] in an HDF5 file: a slice of steps is read when it is asked for.
+    """A lazy array of pictures uint8 [T, H, W, C] in an HDF5 file; slices are read on access.
 
-    :param path: the file, which is opened for each slice, in whatever process asks for it.
-    :param place: of the array in it.
-    :param where: what errors call it, such as ``demo_0: obs/camera``.
-    :param stored: the shape of the array in the file, which may have its channels first or none.
+    :param path: the file, opened for each slice.
+    :param place: the dataset in the file.
+    :param where: name in errors, such as ``demo_0: obs/camera``.
+    :param stored: shape of the dataset, whose channels may come first or be absent.
     """
 
     path: str
@@ -83,9 +93,9 @@ class Pictures:
         return self.shape[0]
 
     def __getitem__(self, steps: Any) -> np.ndarray:
-        """The pictures of some steps, or the picture of one; indexed in any other way it is all of them that are read.
+        """The pictures of a slice of steps or of one step; any other index reads all pictures.
 
-        :raises DemonstrationsError: the file cannot be read, or has changed since.
+        :raises DemonstrationsError: the file cannot be read, or has changed.
         """
         if isinstance(steps, int | np.integer):
             step = range(len(self))[steps]
@@ -103,20 +113,16 @@ class Pictures:
                 raise DemonstrationsError(f"{self.where} cannot be read ({error}); the file may be damaged") from error
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        """All of them, in memory."""
+        """All pictures, in memory."""
         return self[:].astype(dtype or self.dtype, copy=False)
-
-    def blocks(self) -> Iterator[np.ndarray]:
-        """All of them, block by block."""
-        yield from blocks(self)
 
 
 Observed = np.ndarray | Pictures
-"""An observation of a demonstration [T, ...], in memory; pictures perhaps in their file."""
+"""An observation of a demonstration [T, ...], in memory or, for pictures, in a file."""
 
 
 def blocks(array: Observed) -> Iterator[np.ndarray]:
-    """An array [T, ...] in blocks of consecutive steps; one in memory is a single block."""
+    """An array [T, ...] in blocks of consecutive steps; an array in memory is a single block."""
     if isinstance(array, np.ndarray):
         yield array
         return
@@ -126,12 +132,12 @@ def blocks(array: Observed) -> Iterator[np.ndarray]:
 
 
 def block_steps(shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
-    """Steps in a block of an array whose steps have this shape."""
+    """Number of steps of this shape in a block."""
     return max(1, BLOCK_BYTES // max(1, math.prod(shape) * dtype.itemsize))
 
 
 def same(left: Observed, right: Observed) -> bool:
-    """Whether two arrays hold the same; what is in files is read block by block."""
+    """Whether two arrays are equal; arrays in files are compared block by block."""
     if left.shape != right.shape:
         return False
     if isinstance(left, np.ndarray) and isinstance(right, np.ndarray):
@@ -141,13 +147,16 @@ def same(left: Observed, right: Observed) -> bool:
     return all(np.array_equal(left[first : first + at_once], right[first : first + at_once]) for first in firsts)
 
 
-class Transform(NamedTuple):
-    """What networks see of a picture: a part of it, then scaled, then without colours, then beside those before it.
+# --- as networks read them --------------------------------------------------------------------------------------------
 
-    :param crop: top, left, height, width of the part, in the file's pixels; None for all of it.
-    :param resize: height and width that it is scaled to; None for as it is.
-    :param grey: whether red, green and blue become one luminance.
-    :param frames: pictures that are seen together, the last one and those before it.
+
+class Transform(NamedTuple):
+    """The preprocessing of pictures: crop, scale, grey, then stack with earlier pictures.
+
+    :param crop: top, left, height, width in the file's pixels; None for no crop.
+    :param resize: height and width after scaling; None for no scaling.
+    :param grey: whether red, green and blue become one luminance channel.
+    :param frames: number of successive pictures that are stacked.
     """
 
     crop: tuple[int, ...] | None = None
@@ -156,13 +165,13 @@ class Transform(NamedTuple):
     frames: int = 1
 
     def as_data(self) -> dict[str, Any]:
-        """What there is of it, as plain data."""
+        """The settings that differ from their defaults, as plain data."""
         return {key: value for key, value in self._asdict().items() if value != self._field_defaults[key]}
 
     def shape(self, stored: Sequence[int]) -> tuple[int, ...]:
-        """[H, W, C] of what is seen of pictures of this shape.
+        """[H', W', C'] of preprocessed pictures [H, W, C].
 
-        :raises TransformError: they are no pictures, the part is not within them, or they have no three colours.
+        :raises TransformError: the crop leaves the picture, ``grey`` finds no three channels, or there are no pictures.
         """
         if self == Transform():
             return tuple(stored)
@@ -183,7 +192,7 @@ class Transform(NamedTuple):
         return *(self.resize or (height, width)), self.frames * (1 if self.grey else colours)
 
     def seen(self, array: Observed, steps: slice) -> Iterator[np.ndarray]:
-        """Consecutive steps of pictures [T, H, W, C] as they are seen, [steps, H', W', C'], block by block.
+        """Preprocessed pictures of consecutive steps, [steps, H', W', C'], block by block.
 
         :raises DemonstrationsError: a file cannot be read.
         """
@@ -193,31 +202,30 @@ class Transform(NamedTuple):
             yield self(array[first - before : min(first + at_once, last)])[before:]
 
     def __call__(self, frames: np.ndarray) -> np.ndarray:
-        """Pictures [T, H, W, C] from a first step on as they are seen, [T, H', W', C']."""
+        """Pictures [T, H, W, C] from a first step on to [T, H', W', C']."""
         if self.crop is not None:
             top, left, height, width = self.crop
             frames = frames[:, top : top + height, left : left + width]
         if self.resize is not None and frames.shape[1:3] != self.resize:
-            frames = self._resized(frames, self.resize)
-        return self._together(_grey(frames) if self.grey else frames)
+            frames = resized(frames, self.resize)
+        if self.grey:
+            frames = _grey(frames)
+        if self.frames == 1:
+            return frames
+        rows = np.arange(len(frames))  # earlier pictures first; the first picture is repeated
+        return np.concatenate([frames[np.maximum(rows - back, 0)] for back in reversed(range(self.frames))], axis=-1)
 
-    def _together(self, frames: np.ndarray) -> np.ndarray:
-        """Each picture behind those before it, the oldest first, along the channels; the first one is repeated."""
-        rows = np.arange(len(frames))
-        each = [frames[np.maximum(rows - back, 0)] for back in reversed(range(self.frames))]
-        return np.concatenate(each, axis=-1) if len(each) > 1 else frames
 
-    @staticmethod
-    def _resized(frames: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-        """Scaled by the mean over areas (cv2's INTER_AREA)."""
-        import cv2
+def resized(frames: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """Pictures [T, H, W, C] scaled by area averaging (cv2's INTER_AREA) to height and width ``size``."""
+    import cv2
 
-        height, width = size
-        scaled = np.empty((len(frames), height, width, frames.shape[-1]), frames.dtype)
-        for number, frame in enumerate(frames):
-            one = cv2.resize(np.ascontiguousarray(frame), (width, height), interpolation=cv2.INTER_AREA)
-            scaled[number] = one.reshape(scaled.shape[1:])
-        return scaled
+    height, width = size
+    scaled = np.empty((len(frames), height, width, frames.shape[-1]), frames.dtype)
+    for number, frame in enumerate(frames):
+        one = cv2.resize(np.ascontiguousarray(frame), (width, height), interpolation=cv2.INTER_AREA)
+        scaled[number] = one.reshape(scaled.shape[1:])
+    return scaled
 
 
 def _grey(frames: np.ndarray) -> np.ndarray:
@@ -229,9 +237,9 @@ def _grey(frames: np.ndarray) -> np.ndarray:
 def padded(
     frames: Sequence[Observed], steps: slice, transform: Transform, shifts: np.ndarray | None = None
 ) -> np.ndarray:
-    """Steps of several demonstrations as networks see them, [N, steps, H, W, C], zeros past their ends.
+    """Preprocessed pictures of several demonstrations, [N, steps, H, W, C], zero beyond their ends.
 
-    :param shifts: rows and columns by which the pictures of each are moved, [N, 2]; the edge is repeated.
+    :param shifts: rows and columns by which the pictures of each demonstration are shifted, [N, 2].
     :raises DemonstrationsError: a file cannot be read.
     """
     shape = transform.shape(frames[0].shape[1:])
@@ -239,14 +247,134 @@ def padded(
     for row, array in enumerate(frames):
         at = 0
         for seen in transform.seen(array, steps):
-            whole[row, at : at + len(seen)] = seen if shifts is None else shifted(seen, *shifts[row].tolist())
+            target = whole[row, at : at + len(seen)]
+            shift_into(target, seen, *((0, 0) if shifts is None else shifts[row].tolist()))
             at += len(seen)
     return whole
 
 
-def shifted(frames: np.ndarray, down: int, right: int) -> np.ndarray:
-    """Pictures [T, H, W, C] moved by whole pixels; the edge is repeated."""
+def shift_into(target: Any, frames: Any, down: int, right: int) -> None:
+    """Write pictures [T, H, W, C] into ``target``, shifted by whole pixels; the edge is repeated.
+
+    Both are arrays, or tensors on one device.
+    """
     height, width = frames.shape[1:3]
-    before, behind = (max(down, 0), max(right, 0)), (max(-down, 0), max(-right, 0))
-    wider = np.pad(frames, [(0, 0), *zip(before, behind, strict=True), (0, 0)], mode="edge")
-    return wider[:, behind[0] :, behind[1] :][:, :height, :width]
+    down, right = (max(1 - size, min(size - 1, by)) for size, by in ((height, down), (width, right)))
+    top, left, bottom, end = max(down, 0), max(right, 0), height + min(down, 0), width + min(right, 0)
+    target[:, top:bottom, left:end] = frames[:, top - down : bottom - down, left - right : end - right]
+    target[:, top:bottom, :left] = target[:, top:bottom, left : left + 1]
+    target[:, top:bottom, end:] = target[:, top:bottom, end - 1 : end]
+    target[:, :top] = target[:, top : top + 1]
+    target[:, bottom:] = target[:, bottom - 1 : bottom]
+
+
+def shifted(frames: np.ndarray, down: int, right: int) -> np.ndarray:
+    """Pictures [T, H, W, C] shifted by whole pixels; the edge is repeated."""
+    moved = np.empty_like(frames)
+    shift_into(moved, frames, down, right)
+    return moved
+
+
+# --- prefetching ------------------------------------------------------------------------------------------------------
+
+DEAD = (
+    "a process that read pictures was ended from outside (too little memory?); what was trained is kept in a run "
+    "folder: continue with the same command, with fewer training.workers if memory was short"
+)
+
+Read = dict[str, np.ndarray]
+"""Pictures by observation, [N, T, H, W, C]."""
+
+
+class Job(NamedTuple):
+    """Pictures to read together.
+
+    :param rows: indices that identify the trajectories.
+    :param arrays: for each observation the pictures of each trajectory; ``transforms`` and ``shifts`` likewise.
+    """
+
+    rows: tuple[int, ...]
+    arrays: Mapping[str, tuple[Observed, ...]]
+    steps: slice
+    transforms: Mapping[str, Transform]
+    shifts: Mapping[str, np.ndarray]
+
+    @property
+    def key(self) -> Hashable:
+        """Identity of the job among the jobs of one plan."""
+        return (*self.arrays, self.rows, self.steps.start, self.steps.stop)
+
+
+def read(job: Job) -> Read:
+    """The pictures of a job.
+
+    :raises DemonstrationsError: a file cannot be read.
+    """
+    return {
+        key: padded(arrays, job.steps, job.transforms[key], job.shifts.get(key)) for key, arrays in job.arrays.items()
+    }
+
+
+class Readers:
+    """Processes that prefetch planned jobs in order; without processes, jobs are read when taken.
+
+    A job that is taken out of order is read by the caller, so a wrong plan affects speed alone.
+    """
+
+    def __init__(self, processes: int) -> None:
+        self._processes = processes
+        self._pool: ProcessPoolExecutor | None = None
+        self._planned: Iterator[Job] = iter(())
+        self._begun: deque[tuple[Hashable, Future[Read]]] = deque()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def plan(self, jobs: Iterable[Job]) -> None:
+        """Replace the plan by these jobs, in the order in which they will be taken."""
+        self._planned = iter(jobs if self._processes else ())
+        self._begun.clear()
+        self._prefetch()
+
+    def take(self, job: Job) -> Read:
+        """The pictures of a job.
+
+        :raises DemonstrationsError: a file cannot be read.
+        :raises Failed: a process died.
+        """
+        if not self._begun or self._begun[0][0] != job.key:
+            return read(job)
+        _, future = self._begun.popleft()
+        self._prefetch()
+        try:
+            return future.result()
+        except BrokenProcessPool as error:
+            raise Failed(DEAD) from error
+
+    def _prefetch(self) -> None:
+        """Submit planned jobs until one more than there are processes is under way."""
+        while len(self._begun) <= self._processes and (job := next(self._planned, None)) is not None:
+            if self._pool is None:
+                spawn = multiprocessing.get_context("spawn")
+                self._pool = ProcessPoolExecutor(self._processes, mp_context=spawn, initializer=_end_with_parent)
+            try:
+                self._begun.append((job.key, self._pool.submit(read, job)))
+            except BrokenProcessPool as error:
+                raise Failed(DEAD) from error
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent ends, even by kill -9, and ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # this process was spawned
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()

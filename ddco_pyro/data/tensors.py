@@ -1,4 +1,4 @@
-"""Named tensors with metadata in safetensors files that know whether they are damaged."""
+"""Named tensors with metadata in safetensors files, protected by a checksum."""
 
 from __future__ import annotations
 
@@ -16,10 +16,7 @@ from ddco_pyro.data.files import Damaged, whole_file
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write named tensors and text metadata as safetensors, whole or not at all; equal contents give equal bytes.
-
-    A checksum of both is written with them.
-    """
+    """Write tensors and text metadata with a checksum, whole or not at all; equal contents give equal bytes."""
     checked = {**metadata, CHECKSUM: digest_of(tensors, metadata)}
     content = save({name: value.contiguous() for name, value in tensors.items()}, checked)
     with whole_file(path) as temporary:
@@ -27,7 +24,10 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 
 def _metadata_in_order(content: bytes) -> bytes:
-    """The library writes metadata in random order. The header is JSON after its own length, padded to 8 bytes."""
+    """Contents with sorted metadata, which safetensors writes in random order.
+
+    The header is JSON after its own length, padded to 8 bytes.
+    """
     end = 8 + int.from_bytes(content[:8], "little")
     header = json.loads(content[8:end])
     header["__metadata__"] = dict(sorted(header.get("__metadata__", {}).items()))
@@ -50,10 +50,10 @@ def digest_of(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str
 
 
 def read_tensors(path: Path, remedy: str = "write it again") -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Named tensors and metadata of a safetensors file; contents without a checksum are not checked.
+    """Tensors and metadata of a safetensors file; the checksum is optional.
 
-    :param remedy: what to do where it is damaged.
-    :raises Damaged: it cannot be read, or does not hold what was written.
+    :param remedy: what the user can do about a damaged file.
+    :raises Damaged: the file cannot be read, or its contents do not match the checksum.
     """
     try:
         with safe_open(path, framework="pt") as file:

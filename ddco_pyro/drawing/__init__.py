@@ -1,1 +1,1 @@
-"""What pages and figures share: colours, numbers in words, pictures."""
+"""Building blocks of pages and figures: words, colours, tables, plots."""

@@ -1,24 +1,68 @@
-"""One colour for each option, the same in every figure, frame and film."""
+"""Colours: one for each option, the same in every figure, frame and film; and heat over a picture."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import matplotlib
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from ddco_pyro.drawing.words import option_name
 
 CONTROL = "#9a9a9a"
 
 OPTIONS = (
     "#3f90da", "#e76300", "#332288", "#ecd83c", "#882255", "#7fd8f0", "#5c3317", "#bd1f01", "#a96b59", "#000000",
 )  # fmt: skip
-"""For each two of the first five and the grey of control, the distance in CIELAB is above 23 for readers with normal
-sight and for those without red, green or blue cones; for all ten it is above 18."""
+"""Any two of the first five and the grey of control are more than 23 apart in CIELAB, for normal sight and for readers
+without red, green or blue cones. All ten are more than 18 apart."""
+
+HEIGHT = 240
+"""Rows of a picture with heat; pixels stay squares."""
+
+FADED = 0.5
+"""The share by which the picture under the heat is made paler."""
+
+PERCENTILE = 99.5
+"""The percentile of the values that has the strongest colour, so that single pixels do not pale the rest."""
 
 
 def option_colour(choice: int) -> str:
-    """Hex colour of choice 1 to k; control (0) is grey. Ten colours, told apart by colour-blind readers too, repeat."""
+    """Hex colour of choice 1 to k; control (0) is grey. The ten colours repeat."""
     return CONTROL if choice == 0 else OPTIONS[(choice - 1) % len(OPTIONS)]
 
 
 def option_rgb(choice: int) -> tuple[int, int, int]:
-    """The same as 0 to 255 red, green, blue."""
+    """The colour of a choice as red, green and blue, 0 to 255."""
     red, green, blue = (round(255 * part) for part in matplotlib.colors.to_rgb(option_colour(choice)))
     return red, green, blue
+
+
+def legend(choices: Iterable[int]) -> list[Patch]:
+    """Legend handles that name the colours of choices."""
+    return [Patch(color=option_colour(choice), label=option_name(choice)) for choice in choices]
+
+
+def add_legend(figure: Figure, choices: Iterable[int], place: str = "outside lower center") -> None:
+    """Name the colours of these choices below a figure."""
+    handles = legend(sorted(set(choices)))
+    figure.legend(handles=handles, loc=place, ncols=min(len(handles), 11), handlelength=1)  # type: ignore[call-overload]
+
+
+def with_heat(picture: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """A picture uint8 [H, W, C], pale and grey, under the values [H, W] ≥ 0 of its pixels, uint8 [HEIGHT, W', 3].
+
+    Colours go from yellow to dark red on a scale of the picture's own; 0 has none.
+    """
+    import cv2  # one's own vectors need none of it
+
+    grey = 255 - (1 - FADED) * (255 - picture.astype(float).mean(-1, keepdims=True))
+    most = np.percentile(values, PERCENTILE) or values.max() or 1.0
+    share = np.clip(values / most, 0, 1)
+    colours = 255 * colormaps["YlOrRd"](share)[..., :3]
+    drawn = ((1 - share[..., None]) * grey + share[..., None] * colours).astype(np.uint8)
+    width = round(HEIGHT * drawn.shape[1] / drawn.shape[0])
+    return np.asarray(cv2.resize(drawn, (width, HEIGHT), interpolation=cv2.INTER_NEAREST))

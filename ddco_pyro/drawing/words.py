@@ -1,4 +1,4 @@
-"""Numbers in words: the page's verdict and how its numbers are written."""
+"""Words for numbers, methods and stages, and the verdict on a run."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from scipy import stats
 
 CONFIDENCE = 0.95
-"""A difference is called one where this interval about it leaves out 0."""
+"""Level of intervals; a difference is significant where its interval excludes 0."""
 
 SMALLEST = 0.01
-"""A difference in nats per step that is of use: controls are exp(0.01) times, or 1 %, as probable at each step."""
+"""The smallest useful difference in nats per step: each step's control is exp(0.01) times as probable, 1 % more."""
 
 METHODS = {
     "ddco": "DDCO",
@@ -28,17 +28,17 @@ ABOUT = {
     "ddco": "the hierarchy of options",
     "flat": "one policy without options",
     "per_timestep": "a policy for each time step",
-    "mixture": "the hierarchy’s policies, chosen anew at every step (no memory)",
+    "mixture": "the hierarchy’s policies with a new choice at every step (no memory)",
 }
 
 
 def about(names: Iterable[str]) -> str:
-    """A sentence on what the methods are."""
+    """A sentence that explains the methods."""
     return "; ".join(f"{method(name)}: {ABOUT[name]}" for name in names if name in ABOUT) + "."
 
 
 def stage(name: str) -> str:
-    """What a stage of training is called in the page: ``vq-1`` is ``level 1 from clusters``."""
+    """A stage of training in words: ``vq-1`` is ``level 1 from clusters``."""
     kind, _, level = name.partition("-")
     whole = {"meta-policy": "meta-policy alone", "joint": "all together"}
     whole |= {"segments": "levels above the lowest from segments", "upper": "levels above the lowest together"}
@@ -47,18 +47,18 @@ def stage(name: str) -> str:
 
 
 def method(name: str) -> str:
-    """What a method is called in the page."""
+    """A method in words: ``flat_equal`` is ``flat of equal size``."""
     return METHODS.get(name, name.replace("_", " "))
 
 
 def option_name(option: int, labels: Mapping[int, int] | None = None) -> str:
-    """``control``, ``option h``, or ``option h (label l)`` where ``labels`` says for which label it stands."""
+    """``control``, ``option h``, or ``option h (label l)`` where ``labels`` has the option."""
     stands = f" (label {labels[option]})" if labels and option in labels else ""
     return f"option {option}{stands}" if option else "control"
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """A number with a fixed number of digits after the point and a real minus sign; a dash where there is none."""
+    """A number with fixed digits after the point and a real minus sign; a dash for None and NaN."""
     if value is None or not math.isfinite(value):
         return "–"
     text = f"{value:.{digits}f}"
@@ -66,7 +66,7 @@ def number(value: float | None, digits: int = 2) -> str:
 
 
 def signed(value: float, digits: int = 2) -> str:
-    """The same with a plus sign where it is positive."""
+    """A number as :func:`number` gives it, with a plus sign where it is positive."""
     text = number(value, digits)
     return text if text.startswith(("−", "–")) or float(text) == 0 else f"+{text}"
 
@@ -87,7 +87,7 @@ def p_value(value: float) -> str:
 
 
 def rate(result: Mapping[str, Any], of: str = "") -> str:
-    """``41 of 50 (69 to 90 %)``: successes, trials (``of`` what) and the 95 % interval of the rate."""
+    """``41 of 50 (69 to 90 %)``: successes, trials (with a noun ``of``) and the 95 % interval of the rate."""
     text = f"{result['successes']} of {result['trials']} {of}".rstrip()
     return text if result["interval"] is None else f"{text} ({interval(result['interval'], 100, 0)} %)"
 
@@ -105,29 +105,25 @@ def _capital(text: str) -> str:
 
 
 def verdict(metrics: Mapping[str, Any]) -> str:
-    """How well the model explains held-out demonstrations, with the error of that, and who would have needed more
-    epochs.
-    """
+    """How well the model explains held-out demonstrations, with the error, and the models that have not converged."""
     names = (method(name) for name, training in trainings(metrics).items() if not training["converged"])
     return f"{_explained(metrics)}{rising(names)}"
 
 
 def rising(names: Iterable[str]) -> str:
-    """A sentence, after a space, on those whose training ended while they still rose; nothing where there are none."""
+    """A sentence, after a space, on models that have not converged; empty where there are none."""
     rising = list(names)
-    return f" {_capital(listed(rising))} had not converged: more epochs can change this." if rising else ""
+    return f" Not converged: {listed(rising)}; more epochs may change this result." if rising else ""
 
 
 def _explained(metrics: Mapping[str, Any]) -> str:
     name, held_out = _capital(method(metrics["model"])), len(metrics["valid"])
     if not held_out:
         value = number(metrics["log_likelihood_per_step"]["train"])
-        return f"{name} was fitted to all demonstrations ({value} nats per step): none was held out to judge it by."
+        return f"{name} was fitted to all demonstrations ({value} nats per step); none was held out to evaluate it."
     if not metrics["comparison"]:
         value = number(metrics["log_likelihood_per_step"]["valid"])
-        return (
-            f"{name} gives held-out demonstrations {value} nats per step; no other model was trained to compare with."
-        )
+        return f"{name} gives held-out demonstrations {value} nats per step; no baseline was trained to compare with."
     differences = {method(other): comparison["difference"] for other, comparison in metrics["comparison"].items()}
     said = [explains(name, differences, held_out)]
     if "worth" in metrics:
@@ -138,10 +134,11 @@ def _explained(metrics: Mapping[str, Any]) -> str:
 
 
 def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out: int) -> str:
-    """One sentence on how much better than others a model explains held-out demonstrations. Its ± is over these
-    demonstrations, for the fits at hand: fits from other seeds vary besides.
+    """One sentence on the lead of a model over others on held-out demonstrations.
 
-    :param differences: what the others are called to ``nats_per_step`` and ``standard_error`` of the paired difference.
+    Its ± is over these demonstrations, for one fit of each model; fits from other seeds vary, too.
+
+    :param differences: ``nats_per_step`` and ``standard_error`` of the paired difference, by the other model's name.
     """
     clauses = [_clause(other, difference, held_out) for other, difference in differences.items()]
     text = f"{name} explains held-out demonstrations {listed(clauses)}"
@@ -285,23 +282,22 @@ def _direction(difference: Mapping[str, Any], held_out: int) -> int:
 
 
 def trainings(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """How the model and what it is compared with were trained, by name; runs of before do not say."""
+    """The entry ``training`` of the model and of each baseline, by name."""
     rows = {metrics["model"]: metrics, **metrics["comparison"]}
     return {name: row["training"] for name, row in rows.items() if "training" in row}
 
 
 def spent(training: Mapping[str, Any]) -> str:
-    """Epochs and gradient steps, how many were allowed, and what restarts took."""
+    """Epochs and gradient steps, the budget, and the effort of restarts."""
     took, allowed = training["spent"], training["budget"]
     beside = restarts(training)
     of = "" if allowed["epochs"] is None else f" of at most {allowed['epochs']} ({allowed['gradient_steps']})"
-    return f"{took['epochs']} epochs ({took['gradient_steps']} gradient steps){of}{'; ' * bool(beside)}{beside}"
+    steps = "EM" if training.get("by_em") else "gradient"
+    return f"{took['epochs']} epochs ({took['gradient_steps']} {steps} steps){of}{'; ' * bool(beside)}{beside}"
 
 
 def restarts(training: Mapping[str, Any]) -> str:
-    """Which of several restarts was the best, which were stopped early or diverged, and what all of them took; nothing
-    where there was a single restart, or in runs of before.
-    """
+    """The best of several restarts, the ones stopped early or diverged, and the effort of all; else empty."""
     told = training.get("restarts")
     if told is None or len(told["each"]) == 1:
         return ""
@@ -316,11 +312,11 @@ def restarts(training: Mapping[str, Any]) -> str:
     )
 
 
-RAISE = "Raise training.epochs: it is the budget of every model that is compared, whatever its number of stages."
+RAISE = "Raise training.epochs: all compared models have this budget, whatever their number of stages."
 
 
 def unconverged(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Every model of which the budget ended a stage too early, in words with the numbers, and what to do."""
+    """Every model whose budget ended a stage before it converged, in words with the numbers, and the remedy."""
     verdicts = []
     for name, training in trainings(metrics).items():
         stages = [_too_short(stage) for stage in training["stages"] if not stage["converged"]]
@@ -355,7 +351,7 @@ def listed(items: Iterable[str]) -> str:
 
 
 def success(metrics: Mapping[str, Any]) -> str:
-    """One sentence on rollouts; empty where there are none."""
+    """Success in rollouts in one sentence; empty where there are none."""
     methods = metrics.get("rollouts", {}).get("methods", {})
     rates = {name: results["measures"].get("success") for name, results in methods.items()}
     rates = {name: summary for name, summary in rates.items() if summary and "successes" in summary}

@@ -1,4 +1,4 @@
-"""Encoders of pictures: vectors of features in place of a picture observation, in a file and when a policy acts."""
+"""Encoders of pictures: features in place of a picture observation, in a file and when a policy acts."""
 
 from ddco_pyro.encoding.encoder import Encoder, load
 from ddco_pyro.encoding.writing import Encoded, Encoding, encode

@@ -1,8 +1,10 @@
-"""An encoder of pictures with its principal components, in memory and as a folder."""
+"""An encoder of pictures: features of a built-in, a fitted or a user's network, reduced to principal components."""
 
 from __future__ import annotations
 
 import hashlib
+import sys
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,19 +15,21 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from ddco_pyro.data.files import Damaged, whole_folder
+from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.tensors import read_tensors, write_tensors
-from ddco_pyro.encoding.fitted import Reader
-from ddco_pyro.encoding.kinds import Kind, again
-from ddco_pyro.encoding.projection import Projection
-from ddco_pyro.errors import BadInput
-from ddco_pyro.spec.types import Count, Items, Model, Seed
+from ddco_pyro.encoding.autoencoder import BUILT_IN, Convolutions
+from ddco_pyro.encoding.fitted import FittedReader, Reader, from_folder
+from ddco_pyro.encoding.pictures import Pictures
+from ddco_pyro.encoding.user import imported, try_out
+from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.spec.base import Count, Items, Model, Seed
 
 ABOUT, TENSORS = "encoder.json", "encoder.safetensors"
 AGAIN = "write it again with ddco-pyro encode"
 
 
 class About(Model):
-    """What an encoder is, beside its weights."""
+    """The facts of an encoder, beside its weights."""
 
     version: Literal[1] = 1
     encoder: str
@@ -46,17 +50,137 @@ class About(Model):
 
 
 @dataclass(frozen=True)
+class Extractor:
+    """What gives the features of pictures, before they are reduced: uint8 [N, H, W, C] to [N, F].
+
+    :param network: the network whose weights are kept; None for a user's class, which is named alone.
+    :param code: bytes that decide the features, beside the name, the seed and the pictures.
+    """
+
+    encode: Callable[[np.ndarray], np.ndarray]
+    network: Convolutions | FittedReader | None = None
+    code: bytes = b""
+
+    @property
+    def reader(self) -> Reader | None:
+        """The network of a fit."""
+        return self.network.about if isinstance(self.network, FittedReader) else None
+
+    def weights(self) -> Mapping[str, Tensor]:
+        """The tensors that are kept."""
+        return {} if self.network is None else self.network.state_dict()
+
+
+def is_users(name: str, allow_code: bool) -> bool:
+    """Whether an encoder is a user's class, and neither built in nor the folder of a fit.
+
+    :raises BadInput: there is no such encoder, or it is user code and that is not allowed.
+    """
+    if name in BUILT_IN or Path(name).is_dir():
+        return False
+    if ":" not in name:
+        known = f"{', '.join(BUILT_IN)}, the folder of a fit, or your own module:Class"
+        raise BadInput(f"there is no encoder {name!r}{nearest(name, BUILT_IN)}; take {known}")
+    if not allow_code:
+        raise BadInput(
+            f"encoder {name!r} would import user code; pass --allow-code if you trust it (in Python: allow_code=True)"
+        )
+    return True
+
+
+def extractor(name: str, pictures: Pictures, seed: int, allow_code: bool) -> Extractor:
+    """The extractor of this name for these pictures; a user's is tried on the first of them.
+
+    :raises BadInput: it cannot be had, or not for these pictures.
+    """
+    if is_users(name, allow_code):
+        users = _users(name)
+        try_out(name, users.encode, next(pictures.of(pictures.training[0])))
+        return users
+    if name in BUILT_IN:
+        return _of_network(Convolutions(name, pictures.shape, seed))
+    network = from_folder(name, pictures.key, pictures.shape, allow_code)
+    return _of_network(network, (Path(name) / "model.safetensors").read_bytes())  # the folder may change later
+
+
+def _again(about: About, allow_code: bool) -> Extractor:
+    """The extractor of an encoder that was written, before its weights are read."""
+    if about.reader is not None:
+        return _of_network(FittedReader(about.reader, about.picture))
+    if about.encoder in BUILT_IN:
+        return _of_network(Convolutions(about.encoder, about.picture, about.seed))
+    is_users(about.encoder, allow_code)
+    return _users(about.encoder)
+
+
+def _of_network(network: Convolutions | FittedReader, code: bytes = b"") -> Extractor:
+    return Extractor(network.encode, network, code)
+
+
+def _users(name: str) -> Extractor:
+    encode = imported(name)
+    module = sys.modules.get(name.partition(":")[0])
+    source = Path(module.__file__).read_bytes() if module is not None and module.__file__ else b""
+    return Extractor(encode, code=source)
+
+
+@dataclass(frozen=True)
+class Projection:
+    """The projection onto principal components: (x − ``mean`` [F]) · ``components`` [N, F]ᵀ.
+
+    :param explained: the share of the features' variance that is kept.
+    """
+
+    mean: np.ndarray
+    components: np.ndarray
+    explained: float
+
+    def __call__(self, features: np.ndarray) -> np.ndarray:
+        """[..., F] to float32 [..., N]."""
+        return ((features - self.mean) @ self.components.T).astype(np.float32)
+
+
+def principal_components(blocks: Iterable[np.ndarray], size: int) -> Projection:
+    """The ``size`` principal components of rows, from one pass over blocks [M, F] of at least ``size`` rows in all.
+
+    They are exactly those of all rows at once. Memory holds an F × F matrix. The entry of each component that is
+    largest in magnitude is positive.
+
+    :raises DemonstrationsError: that matrix takes more memory than is allowed.
+    """
+    number, total, products, origin = 0, np.zeros(0), np.zeros((0, 0)), np.zeros(0)
+    for block in blocks:
+        if not number:
+            features = block.shape[1]
+            remedy = "take an encoder that gives fewer"
+            refuse_too_much(4 * 8 * features**2, f"reducing {features} features to {size}", remedy)
+            origin = block[0].astype(np.float64)  # near the mean, so that subtracting that loses little
+            total, products = np.zeros(features), np.zeros((features, features))
+        rows = block - origin
+        number += len(rows)
+        total += rows.sum(0)
+        products += rows.T @ rows
+    offset = total / number
+    values, vectors = np.linalg.eigh(products - number * np.outer(offset, offset))
+    kept = vectors[:, ::-1][:, :size].T
+    largest = np.take_along_axis(kept, np.abs(kept).argmax(1)[:, None], 1)
+    variance = values.clip(0)
+    explained = float(variance[::-1][:size].sum() / variance.sum()) if variance.any() else 1.0
+    return Projection(origin + offset, kept * np.where(largest < 0, -1.0, 1.0), explained)
+
+
+@dataclass(frozen=True)
 class Encoder:
-    """A picture to a vector: call it with uint8 [H, W, C], it gives float32 [size]."""
+    """A picture to a vector: call it with uint8 [H, W, C], and it gives float32 [size]."""
 
     about: About
-    kind: Kind
+    extractor: Extractor
     projection: Projection | None
 
     def __call__(self, picture: np.ndarray) -> np.ndarray:
         """The features that a policy, fitted to them, reads in place of the picture.
 
-        :raises BadInput: it is not such a picture.
+        :raises BadInput: the picture has another type or shape.
         """
         picture = np.asarray(picture)
         if picture.dtype != np.uint8 or picture.shape != self.about.picture:
@@ -64,28 +188,28 @@ class Encoder:
                 f"{self.about.observation}: is {picture.dtype} {picture.shape}; this encoder reads uint8 "
                 f"{self.about.picture}"
             )
-        return self.reduced(self.kind(picture[None]))[0]
+        return self.reduced(self.extractor.encode(picture[None]))[0]
 
     def reduced(self, features: np.ndarray) -> np.ndarray:
-        """Features as the encoder gives them, [..., F], to float32 [..., size]."""
+        """The extractor's features [..., F] as float32 [..., size]."""
         return features.astype(np.float32) if self.projection is None else self.projection(features)
 
     def write(self, folder: Path) -> None:
-        """Write it as a folder, whole or not at all; a user's encoder is named there, not kept."""
+        """Write the encoder as a folder, whole or not at all; of a user's class the name alone."""
         with whole_folder(folder) as temporary:
             (temporary / ABOUT).write_text(self.about.model_dump_json(indent=1) + "\n", encoding="utf-8")
             write_tensors(temporary / TENSORS, self._tensors(), {})
 
     @property
     def digest(self) -> str:
-        """SHA-256 of what decides its features."""
-        sha256 = hashlib.sha256(self.about.model_dump_json().encode() + self.kind.decides())
+        """SHA-256 of everything that decides the features."""
+        sha256 = hashlib.sha256(self.about.model_dump_json().encode() + self.extractor.code)
         for name, tensor in sorted(self._tensors().items()):
             sha256.update(name.encode() + tensor.contiguous().numpy().tobytes())
         return sha256.hexdigest()
 
     def _tensors(self) -> dict[str, Tensor]:
-        tensors = {f"network/{key}": value for key, value in self.kind.weights().items()}
+        tensors = {f"network/{key}": value for key, value in self.extractor.weights().items()}
         if self.projection is not None:
             tensors["mean"] = torch.from_numpy(self.projection.mean)
             tensors["components"] = torch.from_numpy(self.projection.components)
@@ -93,7 +217,7 @@ class Encoder:
 
 
 def about_of(folder: Path) -> About:
-    """What the encoder in a folder is.
+    """The facts of the encoder in a folder.
 
     :raises BadInput: there is none, or it is damaged.
     """
@@ -113,14 +237,15 @@ def load(folder: str | Path, allow_code: bool = False) -> Encoder:
     """
     folder = Path(folder)
     about = about_of(folder)
-    kind = again(about.encoder, about.reader, about.picture, about.seed, allow_code)
+    found = _again(about, allow_code)
     tensors, _ = read_tensors(folder / TENSORS, AGAIN)
     projection = None
     if "components" in tensors:
         projection = Projection(tensors["mean"].numpy(), tensors["components"].numpy(), about.explained)
     weights = {key.removeprefix("network/"): value for key, value in tensors.items() if key.startswith("network/")}
     try:
-        kind.restore(weights)
+        if found.network is not None:
+            found.network.load_state_dict(weights)
     except RuntimeError as error:
         raise Damaged(folder / TENSORS, " ".join(str(error).split()), AGAIN) from error
-    return Encoder(about, kind, projection)
+    return Encoder(about, found, projection)

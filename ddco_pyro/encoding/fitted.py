@@ -1,4 +1,4 @@
-"""The network of a fit that reads pictures, taken out of it: an encoder that has learnt from controls."""
+"""The convolutions of a fit as an encoder, which has learnt from controls."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from pathlib import Path
 import numpy as np
 import torch
 from pydantic import field_validator
-from torch import Tensor, nn
+from torch import nn
 
 from ddco_pyro.data.pictures import Transform
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import Fit, load
-from ddco_pyro.model.networks import Inputs, InputShape, build_trunk
-from ddco_pyro.model.networks.branches import Branches
+from ddco_pyro.model.networks import Inputs, InputShape, Network, build_trunk
 from ddco_pyro.model.networks.conv import Conv
 from ddco_pyro.model.networks.lstm import Lstm
-from ddco_pyro.model.networks.shared import Shared
+from ddco_pyro.model.networks.perceptrons import Branches
 from ddco_pyro.spec import NetworkSpec
-from ddco_pyro.spec.types import Count, Items, Model
+from ddco_pyro.spec.base import Count, Items, Model
+from ddco_pyro.spec.networks import BranchesSpec, LstmSpec
 
-Part = tuple[NetworkSpec, nn.Module, Sequence[str]]
-"""A network of a fit: its spec, itself, and the observations that it reads."""
+Part = tuple[NetworkSpec, Network, Sequence[str]]
+"""A network of a fit: its spec, the network, and the names of the observations that it reads."""
 
 
 class ReaderError(BadInput):
@@ -33,7 +33,7 @@ class Reader(Model):
     """A network that reads one observation's pictures, beside its weights."""
 
     network: NetworkSpec
-    """Convolutions, never a user's class: what is written beside a file has to be safe to read."""
+    """Convolutions. A user's class is refused, because what is written beside a file has to be safe to read."""
     crop: Items[int] | None = None
     resize: Items[Count] | None = None
     grey: bool = False
@@ -47,9 +47,9 @@ class Reader(Model):
 
 
 class FittedReader(nn.Module):
-    """uint8 pictures [N, H, W, C], as they are stored, to what the last hidden layer of a fit's network gives, [N, F].
+    """uint8 pictures [N, H, W, C], as they are stored, to the last hidden layer of a fit's network, [N, F].
 
-    :param about: the network, and what it sees of a picture.
+    :param about: the network, and how pictures are cropped and scaled for it.
     :param picture: [H, W, C].
     """
 
@@ -59,16 +59,15 @@ class FittedReader(nn.Module):
         self.transform = Transform(about.crop, about.resize, about.grey)
         (self.key,) = about.network.inputs
         shape = InputShape({}, {self.key: self.transform.shape(picture)})
-        trunk = build_trunk(about.network, shape, 1)
-        self.network, self.features = trunk.network, trunk.features
+        self.network = build_trunk(about.network, shape, 1)
         self.eval()
 
     def encode(self, pictures: np.ndarray) -> np.ndarray:
         """Features of each picture by itself, float32 [N, F]."""
         seen = torch.from_numpy(np.ascontiguousarray(self.transform(pictures)))
         with torch.no_grad():
-            features: Tensor = self.network(Inputs({}, {self.key: seen[:, None]}, torch.zeros(1)))
-        return features[:, 0, 0].numpy()
+            features, _ = self.network(Inputs({}, {self.key: seen[:, None]}, torch.zeros(1)), ())
+        return features[:, 0, 0].numpy()  # type: ignore[no-any-return]
 
 
 def from_folder(folder: str, key: str, picture: Sequence[int], allow_code: bool = False) -> FittedReader:
@@ -83,11 +82,13 @@ def from_folder(folder: str, key: str, picture: Sequence[int], allow_code: bool 
 
 
 def from_fit(fit: Fit, key: str, picture: Sequence[int]) -> FittedReader:
-    """What reads the pictures under ``key`` in a fit: the branch, or the network under an LSTM, that sees nothing else,
-    of a flat policy or, where its options share it, of the lowest options.
+    """The convolutions in a fit that read the pictures under ``key`` and nothing else.
+
+    They are the network of a flat policy or of the lowest options, a branch of it, or the network under its LSTM. The
+    options have to share them.
 
     :param picture: [H, W, C] of the pictures that are to be encoded.
-    :raises ReaderError: it saw other pictures, or several together, or has no such network.
+    :raises ReaderError: the fit observed other pictures, or stacks of several, or has no such network.
     """
     transform = _transform(fit, key, picture)
     found = next(_readers(_lowest(fit), key), None)
@@ -110,7 +111,7 @@ def from_fit(fit: Fit, key: str, picture: Sequence[int]) -> FittedReader:
 
 
 def _transform(fit: Fit, key: str, picture: Sequence[int]) -> Transform:
-    """What a fit sees of such pictures."""
+    """How a fit crops and scales such pictures."""
     encoder = fit.hierarchy.encoder
     if key not in encoder.transforms:
         there = ", ".join(encoder.transforms) or "none"
@@ -124,9 +125,7 @@ def _transform(fit: Fit, key: str, picture: Sequence[int]) -> Transform:
 
 
 def _lowest(fit: Fit) -> Part:
-    """The network of a flat policy, or what the lowest options read: the hierarchy's trunk, their own, or, where there
-    is none, their policy.
-    """
+    """The network of a flat policy; else the hierarchy's trunk, the lowest level's trunk, or that level's policy."""
     networks, encoder = fit.hierarchy.networks(), fit.hierarchy.encoder
     baseline, hierarchy = fit.spec.baseline, fit.spec.hierarchy
     spec: NetworkSpec
@@ -142,17 +141,15 @@ def _lowest(fit: Fit) -> Part:
 
 
 def _readers(part: Part, key: str) -> Iterator[Part]:
-    """The networks of convolutions within one that read these pictures and nothing else."""
+    """The convolutions within a network that read these pictures and nothing else."""
     spec, network, reads = part
-    if isinstance(network, Shared):
-        network = network.network
     if isinstance(network, Conv) and [*reads] == [key]:
         yield spec, network, reads
     within: list[Part] = []
-    if isinstance(network, Branches):
-        named = zip(spec.of.items(), network.of, strict=True)
+    if isinstance(network, Branches) and isinstance(spec, BranchesSpec):
+        named = zip(spec.of.items(), network.branches(), strict=True)
         within = [(branch, own, branch.inputs or (name,)) for (name, branch), own in named]
-    elif isinstance(network, Lstm) and spec.over is not None:
+    elif isinstance(network, Lstm) and isinstance(spec, LstmSpec) and spec.over is not None:
         within = [(spec.over, network.over, spec.over.inputs or reads)]
     for inner in within:
         yield from _readers(inner, key)

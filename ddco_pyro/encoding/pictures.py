@@ -1,4 +1,4 @@
-"""The pictures of a file's demonstrations, read a few at a time."""
+"""The pictures of a file's demonstrations, read in blocks."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from ddco_pyro.data.sources.robomimic import Robomimic
 from ddco_pyro.errors import nearest
 
 AT_ONCE = 32
-"""Pictures that an encoder gets at once, whatever the size of the blocks in which they are read: a network's numbers
-depend, in their last bits, on how many there are."""
+"""Pictures of a call of the encoder, whatever the blocks in which they are read: the last bits of a network's numbers
+depend on how many there are."""
 
 BUFFER_BYTES = 16 * 2**20
-"""Pictures that are drawn from at random while they are read in order, :data:`AT_ONCE` of them at least."""
+"""Bytes of the buffer from which pictures are drawn at random; it holds at least :data:`AT_ONCE` pictures."""
 
 
 class Pictures:
@@ -27,7 +27,7 @@ class Pictures:
 
     :param source: an open file of demonstrations.
     :param key: the observation.
-    :raises DemonstrationsError: it is missing or no picture, or the demonstrations cannot be used or differ.
+    :raises DemonstrationsError: the observation is missing or no picture, or the demonstrations are refused or differ.
     """
 
     def __init__(self, source: Robomimic, key: str) -> None:
@@ -75,9 +75,9 @@ class Pictures:
         return batches(self._source.recording(name, (self.key,), ()).observations[self.key], AT_ONCE)
 
     def at_random(self, seed: int, epoch: int) -> Iterator[np.ndarray]:
-        """Every training picture once, in an order that follows from the seed and the epoch, [H, W, C].
+        """Every training picture [H, W, C] once, in an order that seed and epoch decide.
 
-        Demonstrations come in random order, and their pictures leave a buffer at random.
+        Demonstrations are read in random order, and their pictures leave a buffer in random order.
         """
         random = np.random.default_rng((seed, epoch))
         names = [self.training[index] for index in random.permutation(len(self.training))]
@@ -94,7 +94,7 @@ class Pictures:
 
 
 def batches(column: Column, size: int) -> Iterator[np.ndarray]:
-    """An array in pieces of ``size`` steps, the last of which may be shorter, however long its blocks are."""
+    """An array in pieces of ``size`` steps, whatever its blocks; the last piece may be shorter."""
     rest = np.empty((0, *column.shape[1:]), column.dtype)
     for block in column.blocks():
         rest = np.concatenate([rest, block]) if len(rest) else block

@@ -14,19 +14,19 @@ Features = Callable[[np.ndarray], np.ndarray]
 """uint8 pictures [N, H, W, C] to features [N, F]."""
 
 TOLERANCE = 1e-3
-"""Of the largest feature: two calls on the same picture may differ by so much, alone or among others."""
+"""Largest difference between two calls on the same picture, as a part of the largest feature."""
 
 
 def imported(name: str) -> Features:
     """``Class()`` of a user's ``module:Class``, whose features are checked at each call.
 
-    :raises BadInput: it cannot be imported or made; when called, if it fails or gives something else than features.
+    :raises BadInput: the class cannot be imported or made; at a call, it fails or gives no features.
     """
     module, _, attribute = name.partition(":")
     try:
         own: Any = getattr(importlib.import_module(module), attribute)()
     except Exception as error:  # whatever the user's code raises
-        raise BadInput(f"encoder {name!r} cannot be imported or made: {_said(error)}") from error
+        raise BadInput(f"encoder {name!r} cannot be imported or made: {_message(error)}") from error
     if not callable(own):
         raise BadInput(f"encoder {name!r}: what {attribute}() gives cannot be called; it needs __call__(pictures)")
 
@@ -34,14 +34,14 @@ def imported(name: str) -> Features:
         try:
             values = np.asarray(own(pictures))
         except Exception as error:
-            raise BadInput(f"encoder {name!r} fails on pictures {[*pictures.shape]}: {_said(error)}") from error
-        _see(name, values, len(pictures))
+            raise BadInput(f"encoder {name!r} fails on pictures {[*pictures.shape]}: {_message(error)}") from error
+        _check(name, values, len(pictures))
         return values
 
     return features
 
 
-def _see(name: str, values: np.ndarray, number: int) -> None:
+def _check(name: str, values: np.ndarray, number: int) -> None:
     if values.dtype.kind != "f":
         raise BadInput(f"encoder {name!r} gives {values.dtype}; it has to give floats")
     if values.ndim != 2 or len(values) != number or not values.shape[1]:
@@ -53,9 +53,9 @@ def _see(name: str, values: np.ndarray, number: int) -> None:
 
 
 def try_out(name: str, features: Features, pictures: np.ndarray) -> None:
-    """See that an encoder says the same of a picture when it is asked again, and when it is asked of it alone.
+    """Compare the features of pictures with those of a second call, and with those of a picture alone.
 
-    :raises BadInput: it does not, or fails.
+    :raises BadInput: they differ, or the encoder fails.
     """
     first = features(pictures)
     allowed = TOLERANCE * np.abs(first).max()
@@ -71,5 +71,5 @@ def _close(some: np.ndarray, other: np.ndarray, allowed: float) -> bool:
     return some.shape == other.shape and bool((np.abs(some - other) <= allowed).all())
 
 
-def _said(error: Exception) -> str:
+def _message(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__

@@ -1,8 +1,8 @@
-"""A file of demonstrations with features in place of its pictures; what was killed goes on where it was.
+"""A file of demonstrations with features in place of pictures; an interrupted encoding can be resumed.
 
 While ``out.hdf5`` is made, the folder ``.out.hdf5.encoding`` holds the autoencoder's checkpoint and the features of
-every demonstration before they are reduced: each picture goes through the encoder once. Principal components follow
-from those, and the file is put together at the end.
+every demonstration before they are reduced. Each picture goes through the encoder once. The principal components are
+computed from those features, and the file is written at the end.
 """
 
 from __future__ import annotations
@@ -22,48 +22,53 @@ import numpy as np
 from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.data.hdf5 import DemonstrationsError, opened
 from ddco_pyro.data.pictures import MOVED, shifted
-from ddco_pyro.data.resumable import parts_of
 from ddco_pyro.data.sources import Column, Recording, format_of
-from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
-from ddco_pyro.encoding.encoder import About, Encoder, about_of
-from ddco_pyro.encoding.kinds import Kind, kind_of
+from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, parts_of, robomimic_file, write_recording
+from ddco_pyro.encoding.autoencoder import UPDATES, Convolutions, train
+from ddco_pyro.encoding.encoder import (
+    About,
+    Encoder,
+    Extractor,
+    Projection,
+    about_of,
+    extractor,
+    is_users,
+    principal_components,
+)
 from ddco_pyro.encoding.pictures import Pictures, batches
-from ddco_pyro.encoding.projection import Projection, principal_components
-from ddco_pyro.encoding.training import UPDATES
 from ddco_pyro.errors import BadInput, command
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.inference.threads import one_thread
 
 MADE = "encoded"
-"""Attribute of a file: what decided its contents."""
+"""Attribute of a file: the digest of everything that decides its contents."""
 
 SIZE = 64
-"""Features are reduced to so many unless a size is given."""
+"""Default number of principal components."""
 
 ROWS = 1024
-"""Rows of features that are reduced at once."""
+"""Rows of features that are projected at once."""
 
 FEATURES, VERSIONS = "features", "versions"
-"""Of the pictures as they are, and of them moved."""
+"""Of the pictures, and of shifted pictures."""
 
 _IDENTITY, _CHECKPOINT, _UNREDUCED = "identity.json", "autoencoder.safetensors", "features.hdf5"
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """How pictures become a vector.
+    """Which pictures become a vector, and how.
 
     :param observation: the key of the pictures, uint8 [T, H, W, C].
     :param encoder: ``random_conv``, ``autoencoder``, a user's ``module:Class``, or the folder of a fit.
-    :param size: principal components that are kept; by default :data:`SIZE`, or all features as they are where they
-        are no more than that, or those of a fit.
+    :param size: number of principal components. By default :data:`SIZE`; fewer features, and those of a fit, are not
+        projected.
     :param name: the new observation's key; ``<observation>_features`` by default.
     :param updates: gradient steps of the autoencoder.
-    :param moved: how many times each demonstration is encoded besides, with all of its pictures moved alike, into
-        ``<name>_moved`` [T, moved, size]; a spec has them as other versions of the features (``augment``).
-    :param shift: pixels of the stored pictures, at most, by which they are moved along either axis; the edge is
-        repeated.
-    :raises BadInput: ``moved`` without ``shift``, or the other way round, or a negative one.
+    :param moved: number of further versions of each demonstration, whose pictures are all shifted alike. They become
+        ``<name>_moved`` [T, moved, size], which a spec can name in ``augment.versions``.
+    :param shift: most pixels of a shift along either axis; the edge is repeated.
+    :raises BadInput: only one of ``moved`` and ``shift`` is given, or one is negative.
     """
 
     observation: str
@@ -95,7 +100,7 @@ class Encoding:
 
 @dataclass(frozen=True)
 class Encoded:
-    """What was written: the file, the encoder's folder, and what the encoder is."""
+    """A written file, the folder of its encoder, the encoder's facts, and the number of demonstrations."""
 
     path: Path
     folder: Path
@@ -111,29 +116,28 @@ def encoder_folder(out: Path) -> Path:
 def encode(
     path: str | Path, out: str | Path, encoding: Encoding, on_event: OnEvent = ignore, allow_code: bool = False
 ) -> Encoded:
-    """Write ``out``: the demonstrations of ``path`` with features in place of the pictures, and ``out.encoder`` beside.
+    """Write the demonstrations of ``path`` with features in place of the pictures to ``out``, and ``out.encoder``.
 
-    Principal components, and the autoencoder, see the training demonstrations alone: ``mask/train``, else all that are
-    not in ``mask/valid``. Memory holds one block of pictures, and
-    another to draw from while an autoencoder is trained.
+    Principal components and autoencoder are fitted to the training demonstrations: ``mask/train``, else all that are
+    not in ``mask/valid``. Memory holds one block of pictures, and a buffer of pictures while an autoencoder is trained.
 
     :raises DemonstrationsError: the demonstrations cannot be used, or the observation is missing or no picture.
     :raises BadInput: ``out`` is there already and is something else; the encoder cannot be used, or gives fewer
         features than ``size``.
     """
     path, out = Path(path), Path(out)
-    kind = kind_of(encoding.encoder, allow_code)
+    users = is_users(encoding.encoder, allow_code)
     if out.exists() and not out.is_file():
         raise BadInput(f"{out}: is there already and is no file; choose another --out")
     if (form := format_of(path)) != "robomimic":
         raise BadInput(f"{path}: is a {form} dataset; first: {command('import', path, '--out', 'demos.hdf5')}")
-    with open_robomimic(path) as source, one_thread() if kind.ours else nullcontext():
+    with open_robomimic(path) as source, nullcontext() if users else one_thread():  # same bits
         job = _Job(source, path, out, encoding, on_event, allow_code)
         return job.already() or job.run()
 
 
 class _Job:
-    """The encoding of one file: ``folder`` is where it stands, ``beside`` where the encoder goes."""
+    """The encoding of one file, with the unfinished work in ``folder``; the encoder is written to ``beside``."""
 
     def __init__(
         self, source: Robomimic, path: Path, out: Path, encoding: Encoding, on_event: OnEvent, allow_code: bool
@@ -146,14 +150,13 @@ class _Job:
         if encoding.shift >= min(self.pictures.shape[:2]):
             height, width, _ = self.pictures.shape
             raise BadInput(f"--shift {encoding.shift}: would move pictures of {height} × {width} pixels out of sight")
-        kind = kind_of(encoding.encoder, allow_code)
-        self.kind = kind.made(encoding.encoder, self.pictures, encoding.seed, allow_code)
-        self.about = _about(encoding, self.pictures, self.kind)
-        self.identity = _identity(path, encoding, self.kind)
+        self.extractor = extractor(encoding.encoder, self.pictures, encoding.seed, allow_code)
+        self.about = _about(encoding, self.pictures, self.extractor)
+        self.identity = _identity(path, encoding, self.extractor)
         self.beside, self.folder = encoder_folder(out), out.with_name(f".{out.name}.encoding")
 
     def already(self) -> Encoded | None:
-        """What an earlier call has written; None where there is nothing.
+        """The result of an earlier call; None where there is none.
 
         :raises BadInput: something else is there.
         """
@@ -170,7 +173,7 @@ class _Job:
         return self._encoded(about_of(self.beside))
 
     def run(self) -> Encoded:
-        """Encode every demonstration, reduce the features, and write what comes of it."""
+        """Encode every demonstration, reduce the features, and write both results."""
         with only_one(self.folder):
             known = self.folder / _IDENTITY
             if not known.exists() or known.read_text(encoding="utf-8") != self.identity:
@@ -191,16 +194,17 @@ class _Job:
 
     def _fitted(self) -> Encoder:
         """The encoder with its projection, once every demonstration has been encoded."""
-        seed, updates = self.encoding.seed, self.encoding.updates
-        self.kind.learn(self.pictures, seed, updates, self.folder / _CHECKPOINT, self.on_event)
+        network, encoding = self.extractor.network, self.encoding
+        if encoding.encoder == "autoencoder" and isinstance(network, Convolutions):
+            train(network, self.pictures, encoding.seed, encoding.updates, self.folder / _CHECKPOINT, self.on_event)
         self._encode_all()
         projection = self._projection()
         explained = projection.explained if projection else 1.0
         about = self.about.model_copy(update={"explained": explained})
-        return Encoder(about, self.kind, projection)
+        return Encoder(about, self.extractor, projection)
 
     def _encode_all(self) -> None:
-        """The features of every demonstration, before they are reduced."""
+        """Write the unreduced features of every demonstration that has none yet."""
         with parts_of(self.folder / _UNREDUCED, self.identity, at_most=1) as parts:
             if parts is None:
                 return
@@ -216,15 +220,15 @@ class _Job:
             parts.finish({}, {})
 
     def _shape(self, actions: Column, kind: str, features: int) -> tuple[int, ...]:
-        """[T, F] or, of moved pictures, [T, moved, F]."""
+        """[T, F], or [T, moved, F] of shifted pictures."""
         return actions.shape[0], *((self.encoding.moved,) if kind == VERSIONS else ()), features
 
     def _features_of(self, name: str) -> Iterator[np.ndarray]:
-        """Of the pictures of a demonstration, [M, F] at a time."""
+        """Features of a demonstration's pictures, in blocks [M, F]."""
         return map(partial(self._features, name), self.pictures.of(name))
 
     def _versions_of(self, name: str) -> Iterator[np.ndarray]:
-        """Of the same pictures, moved, [M, moved, F] at a time."""
+        """Features of a demonstration's pictures shifted at random, in blocks [M, moved, F]."""
         most = self.encoding.shift
         random = np.random.default_rng((self.encoding.seed, self.source.names.index(name)))
         moves = random.integers(-most, most + 1, (self.encoding.moved, 2)).tolist()
@@ -232,7 +236,7 @@ class _Job:
             yield np.stack([self._features(name, shifted(block, *by)) for by in moves], axis=1)
 
     def _features(self, name: str, block: np.ndarray) -> np.ndarray:
-        values = self.kind(block)
+        values = self.extractor.encode(block)
         if values.shape[1] != self.about.features:
             raise BadInput(
                 f"encoder {self.about.encoder!r} gives {values.shape[1]} features in {name}, and "
@@ -269,20 +273,20 @@ class _Job:
                 write_recording(data, replace(recording, observations=others | encoded))
 
 
-def _about(encoding: Encoding, pictures: Pictures, kind: Kind) -> About:
-    """What the encoder is.
+def _about(encoding: Encoding, pictures: Pictures, source: Extractor) -> About:
+    """The facts of the encoder.
 
     :raises BadInput: there are fewer features, or training pictures, than the size that is asked for.
     """
-    number = kind(next(pictures.of(pictures.training[0]))).shape[1]
-    size = encoding.size or kind.size(number, min(SIZE, pictures.number))
+    number = source.encode(next(pictures.of(pictures.training[0]))).shape[1]
+    size = encoding.size or (number if source.reader else min(number, SIZE, pictures.number))
     if size > number:
         raise BadInput(f"--size {size}: encoder {encoding.encoder!r} gives {number} features; take at most as many")
     if size > pictures.number:
         raise BadInput(f"--size {size}: there are {pictures.number} training pictures; take at most as many")
     return About(
         encoder=encoding.encoder,
-        reader=kind.reader,
+        reader=source.reader,
         observation=encoding.observation,
         picture=pictures.shape,
         features=number,
@@ -291,9 +295,9 @@ def _about(encoding: Encoding, pictures: Pictures, kind: Kind) -> About:
     )
 
 
-def _identity(path: Path, encoding: Encoding, kind: Kind) -> str:
-    """What decides the contents of the file."""
-    stat, code = path.stat(), hashlib.sha256(kind.decides()).hexdigest()
+def _identity(path: Path, encoding: Encoding, source: Extractor) -> str:
+    """Everything that decides the contents of the file."""
+    stat, code = path.stat(), hashlib.sha256(source.code).hexdigest()
     return json.dumps({"file": [str(path.resolve()), stat.st_size, stat.st_mtime_ns], "code": code} | asdict(encoding))
 
 

@@ -1,12 +1,12 @@
-"""How well segments agree with ground-truth labels, by the field's measures.
+"""Agreement of segments with ground-truth labels, by the measures of the field.
 
-NMI and ARI compare two ways to divide steps, boundary F1 compares where they divide; none of them asks what an option
-is called. For the other measures options are matched with labels, one with one, so that as many steps as possible agree
-(Hungarian assignment): *globally*, once for all demonstrations, or *per demonstration*. An option that is left over, or
-shares no step with its label, agrees with nothing.
+Normalised mutual information (NMI), the adjusted Rand index (ARI) and boundary F1 do not depend on the names of
+options. For the other measures options are matched one to one with labels, so that as many steps as possible agree
+(Hungarian assignment): *globally*, once for all demonstrations, or *per demonstration*. An unmatched option, or one
+that shares no step with its label, agrees with nothing.
 
-Steps labelled :data:`UNKNOWN` are left out as if they were not there. A segment is a maximal run of steps of the same
-option: selecting the same option anew is no boundary.
+Steps labelled :data:`UNKNOWN` are left out. A segment is a maximal run of steps of the same option: selecting the same
+option anew is no boundary.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from scipy.optimize import linear_sum_assignment
 from sklearn.metrics import adjusted_rand_score, normalized_mutual_info_score
 
 UNKNOWN = -1
-"""The label of a step of which nothing is known."""
+"""The label of a step without ground truth."""
 
 TOLERANCES = (1, 3, 5)
-"""Steps by which a boundary may be off."""
+"""Tolerances of boundary F1, in steps."""
 
 OVERLAPS = (10, 25, 50)
-"""Percent of intersection over union from which on two segments are the same."""
+"""Thresholds of segmental F1: intersection over union, in percent."""
 
 UNMATCHED = ("nmi", "ari", *(f"boundary_f1_{steps}" for steps in TOLERANCES))
 MATCHED = ("accuracy", "iou", *(f"f1_{percent}" for percent in OVERLAPS), "edit")
 
 
 def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> dict[str, Any] | None:
-    """All measures over demonstrations, each at most 1, which is perfect; None where no step has a known label.
+    """All measures over demonstrations, each at most 1 (perfect); None where no step has a known label.
 
     - ``nmi``: normalised mutual information, arithmetic mean of the entropies.
     - ``ari``: adjusted Rand index, 0 by chance.
@@ -88,7 +88,7 @@ def confusion(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> d
 
 
 def _known(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Options and labels of the steps whose label is known, of each demonstration that has any."""
+    """Options and labels of the steps with a known label, for each demonstration with such steps."""
     pairs = []
     for options, label in zip(segments, labels, strict=True):
         label = np.asarray(label)
@@ -99,9 +99,9 @@ def _known(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> list
 
 
 def _numbered(sequences: Sequence[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The values and, for each sequence, their numbers 0, 1, ... in the order in which they first appear.
+    """The distinct values, and each sequence with values replaced by numbers in the order of first appearance.
 
-    Where two matchings are equally good, which one is taken then does not depend on names.
+    The choice between equally good matchings then does not depend on names.
     """
     values, first, numbers = np.unique(np.concatenate(sequences), return_index=True, return_inverse=True)
     order = np.argsort(first)
@@ -117,7 +117,7 @@ def _counts(ours: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def _matching(counts: np.ndarray) -> np.ndarray:
-    """The label of each option [options]; a number of its own, above all labels, for one without."""
+    """The label of each option [options]; a distinct number above all labels for an unmatched option."""
     match = LARGEST + np.arange(counts.shape[1])
     for label, option in zip(*linear_sum_assignment(counts, maximize=True), strict=True):
         if counts[label, option]:
@@ -151,7 +151,7 @@ def _boundaries(sequence: np.ndarray) -> np.ndarray:
 
 
 def _f1(right: int, ours: int, theirs: int) -> float:
-    """2 PR / (P + R) of so many right ones; 1 where there are none on either side."""
+    """F1 = 2 PR / (P + R) of so many right ones; 1 where both sides are empty."""
     return 2 * right / (ours + theirs) if ours + theirs else 1.0
 
 
@@ -162,7 +162,7 @@ def _boundary_f1(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], tolera
 
 
 def _within(ours: np.ndarray, theirs: np.ndarray, tolerance: int) -> int:
-    """How many pairs of sorted steps at most ``tolerance`` apart can be made, each step in one pair."""
+    """The number of disjoint pairs of sorted steps at most ``tolerance`` apart."""
     i = j = pairs = 0
     while i < len(ours) and j < len(theirs):
         if abs(ours[i] - theirs[j]) <= tolerance:

@@ -1,4 +1,4 @@
-"""Which inputs matter: how active each branch of a network is, and what is lost without what it reads (SM 1.4)."""
+"""Use of the branches of a network: activation, and loss in log-likelihood when the input is shuffled (SM 1.4)."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from ddco_pyro.evaluation.inferred import Inferred
 from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
-from ddco_pyro.model.networks.branches import Branches
+from ddco_pyro.model.networks.perceptrons import Branches
 
 SEED = 0
-"""Of the steps whose observations stand in for others."""
+"""The seed of the permutation of steps."""
 
 
 def branch_use(hierarchy: Hierarchy, pieces: Iterable[Inferred]) -> list[dict[str, Any]]:
-    """For each level whose policies are branches, lowest first, the meta-policy last.
+    """The use of branches in each level whose policies have branches, lowest first, the meta-policy last.
 
-    ``level`` is its number from 0, ``branches`` the branches' names, and both of these have a row for each option and
-    a column for each branch, weighted by the posterior probability that the option is active:
+    ``level`` is the number of the level from 0, ``branches`` has the names of the branches. Two tables have a row for
+    each option and a column for each branch, weighted by the posterior probability that the option is active:
 
-    - ``activation``: the mean size of what the branch gives the joint layer;
-    - ``loss``: by how many nats per step the option's control, and the meta-policy's choices, are less likely where the
-      branch reads what was observed at another step, drawn among all steps; None where the level emits no control.
+    - ``activation``: the mean absolute value of the branch's output;
+    - ``loss``: the loss in nats per step, of the option's control or the meta-policy's choices, where the branch reads
+      the observation of a random other step; None where the level emits no control.
     """
     branched = _branched(hierarchy)
     if not branched:
@@ -51,7 +51,7 @@ def branch_use(hierarchy: Hierarchy, pieces: Iterable[Inferred]) -> list[dict[st
 
 
 def _branched(hierarchy: Hierarchy) -> dict[int, Branches]:
-    """The branches that each level's policies read, by level; the meta-policy's is the last."""
+    """The branches that each level's policies read, by level; the meta-policy is the last level."""
     by_level: dict[int, Branches] = {}
     for place, network in hierarchy.networks().items():
         inside = [module for module in network.modules() if isinstance(module, Branches)]
@@ -62,21 +62,21 @@ def _branched(hierarchy: Hierarchy) -> dict[int, Branches]:
 
 
 def _levels(place: str, depth: int) -> Iterable[int]:
-    """The levels that a network of the hierarchy belongs to; its trunk to all of them."""
+    """The levels that a network of the hierarchy belongs to; the trunk belongs to all."""
     if place == "trunk":
         return range(depth + 1)
     return (depth,) if place == "meta_policy" else (int(place.split(".")[1]),)
 
 
 def _rows(sums: dict[tuple[int, int], Tensor], level: int, branches: int, what: int) -> list[list[float | None]]:
-    """Means by option and branch; None where an option is never active, or has no such number."""
+    """Means by option and branch; None where an option is never active, or emits no control."""
     columns = [sums[level, number][:, what] / sums[level, number][:, 2] for number in range(branches)]
     values = torch.stack(columns, dim=1).tolist()
     return [[None if math.isnan(value) else value for value in row] for row in values]
 
 
 def _sums(hierarchy: Hierarchy, piece: Inferred, level: int, branch: nn.Module) -> Tensor:
-    """Weighted sums over the steps of activation, loss and weight, [K, 3]."""
+    """Weighted sums of activation, loss and weight over the steps, [K, 3]."""
     weight = _weight(hierarchy, piece, level)
     with torch.no_grad(), ExitStack() as hooks:
         seen = hooks.enter_context(_watched(branch))
@@ -88,7 +88,7 @@ def _sums(hierarchy: Hierarchy, piece: Inferred, level: int, branch: nn.Module) 
 
 
 def _weight(hierarchy: Hierarchy, piece: Inferred, level: int) -> Tensor:
-    """How probably each of a level's callers is active, [N, T, K]."""
+    """The posterior probability that each of a level's callers is active, [N, T, K]."""
     if level < hierarchy.depth:
         return piece.posterior.u[level][..., 1:]
     alive = torch.arange(piece.batch.inputs.batch[1]) < piece.batch.lengths[:, None]
@@ -96,7 +96,7 @@ def _weight(hierarchy: Hierarchy, piece: Inferred, level: int) -> Tensor:
 
 
 def _score(hierarchy: Hierarchy, piece: Inferred, level: int, weight: Tensor, replaced: bool = False) -> Tensor:
-    """Weighted sum of the log-density of each caller's control; of the meta-policy's, the whole log-likelihood, [K]."""
+    """The weighted log-density of each caller's control; for the meta-policy the whole log-likelihood, [K]."""
     outputs = hierarchy(piece.batch.inputs) if replaced else piece.outputs
     if level == hierarchy.depth:
         return log_likelihood(outputs.tables(piece.batch.actions), piece.batch.lengths).sum().reshape(1)
@@ -109,11 +109,11 @@ def _score(hierarchy: Hierarchy, piece: Inferred, level: int, weight: Tensor, re
 
 @contextmanager
 def _watched(branch: nn.Module) -> Iterator[list[Tensor]]:
-    """What a branch gives, [N, T, K, F] for each chunk of time."""
+    """Inside, the list collects the outputs of a branch, [N, T, K, F] for each chunk of time."""
     given: list[Tensor] = []
 
     def keep(_: nn.Module, __: Any, output: Any) -> None:
-        given.append((output if isinstance(output, Tensor) else output[0]).cpu())
+        given.append(output[0].cpu())
 
     handle = branch.register_forward_hook(keep)
     try:
@@ -124,7 +124,7 @@ def _watched(branch: nn.Module) -> Iterator[list[Tensor]]:
 
 @contextmanager
 def _replaced(branch: nn.Module, lengths: Tensor) -> Iterator[None]:
-    """A branch reads at each step what was observed at another of the same chunk of time, drawn without replacement."""
+    """Inside, a branch reads the observations of a chunk of time in a random order."""
 
     def replace(_: nn.Module, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
         inputs: Inputs = arguments[0]

@@ -1,4 +1,4 @@
-"""The walk over demonstrations: what a fitted model says of them, a bounded piece at a time."""
+"""Inference over demonstrations with a trained model, a piece of bounded size at a time."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from ddco_pyro.data.memory import INFERENCE
 from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.inference.paths import Path, most_likely_path
 from ddco_pyro.inference.posteriors import Decomposition, Posterior, decompose, posterior
-from ddco_pyro.model.encoding import Batch, encode
+from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.model.tables import Tables
 
 GROUP_BYTES = 5e8
-"""Demonstrations are taken together while they and what is made of them take no more than this."""
+"""The most bytes that the demonstrations of a piece, with the results of inference, may take."""
 
 COPIES = 4
-"""Bytes that a byte of an observation takes, with the batch that is made of it."""
+"""Bytes for each byte of an observation, with the encoded batch."""
 
 
 @dataclass(frozen=True, eq=False)
 class Inferred:
-    """What a model says of N demonstrations, padded to the longest, T steps; each thing is computed once, when asked.
+    """The inference for N demonstrations, padded to the longest, T steps; each result is computed when first read.
 
     :param names: of the demonstrations.
-    :param batch: the demonstrations as the networks see them.
+    :param batch: the demonstrations, encoded for the networks.
     """
 
     names: tuple[str, ...]
@@ -45,13 +45,13 @@ class Inferred:
 
     @cached_property
     def outputs(self) -> Outputs:
-        """What the networks say at every step."""
+        """The outputs of the networks at every step."""
         with torch.no_grad():
             return self.hierarchy(self.batch.inputs)
 
     @cached_property
     def tables(self) -> Tables:
-        """The tables that exact inference works on."""
+        """The log-probabilities that exact inference works on."""
         with torch.no_grad():
             return self.outputs.tables(self.batch.actions)
 
@@ -73,15 +73,15 @@ class Inferred:
 
     @cached_property
     def decomposition(self) -> Decomposition:
-        """What each control dimension and choosing options add to log p(ξ)."""
+        """The contributions of each control dimension, and of the choice of options, to log p(ξ)."""
         return decompose(self.outputs, self.batch)
 
 
 def infer(hierarchy: Hierarchy, demonstrations: Iterable[Demonstration]) -> Iterator[Inferred]:
-    """What a trained hierarchy says of demonstrations, as many together as the networks take at once.
+    """Inference for demonstrations in order, as many together as the networks take at once.
 
-    :param demonstrations: in memory, or read one by one while this goes on.
-    :raises DemonstrationsError: there are none, they do not go together, or a number is too large for networks.
+    :param demonstrations: in memory, or an iterable that reads one after the other.
+    :raises DemonstrationsError: there are none, their shapes differ, or a number is too large for networks.
     """
     for group in _groups(demonstrations, hierarchy.steps_at_once):
         demos = Demonstrations(tuple(group))
@@ -89,7 +89,7 @@ def infer(hierarchy: Hierarchy, demonstrations: Iterable[Demonstration]) -> Iter
 
 
 def _groups(demonstrations: Iterable[Demonstration], steps: int) -> Iterator[list[Demonstration]]:
-    """Consecutive demonstrations of at most so many steps, padding included; one demonstration at least."""
+    """Consecutive demonstrations with at most so many steps, padding included, and at least one demonstration."""
     group: list[Demonstration] = []
     for demo in demonstrations:
         observed = sum(array[0].nbytes for array in demo.observations.values() if isinstance(array, np.ndarray))

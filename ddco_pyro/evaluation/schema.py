@@ -1,6 +1,6 @@
-"""Files that a run or a selection keeps, read back: what is damaged is one line with the file, the place, the remedy.
+"""The schema of ``metrics.json``, and reading JSON and CSV files of a run: one line names the file, place and remedy.
 
-Keys that are not named here are kept as they are.
+Log-likelihoods are in nats. A model has ``extra="allow"``: further keys of a file are kept.
 """
 
 from __future__ import annotations
@@ -11,22 +11,37 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.errors import command
-from ddco_pyro.evaluation.agreement_record import Agreement, as_today, each_level_of
-from ddco_pyro.evaluation.record_types import NOT_NULL, AtLeastOne, Finite, Record
-from ddco_pyro.spec.messages import invalid, lines
+from ddco_pyro.spec.base import invalid, lines
 
 T = TypeVar("T")
 
 
-def read_record(path: Path, kind: type[T], remedy: str) -> T:
-    """What a JSON file holds, which has to be of this kind.
+def _not_null(value: Any) -> Any:
+    if value is None:
+        raise invalid(("", "must not be null; where there is none the key is left out"))
+    return value
 
-    :param remedy: what to do where it is not.
-    :raises Damaged: it is not.
+
+NOT_NULL = AfterValidator(_not_null)
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+AtLeastOne = Annotated[int, Field(ge=1)]
+
+
+class Record(BaseModel):
+    """A part of a file; further keys are kept."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+
+def read_record(path: Path, kind: type[T], remedy: str) -> T:
+    """Read a JSON file as an instance of a type.
+
+    :param remedy: what to do about a damaged file.
+    :raises Damaged: the file is not of this type.
     """
     try:
         return TypeAdapter(kind).validate_json(path.read_bytes(), strict=True)
@@ -37,11 +52,11 @@ def read_record(path: Path, kind: type[T], remedy: str) -> T:
 
 
 def read_table(path: Path, row: Callable[[dict[str, str]], T], remedy: str) -> list[T]:
-    """The rows of a CSV file.
+    """Read the rows of a CSV file.
 
-    :param row: what is made of a row; KeyError, TypeError and ValueError say that it is damaged.
-    :param remedy: what to do where it is.
-    :raises Damaged: it is.
+    :param row: converts a row; a KeyError, TypeError or ValueError means that the file is damaged.
+    :param remedy: what to do about a damaged file.
+    :raises Damaged: the file is damaged.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -51,9 +66,9 @@ def read_table(path: Path, row: Callable[[dict[str, str]], T], remedy: str) -> l
 
 
 def read_successes(folder: Path) -> dict[tuple[str, int], float]:
-    """Success (1) or not (0) by method and seed, from a run's ``rollouts.csv``; nothing where it says nothing of it.
+    """Success (1) or failure (0) of a run's rollouts by method and seed; empty without rollouts or without success.
 
-    :raises Damaged: it cannot be read.
+    :raises Damaged: ``rollouts.csv`` is damaged.
     """
     path = folder / "rollouts.csv"
     if not path.exists():
@@ -68,31 +83,33 @@ def _success(row: Mapping[str, str]) -> tuple[str, int, float | None]:
 
 
 def read_metrics(folder: Path, counts: Sequence[int]) -> dict[str, Any]:
-    """The contents of a run's ``metrics.json``.
+    """Read a run's ``metrics.json``, which has to agree with :class:`Metrics`.
 
     :param counts: the number of options of each level, lowest first.
-    :raises Damaged: it cannot be read, or lacks something that a reader needs.
+    :raises Damaged: the file is damaged, or is about other levels.
     """
     path, remedy = folder / "metrics.json", refit(folder)
     metrics = read_record(path, Metrics, remedy)
     levels = [[use.choice for use in level] for level in metrics.options]
-    each_level = [
-        values for values in (*each_level_of(metrics.agreement), metrics.divergences or None) if values is not None
-    ]
-    if levels != [list(range(1 + count)) for count in counts] or {len(values) for values in each_level} - {len(counts)}:
+    agreement = metrics.agreement
+    lists: list[Sequence[Any] | None] = [metrics.divergences or None]
+    if agreement is not None:
+        lists += [agreement.labels, agreement.train, agreement.valid, agreement.confusion]
+    wrong = {len(values) for values in lists if values is not None} - {len(counts)}
+    if levels != [list(range(1 + count)) for count in counts] or wrong:
         raise Damaged(path, f"is not about levels with {', '.join(map(str, counts)) or 'no'} options", remedy)
-    data: dict[str, Any] = json.loads(path.read_bytes(), parse_constant=lambda _: None)  # NaN of earlier versions
-    return data | ({"agreement": as_today(data["agreement"], len(counts))} if "agreement" in data else {})
+    data: dict[str, Any] = json.loads(path.read_bytes())
+    return data
 
 
 def option_labels(metrics: Mapping[str, Any]) -> dict[str, dict[int, int]]:
-    """The label that each option stands for, by level, of a run trained from labels."""
-    said = metrics.get("trained_labels")
-    return {said["level"]: dict(enumerate(said["values"], start=1))} if said else {}
+    """The label that each option stands for, by level; empty for a run that was not trained from labels."""
+    trained = metrics.get("trained_labels")
+    return {trained["level"]: dict(enumerate(trained["values"], start=1))} if trained else {}
 
 
 def refit(folder: Path, remove: str = "it") -> str:
-    """What to do about a damaged file of a run: what its checkpoint holds need not be trained again."""
+    """The remedy for a damaged file of a run; what the checkpoints hold is not trained again."""
     return f"remove {remove} and fit again: {command('fit', folder / 'spec.yaml', '--out', folder, '--resume')}"
 
 
@@ -104,7 +121,7 @@ class PerStep(Record):
 
 
 class HeldOut(Record):
-    """A demonstration that was held out."""
+    """The log-likelihood of a held-out demonstration, nats."""
 
     name: str
     steps: AtLeastOne
@@ -112,34 +129,34 @@ class HeldOut(Record):
 
 
 class Difference(Record):
-    """Paired, in nats per step; a single demonstration has no error."""
+    """A paired difference in nats per step; a single demonstration has no standard error."""
 
     nats_per_step: Finite
     standard_error: float | None
 
 
 class BothParts(PerStep):
-    """Baselines are trained only where demonstrations are held out."""
+    """Log-likelihood of a baseline in nats per step; baselines need held-out demonstrations."""
 
     valid: Finite
 
 
 class Allowed(Record):
-    """What training may spend; None for no limit."""
+    """The budget of training; None for no limit."""
 
     epochs: int | None
     gradient_steps: int | None
 
 
 class Spent(Record):
-    """What training has spent."""
+    """The effort of training."""
 
     epochs: int
     gradient_steps: int
 
 
 class Stage(Record):
-    """How a stage of training ended (:class:`ddco_pyro.training.convergence.StageEnd`)."""
+    """The end of a stage of training (:class:`ddco_pyro.training.stages.StageEnd`)."""
 
     stage: str
     epochs: int
@@ -150,9 +167,7 @@ class Stage(Record):
 
 
 class Restart(Record):
-    """What a restart took, after how many epochs of its last stage it was stopped early (None where it was not), and
-    whether it diverged.
-    """
+    """The epochs of a restart, and the epoch of its last stage at which it was stopped early, if it was."""
 
     epochs: int
     stopped: int | None
@@ -160,7 +175,7 @@ class Restart(Record):
 
 
 class Restarts(Record):
-    """Which restart was the best, and what all of them took."""
+    """All restarts of a model, and the number of the best."""
 
     best: int
     spent: Spent
@@ -168,32 +183,36 @@ class Restarts(Record):
 
 
 class Training(Record):
-    """What training spent of its budget, and whether it had converged then."""
+    """The effort of training out of its budget, and whether training converged."""
 
     budget: Allowed
     spent: Spent
     stages: Annotated[list[Stage], Field(min_length=1)]
     converged: bool
-    restarts: Annotated[Restarts | None, NOT_NULL] = None
+    restarts: Restarts
+    device: str
+    by_em: bool = False
+    """Whether the gradient steps are EM steps over all training demonstrations."""
 
 
 class Compared(Record):
-    """A baseline."""
+    """A baseline and the model's difference to it."""
 
     log_likelihood_per_step: BothParts
     difference: Difference
-    training: Annotated[Training | None, NOT_NULL] = None
+    parameters: int
+    training: Training
 
 
 class InARow(Record):
-    """Mean steps for which a level of the hierarchy, and of the mixture, keeps to one choice."""
+    """Mean steps in a row of one choice, in a level of the hierarchy and of the mixture."""
 
     options: Finite
     mixture: Finite
 
 
 class Worth(Record):
-    """What the hierarchy is worth (:func:`ddco_pyro.evaluation.worth.worth`)."""
+    """The parts of the hierarchy's advantage (:func:`ddco_pyro.evaluation.worth.worth`)."""
 
     memory: Difference
     experts: Annotated[Difference | None, NOT_NULL] = None
@@ -203,7 +222,7 @@ class Worth(Record):
 
 
 class Seeds(Record):
-    """What a fit and its repetitions say, in the order of their training seeds."""
+    """Results of a fit and its repetitions, in the order of their training seeds."""
 
     training_seeds: Annotated[list[int], Field(min_length=2)]
     held_out: dict[str, list[Finite]]
@@ -211,14 +230,14 @@ class Seeds(Record):
 
 
 class Dimensions(Record):
-    """Log-likelihood per step that each control dimension adds, None for constant ones, and choosing options."""
+    """Contributions to the log-likelihood per step, by control dimension (None for constant ones) and of options."""
 
     by_dimension: list[Finite | None]
     options: Finite
 
 
 class ByDimension(Record):
-    """That of each part of the data."""
+    """The contributions in each part of the data."""
 
     train: Dimensions
     valid: Dimensions | None
@@ -234,7 +253,7 @@ class Listed(Record):
 
 
 class ControlRange(Record):
-    """What a control dimension does in the demonstrations."""
+    """Statistics of a control dimension in the demonstrations."""
 
     number: int
     minimum: Finite
@@ -247,7 +266,7 @@ class ControlRange(Record):
 
 
 class Branches(Record):
-    """Activation of each branch of a level's networks, and what is lost without its input, by option and branch."""
+    """Use of the branches of a level's networks, by option and branch (:mod:`ddco_pyro.evaluation.branch_use`)."""
 
     level: int
     branches: Annotated[list[str], Field(min_length=1)]
@@ -256,24 +275,24 @@ class Branches(Record):
 
 
 class Use(Record):
-    """How a choice of a level is used."""
+    """The use of a choice of a level (:class:`ddco_pyro.evaluation.options.OptionUse`)."""
 
     choice: int
     share: Finite
     selected: Finite
-    demonstrations: Finite = 0.0
+    demonstrations: Finite
     duration: Finite | None
 
 
 class Alike(Record):
-    """How differently two options act."""
+    """The divergence of two options in nats per step."""
 
     options: tuple[int, int]
     divergence: Finite | None
 
 
 class Measure(Record):
-    """What episodes came to: a rate (``successes``) or a ``mean``."""
+    """A measure of episodes: a ``rate`` of ``successes``, or a ``mean``."""
 
     trials: int
     interval: tuple[Finite, Finite] | None
@@ -293,7 +312,7 @@ class Measure(Record):
 
 
 class Against(Record):
-    """Successes of two methods on the same initial states."""
+    """Successes of two methods from the same initial states (McNemar's test)."""
 
     only_ours: int
     only_theirs: int
@@ -309,7 +328,7 @@ class Method(Record):
 
 
 class SuccessWorth(Record):
-    """The parts of what the hierarchy is worth in success (:func:`ddco_pyro.fitting.worth.success_worth`)."""
+    """The parts of the hierarchy's advantage in success (:func:`ddco_pyro.evaluation.worth.success_worth`)."""
 
     memory: Against
     experts: Annotated[Against | None, NOT_NULL] = None
@@ -326,7 +345,7 @@ class SuccessOfSeeds(Record):
 
 
 class Rollouts(Record):
-    """Those of all methods, from the same initial states."""
+    """The rollouts of all methods, from the same initial states."""
 
     seed: int
     episodes: AtLeastOne
@@ -336,9 +355,7 @@ class Rollouts(Record):
 
 
 class Unfinished(Record):
-    """Rollouts that were interrupted: the outcome of each seed's episode, for every method that was done; null for a
-    measure that does not apply to an episode.
-    """
+    """An interrupted rollout: the outcomes of finished methods by seed; null where a measure does not apply."""
 
     models: str
     seeds: list[int]
@@ -353,7 +370,7 @@ class Unfinished(Record):
 
 
 class Counts(Record):
-    """Demonstrations, and how often their supervisor succeeded."""
+    """Numbers of demonstrations, and the success rate of their supervisor."""
 
     train: AtLeastOne
     tune: int
@@ -362,7 +379,7 @@ class Counts(Record):
 
 
 class TrainedLabels(Record):
-    """The labels that the options 1, 2, ... of a level stand for, and how much of the labelled steps has them."""
+    """The labels that options 1, 2, ... of a level stand for, and the share of labelled steps that agree."""
 
     level: str
     labels: str
@@ -370,14 +387,69 @@ class TrainedLabels(Record):
     agreement: Finite
 
 
+class Matched(Record):
+    """Measures under a matching of options with labels (:mod:`ddco_pyro.evaluation.agreement`)."""
+
+    accuracy: Finite
+    iou: Finite
+    f1_10: Finite
+    f1_25: Finite
+    f1_50: Finite
+    edit: Finite
+
+
+class Scores(Record):
+    """All measures of a level."""
+
+    nmi: Finite
+    ari: Finite
+    boundary_f1_1: Finite
+    boundary_f1_3: Finite
+    boundary_f1_5: Finite
+    matched_globally: Matched
+    matched_per_demonstration: Matched
+
+
+class Confusion(Record):
+    """Steps of each label in each option, and the label that each option is matched with."""
+
+    labels: list[int]
+    options: list[int]
+    steps: list[list[Annotated[int, Field(ge=0)]]]
+    matched: list[int | None]
+
+    @model_validator(mode="after")
+    def _of_one_size(self) -> Confusion:
+        sizes = [len(self.labels), *(len(row) for row in self.steps), len(self.matched)]
+        if sizes != [len(self.steps), *[len(self.options)] * (len(self.steps) + 1)]:
+            raise invalid(("", "is no table of labels by options"))
+        return self
+
+
+class Agreement(Record):
+    """Agreement of each level's segments with the labels so named; None where no label is known."""
+
+    labels: list[str]
+    train: list[Scores | None]
+    valid: Annotated[list[Scores | None] | None, NOT_NULL] = None
+    confusion: list[Confusion]
+
+
+class Engines(Record):
+    """Largest relative differences between the engines before training (:mod:`ddco_pyro.inference.engines`)."""
+
+    value: float
+    gradient: float
+
+
 class Metrics(Record):
-    """What ``metrics.json`` has to have for those who read it."""
+    """The contents of ``metrics.json``; what does not apply to a run is left out."""
 
     model: str
     log_likelihood_per_step: PerStep
-    log_likelihood_by_dimension: Annotated[ByDimension | None, NOT_NULL] = None
+    log_likelihood_by_dimension: ByDimension
     valid: list[HeldOut]
-    demonstrations_by_likelihood: list[Listed] = Field(default_factory=list)
+    demonstrations_by_likelihood: list[Listed]
     comparison: dict[str, Compared]
     worth: Annotated[Worth | None, NOT_NULL] = None
     seeds: Annotated[Seeds | None, NOT_NULL] = None
@@ -385,13 +457,13 @@ class Metrics(Record):
     divergences: list[list[Alike]] = Field(default_factory=list)
     agreement: Annotated[Agreement | None, NOT_NULL] = None
     trained_labels: Annotated[TrainedLabels | None, NOT_NULL] = None
-    engine_check: dict[str, float]
+    engine_check: Engines
     demonstrations: Counts
-    control_dimensions: list[ControlRange] = Field(default_factory=list)
-    measure: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
+    control_dimensions: list[ControlRange]
+    measure: dict[str, Annotated[list[Any], Field(min_length=1)]]
     branches: list[Branches] = Field(default_factory=list)
     parameters: int
-    training: Annotated[Training | None, NOT_NULL] = None
+    training: Training
     seconds: dict[str, float]
     versions: dict[str, str]
     rollouts: Annotated[Rollouts | None, NOT_NULL] = None

@@ -1,4 +1,4 @@
-"""What a hierarchy is worth over a flat policy, in two parts: several experts, and options that last."""
+"""The advantage of a hierarchy over a flat policy in two parts: several experts, and options that last."""
 
 from __future__ import annotations
 
@@ -7,32 +7,40 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.evaluation.analysis import paired
 from ddco_pyro.simulation.episodes import paired_difference
 
 MIXTURE = "mixture"
 FLAT = ("flat", "flat_equal")
-"""The policies without options that a hierarchy is measured against; the first that is there."""
+"""Flat baselines; a hierarchy is compared with the first one that a fit has."""
+
+
+def paired(ours: np.ndarray, theirs: np.ndarray, lengths: np.ndarray) -> dict[str, float]:
+    """Difference in log-likelihood per step between two models on the same demonstrations, with its standard error."""
+    difference = ours - theirs
+    mean = float(difference.sum() / lengths.sum())
+    residual = difference - mean * lengths  # a ratio of sums: the error of its linearisation
+    n = len(difference)
+    error = float(np.sqrt(residual.var(ddof=1) * n) / lengths.sum()) if n > 1 else float("nan")
+    return {"nats_per_step": mean, "standard_error": error}
 
 
 def worth(ours: str, values: Mapping[str, np.ndarray], lengths: Sequence[int]) -> dict[str, Any]:
-    """The paired differences in held-out log-likelihood per step that say what the hierarchy is worth.
+    """The parts of a hierarchy's advantage in held-out log-likelihood per step, as paired differences.
 
-    ``memory`` is hierarchy − mixture: the same experts and gate, which differ in options that last alone. ``experts``
-    is mixture − flat, and ``total`` their sum; both are there where a flat policy is, named in ``flat``.
+    ``memory`` is hierarchy − mixture: both have the same experts and gate, and in the hierarchy alone options last.
+    ``experts`` is mixture − flat and ``total`` is hierarchy − flat, where there is a flat baseline, named in ``flat``.
 
     :param ours: the hierarchy's name.
     :param values: log p(ξ) of each demonstration under each model, nats, [N], by name.
     :param lengths: steps of each demonstration, [N].
-    :returns: nothing where ``values`` has no mixture, or the hierarchy is one.
+    :returns: an empty dict where ``values`` has no mixture, or the hierarchy is one.
     """
     steps = np.array(lengths, dtype=float)
     return _parts(ours, values, lambda one, other: paired(one, other, steps))
 
 
 def success_worth(ours: str, successes: Mapping[str, Sequence[float]]) -> dict[str, Any]:
-    """The same parts of the success in rollouts from the same initial states, each by
-    :func:`ddco_pyro.simulation.episodes.paired_difference`.
+    """The same parts for success in rollouts (:func:`ddco_pyro.simulation.episodes.paired_difference`).
 
     :param successes: success (1) or not (0) of each episode, by method.
     """

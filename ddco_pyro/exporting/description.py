@@ -11,7 +11,6 @@ import torch
 from ddco_pyro.exporting.program import StepProgram
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.links import TERMINATION_BOUND
-from ddco_pyro.model.networks.numpy_form import numpy_form
 from ddco_pyro.spec import STEP, RolloutSpec
 
 Arrays = dict[str, np.ndarray]
@@ -70,11 +69,13 @@ def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
     first = sum(len(other.dims) for other in before if other.continuous)
     own = slice(first, first + len(places))
     each = zip(callers, (*(level.count for level in hierarchy.option_levels()), 1), strict=True)
-    std = [[] if one.std is None else one.std(torch.zeros(k, len(one.std.seen)))[..., own].tolist() for one, k in each]
+    std = [
+        [] if one.std is None else one.std(torch.zeros(k, len(one.std.of_state)))[..., own].tolist() for one, k in each
+    ]
     given = next(caller.std for caller in callers if caller.std is not None)  # all have the same kinds of σ
     per_state = [
         [at - first, scaling.numbers + number, float(given.floor[at]), float(given.start[at])]
-        for number, at in enumerate(given.seen)
+        for number, at in enumerate(given.of_state)
         if first <= at < first + len(places)
     ]
     decides = [len(scaling.varying) + sum(bool(other.exact) for other in before)] if part.exact else []
@@ -105,7 +106,7 @@ def _networks(hierarchy: Hierarchy) -> tuple[dict[str, Any], Arrays]:
     networks |= {f"end_{n}": level.termination for n, level in enumerate(levels) if level.termination is not None}
     networks |= {f"trunk_{number}": level.trunk for number, level in enumerate(levels) if level.trunk is not None}
     networks |= {} if hierarchy.trunk is None else {"trunk": hierarchy.trunk}
-    forms = {name: form for name, network in networks.items() if (form := numpy_form(network)) is not None}
+    forms = {name: form for name, network in networks.items() if (form := network.numpy_form()) is not None}
     facts = {name: about for name, (about, _) in forms.items()}
     arrays |= {f"{name}.{key}": array for name, (_, each) in forms.items() for key, array in each.items()}
     callers = [

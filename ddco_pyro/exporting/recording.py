@@ -12,10 +12,9 @@ import torch
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.exporting import runner
 from ddco_pyro.exporting.program import named
-from ddco_pyro.model.encoding import ObservationEncoder
+from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks import Inputs
-from ddco_pyro.model.networks.state import States
+from ddco_pyro.model.networks import Inputs, States
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.spec import STEP
 

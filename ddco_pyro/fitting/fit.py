@@ -1,10 +1,12 @@
-"""A fitted hierarchy: what it says of demonstrations, how it acts, and reading it back from its run folder."""
+"""``ddco_pyro.fit``, the fitted model that it gives, and ``ddco_pyro.load``."""
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,26 +17,44 @@ from torch import Tensor
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor
-from ddco_pyro.data.control_parts import ControlPart
+from ddco_pyro.data.controls import measure
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.files import Damaged
-from ddco_pyro.data.tensors import read_tensors
-from ddco_pyro.errors import BadInput
+from ddco_pyro.data.files import json_text, leftovers
+from ddco_pyro.data.hdf5 import natural
+from ddco_pyro.data.memory import allowed
 from ddco_pyro.evaluation.inferred import Inferred, infer
-from ddco_pyro.evaluation.schema import read_metrics, refit
-from ddco_pyro.fitting.fitted_to import refuse_others
+from ddco_pyro.evaluation.metrics import evaluate, supervisor
+from ddco_pyro.evaluation.schema import read_metrics
+from ddco_pyro.events import OnEvent, ignore
+from ddco_pyro.fitting.digest import record, recorded, refuse_others
+from ddco_pyro.fitting.run import (
+    Clock,
+    RunError,
+    claim,
+    claimed,
+    is_finished,
+    read_model,
+    write_history,
+    write_metrics,
+    write_model,
+)
 from ddco_pyro.inference import Posterior
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import Spec, load_spec, user_code
-from ddco_pyro.training.data import demonstrations
-from ddco_pyro.training.networks import Dimensions, build_hierarchy, named_baselines
+from ddco_pyro.spec import Spec, load_spec, user_code, with_overrides
+from ddco_pyro.training.data import demonstrations as read_demonstrations
+from ddco_pyro.training.data import dimensions, known_demonstrations, parts, refuse_unfit, seen
+from ddco_pyro.training.devices import repeatable
+from ddco_pyro.training.labels import used
+from ddco_pyro.training.launching import check_processes, together
+from ddco_pyro.training.networks import Dimensions, check_models, model_name, named_baselines, parameters
+from ddco_pyro.training.processes import Ranks, check_jobs
+from ddco_pyro.training.restarts import train_model
+
+PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
+"""Packages whose versions are in ``metrics.json``."""
 
 TOLERANCE = 1e-4
 """Relative; a log-likelihood computed again on another machine differs in the last digits of float32."""
-
-
-class RunError(BadInput):
-    """A folder is not the run it was taken for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +64,10 @@ class Fit:
     >>> fit.spec.hierarchy.levels[0].count, sorted(fit.baselines), fit.metrics["demonstrations"]["valid"]
     (2, ['flat'], 1)
 
-    :param metrics: its numbers, the contents of ``metrics.json``.
-    :param folder: its run folder; None where it was not written.
-    :param given: the demonstrations that it was fitted to; None for those that the spec names.
-    :param beside: the baselines that were trained beside it, by name; None for those in its folder.
+    :param metrics: the contents of ``metrics.json``.
+    :param folder: the run folder; None where nothing was written.
+    :param given: the demonstrations of the fit; None for those that the spec names.
+    :param beside: the fitted baselines, by name; None for those in the run folder.
     """
 
     spec: Spec
@@ -62,9 +82,9 @@ class Fit:
 
     @property
     def run_folder(self) -> Path:
-        """The folder, for what is read from it or written into it.
+        """The run folder.
 
-        :raises RunError: there is none.
+        :raises RunError: the fit has none.
         """
         if self.folder is None:
             raise RunError("this fit has no run folder; fit with out=FOLDER, which this needs")
@@ -72,48 +92,48 @@ class Fit:
 
     @property
     def name(self) -> str:
-        """What the model is called in tables."""
+        """The name of the model in tables."""
         return model_name(self.spec)
 
     @cached_property
     def demonstrations(self) -> Demonstrations:
-        """The demonstrations that it was fitted to, training and held out; those of a run are read when asked for.
+        """The demonstrations of the fit, training and held out; those of a run are read when asked for.
 
-        :raises OtherDemonstrations: their file holds others by now.
+        :raises OtherDemonstrations: their file holds other demonstrations.
         """
         if self.given is not None:
             return self.given
-        demos = demonstrations(self.spec)
+        demos = read_demonstrations(self.spec)
         if self.folder is not None:
             refuse_others(self.folder, demos)
         return demos
 
     @cached_property
     def baselines(self) -> Mapping[str, Fit]:
-        """The baselines that were trained beside it, by name."""
+        """The fitted baselines, by name."""
         if self.beside is not None or self.folder is None:
             return self.beside or {}
         folders = [self.folder / "baselines" / name for name in named_baselines(self.spec)]
-        allow_code = bool(user_code(self.spec))  # theirs is named in this spec too
+        allow_code = bool(user_code(self.spec))  # the spec names theirs too
         return {folder.name: load(folder, allow_code) for folder in folders if is_finished(folder)}
 
     @cached_property
     def held_out(self) -> dict[str, float]:
-        """log p(ξ) of each demonstration that was held out, by name, as it was then."""
+        """log p(ξ) of each held-out demonstration by name, computed when it was fitted, nats."""
         return {row["name"]: row["log_likelihood"] for row in self.metrics["valid"]}
 
     def was_held_out(self, name: str, log_likelihood: float) -> bool:
-        """Whether a demonstration is one of those that were held out: the same name, and as likely as it was then."""
+        """Whether a demonstration is among the held-out ones: the name and the log-likelihood are equal."""
         return bool(np.isclose(self.held_out.get(name, np.nan), log_likelihood, rtol=TOLERANCE, atol=TOLERANCE))
 
     def infer(self, demos: Iterable[Demonstration]) -> Iterator[Inferred]:
-        """What the model says of demonstrations, in pieces that fit into memory, in their order.
+        """The model's outputs, posteriors and paths for demonstrations, in pieces that fit into memory, in order.
 
         >>> for piece in fit.infer(demos):
         ...     print(piece.log_likelihood.shape, piece.posterior.u[0].shape, piece.path.choices[0].shape)
         (6,) torch.Size([6, 10, 3]) torch.Size([6, 10])
 
-        :param demos: :class:`~ddco_pyro.Demonstrations`, or single ones that are read while this goes on.
+        :param demos: :class:`~ddco_pyro.Demonstrations`, or an iterable that reads one after the other.
         :raises DemonstrationsError: there are none, or a number is too large for networks.
         """
         return infer(self.hierarchy, demos)
@@ -153,29 +173,158 @@ class Fit:
         return Controller.from_spec(self.hierarchy, self.spec.rollout, seed)
 
     def monitor(self) -> Monitor:
-        """A live monitor of the active options, for somebody else's acting."""
+        """A live monitor of the active options while another policy, or a person, acts."""
         return Monitor(self.hierarchy)
 
 
 def _stacked(parts: Sequence[Tensor], padding: float) -> Tensor:
-    """Parts [N_i, T_i, ...] one below the other, padded to the longest."""
+    """Parts [N_i, T_i, ...] stacked along N, padded to the longest."""
     rows = [row for part in parts for row in part]
     return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=padding)
 
 
-HIERARCHY = "ddco"
-"""What a hierarchy whose options last is called in tables."""
+def fit(
+    spec: Spec | str | Path,
+    demonstrations: Demonstrations | str | Path | None = None,
+    out: str | Path | None = None,
+    on_event: OnEvent = ignore,
+    jobs: int = 1,
+    processes: int = 1,
+    resume: bool = True,
+    keep: bool = True,
+) -> Fit:
+    """Fit a spec's hierarchy and its baselines to demonstrations, and evaluate them.
+
+    >>> import numpy as np
+    >>> random = np.random.default_rng(0)
+    >>> def demonstration(n):  # to the place, then away from it
+    ...     place = random.normal(size=(10, 2))
+    ...     return ddco_pyro.Demonstration(f"demo_{n}", {"place": place}, place * np.repeat([[-2.0], [2.0]], 5, 0))
+    >>> demos = ddco_pyro.Demonstrations(tuple(demonstration(n) for n in range(6)))
+    >>> fit = ddco_pyro.fit("mine.yaml", demos)
+    >>> fit.metrics["demonstrations"]
+    {'train': 4, 'tune': 1, 'valid': 1}
+    >>> ddco_pyro.fit("mine.yaml", demos, out="runs/mine").folder.as_posix()
+    'runs/mine'
+
+    :param spec: a spec, or its YAML file; one that names user code is given by ``load_spec(path, allow_code=True)``.
+    :param demonstrations: in memory, in any order, or the HDF5 file to use instead of ``demonstrations.path``; None for
+        those that the spec names.
+    :param out: the run folder, as ``ddco-pyro fit`` makes it, with a copy of demonstrations from memory; None to write
+        nothing. An unfinished run is continued; a finished one is loaded.
+    :param on_event: called with progress events (:mod:`ddco_pyro.events`).
+    :param jobs: processes that train restarts, -1 for one on each core; the result is the same for any number. In a
+        script, more than one needs the usual ``if __name__ == "__main__":``.
+    :param processes: processes that share the work of each gradient step instead, at most ``training.shards``; the
+        result is the same for any number.
+    :param resume: whether ``out`` may hold the finished run.
+    :param keep: whether ``out`` has a copy of demonstrations from memory; False where the spec's file has them.
+    :raises BackendError: so many processes cannot share the work.
+    :raises SpecError: something in the spec does not fit the demonstrations.
+    :raises DemonstrationsError: the demonstrations cannot be used.
+    :raises RunError: the folder holds something else.
+    :raises OtherDemonstrations: the folder is a run of other demonstrations.
+    :raises TrainingError: training stopped; the checkpoints stay.
+    """
+    spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else Path(out)
+    check_jobs(jobs)
+    check_processes(processes, jobs, spec.training.shards)
+    allowed()  # or $DDCO_PYRO_MEMORY is wrong
+    clock, given = Clock(), None
+    with clock("demonstrations"):
+        if isinstance(demonstrations, Demonstrations):
+            ordered = demonstrations.select(sorted(demonstrations.names, key=natural))  # as they are read back
+            given = replace(ordered, masks=demonstrations.masks)
+            if keep and folder is not None:
+                spec = with_overrides(spec, {"demonstrations.path": str(folder / "demonstrations.hdf5")})
+            demos: Demonstrations | None = seen(spec, given)
+        else:
+            if demonstrations is not None:
+                spec = with_overrides(spec, {"demonstrations.path": str(demonstrations)})
+            demos = known_demonstrations(spec)
+        models, known = check_models(spec, dimensions(spec, demos)), demos is not None
+        if demos is not None:
+            refuse_unfit(spec, demos)
+            used(spec, demos)
+    with ExitStack() as stack:  # all checks are done: from here on files are written
+        if folder is not None:
+            stack.enter_context(claimed(folder, spec, resume))
+        finished = folder is not None and is_finished(folder)
+        with clock("demonstrations"):
+            if demos is None and not finished:
+                demos = read_demonstrations(spec, on_event)
+            if folder is not None and demos is not None:
+                record(folder, demos)
+        if folder is not None:
+            if keep and given is not None and not (kept := folder / "demonstrations.hdf5").exists():
+                given.write(kept)
+            if finished:
+                return replace(load(folder, allow_code=True), given=demos)  # the caller has this very spec
+            for part in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
+                for old in leftovers(part):
+                    old.unlink()
+        assert demos is not None
+        if not known:  # the dimensions of the control decide the baselines too
+            models = check_models(spec, Dimensions.of(demos))
+        ranks = stack.enter_context(together(processes))
+        baselines = {name: beside for name, (beside, _) in list(models.items())[1:]}
+        return _fit_model(spec, demos, folder, on_event, jobs, ranks, clock, baselines)
 
 
-def model_name(spec: Spec) -> str:
-    """``ddco``, or what a baseline of this model is called (:attr:`~ddco_pyro.spec.BaselineSpec.name`)."""
-    if spec.hierarchy is None:
-        assert spec.baseline is not None  # a spec has one or the other
-        return spec.baseline.name
-    memoryless = [level.name for level in spec.hierarchy.levels if not level.lasts]
-    if not memoryless:
-        return HIERARCHY
-    return "_".join(("mixture", *(memoryless if len(memoryless) < len(spec.hierarchy.levels) else ())))
+def _fit_model(
+    spec: Spec,
+    demos: Demonstrations,
+    folder: Path | None,
+    on_event: OnEvent,
+    jobs: int,
+    ranks: Ranks,
+    clock: Clock,
+    baselines: Mapping[str, Spec],
+    name: str | None = None,
+) -> Fit:
+    """Train a model and its baselines, evaluate it, and write its folder.
+
+    :param baselines: the specs of the baselines by name.
+    :param name: of the model in events.
+    """
+    if folder:
+        on_event = clock.go_on(folder, on_event)
+    split, size = parts(spec, demos), Dimensions.of(demos)
+    checkpoints = folder / "checkpoints" if folder else None
+    with clock("training"):
+        trained = train_model(spec, size, split["train"], on_event, checkpoints, split.get("valid"), name, jobs, ranks)
+    hierarchy = trained.hierarchy
+    if folder:
+        write_history(folder, trained.history)
+        write_model(folder, hierarchy)
+    beside: dict[str, Fit] = {}
+    with clock("baselines"):
+        for baseline, its in baselines.items():
+            place = folder / "baselines" / baseline if folder else None
+            if folder and place:
+                claim(place, its)
+                record(place, demos, recorded(folder))
+            if place and is_finished(place):
+                beside[baseline] = load(place, allow_code=True)
+            else:
+                beside[baseline] = _fit_model(its, demos, place, on_event, jobs, ranks, Clock(), {}, baseline)
+    fitted = Fit(spec, hierarchy, {}, folder, demos, beside)
+    with clock("evaluation"), repeatable(hierarchy.device):
+        metrics = evaluate(fitted, split, demos)
+    counts = {"train": len(trained.data.train), "tune": len(trained.data.tune), "valid": len(split.get("valid", ()))}
+    metrics |= {
+        "engine_check": trained.check._asdict(),
+        "demonstrations": counts | supervisor(demos),
+        "measure": measure(hierarchy.scaling.parts),
+        "control_dimensions": [dimension.as_data() for dimension in size.control],
+        "parameters": parameters(hierarchy),
+        "training": trained.summary,
+        "seconds": clock.end(),
+        "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
+    }
+    if folder:
+        write_metrics(folder, metrics)
+    return replace(fitted, metrics=json.loads(json_text(metrics)))  # as they are read back
 
 
 def load(folder: str | Path, allow_code: bool = False) -> Fit:
@@ -188,6 +337,7 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
     :param allow_code: import the user code (``module:name``) that its spec names; nothing else in a run is ever
         executed.
     :raises RunError: the folder has no finished fit, or its model is of another spec.
+    :raises OtherVersion: the folder was written in another format.
     :raises Damaged: the model or ``metrics.json`` is damaged.
     :raises SpecError: its spec names user code, and that is not allowed.
     """
@@ -199,34 +349,7 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
             what = f"a selection; the fit of what it chose is in {folder / 'fit'} once it is done"
         raise RunError(f"{folder}: {what} (it has no {missing[0]})")
     spec = load_spec(folder / "spec.yaml", allow_code=allow_code)
-    try:
-        hierarchy = _read_model(spec, folder / "model.safetensors").eval()
-    except BadInput:
-        raise
-    except (KeyError, ValueError, RuntimeError) as error:
-        raise RunError(f"{folder / 'model.safetensors'}: is of another spec than spec.yaml; {refit(folder)}") from error
+    recorded(folder)  # or the format is another
+    hierarchy = read_model(folder, spec)
     counts = [level.count for level in spec.hierarchy.levels] if spec.hierarchy else []
     return Fit(spec, hierarchy, read_metrics(folder, counts), folder)
-
-
-def _read_model(spec: Spec, path: Path) -> Hierarchy:
-    tensors, metadata = read_tensors(path, refit(path.parent))
-    wrong = [name for name, tensor in tensors.items() if not bool(torch.isfinite(tensor).all())]
-    if wrong:
-        raise Damaged(path, f"{wrong[0]} has numbers that are NaN or infinite", refit(path.parent))
-    shapes = {key: tuple(shape) for key, shape in json.loads(metadata["shapes"]).items()}
-    size = int(metadata["control_size"])
-    whole = {"scaling.varying": torch.arange(size), "scaling.constant": torch.empty(0, dtype=torch.float64)}
-    tensors = whole | tensors  # models of before had every dimension in them
-    others = sorted(set(range(size)) - set(tensors["scaling.varying"].tolist()))
-    constant = dict(zip(others, tensors["scaling.constant"].tolist(), strict=True))
-    kinds = json.loads(metadata["control"]) if "control" in metadata else None  # models of before are Gaussian
-    parts = None if kinds is None else tuple(ControlPart.of(part) for part in kinds)
-    hierarchy = build_hierarchy(spec, Dimensions(shapes, size, int(metadata["steps"]), constant, parts=parts))
-    hierarchy.load_state_dict(tensors)
-    return hierarchy
-
-
-def is_finished(folder: Path) -> bool:
-    """Whether the run is complete: its metrics are written last. What was damaged and removed is made again."""
-    return all((folder / name).exists() for name in ("model.safetensors", "metrics.json"))

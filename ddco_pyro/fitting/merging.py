@@ -1,4 +1,4 @@
-"""Two options of a run made one, and training continued from there."""
+"""Merging two options of a run, and training again from the merged segments."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.tensors import digest_of
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import OnEvent, ignore
-from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.fit import Fit, fit
 from ddco_pyro.spec import Spec, with_overrides
-from ddco_pyro.spec.messages import nearest
+from ddco_pyro.spec.base import nearest
 from ddco_pyro.training.checkpoint import copy_of
 
 LABELS = "merged"
-"""Name of the labels that say which option each step begins with, and of what their file says of the merge."""
+"""Name of the labels with the option of each step, and of the attribute that describes the merge."""
 
 
 class MergeError(BadInput):
@@ -44,14 +43,13 @@ class Pair:
 
 
 def merge(run: Fit, pair: Pair, out: str | Path | None = None, on_event: OnEvent = ignore, jobs: int = 1) -> Fit:
-    """The run's spec with an option less, fitted to its demonstrations from its segments with two options as one.
+    """Fit the run's spec with one option fewer, initialised by the run's segments with two options as one.
 
-    The other levels are trained anew. The new run keeps a copy of the demonstrations, with the labels it began from,
-    the pair, and the digest of the run's networks.
+    The other levels are trained anew. The new run keeps a copy of the demonstrations with the labels of the merged
+    segments, the pair, and the digest of the run's networks.
 
-    :param out: its folder; None to write nothing.
-    :raises MergeError: the level would have no option left, or has been trained from labels; or the folder is of
-        another pair, or of another run.
+    :param out: the new run folder; None to write nothing.
+    :raises MergeError: the level has one option or was trained from labels, or the folder is of another merge.
     """
     changed = merged_spec(run.spec, pair.level)
     level = changed.hierarchy.levels[pair.level].name if changed.hierarchy else ""
@@ -64,9 +62,9 @@ def merge(run: Fit, pair: Pair, out: str | Path | None = None, on_event: OnEvent
 
 
 def _check_same(folder: Path, origin: Mapping[str, Any]) -> None:
-    """See that a folder which holds a merged run, or a part of one, holds this one.
+    """Refuse a folder that holds another merged run.
 
-    :raises MergeError: it does not.
+    :raises MergeError: the folder is of another pair or of another run.
     """
     path = folder / "demonstrations.hdf5"
     if not path.exists():
@@ -85,9 +83,9 @@ def _check_same(folder: Path, origin: Mapping[str, Any]) -> None:
 
 
 def chosen(run: Fit, level: str | None = None, options: tuple[int, int] | None = None) -> Pair:
-    """The pair that is meant: by default the two options of a level that act most alike.
+    """The pair of options to merge: by default the pair of the level that acts most alike.
 
-    :param level: its name; by default the lowest.
+    :param level: the name of the level; by default the lowest.
     :raises MergeError: there is no such level, or there are no such options.
     """
     levels = run.spec.hierarchy.levels if run.spec.hierarchy else ()
@@ -112,15 +110,15 @@ def chosen(run: Fit, level: str | None = None, options: tuple[int, int] | None =
 
 
 def _divergences(run: Fit, level: int) -> dict[tuple[int, int], float]:
-    """How differently each two options of a level act, where both are used."""
+    """The divergence of each pair of used options of a level."""
     rows: list[dict[str, Any]] = run.metrics["divergences"][level]
     return {(row["options"][0], row["options"][1]): row["divergence"] for row in rows if row["divergence"] is not None}
 
 
 def merged_spec(spec: Spec, level: int) -> Spec:
-    """The spec with an option less at a level (0 is the lowest), whose options begin from labels.
+    """The spec with one option fewer at a level (0 is the lowest), initialised by labels.
 
-    :raises MergeError: there is one option, or its options are named by labels already.
+    :raises MergeError: the level has one option, or labels name its options already.
     """
     assert spec.hierarchy is not None  # or there would be no pair
     own = spec.hierarchy.levels[level]
@@ -138,9 +136,9 @@ def merged_spec(spec: Spec, level: int) -> Spec:
 
 
 def merged_labels(run: Fit, pair: Pair) -> Demonstrations:
-    """The run's demonstrations, labelled by their most likely options from 0 on, of which two are one.
+    """The run's demonstrations, labelled by their most likely options from 0 on, with two options as one.
 
-    Where a caller acts itself (choice 0) the label is -1: nothing is said.
+    The label is -1, unknown, where a caller emits the control itself (choice 0).
     """
     demos = run.demonstrations
     first, second = pair.options

@@ -6,7 +6,7 @@ import csv
 import hashlib
 import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,18 +18,18 @@ from ddco_pyro.errors import command
 from ddco_pyro.evaluation.schema import Unfinished, read_record
 from ddco_pyro.evaluation.worth import success_worth
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
-from ddco_pyro.fitting.fit import Fit, RunError
-from ddco_pyro.fitting.run import write_metrics
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.run import RunError, write_metrics
 from ddco_pyro.simulation.episodes import paired_difference, run_episode, run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task
 
 Outcomes = dict[str, list[dict[str, float]]]
-"""What came of each method's episodes, in the order of their seeds."""
+"""The outcomes of each method's episodes, in the order of their seeds."""
 
 
 def policies(fit: Fit) -> dict[str, Policy | str]:
-    """Every method to roll out, by name: scripted policies, baselines, and the model itself last.
+    """The policies to roll out, by name: scripted ones, baselines, and the model itself last.
 
     :raises RunError: the spec has no task, or names a scripted policy that the task lacks.
     """
@@ -48,14 +48,17 @@ def policies(fit: Fit) -> dict[str, Policy | str]:
 def roll_out(
     fit: Fit, episodes: int, film: int = 0, on_event: OnEvent = ignore, jobs: int = -1, resume: bool = False
 ) -> dict[str, Any]:
-    """Roll every method out from the same ``episodes`` initial states; fills ``rollouts.csv``, ``videos/`` and
-    ``metrics.json``. Methods that were done when this was interrupted are not done again.
+    """Roll out a fit, its baselines and the task's scripted policies from the same initial states.
 
-    :param film: how many episodes of each method to film.
-    :param resume: where the run holds all of these rollouts, leave them as they are.
-    :returns: what ``metrics.json`` now has under ``rollouts``.
+    Writes ``rollouts.csv`` and ``videos/``, and adds ``rollouts`` to ``metrics.json``. After an interruption, finished
+    methods are not played again.
+
+    :param episodes: the number of initial states.
+    :param film: the number of episodes of each method to film.
+    :param resume: return the rollouts of the run where it has these very ones.
+    :returns: ``rollouts`` of ``metrics.json``.
     :raises RunError: there is no task, or the fit has no folder.
-    :raises Damaged: what an interrupted rollout has kept cannot be read.
+    :raises Damaged: the file of an interrupted rollout is damaged.
     """
     folder = fit.run_folder
     seeds = range(fit.spec.rollout.seed, fit.spec.rollout.seed + episodes)
@@ -96,7 +99,7 @@ def roll_out(
 
 
 def _film_looks(fit: Fit, name: str, policy: Policy | str, seed: int) -> None:
-    """Film what a fitted policy looks at, in the episode of a seed; nothing where it sees no pictures."""
+    """Film the saliency of a fitted policy that reads pictures, in the episode of a seed."""
     if isinstance(policy, Controller) and policy.hierarchy.encoder.images:
         looking = Looking(policy)
         again = run_episode(find_task(str(fit.spec.task)), looking, seed, observed=fit.spec.observed, keep=())
@@ -112,7 +115,7 @@ def _filmed(fit: Fit, name: str, seeds: Sequence[int]) -> bool:
 
 
 class _Unfinished:
-    """``outcomes`` of the methods that have been rolled out so far, kept in a file until all have been."""
+    """The ``outcomes`` of finished methods, kept in a file until all methods are finished."""
 
     def __init__(self, folder: Path, seeds: Sequence[int]) -> None:
         self._path = folder / "rollouts.unfinished.json"
@@ -125,17 +128,17 @@ class _Unfinished:
                 self.outcomes = {name: [_numbers(one) for one in each] for name, each in kept.outcomes.items()}
 
     def keep(self, name: str, outcomes: list[dict[str, float]]) -> None:
-        """A method has been rolled out."""
+        """Add a finished method."""
         self.outcomes[name] = outcomes
         write_text(self._path, json_text(self._key | {"outcomes": self.outcomes}))
 
     def end(self) -> None:
-        """All of them have been, and are kept elsewhere."""
+        """Remove the file."""
         self._path.unlink(missing_ok=True)
 
 
 def _numbers(outcome: Mapping[str, float | None]) -> dict[str, float]:
-    """An outcome read back: NaN for what does not apply."""
+    """An outcome from JSON, with NaN for a measure that does not apply."""
     return {measure: math.nan if value is None else value for measure, value in outcome.items()}
 
 
@@ -157,17 +160,13 @@ def _methods(task: Task, by_method: Outcomes, ours: str) -> dict[str, Any]:
 
 
 def _table(by_method: Mapping[str, Sequence[Mapping[str, float]]], seeds: Sequence[int]) -> str:
+    """``rollouts.csv``: a row for each episode, a column for each measure."""
     text = io.StringIO()
-    measures = list(dict.fromkeys(key for outcomes in by_method.values() for outcome in outcomes for key in outcome))
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["method", "seed", *measures])
-    writer.writerows(_rows(by_method, seeds, measures))
-    return text.getvalue()
-
-
-def _rows(
-    by_method: Mapping[str, Sequence[Mapping[str, float]]], seeds: Sequence[int], measures: Sequence[str]
-) -> Iterator[list[Any]]:
+    measures = dict.fromkeys(key for outcomes in by_method.values() for outcome in outcomes for key in outcome)
+    writer = csv.DictWriter(text, ["method", "seed", *measures], lineterminator="\n")
+    writer.writeheader()
     for name, outcomes in by_method.items():
-        for seed, outcome in zip(seeds, outcomes, strict=True):
-            yield [name, seed, *(outcome.get(measure) for measure in measures)]
+        writer.writerows(
+            {"method": name, "seed": seed, **outcome} for seed, outcome in zip(seeds, outcomes, strict=True)
+        )
+    return text.getvalue()

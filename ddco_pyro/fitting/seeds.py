@@ -1,4 +1,4 @@
-"""A fit repeated with other training seeds: how much the models, and their differences, vary with the seed."""
+"""Repetitions of a fit with other training seeds, and how much the results vary with the seed."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from typing import Any
 from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import OnEvent, SeedFitted, ignore
-from ddco_pyro.fitting.fit import Fit, is_finished, load
+from ddco_pyro.fitting.fit import Fit, load
+from ddco_pyro.fitting.fit import fit as fit_again
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.fitting.run import fit_run, write_metrics
+from ddco_pyro.fitting.run import is_finished, write_metrics
 from ddco_pyro.simulation.task import SUCCESS
 from ddco_pyro.spec import Spec, user_code, with_overrides
-from ddco_pyro.training.jobs import pool, results, useful_jobs
+from ddco_pyro.training.processes import pool, results, useful_jobs
 
 DEAD = "a process that repeated the fit was ended from outside (too little memory?); the same command goes on"
 
 
 def check_seeds(spec: Spec, seeds: int) -> None:
-    """See that a fit can be repeated with so many training seeds.
+    """Refuse a number of training seeds that a fit cannot be repeated with.
 
-    :raises BadInput: nothing is held out to compare them on, or the last seed is too large.
+    :raises BadInput: no demonstrations are held out, or the last seed is too large.
     """
     if spec.demonstrations.valid_fraction == 0:
         raise BadInput("--seeds compares on held-out demonstrations; raise demonstrations.valid_fraction")
@@ -32,18 +33,18 @@ def check_seeds(spec: Spec, seeds: int) -> None:
 
 
 def training_seeds(spec: Spec, seeds: int) -> list[int]:
-    """The training seeds of a fit and of its repetitions: the spec's own, and those that follow it."""
+    """The training seeds of a fit and its repetitions: the spec's own, and the numbers after it."""
     first = spec.seed if spec.training.seed is None else spec.training.seed
     return list(range(first, first + seeds))
 
 
 def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) -> Fit:
-    """Repeat a fit and its baselines until there is one for each of ``seeds`` training seeds; nothing else differs.
+    """Repeat a fit and its baselines with other training seeds, ``seeds`` in all.
 
-    Each repetition is a run in ``seeds/SEED`` of the run folder. One that is finished is not done again.
+    Each repetition is a run in ``seeds/SEED`` of the run folder. Finished repetitions are not done again.
 
     :param jobs: processes that fit side by side; -1 is one for each core. The result is the same for any number.
-    :returns: the fit, whose ``metrics["seeds"]``, and ``metrics.json``, have what comes of all of them.
+    :returns: the fit, with the results of all repetitions in ``metrics["seeds"]`` and ``metrics.json``.
     :raises Failed: a process died.
     """
     folder = first.run_folder
@@ -65,8 +66,8 @@ def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) ->
 
 
 def _again(spec: Spec, seed: int, folder: Path) -> None:
-    """The fit with another training seed, in a folder of its own."""
-    fit_run(with_overrides(spec, {"training.seed": seed}), None, folder)
+    """Fit with another training seed, in another folder."""
+    fit_again(with_overrides(spec, {"training.seed": seed}), None, folder)
 
 
 def roll_out_repetitions(first: Fit, on_event: OnEvent = ignore, jobs: int = -1) -> None:
@@ -102,7 +103,7 @@ PARTS = ("memory", "experts", "total")
 
 
 def over_seeds(seeds: Sequence[int], each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What fits with these training seeds say, from the ``metrics`` of each.
+    """``metrics["seeds"]``: the results of fits with these training seeds, from the metrics of each.
 
     :returns: the ``training_seeds``; by model its ``held_out`` log-likelihoods per step; and the parts of ``worth``
         (:mod:`ddco_pyro.evaluation.worth`), nats per step: all in the order of the seeds.

@@ -12,8 +12,7 @@ import torch
 from pyro.ops.contract import contract_tensor_tree
 from torch import Tensor
 
-from ddco_pyro.model.actor import Scored
-from ddco_pyro.model.ahmm import ahmm
+from ddco_pyro.model.ahmm import Scored, ahmm
 from ddco_pyro.model.emissions import Steps
 from ddco_pyro.model.tables import Tables, complete
 

@@ -25,7 +25,7 @@ class EliminatedAHMM(TorchDistribution):
     ``pyro.sample("controls", EliminatedAHMM(hierarchy(batch.inputs), batch.lengths), obs=batch.actions)``.
     Its gradient is the posterior; second derivatives raise an error. The batch shape is [N], the event shape [T, A].
 
-    >>> from ddco_pyro.model.encoding import encode
+    >>> from ddco_pyro.model.batch import encode
     >>> batch = encode(demos, fit.hierarchy.encoder, fit.hierarchy.scaling)
     >>> controls = ddco_pyro.EliminatedAHMM(fit.hierarchy(batch.inputs), batch.lengths)
     >>> controls.log_prob(batch.actions).shape, controls.sample().shape

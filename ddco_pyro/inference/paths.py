@@ -72,7 +72,7 @@ def sample_paths(tables: Tables, lengths: Tensor, samples: int = 1, seed: int = 
 def segment(tables: Tables, lengths: Tensor) -> tuple[Tensor, ...]:
     """The choices of :func:`most_likely_path`, [N, T] for every level, lowest first; -1 past the lengths.
 
-    >>> from ddco_pyro.model.encoding import encode
+    >>> from ddco_pyro.model.batch import encode
     >>> batch = encode(demos, fit.hierarchy.encoder, fit.hierarchy.scaling)
     >>> ddco_pyro.inference.segment(fit.hierarchy.tabulate(batch), batch.lengths)[0].shape
     torch.Size([6, 10])

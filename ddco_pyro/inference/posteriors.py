@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ddco_pyro.inference import fused, logspace
 from ddco_pyro.inference.arguments import refuse_impossible
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.model.tables import NEVER, Tables, complete
 

@@ -1,12 +1,13 @@
 """The abstract hidden Markov model of DDCO (paper §4.1, §4.2), for any number of option levels, as a Pyro program.
 
-:mod:`ddco_pyro.model.tables` numbers the levels and their choices. What the networks say about the observations is
-given; the program draws who acts, and what they do. The engines in :mod:`ddco_pyro.inference` eliminate its latents.
+:mod:`ddco_pyro.model.tables` numbers the levels and their choices. The networks' outputs are given; the program draws
+the options and the control of the acting caller. The engines in :mod:`ddco_pyro.inference` eliminate its latents.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import pyro
@@ -17,7 +18,6 @@ from torch import Tensor
 from torch.distributions import constraints
 from torch.nn.functional import one_hot
 
-from ddco_pyro.model.actor import Acting
 from ddco_pyro.model.emissions import Steps
 from ddco_pyro.model.tables import NEVER, Chain, Step
 
@@ -58,6 +58,107 @@ class Tabulated(TorchDistribution):
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
         """A draw from the choices."""
         return torch.distributions.Categorical(logits=self.logits, validate_args=False).sample(torch.Size(sample_shape))
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Controls with known log-densities [..., K] and without dimensions; they cannot be drawn.
+
+    The program runs on :class:`ddco_pyro.model.tables.Tables` with these in place of emissions.
+    """
+
+    table: Tensor
+
+    @property
+    def shape(self) -> torch.Size:
+        """[..., K, 0]."""
+        return torch.Size([*self.table.shape, 0])
+
+    def log_density(self, actions: Tensor) -> Tensor:
+        """The known log-densities, whatever the controls."""
+        return self.table
+
+    def steps(self) -> list[Scored]:
+        """One for each step."""
+        return [Scored(table) for table in self.table.unbind(1)]
+
+
+class Acting(TorchDistribution):
+    """The control of the acting caller: of the lowest level whose choice is not 0, else of the meta-policy.
+
+    :param emissions: of each level's options at one step, lowest first, the meta-policy's last, [N, K, A]; None for
+        callers that emit no control. The lowest level's callers always do.
+    :param choices: (h^1, ..., h^D), each [..., N].
+    """
+
+    arg_constraints: ClassVar = {}
+    support = constraints.real_vector
+
+    def __init__(
+        self,
+        emissions: tuple[Any, ...],
+        choices: tuple[Tensor, ...],
+        validate_args: bool | None = None,
+    ) -> None:
+        self.emissions, self.choices = emissions, choices
+        *batch, _, size = emissions[0].shape
+        shape = torch.broadcast_shapes(batch, *(choice.shape for choice in choices))
+        super().__init__(shape, torch.Size([size]), validate_args=validate_args)
+
+    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Acting:
+        """The control for choices of a larger batch."""
+        return Acting(self.emissions, tuple(choice.expand(batch_shape) for choice in self.choices), validate_args=False)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """log π(a | s) of the acting caller; -inf for impossible joint choices."""
+        control = torch.zeros((), dtype=torch.bool)
+        impossible = control
+        for choice in reversed(self.choices):
+            impossible = impossible | (control & (choice > 0))
+            control = control | (choice == 0)
+        densities = [
+            None if emission is None else emission.log_density(value).double().unsqueeze(-1)
+            for emission in self.emissions
+        ]
+        density = self._of_actor(densities, NEVER).squeeze(-1)
+        return torch.where(impossible, NEVER, density).expand(self.batch_shape)
+
+    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        """A control of the acting caller, [..., N, A] in scaled units."""
+        return self.draw(torch.randn(*sample_shape, *self.batch_shape, self.noise))
+
+    @property
+    def noise(self) -> int:
+        """How many standard normal numbers a control is drawn from."""
+        number: int = self.emissions[0].noise
+        return number
+
+    def draw(self, noise: Tensor) -> Tensor:
+        """The control [..., N, A] that standard normal numbers [..., N, noise] stand for."""
+        with torch.no_grad():
+            draws = [None if emission is None else emission.draw(noise) for emission in self.emissions]
+            return self._of_actor(draws, torch.nan)
+
+    @property
+    def mode(self) -> Tensor:
+        """The most likely control of the acting caller, [..., N, A] in scaled units."""
+        return self._of_actor([None if emission is None else emission.mode for emission in self.emissions], torch.nan)
+
+    def _of_actor(self, values: Sequence[Tensor | None], missing: float) -> Tensor:
+        """The acting caller's part [..., N, E] of values [..., N, K, E] of each level's callers."""
+        none = torch.tensor([missing], dtype=torch.float64)
+        acting = none if values[-1] is None else values[-1][..., 0, :]
+        for own, choice in zip(reversed(values[:-1]), reversed(self.choices), strict=True):
+            option = none if own is None else _of_caller(own, (choice - 1).clamp(min=0))
+            acting = torch.where((choice > 0).unsqueeze(-1), option, acting)
+        return acting
+
+
+def _of_caller(values: Tensor, caller: Tensor) -> Tensor:
+    """One caller's part [..., E] of values [..., K, E]."""
+    shape = torch.broadcast_shapes(values.shape[:-2], caller.shape)
+    index = caller.expand(shape)[..., None, None].expand(*shape, 1, values.shape[-1])
+    return values.expand(*shape, *values.shape[-2:]).gather(-2, index).squeeze(-2)
 
 
 def choose(t: int, now: Step, previous: tuple[Tensor, ...] | None) -> tuple[Tensor, ...]:

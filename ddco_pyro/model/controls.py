@@ -1,4 +1,4 @@
-"""How each dimension of the control is modelled, what the model sees of it, and what it emits for it."""
+"""The control dimensions in the model: their scaling, their emissions, and their standard deviations."""
 
 from __future__ import annotations
 
@@ -10,28 +10,25 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from ddco_pyro.data.control_dimensions import number
-from ddco_pyro.data.control_parts import ControlPart
+from ddco_pyro.data.controls import ControlPart, number
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
-from ddco_pyro.model.discrete import Binary, Categorical
-from ddco_pyro.model.emissions import Clipped, Emission, Gaussian, Hurdle, Product
+from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Emission, Gaussian, Hurdle, Product
 from ddco_pyro.spec import ControlSpec, LearnedStd
 
 INITIAL_STD = 0.5
-"""A learned standard deviation starts here, in scaled units."""
+"""Initial value of a learned standard deviation, in scaled units."""
 
 
 class ControlScaling(nn.Module):
-    """The A' of A control dimensions that vary, as the model sees them, and back.
+    """The map between a control [A] in its own units and the A' dimensions of it in the model, in scaled units.
 
-    Continuous ones are in units of their own spread, z = (a - shift) / scale; switches are 0 and 1, discrete actions
-    their index. A hurdle is 0 at its value and nowhere else; its spread is that of the steps where it is not there.
-    Constant ones are no part of the model and put back into what it emits; bounds, switches' and hurdles' values are
-    emitted exactly.
+    A continuous dimension is z = (a - shift) / scale, a switch 0 or 1, a discrete action its index. A hurdle is 0 at
+    its value and nowhere else; its spread is that of the other steps. Constant dimensions are outside the model.
+    Constant values, bounds, and the values of switches and hurdles are emitted exactly.
 
     :param size: A.
     :param constant: the constant dimensions and their values, in the control's own units.
-    :param parts: how the others are modelled.
+    :param parts: the kinds of the other dimensions.
     """
 
     shift: Tensor
@@ -70,12 +67,12 @@ class ControlScaling(nn.Module):
 
     @property
     def numbers(self) -> int:
-        """How many numbers a network gives for the control of a caller, without those for a σ (:class:`ControlStd`)."""
+        """How many numbers a network gives for a caller's control, without those of a σ (:class:`ControlStd`)."""
         return sum(part.size for part in self.parts)
 
     @property
     def continuous(self) -> list[int]:
-        """The dimensions, of A', that have a σ: part after part."""
+        """The dimensions, of A', that have a σ, part after part."""
         both = zip(self.groups, self.parts, strict=True)
         return [dimension for dims, part in both if part.continuous for dimension in dims]
 
@@ -94,7 +91,7 @@ class ControlScaling(nn.Module):
             self.scale.copy_(torch.as_tensor(np.where(self.standardized, scale, self.scale.numpy())))
 
     def scaled(self, actions: np.ndarray) -> np.ndarray:
-        """[T, A] in the control's own units to [T, A'] as the model sees them; NaN for an unknown discrete action."""
+        """[T, A] in the control's own units to [T, A'] in scaled units; NaN for an unknown discrete action."""
         scaled: np.ndarray = (actions[:, self.varying.numpy()] - self.shift.numpy()) / self.scale.numpy()
         for dims, part in zip(self.groups, self.parts, strict=True):
             if part.values:
@@ -104,7 +101,7 @@ class ControlScaling(nn.Module):
         return scaled
 
     def impossible(self, demonstration: Demonstration) -> str:
-        """What is wrong with a demonstration that has a control of probability 0; nothing where none has."""
+        """The first control of probability 0 in a demonstration, in words; empty without one."""
         scaled = self.scaled(demonstration.actions)
         for dims, part in zip(self.groups, self.parts, strict=True):
             if not part.continuous:
@@ -122,7 +119,7 @@ class ControlScaling(nn.Module):
         return ""
 
     def emitted(self, scaled: Tensor) -> Tensor:
-        """[..., A'] as the model sees them to [..., A] in the control's own units, the constant dimensions put back."""
+        """[..., A'] in scaled units to [..., A] in the control's own units, constant dimensions included."""
         values = scaled.double() * self.scale + self.shift
         low, high = self.ends()
         values = torch.where(scaled.float() <= low, self.low, values)
@@ -134,16 +131,16 @@ class ControlScaling(nn.Module):
         return torch.cat([values, self.constant.expand(*values.shape[:-1], -1)], dim=-1)[..., self.order]
 
     def unscaled(self, scaled: Tensor) -> np.ndarray:
-        """The same as an array."""
+        """:meth:`emitted` as an array."""
         controls: np.ndarray = self.emitted(scaled).numpy()
         return controls
 
     def ends(self) -> tuple[Tensor, Tensor]:
-        """Bounds as the model sees them, float32 [A'], infinite where there are none."""
+        """Lower and upper bounds in scaled units, float32 [A'], infinite where there are none."""
         return ((self.low - self.shift) / self.scale).float(), ((self.high - self.shift) / self.scale).float()
 
     def emission(self, numbers: Tensor, std: Tensor) -> Emission:
-        """The emission that a network's numbers [..., K, size] stand for.
+        """The emission of a network's numbers [..., K, size].
 
         :param std: σ of the continuous dimensions, part after part, [C], [K, C] or [..., K, C].
         """
@@ -170,7 +167,7 @@ class ControlScaling(nn.Module):
 def _declared(
     spec: ControlSpec, varying: Sequence[int], parts: Sequence[ControlPart]
 ) -> tuple[list[float], list[float], list[bool]]:
-    """Shift, scale, and whether both are taken from demonstrations, of each dimension that varies."""
+    """Shift and scale of each dimension that varies, and whether both are estimated from demonstrations."""
     own = {part.name: part.scale for part in spec.parts if part.scale is not None}
     shift, scale, standardized = [0.0] * len(varying), [1.0] * len(varying), [False] * len(varying)
     for part in parts:
@@ -191,9 +188,11 @@ def _declared(
 class ControlStd(nn.Module):
     """The standard deviations σ of the continuous control dimensions, in scaled units: fixed, or learned above a floor.
 
-    The options of a level share a σ unless ``per_option`` says otherwise: one of them could collect the steps where a
-    Gaussian control hardly varies (an actuator on its bound), whatever the skill (see docs/decisions.md). With
-    ``per_state`` σ = floor + softplus(y + start), where y is a number of the caller's network.
+    The options of a level share a σ unless the spec says ``per_option``: with its own σ an option can collect the steps
+    where a Gaussian control hardly varies, as on a bound, whatever the skill (docs/decisions.md). With ``per_state``
+    σ = floor + softplus(y + start), where y is a number of the caller's network.
+
+    :ivar of_state: the dimensions whose σ depends on the state.
     """
 
     fixed: Tensor
@@ -206,8 +205,8 @@ class ControlStd(nn.Module):
         fixed = [0.0 if isinstance(std, LearnedStd) else float(std) for std in stds]
         learned = [place for place, std in enumerate(stds) if isinstance(std, LearnedStd)]
         self.own = [place for place in learned if getattr(stds[place], "per_option", False)]
-        self.seen = [place for place in learned if getattr(stds[place], "per_state", False)]
-        self.shared = [place for place in learned if place not in (*self.own, *self.seen)]
+        self.of_state = [place for place in learned if getattr(stds[place], "per_state", False)]
+        self.shared = [place for place in learned if place not in (*self.own, *self.of_state)]
         floors = [std.floor if isinstance(std, LearnedStd) else 0.0 for std in stds]
         self.register_buffer("fixed", torch.tensor(fixed), persistent=False)
         self.register_buffer("floor", torch.tensor(floors), persistent=False)
@@ -218,24 +217,31 @@ class ControlStd(nn.Module):
         if self.own:
             self.raw_own = nn.Parameter(start[self.own].repeat(copies, 1))
 
-    def forward(self, numbers: Tensor | None = None) -> Tensor:
-        """σ [C]; [K, C] where a dimension has one for each option; [..., K, C] where one depends on the state.
-
-        :param numbers: y of each dimension in ``seen``, [..., K, S]; None where there is none.
-        """
+    def table(self) -> Tensor:
+        """σ without the dimensions whose σ depends on the state: [C]; [K, C] with a σ of each option."""
         std = self.fixed
         if self.shared:
             std = std.index_put((torch.tensor(self.shared),), self.floor[self.shared] + softplus(self.raw))
         if self.own:
             std = _with_columns(std, self.own, self.floor[self.own] + softplus(self.raw_own))
-        if self.seen:
+        return std
+
+    def forward(self, numbers: Tensor | None = None, table: Tensor | None = None) -> Tensor:
+        """σ [C]; [K, C] with a σ of each option; [..., K, C] with a σ that depends on the state.
+
+        :param numbers: y of each dimension in ``of_state``, [..., K, S]; None without such a dimension.
+        :param table: the result of :meth:`table`, if it is known.
+        """
+        std = self.table() if table is None else table
+        if self.of_state:
             assert numbers is not None  # the caller's network gives them
-            std = _with_columns(std, self.seen, self.floor[self.seen] + softplus(numbers + self.start[self.seen]))
+            floor, start = self.floor[self.of_state], self.start[self.of_state]
+            std = _with_columns(std, self.of_state, floor + softplus(numbers + start))
         return std
 
 
 def _with_columns(table: Tensor, places: Sequence[int], values: Tensor) -> Tensor:
-    """The table [C] or [K, C] for each row of values [..., S], which stand at S of its places, [..., C]."""
+    """A table [C] or [K, C] with values [..., S] at S of its places, [..., C]."""
     columns = list(table.expand(*values.shape[:-1], -1).unbind(-1))
     for place, column in zip(places, values.unbind(-1), strict=True):
         columns[place] = column
@@ -248,10 +254,10 @@ def _std_of(spec: ControlSpec, dimension: int) -> float | LearnedStd:
 
 
 def refuse_impossible(demonstrations: Demonstrations, scaling: ControlScaling, fitted: bool = False) -> None:
-    """See that every control of these demonstrations can be emitted.
+    """Check that every control of these demonstrations has a probability above 0.
 
     :param fitted: whether the model is fitted, so that its kinds of controls stand.
-    :raises DemonstrationsError: a switch or a discrete action has a value that it does not have in the model.
+    :raises DemonstrationsError: a switch or a discrete action has a value that the model does not know.
     """
     for demonstration in demonstrations:
         if problem := scaling.impossible(demonstration):

@@ -1,7 +1,7 @@
 """Emissions: how the numbers that networks give a caller become a distribution of the control (paper §4.2).
 
-The callers of a level share one emission object. It scores a control for each of them, draws one, and says how far
-two of them are apart; nothing else in the project knows how a control is distributed.
+The callers of a level share one emission object, and no other module knows how a control is distributed. Controls are
+in scaled units; log-densities are in the control's own units.
 """
 
 from __future__ import annotations
@@ -10,14 +10,18 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import reduce
+from operator import add
 from typing import Any, Protocol, Self
 
 import torch
 from torch import Tensor
-from torch.nn.functional import logsigmoid
+from torch.distributions import Normal, kl_divergence
+from torch.nn.functional import logsigmoid, one_hot, pad
 from torch.special import ndtr
 
 from ddco_pyro.model.links import weighted_squares
+from ddco_pyro.model.tables import NEVER
 
 LOG_2PI = math.log(2 * math.pi)
 
@@ -35,81 +39,78 @@ class Steps(Protocol):
         ...
 
     def steps(self) -> Sequence[Any]:
-        """The same at each of T steps, from [N, T, K, A] to [N, K, A]; unbound once."""
+        """One emission [N, K, A] for each of T steps, from [N, T, K, A]; unbound once."""
         ...
 
 
-class Emission(Steps, Protocol):
-    """The controls of K callers, [..., K, A] in scaled units; log-densities are in the control's own units."""
+class Emission(ABC):
+    """The distributions of the controls of K callers, [..., K, A].
 
-    def by_dimension(self, actions: Tensor) -> Tensor:
-        """log π(a_d | s) of each caller and dimension of controls [..., A], [..., K, A]."""
-        ...
-
-    @property
-    def mode(self) -> Tensor:
-        """The most likely control of each caller, [..., K, A]."""
-        ...
-
-    @property
-    def noise(self) -> int:
-        """How many standard normal numbers a control is drawn from."""
-        ...
-
-    def draw(self, noise: Tensor) -> Tensor:
-        """The controls [..., K, A] that standard normal numbers [..., noise] stand for."""
-        ...
-
-    def divergence(self, i: int, j: int) -> Tensor:
-        """Mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i) of two callers, [...] nats."""
-        ...
-
-    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
-        """The same of changed tensors."""
-        ...
-
-
-class Kind(ABC):
-    """What all kinds share: tensors as fields, the first one [..., K, ...], others like it or the same at all steps."""
+    A kind is a dataclass of tensors [..., K, ...], of tensors that are the same at all steps, and of other emissions.
+    The first field is a tensor [..., K, ...].
+    """
 
     @property
     def shape(self) -> torch.Size:
-        """[..., K, A]: a number for each dimension, unless a kind says otherwise."""
-        first: Tensor = getattr(self, fields(self)[0].name)  # type: ignore[arg-type]
+        """[..., K, A]: that of the first field, unless a kind says otherwise."""
+        first: Tensor = next(iter(self._fields().values()))
         return first.shape
 
     @property
     def noise(self) -> int:
-        """A: a standard normal number for each dimension."""
+        """How many standard normal numbers a control is drawn from: A, unless a kind says otherwise."""
         return self.shape[-1]
 
     @abstractmethod
     def by_dimension(self, actions: Tensor) -> Tensor:
-        """log π(a_d | s) of each caller and dimension, [..., K, A]."""
+        """log π(a_d | s) of each caller and dimension of controls [..., A], [..., K, A]."""
 
     def log_density(self, actions: Tensor) -> Tensor:
-        """log π(a | s), [..., K]: dimensions are independent given the caller, unless a kind says otherwise."""
+        """log π(a | s) [..., K]: dimensions are independent given the caller, unless a kind says otherwise."""
         return self.by_dimension(actions).sum(-1)
 
+    @property
+    @abstractmethod
+    def mode(self) -> Tensor:
+        """The most likely control of each caller, [..., K, A]."""
+
+    @abstractmethod
+    def draw(self, noise: Tensor) -> Tensor:
+        """The controls [..., K, A] that standard normal numbers [..., noise] stand for."""
+
+    @abstractmethod
+    def divergence(self, i: int, j: int) -> Tensor:
+        """Mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i) of two callers, [...] nats."""
+
     def steps(self) -> list[Self]:
-        """The same at each step: fields with as many dimensions as the first one differ from step to step."""
-        each = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
-        names = [name for name, tensor in each.items() if tensor.dim() == next(iter(each.values())).dim()]
-        unbound = zip(*(each[name].unbind(1) for name in names), strict=True)
-        return [replace(self, **dict(zip(names, tensors, strict=True))) for tensors in unbound]  # type: ignore[type-var]
+        """One emission for each step: tensors with as many dimensions as the first field differ from step to step."""
+        each = self._fields()
+        dimensions = next(iter(each.values())).dim()
+        by_step = {
+            name: value.unbind(1) if isinstance(value, Tensor) else value.steps()
+            for name, value in each.items()
+            if isinstance(value, Emission) or value.dim() == dimensions
+        }
+        return [replace(self, **dict(zip(by_step, now, strict=True))) for now in zip(*by_step.values(), strict=True)]  # type: ignore[type-var]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
-        """The same of changed tensors."""
-        return replace(self, **{field.name: change(getattr(self, field.name)) for field in fields(self)})  # type: ignore
+        """The emission of changed tensors."""
+        changed = {
+            name: change(value) if isinstance(value, Tensor) else value.map(change)
+            for name, value in self._fields().items()
+        }
+        return replace(self, **changed)  # type: ignore[type-var]
+
+    def _fields(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
-class Gaussian(Kind):
-    """A free continuous control, a ~ N(μ, σ²), each dimension by itself (§4.2).
+class Gaussian(Emission):
+    """A free continuous control, a ~ N(μ, σ²), with independent dimensions (§4.2).
 
-    :param mean: μ, [..., K, A] in scaled units.
-    :param std: σ, [A], [K, A] where each caller has its own, or [..., K, A] where it depends on the state, in scaled
-        units.
+    :param mean: μ, [..., K, A].
+    :param std: σ, [A]; [K, A] for a σ of each caller; [..., K, A] for a σ that depends on the state.
     :param log_scale: logarithms of the control's units, [A].
     """
 
@@ -138,39 +139,38 @@ class Gaussian(Kind):
         return self.mean + self.std * noise.unsqueeze(-2)
 
     def divergence(self, i: int, j: int) -> Tensor:
-        """Mean of both divergences; ½ Σ (μ_i - μ_j)² / σ² where callers share σ."""
+        """½ Σ (μ_i - μ_j)² / σ² where callers share σ."""
         return 0.5 * (self.relative_entropy(i, j) + self.relative_entropy(j, i))
 
     def relative_entropy(self, i: int, j: int) -> Tensor:
         """KL(π_i ‖ π_j) of two callers, [...] nats."""
-        mean, std = self.mean.double(), self.std.double()
-        apart = (mean[..., i, :] - mean[..., j, :]).square()
-        first, second = (std, std) if std.dim() == 1 else (std[..., i, :], std[..., j, :])
-        return (0.5 * (first.square() + apart) / second.square() - 0.5 + second.log() - first.log()).sum(-1)
+        mean, std = self.mean.double(), self.std.double().expand(self.mean.shape)
+        first, second = (Normal(mean[..., k, :], std[..., k, :], validate_args=False) for k in (i, j))
+        return kl_divergence(first, second).sum(-1)
 
 
 @dataclass(frozen=True)
 class Clipped(Gaussian):
-    """A continuous control with bounds that it reaches: a = min(max(z, low), high) of z ~ N(μ, σ²), a censored normal.
+    """A continuous control that reaches its bounds: a = min(max(z, low), high) of z ~ N(μ, σ²), a censored normal.
 
-    Within its bounds it has the normal's density; on a bound, or beyond, the probability of what lies there, Φ. That is
-    a mass, whatever the units: densities and masses are different measures. Divergences are those of the normals before
-    they are clipped, upper bounds of those after.
+    Within its bounds a control has the normal's density. On a bound, or beyond, it has the probability Φ of what lies
+    there. That is a mass, whatever the units: densities and masses are different measures. Divergences are those of
+    the normals before clipping, upper bounds of those after.
 
-    :param low: the lower bound of each dimension, -inf where it has none, [A] in scaled units; ``high`` likewise.
+    :param low: the lower bound of each dimension in scaled units, -inf for none, [A]; ``high`` likewise.
     """
 
     low: Tensor
     high: Tensor
 
     def by_dimension(self, actions: Tensor) -> Tensor:
-        """log N(a_d; μ_d, σ_d²) within the bounds, log Φ of what lies beyond on one of them, float64 [..., K, A]."""
+        """log N(a_d; μ_d, σ_d²) within the bounds, log Φ of what lies beyond on a bound, float64 [..., K, A]."""
         actions, mean, std = actions.double().unsqueeze(-2), self.mean.double(), self.std.double()
         inside = -0.5 * (((actions - mean) / std).square() + LOG_2PI) - std.log() - self.log_scale
         below, above = actions <= self.low, actions >= self.high
         if not bool((below | above).any()):
             return inside
-        at = (below | above).expand(inside.shape).nonzero(as_tuple=True)  # elsewhere no Φ is asked for
+        at = (below | above).expand(inside.shape).nonzero(as_tuple=True)  # Φ is computed on bounds alone
         low, high, mean, std = (values.expand(inside.shape)[at] for values in (self.low, self.high, mean, std))
         beyond = torch.where(below.expand(inside.shape)[at], low - mean, mean - high) / std
         return inside.index_put(at, log_ndtr(beyond))
@@ -186,15 +186,15 @@ class Clipped(Gaussian):
 
     def draw(self, noise: Tensor) -> Tensor:
         """μ + σ·z within the bounds."""
-        return (self.mean + self.std * noise.unsqueeze(-2)).clamp(self.low, self.high)
+        return super().draw(noise).clamp(self.low, self.high)
 
 
 @dataclass(frozen=True)
-class Hurdle:
+class Hurdle(Emission):
     """A two-part control: exactly one value with probability p = logistic(y), continuous otherwise (a hurdle model).
 
-    All dimensions are at their values at once, or none is. The value is 0 in scaled units, and nothing else is, so the
-    comparison is exact at any scale.
+    All dimensions are at their values at once, or none is. The value is 0 in scaled units, and no other control is, so
+    the comparison is exact at any scale.
 
     :param logit: y, [..., K, 1].
     :param slab: the continuous part.
@@ -210,11 +210,11 @@ class Hurdle:
 
     @property
     def noise(self) -> int:
-        """A + 1: the last one decides which part a control is of."""
+        """A + 1: the last one decides between the parts."""
         return self.slab.noise + 1
 
     def by_dimension(self, actions: Tensor) -> Tensor:
-        """log π(a_d | s), [..., K, A]: each dimension has its share of which part a control is of."""
+        """log π(a_d | s), [..., K, A]: each dimension has an equal share of the log-probability of the part."""
         at = _at_value(actions).unsqueeze(-1)
         return self._part(at) / self.shape[-1] + torch.where(at, 0.0, self.slab.by_dimension(actions))
 
@@ -238,22 +238,11 @@ class Hurdle:
         return torch.where(at, 0.0, self.slab.draw(noise[..., :-1]))
 
     def divergence(self, i: int, j: int) -> Tensor:
-        """Mean of both divergences: of which part it is, and of the slabs as often as these are seen."""
+        """That of the parts, and that of the slabs weighted by 1 - p."""
         first, second = (self.logit[..., caller, 0].double() for caller in (i, j))
-        part = 0.5 * (first.sigmoid() - second.sigmoid()) * (first - second)
-        slabs = (
-            (-first).sigmoid() * self.slab.relative_entropy(i, j),
-            (-second).sigmoid() * self.slab.relative_entropy(j, i),
-        )
-        return part + 0.5 * sum_of(slabs)
-
-    def steps(self) -> list[Hurdle]:
-        """The same at each step."""
-        return [Hurdle(*parts) for parts in zip(self.logit.unbind(1), self.slab.steps(), strict=True)]
-
-    def map(self, change: Callable[[Tensor], Tensor]) -> Hurdle:
-        """The same of changed tensors."""
-        return Hurdle(change(self.logit), self.slab.map(change))
+        slabs = (-first).sigmoid() * self.slab.relative_entropy(i, j)
+        slabs = slabs + (-second).sigmoid() * self.slab.relative_entropy(j, i)
+        return _of_switch(first, second) + 0.5 * slabs
 
 
 def _at_value(actions: Tensor) -> Tensor:
@@ -261,9 +250,94 @@ def _at_value(actions: Tensor) -> Tensor:
     return (actions == 0).all(-1, keepdim=True)
 
 
+def _of_switch(first: Tensor, second: Tensor) -> Tensor:
+    """The divergence ½ (p_i - p_j)(y_i - y_j) of two switches, also where torch's own is infinite by rounding."""
+    return 0.5 * (first.sigmoid() - second.sigmoid()) * (first - second)
+
+
 @dataclass(frozen=True)
-class Product:
-    """Groups of dimensions, each of its own kind, independent given the caller.
+class Binary(Emission):
+    """Switches, each on (1) with probability logistic(y) and off (0) otherwise.
+
+    :param logits: y, [..., K, A].
+    """
+
+    logits: Tensor
+
+    def by_dimension(self, actions: Tensor) -> Tensor:
+        """The log-probability of each switch's position, [..., K, A]; -inf for values other than 0 and 1."""
+        actions = actions.unsqueeze(-2)
+        position = logsigmoid(torch.where(actions > 0.5, self.logits, -self.logits))
+        return torch.where((actions == 0) | (actions == 1), position, NEVER)
+
+    @property
+    def mode(self) -> Tensor:
+        """The more likely position."""
+        return (self.logits > 0).to(self.logits.dtype)
+
+    def draw(self, noise: Tensor) -> Tensor:
+        """On where Φ(z) is less than logistic(y)."""
+        return (ndtr(noise).unsqueeze(-2) < self.logits.sigmoid()).to(self.logits.dtype)
+
+    def divergence(self, i: int, j: int) -> Tensor:
+        """½ Σ (p_i - p_j)(y_i - y_j)."""
+        return _of_switch(self.logits[..., i, :].double(), self.logits[..., j, :].double()).sum(-1)
+
+
+@dataclass(frozen=True)
+class Categorical(Emission):
+    """One of C discrete actions, as its index (A = 1) or, where A = C, as a row with a single 1.
+
+    :param logits: [..., K, C].
+    :param rows: whether actions are rows; a tensor with one truth value.
+    """
+
+    logits: Tensor
+    rows: Tensor
+
+    @property
+    def shape(self) -> torch.Size:
+        """[..., K, A]."""
+        return torch.Size([*self.logits.shape[:-1], self.logits.shape[-1] if bool(self.rows) else 1])
+
+    def by_dimension(self, actions: Tensor) -> Tensor:
+        """log softmax(logits)[a], [..., K, A]: in the first dimension, 0 in the others; -inf for no such action."""
+        classes = self.logits.shape[-1]
+        index = actions.argmax(-1, keepdim=True) if bool(self.rows) else actions.clamp(0, classes - 1).long()
+        meant = one_hot(index.squeeze(-1), classes) if bool(self.rows) else index
+        possible = (actions == meant).all(-1, keepdim=True).unsqueeze(-2)
+        log_probs = self.logits.log_softmax(-1)
+        chosen = log_probs.gather(-1, index.unsqueeze(-2).expand(*log_probs.shape[:-1], 1))
+        return pad(torch.where(possible, chosen, NEVER), (0, self.shape[-1] - 1))
+
+    def log_density(self, actions: Tensor) -> Tensor:
+        """log π(a | s), [..., K]."""
+        return self.by_dimension(actions)[..., 0]
+
+    @property
+    def mode(self) -> Tensor:
+        """The most likely action."""
+        return self._action(self.logits.argmax(-1))
+
+    def draw(self, noise: Tensor) -> Tensor:
+        """The first action up to which the probabilities sum to more than Φ(z) of the first number."""
+        total = self.logits.double().softmax(-1).cumsum(-1)
+        uniform = ndtr(noise[..., :1].double()).unsqueeze(-2)
+        return self._action((total <= uniform * total[..., -1:]).sum(-1).clamp(max=total.shape[-1] - 1))
+
+    def divergence(self, i: int, j: int) -> Tensor:
+        """½ Σ (p_i - p_j)(log p_i - log p_j)."""
+        first, second = (self.logits[..., caller, :].double().log_softmax(-1) for caller in (i, j))
+        return 0.5 * ((first.exp() - second.exp()) * (first - second)).sum(-1)
+
+    def _action(self, index: Tensor) -> Tensor:
+        actions = one_hot(index, self.logits.shape[-1]) if bool(self.rows) else index.unsqueeze(-1)
+        return actions.to(self.logits.dtype)
+
+
+@dataclass(frozen=True)
+class Product(Emission):
+    """Groups of control dimensions with a kind each, independent given the caller.
 
     :param groups: the dimensions of each group, and their emission.
     """
@@ -282,7 +356,7 @@ class Product:
 
     def log_density(self, actions: Tensor) -> Tensor:
         """log π(a | s), [..., K]."""
-        return sum_of([emission.log_density(actions[..., dims]) for dims, emission in self.groups])
+        return reduce(add, (emission.log_density(actions[..., dims]) for dims, emission in self.groups))
 
     @property
     def mode(self) -> Tensor:
@@ -295,7 +369,7 @@ class Product:
         return sum(emission.noise for _, emission in self.groups)
 
     def draw(self, noise: Tensor) -> Tensor:
-        """The controls that standard normal numbers stand for: the first A each dimension's, then what groups add."""
+        """The controls that standard normal numbers stand for: one for each dimension, then those that groups add."""
         draws, first = [], self.shape[-1]
         for dimensions, emission in self.groups:
             last = first + emission.noise - len(dimensions)
@@ -305,30 +379,22 @@ class Product:
 
     def divergence(self, i: int, j: int) -> Tensor:
         """The sum of the groups' divergences."""
-        return sum_of([emission.divergence(i, j) for _, emission in self.groups])
+        return reduce(add, (emission.divergence(i, j) for _, emission in self.groups))
 
-    def steps(self) -> list[Product]:
-        """The same at each step."""
+    def steps(self) -> list[Self]:
+        """One for each step."""
         each = zip(*(emission.steps() for _, emission in self.groups), strict=True)
         names = [dimensions for dimensions, _ in self.groups]
-        return [Product(tuple(zip(names, emissions, strict=True))) for emissions in each]
+        return [replace(self, groups=tuple(zip(names, emissions, strict=True))) for emissions in each]
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> Product:
-        """The same of changed tensors."""
-        return Product(tuple((dimensions, emission.map(change)) for dimensions, emission in self.groups))
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """The groups of changed tensors."""
+        return replace(self, groups=tuple((dimensions, emission.map(change)) for dimensions, emission in self.groups))
 
     def _joined(self, values: Sequence[Tensor]) -> Tensor:
         """The groups' values [..., K, A_g] in the order of the dimensions."""
         order = torch.tensor([dimension for dimensions, _ in self.groups for dimension in dimensions]).argsort()
         return torch.cat(list(values), dim=-1)[..., order]
-
-
-def sum_of(values: Sequence[Tensor]) -> Tensor:
-    """The sum of one or more tensors."""
-    total = values[0]
-    for value in values[1:]:
-        total = total + value
-    return total
 
 
 TAIL = -30.0

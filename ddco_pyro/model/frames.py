@@ -1,17 +1,16 @@
-"""Pictures of several trajectories as networks see them, read when a network asks for them, or held on its device."""
+"""Pictures of several trajectories as networks see them, read on demand, or held on the networks' device."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.data.pictures import Observed, Pictures, Transform
-from ddco_pyro.data.reading import Job, Readers
+from ddco_pyro.data.pictures import Job, Observed, Pictures, Readers, Transform, shift_into
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,11 +18,11 @@ class Frames(Mapping[str, Tensor]):
     """Pictures of N trajectories by observation, each uint8 [N, T, H, W, C], zeros past their ends.
 
     :param arrays: of each observation the pictures [T_n, ...] of each trajectory, in memory or in their file.
-    :param transforms: what is seen of them.
-    :param rows: what the trajectories are called among those that this is a part of.
-    :param steps: the steps of time that are seen, T of them.
-    :param shifts: by how many rows and columns the pictures of each trajectory are moved, [N, 2]; none where left out.
-    :param readers: read what is in files, perhaps before it is asked for, or hold all of it on a device.
+    :param transforms: how they are cropped and scaled.
+    :param rows: the numbers of the trajectories in the batch that these are a part of.
+    :param steps: the T steps of time.
+    :param shifts: rows and columns by which the pictures of each trajectory are shifted, [N, 2]; by default none.
+    :param readers: read files, with prefetching or without, or hold the pictures on a device.
     """
 
     arrays: Mapping[str, tuple[Observed, ...]]
@@ -31,7 +30,7 @@ class Frames(Mapping[str, Tensor]):
     rows: tuple[int, ...]
     steps: slice
     shifts: Mapping[str, np.ndarray] = field(default_factory=dict)
-    readers: Readers | Held = field(default_factory=lambda: Readers(0))
+    readers: Readers | DeviceFrames = field(default_factory=lambda: Readers(0))
 
     def __getitem__(self, key: str) -> Tensor:
         return replace(self, arrays={key: self.arrays[key]}).loaded()[key]
@@ -49,7 +48,7 @@ class Frames(Mapping[str, Tensor]):
 
     @property
     def job(self) -> Job:
-        """What is to be read for them."""
+        """The job of reading them."""
         return Job(self.rows, self.arrays, self.steps, self.transforms, self.shifts)
 
     @property
@@ -59,7 +58,7 @@ class Frames(Mapping[str, Tensor]):
 
     @property
     def size(self) -> int:
-        """Bytes of the trajectories' pictures as they are seen, without padding."""
+        """Bytes of the pictures as networks see them, without padding."""
         return sum(
             len(array) * math.prod(self.transforms[key].shape(array.shape[1:]))
             for key, arrays in self.arrays.items()
@@ -67,21 +66,21 @@ class Frames(Mapping[str, Tensor]):
         )
 
     def held(self, device: torch.device) -> Frames:
-        """The same with all pictures on a device; they are read once, one trajectory at a time.
+        """These frames on a device; the pictures are read once, one trajectory at a time.
 
         :raises DemonstrationsError: a file cannot be read.
         """
-        return replace(self, readers=Held(self, device))
+        return replace(self, readers=DeviceFrames(self, device))
 
     def loaded(self) -> dict[str, Tensor]:
-        """All of them, in memory, or on the device that holds them.
+        """All pictures, in memory, or on the device that holds them.
 
         :raises DemonstrationsError: a file cannot be read.
         """
         return {key: torch.as_tensor(array) for key, array in self.readers.take(self.job).items()}
 
     def part(self, rows: Tensor | slice, steps: slice) -> Frames:
-        """The same of some trajectories and of consecutive steps; nothing is read."""
+        """The frames of some trajectories and of consecutive steps; nothing is read."""
         chosen = torch.arange(len(self.rows))[rows].tolist()
         arrays = {key: tuple(each[row] for row in chosen) for key, each in self.arrays.items()}
         shifts = {key: each[chosen] for key, each in self.shifts.items()}
@@ -90,8 +89,8 @@ class Frames(Mapping[str, Tensor]):
         return replace(self, arrays=arrays, shifts=shifts, rows=tuple(self.rows[row] for row in chosen), steps=seen)
 
 
-class Held:
-    """Has the pictures of trajectories on a device, as they are seen, and gives what :class:`Readers` would read."""
+class DeviceFrames:
+    """Preprocessed pictures of trajectories on a device, in place of :class:`Readers`."""
 
     def __init__(self, frames: Frames, device: torch.device) -> None:
         self._pictures = {
@@ -101,33 +100,21 @@ class Held:
         }
 
     def plan(self, _: Iterable[Job]) -> None:
-        """Nothing is read any more."""
+        """Nothing: all pictures are there."""
 
     def take(self, job: Job) -> dict[str, Tensor]:
         """The pictures of a job, on the device."""
-        return {
-            key: _padded([self._pictures[key, row] for row in job.rows], job.steps, job.shifts.get(key))
-            for key in job.arrays
-        }
+        return {key: self._padded(key, job) for key in job.arrays}
+
+    def _padded(self, key: str, job: Job) -> Tensor:
+        """:func:`ddco_pyro.data.pictures.padded` of pictures that are on the device as networks see them."""
+        pictures, shifts = [self._pictures[key, row] for row in job.rows], job.shifts.get(key)
+        whole = pictures[0].new_zeros(len(pictures), job.steps.stop - job.steps.start, *pictures[0].shape[1:])
+        for row, each in enumerate(pictures):
+            seen = each[job.steps]
+            shift_into(whole[row, : len(seen)], seen, *((0, 0) if shifts is None else shifts[row].tolist()))
+        return whole
 
 
 def _whole(array: Observed, transform: Transform) -> Tensor:
     return torch.from_numpy(np.concatenate(list(transform.seen(array, slice(0, len(array))))))
-
-
-def _padded(pictures: Sequence[Tensor], steps: slice, shifts: np.ndarray | None) -> Tensor:
-    """:func:`ddco_pyro.data.pictures.padded` of pictures on a device, which are as they are seen."""
-    whole = pictures[0].new_zeros(len(pictures), steps.stop - steps.start, *pictures[0].shape[1:])
-    for row, each in enumerate(pictures):
-        seen = each[steps]
-        whole[row, : len(seen)] = seen if shifts is None else _shifted(seen, *shifts[row].tolist())
-    return whole
-
-
-def _shifted(pictures: Tensor, down: int, right: int) -> Tensor:
-    """:func:`ddco_pyro.data.pictures.shifted` on a device."""
-    for axis, by in ((1, down), (2, right)):
-        last = pictures.shape[axis] - 1
-        from_ = (torch.arange(last + 1, device=pictures.device) - by).clamp(0, last)
-        pictures = pictures.index_select(axis, from_)
-    return pictures

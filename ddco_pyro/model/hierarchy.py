@@ -1,6 +1,6 @@
-"""The networks of a hierarchy and the tables they give: levels of options under a meta-policy (paper §4).
+"""The networks of a hierarchy and the tables that they give: levels of options under a meta-policy (paper §4).
 
-A baseline is a hierarchy without option levels whose meta-policy emits control.
+A flat policy is a hierarchy without option levels, whose meta-policy emits the control.
 """
 
 from __future__ import annotations
@@ -9,34 +9,36 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from ddco_pyro.data.control_parts import ControlPart, all_gaussian
+from ddco_pyro.data.controls import ControlPart, all_gaussian
 from ddco_pyro.data.memory import share
+from ddco_pyro.model.batch import STEPS_AT_ONCE, Batch
 from ddco_pyro.model.controls import ControlScaling, ControlStd
-from ddco_pyro.model.encoding import STEPS_AT_ONCE, Batch, ObservationEncoder, Shapes
-from ddco_pyro.model.networks import Inputs, InputShape, begin_at_zero, build, build_trunk, named
-from ddco_pyro.model.networks.activations import training_bytes
-from ddco_pyro.model.networks.state import Carried, State, States, Trunk, remembers
+from ddco_pyro.model.encoder import ObservationEncoder, Shapes
+from ddco_pyro.model.networks import Inputs, InputShape, Network, State, States, build, build_trunk, named
+from ddco_pyro.model.networks.probe import training_bytes
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.seeding import HOST
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
+from ddco_pyro.spec.networks import Network as AnyNetworkSpec
+from ddco_pyro.spec.networks import PerTimestepSpec
 
 BYTES_AT_ONCE = 256 * 10**6
-"""Most bytes that networks take for the steps that go through them together, one step at least; less where less memory
+"""Most bytes that networks take for the steps that go through them together, at least one step. Less where less memory
 is allowed (:func:`ddco_pyro.data.memory.share`)."""
 
 PART_OF_A_GPU = 0.1
-"""The same of the memory of a GPU, whatever else is there: GPUs of one kind cut alike."""
+"""Share of a GPU's whole memory that networks take in place of that, so that GPUs of one kind cut alike."""
 
 Emits = Literal["options", "control"]
 
-Answers = Sequence[Tensor]
+RawOutputs = Sequence[Tensor]
 """The outputs of networks [N, T, K, F]: policy and, where it has one, termination of each level, lowest first, and the
 meta-policy's."""
 
@@ -44,8 +46,8 @@ meta-policy's."""
 class Caller(nn.Module):
     """K policies over the options of the level below, the physical control, or both (§4.2).
 
-    One network gives the log-probabilities y_0 (control), y_1, ..., y_k and the numbers of the control of each; last
-    come those of every σ that depends on the state.
+    The outputs of their network are the log-probabilities y_0 (control), y_1, ..., y_k, then the numbers of the
+    control, then y of every σ that depends on the state.
     """
 
     def __init__(
@@ -53,47 +55,43 @@ class Caller(nn.Module):
         network: NetworkSpec,
         emits: tuple[Emits, ...],
         options: int,
-        shape: InputShape | Trunk,
+        shape: InputShape | Network,
         control: ControlSpec,
         scaling: ControlScaling,
         copies: int,
     ) -> None:
         super().__init__()
-        self.options = options
+        self.options, self.copies = options, copies
         self.emits_control = "control" in emits
         self.emits_options = "options" in emits and options > 0
         logits = options + self.emits_control if self.emits_options else 0
         std = ControlStd(control, scaling, copies) if self.emits_control else None
-        seen = 0 if std is None else len(std.seen)
-        self.sizes = (logits, scaling.numbers + seen if self.emits_control else 0)
+        of_state = 0 if std is None else len(std.of_state)
+        self.sizes = (logits, scaling.numbers + of_state if self.emits_control else 0)
         self.network = build(network, shape, sum(self.sizes), copies)
-        if seen:
-            begin_at_zero(self.network, seen)
+        if of_state:
+            self.network.begin_at_zero(of_state)
         self.std = std
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
-        """Models that have a σ also where no control is emitted are read without it."""
-        if self.std is None:
-            for name in [name for name in state_dict if name.startswith(f"{prefix}std.")]:
-                del state_dict[name]
-        super()._load_from_state_dict(state_dict, prefix, *others)
+    def forward(self, raw: Tensor, scaling: ControlScaling, std: Tensor | None = None) -> CallerOutputs:
+        """The policies at every step, from the outputs of their network [N, T, K, F].
 
-    def forward(self, said: Tensor, scaling: ControlScaling) -> CallerOutputs:
-        """What the callers say at every step, given what their network says, [N, T, K, outputs]."""
-        logits, numbers = said.split(self.sizes, dim=-1) if all(self.sizes) else (said, said)
+        :param std: σ, the result of :meth:`ControlStd.table`, if it is known.
+        """
+        logits, numbers = raw.split(self.sizes, dim=-1) if all(self.sizes) else (raw, raw)
         choices = logits if self.emits_options else None
         if self.std is None:
             return CallerOutputs(self.options, choices, None)
-        seen = len(self.std.seen)
-        means, of_std = numbers.split([scaling.numbers, seen], dim=-1) if seen else (numbers, None)
-        return CallerOutputs(self.options, choices, scaling.emission(means, self.std(of_std)), numbers)
+        of_state = len(self.std.of_state)
+        means, of_std = numbers.split([scaling.numbers, of_state], dim=-1) if of_state else (numbers, None)
+        return CallerOutputs(self.options, choices, scaling.emission(means, self.std(of_std, std)), numbers)
 
 
 class Level(nn.Module):
-    """The k options of one level: their policies π (or, above the lowest level, η) and terminations ψ, which read the
-    observations, or the features of a trunk that they share.
+    """The k options of one level: policies π (above the lowest level η) and terminations ψ.
 
-    ``termination`` is None where every option ends after every step (ψ = 1).
+    Both read the observations, or the features of a trunk. ``termination`` is None where every option ends after every
+    step (ψ = 1).
 
     :param shape: of the observations, or the hierarchy's trunk.
     """
@@ -103,23 +101,23 @@ class Level(nn.Module):
         place: str,
         spec: LevelSpec,
         options_below: int,
-        shape: InputShape | Trunk,
+        shape: InputShape | Network,
         control: ControlSpec,
         scaling: ControlScaling,
     ) -> None:
         super().__init__()
         self.count = spec.count
-        seen = shape
+        self.trunk: Network | None = None
         if spec.trunk is not None:
             with named(f"{place}.trunk"):
-                seen = build_trunk(spec.trunk, shape, spec.count)
-        self.trunk = seen.network if isinstance(seen, Trunk) and seen is not shape else None
+                self.trunk = build_trunk(spec.trunk, shape, spec.count)
+        read = self.trunk or shape
         with named(f"{place}.policy"):
-            self.policy = Caller(spec.policy, spec.policy.emits, options_below, seen, control, scaling, spec.count)
-        self.termination: nn.Module | None = None
-        if isinstance(spec.termination, NetworkSpec):
+            self.policy = Caller(spec.policy, spec.policy.emits, options_below, read, control, scaling, spec.count)
+        self.termination: Network | None = None
+        if isinstance(spec.termination, AnyNetworkSpec):
             with named(f"{place}.termination"):
-                self.termination = build(spec.termination, seen, 1, spec.count)
+                self.termination = build(spec.termination, read, 1, spec.count)
 
 
 class Hierarchy(nn.Module):
@@ -128,10 +126,10 @@ class Hierarchy(nn.Module):
     :param shapes: shapes of the observations by name, without time.
     :param control_size: A, the number of control dimensions.
     :param steps: the longest demonstration, for per-timestep networks.
-    :param constant: the control dimensions that are no part of the model, and the values that are emitted for them.
-    :param parts: how the other control dimensions are modelled; by default all of them are Gaussian.
-    :raises ShapeError: where a network cannot read these observations.
-    :raises SpecError: where a user's network does not take its options.
+    :param constant: the control dimensions outside the model, and the values that are emitted for them.
+    :param parts: the kinds of the other control dimensions; by default all are Gaussian.
+    :raises ShapeError: a network cannot read these observations.
+    :raises SpecError: a user's network does not take its options.
     """
 
     def __init__(
@@ -150,12 +148,12 @@ class Hierarchy(nn.Module):
         varying = [dimension for dimension in range(control_size) if dimension not in constant]
         parts = all_gaussian(varying) if parts is None else parts
         self.scaling = scaling = ControlScaling(spec.control, control_size, dict(constant), parts)
-        self.input_shape = seen = self.encoder.shape(steps)
-        shape: InputShape | Trunk = seen
+        self.input_shape = self.encoder.shape(steps)
+        self.trunk: Network | None = None
         if spec.hierarchy is not None and spec.hierarchy.trunk is not None:
             with named("hierarchy.trunk"):
-                shape = build_trunk(spec.hierarchy.trunk, seen, 1)
-        self.trunk = shape.network if isinstance(shape, Trunk) else None
+                self.trunk = build_trunk(spec.hierarchy.trunk, self.input_shape, 1)
+        shape = self.trunk or self.input_shape
         levels, below = [], 0
         for number, level in enumerate(spec.hierarchy.levels if spec.hierarchy else ()):
             levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, spec.control, scaling))
@@ -166,7 +164,7 @@ class Hierarchy(nn.Module):
             self.meta_policy = Caller(network, emits, below, shape, spec.control, scaling, copies=1)
 
     def place(self, device: torch.device) -> Hierarchy:
-        """Have the networks, and nothing else, on a device. Whatever calls them gives and gets tensors on the host."""
+        """Move the networks, and nothing else, to a device. Their callers give and get tensors on the host."""
         if device != self.device:
             _ = self.step_bytes  # counted on the host
             for network in self.networks().values():
@@ -180,35 +178,27 @@ class Hierarchy(nn.Module):
         return len(self.levels)
 
     def callers(self) -> list[Caller]:
-        """Who chooses: the policies of each level, lowest first, and the meta-policy."""
+        """The policies of each level, lowest first, and the meta-policy."""
         return [*(level.policy for level in self.option_levels()), self.meta_policy]
 
     def option_levels(self) -> list[Level]:
         """The levels of options, lowest first."""
         return [level for level in self.levels if isinstance(level, Level)]
 
-    def networks(self) -> dict[str, nn.Module]:
-        """Every network by its place here."""
-        each: dict[str, nn.Module] = {} if self.trunk is None else {"trunk": self.trunk}
+    def networks(self) -> dict[str, Network]:
+        """Every network by its place here, such as ``levels.0.policy``."""
+        each = {} if self.trunk is None else {"trunk": self.trunk}
         for number, level in enumerate(self.option_levels()):
-            if level.trunk is not None:
-                each[f"levels.{number}.trunk"] = level.trunk
-            each[f"levels.{number}.policy"] = level.policy.network
-            if level.termination is not None:
-                each[f"levels.{number}.termination"] = level.termination
+            place = f"levels.{number}"
+            each |= {} if level.trunk is None else {f"{place}.trunk": level.trunk}
+            each[f"{place}.policy"] = level.policy.network
+            each |= {} if level.termination is None else {f"{place}.termination": level.termination}
         return each | {"meta_policy": self.meta_policy.network}
 
     def named_networks(self) -> Iterator[tuple[str, nn.Module]]:
-        """Every network by its place in the spec."""
-        if self.trunk is not None:
-            yield "hierarchy.trunk", self.trunk
-        for number, level in enumerate(self.option_levels()):
-            if level.trunk is not None:
-                yield f"hierarchy.levels.{number}.trunk", level.trunk
-            yield f"hierarchy.levels.{number}.policy", level.policy
-            if level.termination is not None:
-                yield f"hierarchy.levels.{number}.termination", level.termination
-        yield "hierarchy.meta_policy" if self.depth else "baseline.policy", self.meta_policy
+        """Every network, with the σ of its control, by its place in the spec."""
+        for place in self.networks():
+            yield f"hierarchy.{place}" if self.depth else "baseline.policy", self.get_submodule(place)
 
     @cached_property
     def step_bytes(self) -> int:
@@ -217,87 +207,94 @@ class Hierarchy(nn.Module):
 
     @property
     def steps_in_memory(self) -> int:
-        """Steps that networks can be trained on at a time: longer trajectories are processed in chunks of time."""
+        """Most steps of a trajectory in a chunk of time, for training within the memory that is allowed."""
         return max(1, int(_bytes_at_once(self.device)) // max(1, self.step_bytes))
 
     @property
     def steps_at_once(self) -> int:
-        """Steps of several trajectories that go through the networks together, where these are short enough."""
+        """Most steps of several trajectories that go through the networks together."""
         return min(STEPS_AT_ONCE, self.steps_in_memory)
 
-    def forward(self, inputs: Inputs, discovering: int | None = None) -> Outputs:
-        """What the networks say about these observations, from the first step of their trajectories on.
-
-        What is too long for :attr:`steps_in_memory` goes through them in chunks of time, of which nothing is kept but
-        the answers and the states between; for the gradient, each chunk is computed again, the last first.
+    def tabulate(self, batch: Batch, discovering: int | None = None) -> Tables:
+        """The tables of a batch: every network once, over all options, steps and trajectories.
 
         :param discovering: d gives levels 1 to d alone under a uniform meta-policy (layer-wise training, SM 2.3).
         """
-        chunks = self.chunks(inputs)
-        if len(chunks) == 1:
-            return self.advance(inputs, None, discovering)[0]
-        answers: list[Answers] = []
-        states: States | None = None
-        there = torch.empty(0, device=self.device)  # the device whose random numbers are drawn again
-        for chunk in chunks:
-            said, states = checkpoint(self._answers, chunk, states, discovering, there, use_reentrant=False)
-            answers.append(said)
-        return self._outputs([torch.cat(each, dim=1) for each in zip(*answers, strict=True)], discovering)
-
-    def chunks(self, inputs: Inputs) -> list[Inputs]:
-        """The chunks of time in which they go through the networks; a single one where they are short enough."""
-        return list(inputs.chunks(self.steps_in_memory // inputs.batch[0]))
-
-    def advance(
-        self, inputs: Inputs, states: States | None, discovering: int | None = None
-    ) -> tuple[Outputs, dict[str, State]]:
-        """What the networks say about these observations, and their states after them, by :meth:`networks`' names.
-
-        :param states: those after the observations before; None at the first step.
-        """
-        answers, after = self._answers(inputs, states, discovering)
-        return self._outputs(answers, discovering), after
-
-    def _answers(
-        self, inputs: Inputs, states: States | None, discovering: int | None, _: Tensor | None = None
-    ) -> tuple[Answers, dict[str, State]]:
-        """The networks' own outputs, and their states after them, which stay where the networks are."""
-        inputs, carried, answers = inputs.loaded().to(self.device), Carried(states), []
-        reduced = self._reduced and self.training
-        with torch.autocast(self.device.type, torch.bfloat16) if reduced else nullcontext():
-            given = inputs if self.trunk is None else carried.answer("trunk", self.trunk, inputs)
-            for number, level in enumerate(self.option_levels()[:discovering]):
-                place, trunk = f"levels.{number}", level.trunk
-                seen = given if trunk is None else carried.answer(f"{place}.trunk", trunk, given)
-                answers.append(carried.answer(f"{place}.policy", level.policy.network, seen))
-                if level.termination is not None:
-                    answers.append(carried.answer(f"{place}.termination", level.termination, seen))
-            if not discovering:
-                answers.append(carried.answer("meta_policy", self.meta_policy.network, given))
-        if reduced or self.device != HOST:
-            answers = [said.float().to(HOST) if reduced else said.to(HOST) for said in answers]
-        return answers, carried.after
-
-    def _outputs(self, answers: Answers, discovering: int | None) -> Outputs:
-        """What the networks' outputs stand for."""
-        levels, said = self.option_levels()[:discovering], iter(answers)
-        callers, endings = [], []
-        for level in levels:
-            callers.append(level.policy(next(said), self.scaling))
-            endings.append(None if level.termination is None else next(said).squeeze(-1))
-        top = answers[-1]
-        last = _uniform(top, levels[-1].count) if discovering else self.meta_policy(top, self.scaling)
-        return Outputs((*callers, last), tuple(endings))
-
-    def initial_states(self, trajectories: int) -> dict[str, State]:
-        """The states of the networks that remember before the first step, by name."""
-        each = self.networks().items()
-        return {name: network.initial_state(trajectories) for name, network in each if remembers(network)}
-
-    def tabulate(self, batch: Batch, discovering: int | None = None) -> Tables:
-        """The tables of a batch: every network once, over all options, steps and trajectories."""
         outputs: Outputs = self(batch.inputs, discovering)
         return outputs.tables(batch.actions)
+
+    def forward(self, inputs: Inputs, discovering: int | None = None) -> Outputs:
+        """The outputs for these observations, which begin with the first step of their trajectories.
+
+        Trajectories longer than :attr:`steps_in_memory` go through the networks in chunks of time. Only the raw outputs
+        and the states between chunks are kept; for the gradient each chunk is computed again, the last first.
+
+        :param discovering: as in :meth:`tabulate`.
+        """
+        chunks = self.chunks(inputs)
+        if len(chunks) == 1:
+            return self._outputs(self._run_networks(inputs, None, discovering)[0], discovering)
+        each: list[RawOutputs] = []
+        states: States | None = None
+        there = torch.empty(0, device=self.device)  # checkpoint draws again the random numbers of this device
+        for chunk in chunks:
+            raw, states = checkpoint(self._run_networks, chunk, states, discovering, there, use_reentrant=False)
+            each.append(raw)
+        return self._outputs([torch.cat(parts, dim=1) for parts in zip(*each, strict=True)], discovering)
+
+    def advance(self, inputs: Inputs, states: States | None) -> tuple[Outputs, dict[str, State]]:
+        """The outputs for these observations, and the networks' states after them, by :meth:`networks`' names.
+
+        :param states: after the observations before; None at the first step.
+        """
+        raw, after = self._run_networks(inputs, states)
+        return self._outputs(raw), after
+
+    def initial_states(self, trajectories: int) -> dict[str, State]:
+        """The states of all networks before the first step, by :meth:`networks`' names."""
+        return {place: network.initial_state(trajectories) for place, network in self.networks().items()}
+
+    def chunks(self, inputs: Inputs) -> list[Inputs]:
+        """The chunks of time in which these observations go through the networks; a single one where they fit."""
+        return list(inputs.chunks(self.steps_in_memory // inputs.batch[0]))
+
+    def _run_networks(
+        self, inputs: Inputs, before: States | None, discovering: int | None = None, _: Tensor | None = None
+    ) -> tuple[RawOutputs, dict[str, State]]:
+        """The networks' outputs, on the host, and their states after them, which stay on the networks' device."""
+        inputs, states = inputs.loaded().to(self.device), before or self.initial_states(inputs.batch[0])
+        after: dict[str, State] = {}
+        raw: list[Tensor] = []
+        reduced = self._reduced and self.training
+
+        def run(place: str, network: Network, seen: Inputs | Tensor) -> Tensor:
+            output, after[place] = network(seen, states[place])
+            return output
+
+        with torch.autocast(self.device.type, torch.bfloat16) if reduced else nullcontext():
+            read = inputs if self.trunk is None else run("trunk", self.trunk, inputs)
+            for number, level in enumerate(self.option_levels()[:discovering]):
+                place = f"levels.{number}"
+                own = read if level.trunk is None else run(f"{place}.trunk", level.trunk, read)
+                raw.append(run(f"{place}.policy", level.policy.network, own))
+                if level.termination is not None:
+                    raw.append(run(f"{place}.termination", level.termination, own))
+            if not discovering:
+                raw.append(run("meta_policy", self.meta_policy.network, read))
+        if reduced or self.device != HOST:
+            raw = [output.float().to(HOST) if reduced else output.to(HOST) for output in raw]
+        return raw, after
+
+    def _outputs(self, raw: RawOutputs, discovering: int | None = None) -> Outputs:
+        """The outputs as logits and emissions of each level."""
+        levels, each = self.option_levels()[:discovering], iter(raw)
+        callers, endings = [], []
+        for level in levels:
+            callers.append(level.policy(next(each), self.scaling))
+            endings.append(None if level.termination is None else next(each).squeeze(-1))
+        top = raw[-1]
+        last = _uniform(top, levels[-1].count) if discovering else self.meta_policy(top, self.scaling)
+        return Outputs((*callers, last), tuple(endings))
 
 
 def _bytes_at_once(device: torch.device) -> float:
@@ -312,11 +309,11 @@ def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
     assert spec.baseline is not None  # a spec has one or the other
     policy = spec.baseline.policy
     if spec.baseline.kind == "per_timestep":
-        kept = {key: getattr(policy, key) for key in ("inputs", "shared", "hidden", "dropout", "activation")}
-        policy = NetworkSpec(network="per_timestep", **kept)
+        kept = {"hidden": ()} | policy.model_dump(exclude={"network"})  # a linear policy has no hidden layers
+        policy = PerTimestepSpec(network="per_timestep", **kept)
     return policy, ("control",)
 
 
 def _uniform(like: Tensor, options: int) -> CallerOutputs:
-    """A meta-policy that selects each of the k options with probability 1/k, at as many steps [N, T, ...]."""
+    """A meta-policy that selects each of k options with probability 1/k, at the steps of ``like`` [N, T, ...]."""
     return CallerOutputs(options, torch.zeros(*like.shape[:2], 1, options), None)

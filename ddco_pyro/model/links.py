@@ -1,7 +1,7 @@
-"""From what networks say to log-probabilities, compiled: over a handful of columns torch takes longer than inference.
+"""Compiled links from network outputs to log-probabilities; torch's own take longer than inference on few columns.
 
-Exponentials are left to torch, which computes many at once; sums over columns are compiled. Every link has its formula
-in torch besides, which says what it is, and is used for second derivatives and on other devices.
+torch computes the exponentials, many at once; the sums over columns are compiled. Each link also has a formula in
+torch, which defines it and is used for second derivatives, on other devices and in exported programs.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ TERMINATION_BOUND = 12.0
 Array = np.ndarray
 Gradients = tuple[Tensor | None, ...]
 Wanted = tuple[bool, ...]
-"""Of which inputs a gradient is wanted."""
+"""Whether the gradient of each input is wanted."""
 
 jit = numba.njit(cache=True, error_model="numpy")
 
 
 def log_selection(logits: Tensor, control: int) -> Tensor:
-    """Log-softmax over the last dimension, after ``control`` (0 or 1) choices that are impossible."""
+    """Log-softmax over the last dimension, after ``control`` (0 or 1) impossible choices."""
     return _linked(_SELECTION, logits, torch.empty(control))
 
 
 def log_termination(logits: Tensor) -> Tensor:
-    """(log(1 - ψ), log ψ), [..., 2], of logits that are yet to be bounded."""
+    """(log(1 - ψ), log ψ) [..., 2] of logits, which are bounded first."""
     return _linked(_TERMINATION, logits)
 
 
@@ -54,8 +54,9 @@ def bounded(logits: Tensor) -> Tensor:
 class Link(NamedTuple):
     """A function of tensors, in torch (``formula``) and compiled.
 
-    ``forward`` gives the value and what else ``backward`` needs; that takes what is wanted, the gradient of the value,
-    the inputs and what ``forward`` gave, and returns the gradients of the first ``differentiable`` inputs.
+    ``forward`` gives the value, then further tensors for ``backward``. ``backward`` takes which gradients are wanted,
+    the gradient of the value, the inputs and those tensors. It returns the gradients of the first ``differentiable``
+    inputs.
     """
 
     formula: Callable[..., Tensor]

@@ -1,9 +1,9 @@
-"""What the networks of a hierarchy say about a batch, and the log-probabilities it stands for."""
+"""The outputs of a hierarchy's networks for a batch, and the log-probabilities they stand for."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,13 +16,13 @@ from ddco_pyro.model.tables import NEVER, Tables
 
 @dataclass(frozen=True)
 class CallerOutputs:
-    """What the K callers of one level say.
+    """The outputs of the K callers of one level.
 
     :param options: k, the number of options that they select among; 0 for the lowest level.
-    :param logits: of their choices [N, T, K, k], or [N, T, K, 1 + k] where control (choice 0) is one of them; None for
-        callers that emit control alone.
-    :param emission: how they emit the control, [N, T, K, A]; None for callers that emit none.
-    :param numbers: what their network gave for that, [N, T, K, size]; None where there is none.
+    :param logits: of their choices [N, T, K, k], or [N, T, K, 1 + k] with control (choice 0) first; None for callers
+        that only emit control.
+    :param emission: the distribution of their control, [N, T, K, A]; None for callers that emit none.
+    :param numbers: the network's numbers behind the emission, [N, T, K, size].
     """
 
     options: int
@@ -40,7 +40,7 @@ class CallerOutputs:
 
     @property
     def selection(self) -> Tensor | None:
-        """log η [N, T, K, 1 + k]; None where there is nothing to select."""
+        """log η [N, T, K, 1 + k]; None without options."""
         if not self.options:
             return None
         if self.logits is not None:
@@ -48,7 +48,7 @@ class CallerOutputs:
         return pad(torch.zeros(*self.shape, 1), (0, self.options), value=NEVER)
 
     def log_density(self, actions: Tensor) -> Tensor:
-        """log π(a | s) of each caller, [N, T, K]; -inf where it emits no control."""
+        """log π(a | s) of each caller, [N, T, K]; -inf for a caller that emits no control."""
         if self.emission is None:
             assert self.logits is not None  # a caller emits something
             return self.logits.new_full(self.logits.shape[:-1], NEVER)
@@ -57,7 +57,7 @@ class CallerOutputs:
 
 @dataclass(frozen=True)
 class Outputs:
-    """What all networks say about a batch, before any control is known.
+    """The outputs of all networks for a batch, before any control is known.
 
     :param callers: each level's, lowest first, the meta-policy's last.
     :param termination_logits: of each level's options [N, T, k], before they are bounded; None for a level whose
@@ -69,7 +69,7 @@ class Outputs:
 
     @property
     def emissions(self) -> tuple[Emission | None, ...]:
-        """How the callers of each level emit the control, lowest first, the meta-policy's last."""
+        """The distributions of the control of each level's callers, lowest first, the meta-policy's last."""
         return tuple(caller.emission for caller in self.callers)
 
     @property
@@ -85,24 +85,27 @@ class Outputs:
         return Tables(tuple(table for table in selection if table is not None), self.termination, control)
 
     def tensors(self) -> list[Tensor]:
-        """Everything that the networks say, each [N, T, ...]."""
+        """All outputs of the networks, each [N, T, ...]."""
         logits = [caller.logits for caller in self.callers if caller.logits is not None]
         numbers = [caller.numbers for caller in self.callers if caller.numbers is not None]
         return [*logits, *numbers, *(logit for logit in self.termination_logits if logit is not None)]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Outputs:
-        """The same of changed tensors."""
+        """The outputs of changed tensors."""
+
+        def changed(tensor: Tensor | None) -> Tensor | None:
+            return None if tensor is None else change(tensor)
+
         callers = (
-            replace(
-                caller,
-                logits=None if caller.logits is None else change(caller.logits),
-                emission=None if caller.emission is None else caller.emission.map(change),
-                numbers=None if caller.numbers is None else change(caller.numbers),
+            CallerOutputs(
+                caller.options,
+                changed(caller.logits),
+                None if caller.emission is None else caller.emission.map(change),
+                changed(caller.numbers),
             )
             for caller in self.callers
         )
-        endings = (None if logit is None else change(logit) for logit in self.termination_logits)
-        return Outputs(tuple(callers), tuple(endings))
+        return Outputs(tuple(callers), tuple(changed(logit) for logit in self.termination_logits))
 
 
 def _always(shape: torch.Size) -> Tensor:

@@ -1,6 +1,6 @@
-"""torch's random numbers by a seed, on the host and on the device that networks are on, and on no other.
+"""Seeds of torch's random numbers, on the host and on the networks' device.
 
-``torch.manual_seed`` seeds the generators of all GPUs, also where nothing is drawn there.
+``torch.manual_seed`` would seed the generators of all GPUs.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from contextlib import contextmanager
 import torch
 
 HOST = torch.device("cpu")
-"""Where everything but networks is: tables, inference, emissions and their spreads."""
+"""The device of tables, inference and emissions; only networks can be on another."""
 
 
 def seed(value: int, device: torch.device = HOST) -> None:
-    """What is drawn from here on, on the host and on ``device``, follows from ``value``."""
+    """Seed the generators of the host and of ``device``."""
     torch.default_generator.manual_seed(value)
     if device.type == "cuda":
         with torch.cuda.device(device):
@@ -24,7 +24,7 @@ def seed(value: int, device: torch.device = HOST) -> None:
 
 @contextmanager
 def seeded(value: int, device: torch.device = HOST) -> Iterator[None]:
-    """The same inside; behind it, generators are as they were."""
+    """Seed the generators within the block, and restore them afterwards."""
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         seed(value, device)
         yield

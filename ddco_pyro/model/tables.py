@@ -1,8 +1,8 @@
-"""Every log-probability that an AHMM needs, as arrays: what the engines in :mod:`ddco_pyro.inference` eliminate.
+"""The log-probabilities of an AHMM as arrays, from which the engines in :mod:`ddco_pyro.inference` eliminate latents.
 
 Level 1 is the lowest, level D the highest option level; the meta-policy calls level D. At each step every level d
 has a choice h^d in {0, 1, ..., k_d}: options are 1 to k_d, and choice 0 is *control*: the caller emits the physical
-control itself, for this step. Below a choice 0 there is nothing left to choose, so every lower choice is 0 too.
+control itself, for this step. Below a choice 0 every lower choice is 0 too.
 
 :class:`Tables` holds what the networks give; :class:`Chain` adds what the model fixes: choice 0 and padding.
 """
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 NEVER = -torch.inf
-"""Log-probability of what cannot happen: a true zero, never a small number."""
+"""Log-probability of an impossible event: a true zero, not a small number."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Tables:
     :param selection: log η^{d+1}(h^d | s_t, h^{d+1}), shapes [N, T, K_d, 1 + k_d]; the first choice is control.
     :param termination: (log(1 - ψ^d(s_t)), log ψ^d(s_t)), shapes [N, T, k_d, 2]; unused at t = 0.
     :param control: log π(a_t | s_t) of each level's options and, last, of the meta-policy, shapes [N, T, k_d] and
-        [N, T, 1]; -inf where that caller does not emit control; empty where no control is known.
-    :param evidence: what else is known of the choices, added to the log-likelihood of each choice, shapes
-        [N, T, 1 + k_d]; None where nothing is. Hard labels are 0 and -inf.
+        [N, T, 1]; -inf for callers that emit no control; empty where no control is known.
+    :param evidence: log-likelihood of each choice by other evidence, shapes [N, T, 1 + k_d]; None for a level without.
+        Hard labels are 0 and -inf.
     """
 
     selection: tuple[Tensor, ...]
@@ -53,7 +53,7 @@ class Tables:
 
     @classmethod
     def of(cls, depth: int, leaves: Sequence[Tensor | None]) -> Tables:
-        """The tables of a hierarchy of so many levels from their :meth:`leaves`."""
+        """The tables of a hierarchy of ``depth`` levels from their :meth:`leaves`."""
         selection, termination = leaves[:depth], leaves[depth : 2 * depth]
         control, evidence = leaves[2 * depth : 3 * depth + 1], leaves[3 * depth + 1 :]
         return cls(_present(selection), _present(termination), _present(control), tuple(evidence))
@@ -74,8 +74,9 @@ class Tables:
         return None if total is None else total.expand(*total.shape[:2], *reversed(sizes))
 
     def clamp(self, level: int, choices: Tensor) -> Tables:
-        """These tables where the choices of one level (1 is the lowest) are known to be ``choices``, [N, T]; -1 leaves
-        that of a step free.
+        """These tables with the choices of one level clamped to ``choices`` [N, T]; -1 leaves a step free.
+
+        :param level: 1 is the lowest.
         """
         evidence = list(self.evidence or (None,) * self.depth)
         each, choices = torch.arange(self.selection[level - 1].shape[-1]), choices.unsqueeze(-1)
@@ -83,7 +84,7 @@ class Tables:
         return replace(self, evidence=tuple(evidence))
 
     def apart(self) -> tuple[Tables, Tables]:
-        """These tables with a uniform meta-policy, and with the meta-policy alone to differentiate."""
+        """These tables with a uniform meta-policy, and these tables with a gradient for the meta-policy alone."""
         *lower, top = self.selection
         uniform = torch.full_like(top, -math.log(top.shape[-1] - 1))
         uniform[..., 0] = NEVER
@@ -100,25 +101,26 @@ class Tables:
 
 
 def always_ends(termination: Tensor) -> bool:
-    """Whether the options of a level, whose table [N, T, k, 2] this is, end after every step; ψ of a network is less
-    than 1.
+    """Whether a level's termination table [N, T, k, 2] is that of options that end after every step.
+
+    A network's ψ is less than 1.
     """
     return bool(termination[0, 0, 0, 0] == NEVER)
 
 
 @dataclass(frozen=True)
 class Chain:
-    """The Markov chain over joint choices that :class:`Tables` describe, complete: what an engine eliminates.
+    """The complete Markov chain over joint choices that :class:`Tables` describe.
 
     C_d = 1 + k_d counts the choices of level d, control among them.
 
     :param selection: log-probability of choosing h^d given the caller h^{d+1}, shapes [N, T, C_{d+1}, C_d];
         the highest level's has one caller.
     :param termination: log-probabilities of b^d = 0 and 1 given h^d, shapes [N, T, C_d, 2].
-    :param evidence: what else is known of the joint choice, [N, T, C_D, ..., C_1]; None where nothing is.
+    :param evidence: log-likelihood of the joint choice by other evidence, [N, T, C_D, ..., C_1]; None for none.
     :param emission: log-probability of the control given the joint choice, evidence included, [N, T, C_D, ..., C_1];
         None where no control is known.
-    :param alive: whether a step is one of its trajectory's, [N, T].
+    :param alive: whether a step is within its trajectory's length, [N, T].
     """
 
     selection: tuple[Tensor, ...]

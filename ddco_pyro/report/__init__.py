@@ -1,47 +1,82 @@
-"""A run as one self-contained HTML page."""
+"""The report of a run: one self-contained HTML page."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
-from ddco_pyro.drawing.pictures import style
-from ddco_pyro.drawing.templates import render
+from ddco_pyro.drawing import words
+from ddco_pyro.drawing.figures import style
+from ddco_pyro.drawing.page import Block, Facts, Page, Text, note
 from ddco_pyro.drawing.words import unconverged
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.report import activity, demonstration_list, dimensions, looks, option_figures, sections, worth
-from ddco_pyro.report.sections import degeneracies
+from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, training, worth
+from ddco_pyro.report.activity import activity
+from ddco_pyro.report.training import degeneracies
+from ddco_pyro.segmenting.page import timelines
 
 __all__ = ["degeneracies", "unconverged", "write_report"]
 
 
 def write_report(fit: Fit, demos: Demonstrations) -> Path:
-    """Write ``report.html`` and ``figures/`` into the run folder; the path of the page.
+    """Write ``report.html`` and ``figures/`` into the run folder.
 
-    :param demos: the demonstrations the fit was made from.
+    :param demos: the demonstrations of the fit.
+    :returns: the path of the page.
     :raises RunError: the fit has no folder.
     """
     path, metrics = fit.run_folder / "report.html", fit.metrics
-    active = activity.activity(fit, demos) if fit.spec.hierarchy else None
-    timelines = demonstration_list.timelines(fit, demos, active, metrics) if active else []
+    active = activity(fit, demos) if fit.spec.hierarchy else None
+    segmented = options.segmented(fit, demos, active) if active else None
+    drawn = timelines(segmented, options.MOST_SEGMENTS) if segmented else []
     with style():
-        page = {
-            "header": sections.header(fit, metrics),
-            "worth": worth.section(metrics),
-            "likelihood": sections.likelihood(fit, metrics),
-            "dimensions": dimensions.section(metrics, {name: other.metrics for name, other in fit.baselines.items()}),
-            "rollouts": sections.rollouts(fit, metrics),
-            "learning": sections.learning(fit),
-            "options": option_figures.options(fit, demos, active, metrics) if active else None,
-            "agreement": sections.agreement(fit, metrics),
-            "looks": looks.section(fit, demos),
-            "branches": sections.branches(fit, metrics),
-            "warnings": sections.warnings(fit, metrics),
-            "films": sections.films(fit),
-            "particulars": sections.particulars(fit, metrics),
-            "demonstrations": demonstration_list.listed(metrics, {timeline.anchor for timeline in timelines}),
-            "timelines": timelines,
-        }
-    write_text(path, render("report/report.html.j2", page))
+        sections = [
+            worth.section(metrics),
+            likelihood.section(fit),
+            likelihood.demonstrations(metrics, {timeline.anchor for timeline in drawn}),
+            likelihood.dimensions(fit),
+            rollouts.success(fit),
+            training.learning(fit),
+            options.section(fit, demos, active) if active else None,
+            agreement.section(fit),
+            inputs.saliency(fit, demos),
+            inputs.branches(fit),
+            training.warnings(fit),
+            rollouts.films(fit),
+            training.particulars(fit),
+            options.segments(drawn, len(metrics["demonstrations_by_likelihood"])) if drawn else None,
+        ]
+    name = fit.run_folder.resolve().name
+    write_text(path, Page(words.method(fit.name), header(fit, metrics), sections, subtitle=name).html())
     return path
+
+
+def header(fit: Fit, metrics: Mapping[str, Any]) -> list[Block]:
+    """The verdict, success in rollouts, warnings, and facts about demonstrations and training."""
+    counts = metrics["demonstrations"]
+    facts = {
+        "Demonstrations": f"{counts['train']} for training, {counts['tune']} for tuning, {counts['valid']} held out",
+        "Parameters": str(metrics["parameters"]),
+    }
+    if "training" in metrics:
+        facts["Training"] = words.spent(metrics["training"])
+    supervisor = counts.get("supervisor", {}).get("success")
+    if supervisor and "successes" in supervisor:
+        facts["Supervisor’s own success"] = f"{words.rate(supervisor, 'demonstrations')}, 95 % interval"
+    blocks: list[Block] = [Text(words.verdict(metrics), "verdict")]
+    if success := words.success(metrics):
+        blocks.append(Text(success))
+    if found := degeneracies(fit.spec, metrics):
+        signs = "1 sign" if len(found) == 1 else f"{len(found)} signs"
+        link = Markup('<a href="#warnings">Warnings</a>')
+        blocks.append(Text(Markup("{} of a degenerate solution: see {}.").format(signs, link)))
+    explained = (
+        "Held out: used neither in training nor in tuning, which decides when to stop. A nat is the unit of "
+        "log-likelihood: one nat more per step means that the control of a step is e = 2.7 times as probable."
+    )
+    return [*blocks, note(explained), Facts(facts)]

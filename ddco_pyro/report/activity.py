@@ -1,4 +1,4 @@
-"""What a fitted hierarchy says about demonstrations, as arrays that figures are drawn from."""
+"""Posteriors, most likely paths and terminations of demonstrations, as arrays for figures."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ MOST_BINS = 60
 class LevelActivity:
     """One level over N demonstrations of at most T steps, C = 1 + k choices, control first.
 
-    :param active: u_t, probability that a choice is active [N, T, C]; 0 past a demonstration's end.
+    :param active: u_t, the posterior probability of each choice [N, T, C]; 0 past a demonstration's end.
     :param path: choices of the most likely path [N, T]; -1 past the end.
-    :param ended: whether that path terminates a choice before this step, to select one anew: 1, 0, or -1 past the end
-        [N, T].
+    :param ended: whether the path makes a new choice at this step: 1, 0, or -1 past the end [N, T].
     :param termination: ψ_h(s_t) of the k options [N, T, k].
     :param lasts: whether options can be active for more than one step.
     """
@@ -34,7 +33,7 @@ class LevelActivity:
 
     @property
     def choices(self) -> list[int]:
-        """The choices that can occur: control is left out where it is never chosen."""
+        """The choices that can occur: without control where it is never chosen."""
         return [choice for choice in range(self.active.shape[2]) if choice or self.active[..., 0].any()]
 
 
@@ -45,9 +44,14 @@ class Activity:
     levels: tuple[LevelActivity, ...]
     lengths: np.ndarray
 
+    @property
+    def choices(self) -> set[int]:
+        """The choices that can occur at any level."""
+        return {choice for level in self.levels for choice in level.choices}
+
 
 def activity(fit: Fit, demos: Demonstrations) -> Activity:
-    """Posteriors, most likely paths and terminations of a fit with at least one level."""
+    """The activity of a fit with at least one level."""
     assert fit.spec.hierarchy is not None  # a baseline has no levels
     parts = [_arrays(piece, max(demos.lengths)) for piece in fit.infer(demos)]
     levels = []
@@ -75,8 +79,8 @@ class Bins:
     """Steps of demonstrations gathered into bins of time.
 
     :param index: the bin of each step [N, T]; -1 past a demonstration's end.
-    :param edges: where bins begin and end [B + 1], steps or parts of a demonstration.
-    :param axis: what the edges measure.
+    :param edges: the bins' edges [B + 1], in steps or as shares of a demonstration.
+    :param axis: the label of the time axis.
     """
 
     index: np.ndarray
@@ -95,7 +99,7 @@ class Bins:
 
 
 def bins(lengths: np.ndarray) -> Bins:
-    """One bin a step where all demonstrations are equally long and short enough; else bins of normalised time."""
+    """One bin for each step of equally long, short demonstrations; else bins of normalised time."""
     steps = np.arange(lengths.max())
     alive = steps < lengths[:, None]
     if len(set(lengths)) == 1 and lengths[0] <= MOST_BINS:
@@ -104,5 +108,5 @@ def bins(lengths: np.ndarray) -> Bins:
     count = int(min(MOST_BINS, lengths.min()))
     index = np.minimum((steps + 0.5) / lengths[:, None] * count, count - 1).astype(int)
     return Bins(
-        np.where(alive, index, -1), np.linspace(0.0, 1.0, count + 1), "part of the demonstration that has passed"
+        np.where(alive, index, -1), np.linspace(0.0, 1.0, count + 1), "share of the demonstration that has passed"
     )

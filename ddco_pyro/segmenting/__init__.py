@@ -1,4 +1,4 @@
-"""Labels for demonstrations: the options of a run, step by step, and what they can be written as."""
+"""Segments of demonstrations: the most likely option of a run at each step."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
-from ddco_pyro.data.memory import INFERENCE, PROGRAM, Extent, refuse_too_much
+from ddco_pyro.data.memory import Extent, refuse_too_much
 from ddco_pyro.data.sources import Recording, Source, open_source
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.inferred import Inferred
@@ -27,10 +27,10 @@ __all__ = ["LevelLabels", "Segmented", "Segments", "demonstrations", "segments"]
 class LevelLabels:
     """One level over one demonstration of T steps.
 
-    :param options: choices of the most likely path [T]: 1 to k, 0 where the caller emits the control itself.
-    :param boundaries: whether a choice is made anew at this step [T], be it the same again; true at the first. At a
-        level whose options end after every step: whether another one is active than before.
-    :param probability: of that choice at that step, given the whole demonstration [T].
+    :param options: choices of the most likely path [T]: 1 to k, or 0 where the caller emits the control.
+    :param boundaries: whether the path makes a new choice at this step [T], which may be the same option; true at the
+        first step. Where options end after every step: whether the option differs from the step before.
+    :param probability: posterior probability of the chosen option at each step [T].
     """
 
     options: np.ndarray
@@ -39,7 +39,7 @@ class LevelLabels:
 
     @classmethod
     def of(cls, options: np.ndarray, terminations: np.ndarray, active: np.ndarray, *, lasts: bool) -> LevelLabels:
-        """From the most likely path, choices and terminations [T], and the posterior u [T, 1 + k].
+        """Labels from the most likely path (choices and terminations [T]) and the posterior u [T, 1 + k].
 
         :param lasts: whether the level's options can be active for more than one step.
         """
@@ -49,15 +49,19 @@ class LevelLabels:
         return cls(options, boundaries, probability)
 
     def runs(self) -> list[tuple[int, int, int]]:
-        """(option, first step, step after the last) of each segment."""
+        """Each segment as (option, first step, step after the last)."""
         starts = np.flatnonzero(self.boundaries).tolist()
         return [(int(self.options[a]), a, b) for a, b in zip(starts, [*starts[1:], len(self.options)], strict=True)]
 
 
 @dataclass(frozen=True)
 class Segments:
-    """One demonstration: its levels by name, lowest first, log p(ξ) per step, whether it was held out when the run was
-    fitted, and the labels it had, name to [T].
+    """One demonstration with its segments.
+
+    :param levels: by name, lowest first.
+    :param log_likelihood: log p(ξ) per step, nats.
+    :param held_out: whether the run's fit held the demonstration out.
+    :param labels: ground-truth labels in the file, name to [T].
     """
 
     name: str
@@ -72,9 +76,12 @@ class Segments:
 
 @dataclass(frozen=True)
 class Segmented:
-    """All demonstrations of a source. ``counts`` has the number of options of each level by name; ``truth`` the name of
-    the labels that the run's spec compares a level with; ``option_labels`` the label that each option stands for, by
-    level, where the run was trained from labels.
+    """All demonstrations of a source.
+
+    :param counts: the number of options of each level, by name.
+    :param frequency: steps per second (Hz); None where unknown.
+    :param truth: for each level, the name of the labels that the run's spec compares with it.
+    :param option_labels: for each level of a run trained from labels, the label of each option.
     """
 
     segments: tuple[Segments, ...]
@@ -103,11 +110,10 @@ def segment(fit: Fit, path: str | Path) -> Segmented:
 
 
 def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
-    """The options of a run over every demonstration of a source, some at a time; those that its spec leaves out of its
-    own file are left out here.
+    """The segments of every demonstration of a source, except those that the run's spec excludes from its file.
 
-    :raises BadInput: the run has no options, or was fitted to other observations.
-    :raises DemonstrationsError: a demonstration cannot be used.
+    :raises BadInput: the run has no options.
+    :raises DemonstrationsError: a demonstration cannot be used, or lacks an observation of the run.
     """
     hierarchy = fit.spec.hierarchy
     if hierarchy is None:
@@ -125,29 +131,29 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
 
 
 def demonstrations(source: Source, names: Iterable[str], fit: Fit) -> Demonstrations:
-    """What a run's networks see of these demonstrations of a source, all in memory."""
+    """Demonstrations of a source with the observations of a run's networks, in memory."""
     return Demonstrations(tuple(_demonstration(source.recording(name), fit) for name in names))
 
 
 def chosen_names(source: Source, fit: Fit) -> list[str]:
-    """The demonstrations to segment: those that a spec excludes may hold anything."""
+    """The demonstrations to segment: all except those that the spec excludes from its file."""
     known = fit.spec.demonstrations
     same = known.path is not None and Path(known.path).resolve() == source.files[0].resolve()
     return [name for name in source.names if not (same and name in known.exclude)]
 
 
 FOUND = 40
-"""Bytes that are kept of a segmented step for each level."""
+"""Bytes of one step's labels at one level."""
 
 
 def _demonstrations(
     source: Source, names: Sequence[str], fit: Fit, labels: dict[str, dict[str, np.ndarray]]
 ) -> Iterator[Demonstration]:
-    """What the run's networks see of each recording; their ground-truth labels, which may differ, go into ``labels``.
+    """Each recording as the run's networks observe it. Ground-truth labels go into ``labels``.
 
-    :raises DemonstrationsError: one cannot be used, or alone takes more memory than is allowed.
+    :raises DemonstrationsError: a recording cannot be used, or needs more memory than is allowed.
     """
-    before = 0  # steps: their options are in memory
+    before = 0  # steps whose labels are in memory
     for name in names:
         recording = source.recording(name)
         _refuse_too_long(recording, fit, before)
@@ -166,16 +172,14 @@ def _refuse_too_long(recording: Recording, fit: Fit, before: int) -> None:
     seen = {f"obs/{key}": known[key] for key in fit.hierarchy.encoder.shapes if key in known}
     extent = Extent.of([{"actions": recording.actions, **seen}])
     (steps,) = extent.lengths
-    each, networks = extent.step(fit.spec.seen) + INFERENCE, min(steps, fit.hierarchy.steps_in_memory)
-    needed = PROGRAM + extent.size + steps * each + networks * fit.hierarchy.step_bytes
-    needed += FOUND * fit.hierarchy.depth * (before + steps)
+    needed = extent.segmenting + FOUND * fit.hierarchy.depth * (before + steps)
     refuse_too_much(needed, f"{recording.name}: segmenting its {steps} steps", "divide it, or the file")
 
 
 def _demonstration(recording: Recording, fit: Fit) -> Demonstration:
-    """What the run's networks see of a recording.
+    """A recording with the observations of the run's networks.
 
-    :raises DemonstrationsError: it lacks an observation, or one or its control has another shape than was fitted to.
+    :raises DemonstrationsError: an observation is missing, or it or the control has another shape than in the fit.
     """
     shapes, known = fit.hierarchy.encoder.shapes, recording.observations
     for key, shape in shapes.items():

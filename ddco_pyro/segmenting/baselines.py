@@ -1,4 +1,4 @@
-"""Segmentation without a hierarchy of options, to compare with: clusters, hidden Markov models, change points, rules.
+"""Baselines of segmentation: clusters, hidden Markov models, change points and rules.
 
 >>> names = baselines.segment("hmm", train, valid, count=2, seed=0)  # [T] for each demonstration of ``valid``
 >>> len(names) == len(valid), len(names[0]) == len(valid[0])
@@ -17,18 +17,18 @@ from sklearn.mixture import GaussianMixture
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput, nearest
-from ddco_pyro.model.encoding import ObservationEncoder
+from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec
 from ddco_pyro.training.initialization import block_means, distinct, joined
 
 PIECES = 2
-"""Pieces into which change points divide a demonstration, for each of the segments asked for."""
+"""Pieces of a demonstration between change points, for each kind of segment asked for."""
 
 RESTARTS = 3
-"""Of hidden Markov models and mixtures; the likeliest is kept."""
+"""Restarts of hidden Markov models and mixtures; the likeliest is kept."""
 
 SPREAD = 1e-3
-"""Least variance, in standardised units, of mixtures and hidden Markov models."""
+"""Smallest variance of mixtures and hidden Markov models, in standardised units."""
 
 
 def segment(
@@ -40,15 +40,15 @@ def segment(
     observations: Sequence[ObservationSpec] | None = None,
     gripper: int = -1,
 ) -> list[np.ndarray]:
-    """What a baseline, fitted to ``train``, says of every step of ``valid``: which of ``count`` kinds it is, [T] each.
+    """Segments of a baseline that is fitted to ``train``: one of ``count`` kinds at each step of ``valid``, [T] each.
 
-    Clusters, mixtures, hidden Markov models and change points see observations and controls, standardised by ``train``,
-    with as much weight on either; pictures by their block means.
+    Clusters, mixtures, hidden Markov models and change points read observations and controls, standardised by
+    ``train`` and equally weighted. Pictures enter as block means.
 
     :param name: one of :data:`BASELINES`.
-    :param observations: what they see; all that ``train`` has if None.
-    :param gripper: the control dimension whose changes divide, for ``gripper``; counted from the end if negative.
-    :raises BadInput: there is no such baseline or control dimension, or it needs a package that is not installed.
+    :param observations: the observations to read; all of ``train`` for None.
+    :param gripper: for ``gripper``, the control dimension whose changes divide; negative ones count from the end.
+    :raises BadInput: there is no such baseline or control dimension, or a package is not installed.
     """
     if name not in BASELINES:
         raise BadInput(f"there is no baseline {name!r}{nearest(name, BASELINES)}; there is: {', '.join(BASELINES)}")
@@ -63,7 +63,7 @@ def segment(
 def _rows_of(
     train: Demonstrations, observations: Sequence[ObservationSpec] | None
 ) -> Callable[[Demonstration], np.ndarray]:
-    """How a demonstration is seen: a row of features for each step, standardised by the training demonstrations."""
+    """A function from a demonstration to a row of features for each step, standardised by the training ones."""
     shapes = train.observation_shapes
     encoder = ObservationEncoder(observations or [ObservationSpec(key=key) for key in shapes], shapes)
     encoder.fit(train)
@@ -111,10 +111,10 @@ def _hidden_markov(train: Rows, valid: Rows, count: int, seed: int) -> Rows:
         from hmmlearn.hmm import GaussianHMM
     except ImportError:
         raise _missing("hmm", "hmmlearn") from None
-    logging.getLogger("hmmlearn").setLevel(logging.ERROR)  # restarts that do not converge do not matter
+    logging.getLogger("hmmlearn").setLevel(logging.ERROR)  # a warning for each restart that does not converge
     rows, lengths = np.concatenate(train), [len(own) for own in train]
     count = distinct(rows, count)
-    # A count of 0.1 more of everything: no state is impossible to begin with or to leave for.
+    # Dirichlet priors of 1.1: no state and no transition gets probability 0.
     fitted = [
         GaussianHMM(count, "diag", SPREAD, 1.1, 1.1, n_iter=100, random_state=seed + 7919 * restart).fit(rows, lengths)
         for restart in range(RESTARTS)
@@ -124,7 +124,7 @@ def _hidden_markov(train: Rows, valid: Rows, count: int, seed: int) -> Rows:
 
 
 def _change_points(train: Rows, valid: Rows, count: int, seed: int) -> Rows:
-    """Pieces within which the features vary the least (exact, by dynamic programming), clustered by their means."""
+    """Pieces of least variance (exact, by dynamic programming), clustered by their means."""
     try:
         import ruptures
     except ImportError:
@@ -148,7 +148,7 @@ def _change_points(train: Rows, valid: Rows, count: int, seed: int) -> Rows:
 
 
 def _gripper(train: Demonstrations, valid: Demonstrations, dimension: int) -> Rows:
-    """Pieces between the steps at which a control crosses the middle of its range, numbered in their order."""
+    """Pieces between the steps at which a control crosses the middle of its range, numbered in order."""
     if not -train.control_size <= dimension < train.control_size:
         raise BadInput(f"there is no control dimension {dimension}; there are {train.control_size}, counted from 0")
     values = np.concatenate([demo.actions[:, dimension] for demo in train])
@@ -176,4 +176,4 @@ BASELINES = {
     "equal": "equal lengths",
     "gripper": "gripper changes",
 }
-"""What each is called in tables."""
+"""The baselines and their names in tables."""

@@ -1,4 +1,4 @@
-"""Segments as subtasks in a copy of a LeRobot dataset, in the form that LeRobot reads from 0.6 on, or up to 0.5."""
+"""Segments as subtasks in a copy of a LeRobot dataset, in either of the two forms that LeRobot reads."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow
@@ -18,15 +19,111 @@ from ddco_pyro.data.sources.lerobot import SUBTASK, LeRobot
 from ddco_pyro.data.sources.metadata import inside
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting import Segmented
-from ddco_pyro.segmenting.lerobot_forms import PERSISTENT, Form, subtask_names
+
+PERSISTENT, EVENTS = "language_persistent", "language_events"
+
+
+def subtask_names(level: str, count: int) -> list[str]:
+    """The name of each choice of a level, control (0) first."""
+    return ["control", *(f"{level} {option}" for option in range(1, 1 + count))]
+
+
+class Form:
+    """How a dataset holds subtasks: ``features`` are the entries of the new columns in ``meta/info.json``."""
+
+    features: ClassVar[dict[str, Any]]
+
+    def columns(self, rows: pyarrow.Table, options: np.ndarray, names: list[str]) -> dict[str, pyarrow.Array]:
+        """The new columns of an episode.
+
+        :param rows: the episode's rows [T].
+        :param options: the option of each row [T].
+        :param names: the subtask of each option.
+        """
+        raise NotImplementedError
+
+    def tables(self, names: list[str]) -> dict[Path, pyarrow.Table]:
+        """Further files of the dataset."""
+        return {}
+
+    def metadata(self, known: Mapping[bytes, bytes]) -> dict[bytes, bytes]:
+        """The metadata of the data files, from the metadata before."""
+        return dict(known)
+
+
+class Language(Form):
+    """LeRobot 0.6 and newer: each row holds all subtasks of its episode in ``language_persistent``.
+
+    A subtask lasts from its ``timestamp``, the time of its first frame, to the next subtask.
+    """
+
+    features: ClassVar = {name: {"dtype": "language", "shape": [1], "names": None} for name in (PERSISTENT, EVENTS)}
+
+    def columns(self, rows: pyarrow.Table, options: np.ndarray, names: list[str]) -> dict[str, pyarrow.Array]:
+        """The same list of subtasks on each row, and no events."""
+        starts = np.flatnonzero(np.diff(options, prepend=-1))
+        text = pyarrow.string()
+        entries = {
+            "role": pyarrow.array(["assistant"] * len(starts)),
+            "content": pyarrow.array([names[option] for option in options[starts]]),
+            "style": pyarrow.array(["subtask"] * len(starts)),
+            "timestamp": rows["timestamp"].combine_chunks().take(pyarrow.array(starts)),
+            "camera": pyarrow.nulls(len(starts), text),
+            "tool_calls": pyarrow.nulls(len(starts), pyarrow.list_(text)),
+        }
+        events = {name: values.type for name, values in entries.items() if name != "timestamp"}
+        persistent = pyarrow.StructArray.from_arrays(list(entries.values()), list(entries))
+        on_each_row = persistent.take(pyarrow.array(np.tile(np.arange(len(starts)), len(rows))))
+        offsets = np.arange(len(rows) + 1, dtype=np.int32)
+        return {
+            PERSISTENT: pyarrow.ListArray.from_arrays(pyarrow.array(offsets * len(starts)), on_each_row),
+            EVENTS: pyarrow.ListArray.from_arrays(
+                pyarrow.array(0 * offsets), pyarrow.array([], pyarrow.struct(events))
+            ),
+        }
+
+
+class SubtaskIndex(Form):
+    """LeRobot 0.4 and 0.5: ``subtask_index`` of each frame, and the names in ``meta/subtasks.parquet``."""
+
+    features: ClassVar = {SUBTASK: {"dtype": "int64", "shape": [1], "names": None}}
+
+    def columns(self, rows: pyarrow.Table, options: np.ndarray, names: list[str]) -> dict[str, pyarrow.Array]:
+        """The option of each row."""
+        return {SUBTASK: pyarrow.array(options.astype(np.int64))}
+
+    def tables(self, names: list[str]) -> dict[Path, pyarrow.Table]:
+        """The name of each option, as the pandas index that LeRobot expects."""
+        table = pyarrow.table({"subtask": names, SUBTASK: list(range(len(names)))})
+        columns = [_column("subtask", "unicode", "object"), _column(SUBTASK, "int64", "int64")]
+        pandas = {"index_columns": ["subtask"], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
+        return {Path("meta/subtasks.parquet"): table.replace_schema_metadata({"pandas": json.dumps(pandas)})}
+
+    def metadata(self, known: Mapping[bytes, bytes]) -> dict[bytes, bytes]:
+        """The columns as the ``datasets`` library lists them, with the new one."""
+        listed = known.get(b"huggingface")
+        if listed is None:
+            return dict(known)
+        info: dict[str, Any] = json.loads(listed)
+        info["info"]["features"][SUBTASK] = {"dtype": "int64", "_type": "Value"}
+        return {**known, b"huggingface": json.dumps(info).encode()}
+
+
+def _column(name: str, kind: str, numpy_kind: str) -> dict[str, Any]:
+    return {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_kind, "metadata": None}
+
+
+FORMS: Mapping[str, Form] = {"0.6": Language(), "0.4": SubtaskIndex()}
+"""The forms, by the first version of LeRobot that reads them."""
 
 
 def annotate(source: LeRobot, out: Path, segmented: Segmented, level: str, form: Form) -> None:
-    """Write the dataset with its subtasks to ``out``, a new folder, whole or not at all.
+    """Write a copy of the dataset with subtasks to ``out``, a new folder, whole or not at all.
 
-    Videos are linked where the file system can, else copied. A copy that has these very subtasks stays as it is.
+    Videos are hard links where the file system has them, else copies. A folder that has these very subtasks is not
+    written again.
 
-    :raises BadInput: ``out`` is something else, or the dataset has subtasks of its own, or rows of unknown episodes.
+    :raises BadInput: ``out`` is something else, the dataset has subtasks already, or it has rows of unknown episodes.
     """
     names = subtask_names(level, segmented.counts[level])
     check_target(source, out, names, form)
@@ -49,14 +146,14 @@ def annotate(source: LeRobot, out: Path, segmented: Segmented, level: str, form:
 
 
 def check_target(source: LeRobot, out: Path, names: list[str], form: Form) -> None:
-    """See that ``out`` is not there, or is a copy with such subtasks.
+    """Check that ``out`` does not exist or is a copy with such subtasks.
 
-    :raises BadInput: it is something else, or the dataset has subtasks of its own.
+    :raises BadInput: ``out`` is something else, or the dataset has subtasks already.
     """
     if {SUBTASK, PERSISTENT} & source.features.keys():
         raise BadInput(f"{source.folder}: has subtasks already; name a dataset without them")
     if out.resolve().is_relative_to(source.folder.resolve()):
-        raise BadInput(f"{out}: lies in the dataset itself; choose another --lerobot")
+        raise BadInput(f"{out}: lies in the dataset; choose another --lerobot")
     info = out / "meta" / "info.json"
     if out.exists() and not (
         (info.is_file() and info.read_text(encoding="utf-8") == _info(source, form))
@@ -70,7 +167,7 @@ def _equal(path: Path, table: pyarrow.Table) -> bool:
 
 
 def _taken(out: Path) -> BadInput:
-    return BadInput(f"{out}: is there already; choose another --lerobot")
+    return BadInput(f"{out}: exists; choose another --lerobot")
 
 
 def _info(source: LeRobot, form: Form) -> str:
@@ -79,7 +176,7 @@ def _info(source: LeRobot, form: Form) -> str:
 
 
 def _link(source: str, target: str) -> None:
-    """Copy a file; of a link in the dataset, the file that it leads to."""
+    """Copy a file, following links; link a video instead where that is possible."""
     source = os.path.realpath(source)
     if Path(target).suffix == ".mp4":
         try:
@@ -91,7 +188,7 @@ def _link(source: str, target: str) -> None:
 
 
 def _write(source: Path, target: Path, options: Mapping[str, np.ndarray], names: list[str], form: Form) -> None:
-    """The same rows with the form's columns, a row group for each episode, as LeRobot writes them."""
+    """Write the rows with the form's columns, one row group for each episode, as LeRobot does."""
     table = parquet.read_table(source)
     writer = None
     for rows, columns in _episodes(table, options, names, form):
@@ -105,7 +202,7 @@ def _write(source: Path, target: Path, options: Mapping[str, np.ndarray], names:
 
 
 def _has(source: Path, target: Path, options: Mapping[str, np.ndarray], names: list[str], form: Form) -> bool:
-    """Whether a data file of a copy, which is whole, has these very subtasks."""
+    """Whether a data file of a copy has these very subtasks."""
     there = parquet.read_table(target)
     expected = _episodes(parquet.read_table(source, columns=["episode_index", "timestamp"]), options, names, form)
     start = 0
@@ -119,9 +216,9 @@ def _has(source: Path, target: Path, options: Mapping[str, np.ndarray], names: l
 def _episodes(
     table: pyarrow.Table, options: Mapping[str, np.ndarray], names: list[str], form: Form
 ) -> Iterator[tuple[pyarrow.Table, dict[str, pyarrow.Array]]]:
-    """The rows of each episode in a data file, and the columns that go with them.
+    """The rows of each episode in a data file, and the new columns.
 
-    :raises BadInput: it has rows of an episode that the dataset does not name, or no times.
+    :raises BadInput: the file has no times, or rows of an episode that the dataset does not name.
     """
     if "timestamp" not in table.column_names:
         raise BadInput("the data files have no column timestamp; subtasks begin at times of frames")

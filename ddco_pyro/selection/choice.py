@@ -1,26 +1,32 @@
-"""From the scores of all folds to a choice: paired differences, their standard errors, the one-standard-error rule.
+"""The choice among candidates by the one-standard-error rule, as data, a table and a figure.
 
-The demonstrations held out in one fold are scored by one trained model, so their errors go together: a fold, and not
-a demonstration, counts as one observation in every standard error here.
+One trained model scores all demonstrations held out in a fold, so their errors are not independent. Every standard
+error here therefore counts a fold, not a demonstration, as one observation.
 """
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy import stats
 
-from ddco_pyro.evaluation.analysis import paired
+from ddco_pyro.drawing.figures import ACCENT, FAINT, INK, Interval, Panel, interval_plot, save, style
+from ddco_pyro.drawing.page import Page, Table, Text
+from ddco_pyro.drawing.words import number, signed
+from ddco_pyro.evaluation.worth import paired
+from ddco_pyro.selection.folds import Score
 from ddco_pyro.selection.grid import Candidate
-from ddco_pyro.selection.scoring import Score
 
 RULE = (
-    "chosen: the fewest parameters among the candidates whose mean held-out log-likelihood per step is at most one "
-    "standard error of the best's mean below it (the better one where parameters are equal); a candidate with a failed "
-    "fold, or one that was stopped early, is not chosen"
+    "chosen: the candidate with the fewest parameters within one standard error of the best, that is, with a mean "
+    "held-out log-likelihood per step at most one standard error of the best's mean below it; the better one where "
+    "parameters are equal. A candidate that failed in a fold, or was stopped early, is not chosen"
 )
 
 STOP_FOLDS = 3
@@ -39,15 +45,15 @@ STD_NOTE = (
 
 @dataclass(frozen=True)
 class Row:
-    """One candidate's result; log-likelihoods in nats per step.
+    """The result of one candidate; log-likelihoods in nats per step.
 
-    :param status: ``scored``; ``failed`` where a fold has failed; ``stopped`` where it was given up early.
-    :param mean: held-out log-likelihood per step over the folds that were scored, and its standard ``error``.
-    :param difference: this minus the best over the folds that both have, and its standard error.
-    :param folds: log-likelihood per step of each fold that was scored, by number.
-    :param failed: why, by number of the fold.
-    :param gradient_steps: of a fold's training, on average; None where none was scored.
-    :param unconverged: the folds whose training had not converged when its budget ended.
+    :param status: ``scored``; ``failed`` where a fold failed; ``stopped`` where the candidate was given up early.
+    :param mean: held-out log-likelihood per step over the scored folds, and its standard ``error``.
+    :param difference: this minus the best over the folds of both, and its standard error.
+    :param folds: log-likelihood per step of each scored fold, by number.
+    :param failed: the reason, by number of the fold.
+    :param gradient_steps: of a fold's training, on average; None where no fold was scored.
+    :param unconverged: the folds whose training had not converged.
     """
 
     candidate: Candidate
@@ -71,20 +77,15 @@ class Choice:
 
     @property
     def notes(self) -> list[str]:
-        """What has to be known to read the numbers."""
-        return [STD_NOTE] if std_varies([row.candidate for row in self.rows]) else []
-
-
-def std_varies(candidates: Sequence[Candidate]) -> bool:
-    """Whether candidates differ in σ."""
-    stds = [candidate.spec.control.std for candidate in candidates]
-    return any(std != stds[0] for std in stds)
+        """Caveats about the numbers."""
+        stds = [row.candidate.spec.control.std for row in self.rows]
+        return [STD_NOTE] if any(std != stds[0] for std in stds) else []
 
 
 def choose(candidates: Sequence[Candidate], scores: Sequence[Score], folds: int) -> Choice:
-    """The best candidate and the one that the one-standard-error rule chooses.
+    """The best candidate, and the candidate that the one-standard-error rule chooses.
 
-    :param folds: how many folds a candidate needs to have been scored in.
+    :param folds: how many folds a complete candidate has.
     """
     results = [_Scored(candidate, [s for s in scores if s.candidate == candidate.number]) for candidate in candidates]
     complete = [result for result in results if len(result.good) == folds]
@@ -98,7 +99,7 @@ def choose(candidates: Sequence[Candidate], scores: Sequence[Score], folds: int)
 
 
 def within_one_error(row: Row, best: Row | None) -> bool:
-    """Whether a candidate is complete, and its mean at most one standard error of the best's mean below that."""
+    """Whether a candidate is complete and within one standard error of the best."""
     if row.status != "scored" or best is None or row.mean is None or best.mean is None or best.error is None:
         return False
     return best.mean - row.mean <= best.error
@@ -125,30 +126,26 @@ class _Scored:
         return float(values.sum() / steps.sum())
 
     def row(self, folds: int, best: _Scored | None) -> Row:
-        """Its row, compared with the best."""
+        """The candidate's row, compared with the best."""
         status = "failed" if self.failed else "scored" if len(self.good) == folds else "stopped"
         if not self.good:
             return Row(self.candidate, status, None, None, None, {}, self.failed)
         values, steps = self.arrays(list(self.good))
-        own = paired(values, np.zeros(len(values)), steps)
+        error = paired(values, np.zeros(len(values)), steps)["standard_error"]
         per_fold = dict(zip(self.good, (values / steps).tolist(), strict=True))
         took = float(np.mean([score.gradient_steps for score in self.good.values()]))
         rising = tuple(fold for fold, score in self.good.items() if not score.converged)
-        error, difference = _finite(own["standard_error"]), self.against(best)
-        return Row(self.candidate, status, self.mean, error, difference, per_fold, self.failed, took, rising)
+        shown = error if np.isfinite(error) else None
+        return Row(self.candidate, status, self.mean, shown, self.against(best), per_fold, self.failed, took, rising)
 
     def against(self, best: _Scored | None) -> tuple[float, float] | None:
-        """Difference to another candidate per step and its standard error, over the folds that both have."""
+        """Difference to another candidate per step and its standard error, over the folds of both."""
         both = [fold for fold in self.good if best and fold in best.good]
         if best is None or len(both) < 2:
             return None
         (ours, steps), (theirs, _) = self.arrays(both), best.arrays(both)
         margin = paired(ours, theirs, steps)
         return margin["nats_per_step"], margin["standard_error"]
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 def hopeless(candidates: Sequence[Candidate], scores: Sequence[Score]) -> set[int]:
@@ -202,3 +199,74 @@ def _row(row: Row, best: Row | None) -> dict[str, Any]:
         "not_converged": len(row.unconverged),
         "folds": [{"fold": fold, "log_likelihood_per_step": value} for fold, value in row.folds.items()],
     }
+
+
+def table(choice: Choice, title: str | None = None) -> Table:
+    """A row for each candidate."""
+    head = ["Candidate", "Parameters", "Held-out nats/step", "Minus the best", "Gradient steps", "Folds", ""]
+    return Table(head, [_cells(row, choice) for row in choice.rows], {0, 6}, title)
+
+
+def _cells(row: Row, choice: Choice) -> list[str]:
+    mean = "–" if row.mean is None else f"{number(row.mean, 3)} ± {number(row.error, 3)}"
+    difference = "–"
+    if row.difference is not None and row is not choice.best:
+        difference = f"{signed(row.difference[0], 3)} ± {number(row.difference[1], 3)}"
+    marks = [name for name, marked in (("best", choice.best), ("chosen", choice.chosen)) if marked is row]
+    marks += [] if row.status == "scored" else [row.status]
+    marks += [f"not converged in {len(row.unconverged)}"] if row.unconverged else []
+    took = [number(row.gradient_steps, 0), str(len(row.folds))]
+    return [row.candidate.name, str(row.candidate.parameters), mean, difference, *took, ", ".join(marks)]
+
+
+def markdown(choice: Choice, data: Mapping[str, Any]) -> str:
+    """Table, rule, failed folds and notes.
+
+    :param data: the contents of ``selection.json``.
+    """
+    intro = (
+        f"{data['folds']}-fold cross-validation over {data['demonstrations']} demonstrations, with the same folds for "
+        "every candidate. Log-likelihood in nats: one nat more per step means that the control of a step is e = 2.7 "
+        "times as probable. ± is one standard error over the folds; gradient steps are the mean of a fold."
+    )
+    lines = [data["rule"] + ".", *([data["stop_early"] + "."] if data["stop_early"] else [])]
+    lines += [f"**Failed:** {one['name']}, fold {one['fold']}: {one['reason']}" for one in data["failed"]]
+    lines += [f"**Note:** {note}." for note in choice.notes]
+    return Page("Selection", [Text(intro), table(choice), *map(Text, lines)], []).markdown()
+
+
+def write_figure(choice: Choice, path: Path) -> None:
+    """Draw the choice as PNG; nothing where no candidate was scored."""
+    if any(row.mean is not None for row in choice.rows):
+        with style():
+            save(draw(choice), path, "Held-out log-likelihood of each candidate, and paired differences to the best")
+
+
+def draw(choice: Choice) -> Figure:
+    """Log-likelihood of each candidate with the band of one standard error below the best, and paired differences."""
+    best, band = choice.best, None
+    if best and best.mean is not None and best.error is not None:
+        band = (best.mean - best.error, best.mean)
+    means: list[Interval | None] = []
+    differences: list[Interval | None] = []
+    for row in choice.rows:
+        looks: dict[str, Any] = {
+            "marker": "D" if row is best else "s" if row is choice.chosen else "o",
+            "colour": ACCENT if row is choice.chosen else INK if row.status == "scored" else FAINT,
+        }
+        best_folds = best.folds if best else {}
+        each = [value - best_folds[fold] for fold, value in row.folds.items() if fold in best_folds]
+        points = list(row.folds.values())
+        means.append(None if row.mean is None else Interval.around(row.mean, row.error, points, **looks))
+        differences.append(row.difference and Interval.around(*row.difference, each, **looks))
+    panels = [
+        Panel("Each candidate, ± one standard error", "held-out log-likelihood (nats per step)", means, band=band),
+        Panel("Minus the best, ± one standard error", "nats per step above the best, same folds", differences, line=0),
+    ]
+    marks = (
+        "diamond: best; orange: chosen, the smallest within one standard error of the best (band); dots: single folds"
+    )
+    notes = [line for note in choice.notes for line in textwrap.wrap(f"Note: {note}.", 150)]
+    status = {"scored": "", "failed": " (failed)", "stopped": " (stopped)"}
+    names = [f"{row.candidate.name} ({row.candidate.parameters} parameters){status[row.status]}" for row in choice.rows]
+    return interval_plot(names, panels, [marks, *notes])

@@ -1,32 +1,45 @@
-"""The folds of a cross-validation: the same for every candidate, and kept with the results."""
+"""Folds of a cross-validation: the same for every candidate, trained in parallel, each score kept in a file."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+import math
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from joblib import Parallel, parallel_config
 from sklearn.model_selection import KFold
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import write_text
-from ddco_pyro.errors import BadInput
-from ddco_pyro.evaluation.record_types import Record
-from ddco_pyro.evaluation.schema import read_record
+from ddco_pyro.data.files import Damaged, json_text, write_text
+from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.evaluation.schema import Record, read_record
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.inference.threads import one_thread
+from ddco_pyro.selection.grid import Candidate
+from ddco_pyro.training import processes
 from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.processes import ALL_CORES, BackendError
+from ddco_pyro.training.restarts import train_model
+
+CONNECT_SECONDS = 10
+"""How long a dask scheduler may take to answer."""
 
 
 class FoldError(BadInput):
-    """Demonstrations that cannot be divided as asked, or are divided otherwise in the folder."""
+    """Demonstrations that cannot be divided into so many folds, or a folder that holds other folds."""
 
 
 @dataclass(frozen=True)
 class Folds:
-    """Demonstrations ``demos`` and, for each fold, the names of those that are ``held_out``.
+    """Demonstrations ``demos`` and, for each fold, the names of the ``held_out`` ones.
 
-    :param dimensions: the dimensions of all the demonstrations, so that networks and what they score are the same in
-        every fold, and in the fit that follows.
+    :param dimensions: those of all demonstrations, so that networks are the same in every fold and in the final fit.
     """
 
     demos: Demonstrations
@@ -34,15 +47,14 @@ class Folds:
     dimensions: Dimensions
 
     def split(self, fold: int) -> tuple[Demonstrations, Demonstrations]:
-        """The demonstrations to train with in a fold, and those to score on."""
+        """The training demonstrations and the held-out demonstrations of a fold."""
         out = set(self.held_out[fold])
         train = [name for name in self.demos.names if name not in out]
         return self.demos.select(train), self.demos.select(self.held_out[fold])
 
 
 def divide(demos: Demonstrations, folds: int, seed: int) -> Folds:
-    """Folds over all demonstrations, or over those to train with where the file has masks: what its author set apart to
-    validate with is not touched.
+    """Folds over all demonstrations; over the training ones alone where the file has masks for that.
 
     :raises FoldError: there are fewer demonstrations than folds, or too few to train and tune with.
     """
@@ -52,7 +64,7 @@ def divide(demos: Demonstrations, folds: int, seed: int) -> Folds:
 
 
 def assign(count: int, folds: int, seed: int) -> list[list[int]]:
-    """The numbers of the demonstrations held out in each fold: a partition of 0 to count - 1, as even as can be.
+    """The numbers of the demonstrations held out in each fold: a partition of 0 to count - 1, as even as possible.
 
     :raises FoldError: there are fewer demonstrations than folds, or too few to train and tune with.
     """
@@ -64,19 +76,171 @@ def assign(count: int, folds: int, seed: int) -> list[list[int]]:
     return [sorted(int(row) for row in held_out) for _, held_out in shuffled]
 
 
-def keep(folds: Folds, path: Path) -> None:
-    """Write the folds, or see that those already there are the same.
+class _FoldsFile(Record):
+    folds: list[list[str]]
 
-    :raises Damaged: they cannot be read.
-    :raises FoldError: those are others.
+
+def keep_folds(folds: Folds, path: Path) -> None:
+    """Write the folds, or check that the file holds the same ones.
+
+    :raises Damaged: the file cannot be read.
+    :raises FoldError: the file holds other folds.
     """
     text = json.dumps({"folds": folds.held_out}, indent=1) + "\n"
     if path.exists() and path.read_bytes() != text.encode():
-        read_record(path, _Kept, "remove it and do the same again")
+        read_record(path, _FoldsFile, "remove it and do the same again")
         raise FoldError(f"{path}: another version divided these demonstrations otherwise; choose another --out")
     if not path.exists():
         write_text(path, text)
 
 
-class _Kept(Record):
-    folds: list[list[str]]
+@dataclass(frozen=True)
+class Score:
+    """The result of one fold of one candidate.
+
+    :param log_likelihood: of each demonstration in ``names``, nats; empty where the fold failed.
+    :param steps: of each demonstration.
+    :param failed: why there is no log-likelihood; else empty.
+    :param gradient_steps: of the training.
+    :param converged: whether the last stage of training had converged.
+    :param final: False where the failure may be transient, so that it is not kept.
+    """
+
+    candidate: int
+    fold: int
+    names: tuple[str, ...]
+    steps: tuple[int, ...]
+    log_likelihood: tuple[float, ...] = ()
+    failed: str = ""
+    gradient_steps: int = 0
+    converged: bool = True
+    final: bool = True
+    seconds: float = 0.0
+
+    @property
+    def total(self) -> float:
+        """Log-likelihood of all demonstrations, nats."""
+        return math.fsum(self.log_likelihood)
+
+
+def score(folds: Folds, candidate: Candidate, fold: int) -> Score:
+    """Train a candidate without a fold's demonstrations and score them, on one thread for the same bits anywhere.
+
+    Early stopping and the choice among restarts use a part of the training demonstrations
+    (``training.tune_fraction``). A failure is a part of the score and does not stop other folds.
+    """
+    start = time.perf_counter()
+    training, held_out = folds.split(fold)
+    empty = Score(candidate.number, fold, held_out.names, held_out.lengths)
+    try:
+        with one_thread():
+            trained = train_model(candidate.spec, folds.dimensions, training, held_out=held_out)
+            values = tuple(Fit(candidate.spec, trained.hierarchy).log_likelihood(held_out).tolist())
+        bad = [name for name, value in zip(held_out.names, values, strict=True) if not math.isfinite(value)]
+        if bad:
+            raise Failed(f"the held-out log-likelihood of {', '.join(bad)} is not finite")
+        steps, converged = trained.summary["spent"]["gradient_steps"], trained.summary["converged"]
+        result = replace(empty, log_likelihood=values, gradient_steps=steps, converged=converged)
+    except (BadInput, Failed) as error:
+        result = replace(empty, failed=str(error))
+    except Exception as error:  # other folds go on, and the reason is shown
+        reason = f"unexpected {type(error).__name__}: {' '.join(str(error).split())}"
+        result = replace(empty, failed=reason, final=False)
+    return replace(result, seconds=time.perf_counter() - start)
+
+
+def score_path(folder: Path, candidate: int, fold: int) -> Path:
+    """The file of a score."""
+    return folder / "folds" / f"{candidate:03d}-{fold:02d}.json"
+
+
+def keep_score(folder: Path, score: Score) -> None:
+    """Write a score, whole or not at all, unless its failure may be transient."""
+    if score.final:
+        write_text(score_path(folder, score.candidate, score.fold), json_text(asdict(score)))
+
+
+def kept_score(folder: Path, candidate: int, fold: int) -> Score | None:
+    """The score in the folder, if there is one.
+
+    :raises Damaged: the file cannot be read.
+    """
+    path = score_path(folder, candidate, fold)
+    if not path.exists():
+        return None
+    remedy = "remove it and do the same again: this fold alone is trained anew"
+    score = read_record(path, Score, remedy)
+    lengths = (len(score.steps), len(score.names) if score.failed else len(score.log_likelihood))
+    if (score.candidate, score.fold) != (candidate, fold) or {*lengths} != {len(score.names)} or 0 in score.steps:
+        raise Damaged(path, "is not the score of this candidate and fold", remedy)
+    return score
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Where folds are trained: in ``jobs`` processes here (-1: one for each core), or by a dask ``scheduler``.
+
+    :raises BackendError: ``jobs`` is not a number of processes.
+    """
+
+    jobs: int = ALL_CORES
+    scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        processes.check_jobs(self.jobs)
+
+    @contextmanager
+    def pool(self) -> Iterator[Parallel]:
+        """Processes for :func:`scores`.
+
+        :raises BackendError: dask is not installed, no scheduler answers, or the scheduler has no workers.
+        """
+        with ExitStack() as stack:
+            if self.scheduler is not None:
+                stack.enter_context(_client(self.scheduler))
+                stack.enter_context(parallel_config(backend="dask"))
+            yield stack.enter_context(processes.pool(self.jobs))
+
+    def check(self) -> None:
+        """Check that the scheduler and its workers answer.
+
+        :raises BackendError: as :meth:`pool`.
+        """
+        if self.scheduler is not None:
+            with _client(self.scheduler):
+                pass
+
+
+@contextmanager
+def _client(scheduler: str) -> Iterator[None]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise BackendError("--backend dask: dask is not installed; pip install 'ddco-pyro[dask]'") from None
+    try:
+        client = Client(scheduler, timeout=CONNECT_SECONDS)
+    except (OSError, ValueError) as error:
+        raise BackendError(
+            f"--scheduler {scheduler}: no dask scheduler answers there within {CONNECT_SECONDS} s; start one with: "
+            "dask scheduler"
+        ) from error
+    with client:
+        if not client.ncores():
+            raise BackendError(f"--scheduler {scheduler}: has no workers; start some with: dask worker {scheduler}")
+        yield
+
+
+def scores(pool: Parallel, folds: Folds, pending: Sequence[tuple[Candidate, int]]) -> Iterator[Score]:
+    """The score of each (candidate, fold), in the order in which they finish.
+
+    :raises Failed: a process died.
+    """
+    # The demonstrations are bound into the function. As an argument, dask would store them with one worker and lose
+    # them with the worker.
+    calls = [partial(score, folds, candidate, fold) for candidate, fold in pending]
+    yield from processes.results(
+        pool,
+        calls,
+        "a process that trained a fold was ended from outside (too little memory?); finished folds are kept: "
+        "continue with --resume, with fewer --jobs if memory was short",
+    )

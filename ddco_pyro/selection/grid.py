@@ -1,4 +1,4 @@
-"""The candidates of a selection: one for each point of the grid, all of them valid before any work starts."""
+"""The candidates of a selection, one for each point of the grid; all are checked before any work starts."""
 
 from __future__ import annotations
 
@@ -7,19 +7,23 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from ddco_pyro.data.control_parts import control_parts, difference
+from ddco_pyro.data.controls import control_parts, difference
 from ddco_pyro.spec import Spec, SpecError, with_overrides
-from ddco_pyro.spec.messages import show
-from ddco_pyro.training.networks import Dimensions, build_hierarchy, parameters
+from ddco_pyro.spec.base import show
+from ddco_pyro.training.networks import Dimensions, check_networks, parameters
 
 DATA = ("task", "demonstrations")
-"""What all candidates have to share, because they are compared on the same demonstrations."""
+"""Keys that all candidates share, as they are compared on the same demonstrations."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One point of the grid: its ``number`` (from 0), the ``values`` at the grid's key paths, the whole ``spec`` with
-    them, and the number of trained ``parameters``.
+    """One point of the grid.
+
+    :param number: from 0.
+    :param values: by key path of the grid.
+    :param spec: the whole spec with these values.
+    :param parameters: the number of trained parameters.
     """
 
     number: int
@@ -29,12 +33,12 @@ class Candidate:
 
     @property
     def name(self) -> str:
-        """What it is called in tables, such as ``count = 3``."""
+        """The candidate's name in tables, such as ``count = 3``."""
         return ", ".join(f"{_short(path, self.values)} = {_value(value)}" for path, value in self.values.items())
 
 
 def _short(path: str, paths: Iterable[str]) -> str:
-    """As much of the end of a key path as tells it from the others."""
+    """The shortest end of a key path that no other one has."""
     others = [f".{other}" for other in paths if other != path]
     parts = path.split(".")
     for start in range(len(parts) - 1, 0, -1):
@@ -45,7 +49,7 @@ def _short(path: str, paths: Iterable[str]) -> str:
 
 
 def _value(value: Any) -> str:
-    """A value of the grid in a few words: a list of levels as their numbers of options, lowest first."""
+    """A value of the grid; a list of levels as their numbers of options, lowest first."""
     levels = value if isinstance(value, list | tuple) else ()
     if levels and all(isinstance(level, Mapping) and "count" in level for level in levels):
         return f"[{', '.join(str(level['count']) for level in levels)}]"
@@ -53,7 +57,7 @@ def _value(value: Any) -> str:
 
 
 def wide(spec: Spec) -> Spec:
-    """The spec with every observation that a candidate sees, for reading the demonstrations once for all."""
+    """The spec with the observations of all candidates, for reading the demonstrations once."""
     alone = with_overrides(spec, {"selection.grid": {}})
     seen = {obs.key: obs for obs in spec.observations}
     for path, values in spec.selection.grid.items():
@@ -90,7 +94,7 @@ def candidates(spec: Spec, dimensions: Dimensions) -> list[Candidate]:
 
 
 def _refuse_other_measures(candidates: Sequence[Candidate], dimensions: Dimensions) -> None:
-    """A density cannot be ranked against a probability.
+    """Refuse to rank densities against probabilities.
 
     :raises SpecError: candidates model a control dimension as different kinds.
     """
@@ -110,4 +114,4 @@ def _where(grid: Mapping[str, Any], values: tuple[Any, ...]) -> str:
 def _candidate(number: int, values: dict[str, Any], spec: Spec, dimensions: Dimensions) -> Candidate:
     alone: dict[str, Any] = {"selection.grid": {}, "compare_with": []}  # baselines are compared, not selected
     own = with_overrides(spec, alone | values)
-    return Candidate(number, values, own, parameters(build_hierarchy(own, dimensions)))
+    return Candidate(number, values, own, parameters(check_networks(own, dimensions)))

@@ -11,7 +11,7 @@ from typing import Any
 
 from ddco_pyro.data.demonstrations import DemonstrationsError
 from ddco_pyro.data.hdf5 import opened
-from ddco_pyro.data.resumable import Parts, parts_of
+from ddco_pyro.data.sources.robomimic import Parts, parts_of
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.simulation.episodes import run_episodes, summarize

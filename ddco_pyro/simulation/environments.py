@@ -24,7 +24,7 @@ from gymnasium import spaces
 
 from ddco_pyro.errors import BadInput
 from ddco_pyro.simulation.task import Policy, Task, find_task
-from ddco_pyro.spec.types import TASKS
+from ddco_pyro.spec.base import TASKS
 
 NAMESPACE = "ddco"
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 import numpy as np
 
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.spec.types import TASKS
+from ddco_pyro.spec.base import TASKS
 
 if TYPE_CHECKING:  # one's own demonstrations need no simulator
     import dm_env

@@ -1,12 +1,11 @@
-"""The declarative spec: YAML in, one frozen and fully validated :class:`Spec` out. Nothing else reads YAML.
+"""The declarative spec: YAML in, one frozen and validated :class:`Spec` out.
 
 An unknown key, a wrong type or a value out of range is a :class:`SpecError` with one line for each problem.
 """
 
-from ddco_pyro.spec.hierarchy import BaselineSpec, HierarchySpec, LevelSpec
-from ddco_pyro.spec.messages import SpecError
-from ddco_pyro.spec.networks import Activation, ConvolutionLayer, MetaPolicySpec, NetworkSpec, PolicySpec, Pool
-from ddco_pyro.spec.reading import dump_spec, load_spec, spec_schema
+from ddco_pyro.spec.base import SpecError
+from ddco_pyro.spec.model import BaselineSpec, HierarchySpec, LevelSpec
+from ddco_pyro.spec.networks import Activation, ConvolutionLayer, NetworkSpec, PolicySpec, Pool, network_spec
 from ddco_pyro.spec.settings import (
     STEP,
     AugmentSpec,
@@ -21,9 +20,9 @@ from ddco_pyro.spec.settings import (
     RolloutSpec,
     SelectionSpec,
 )
-from ddco_pyro.spec.training import DurationSpec, LabelsSpec, OptimizerSpec, TrainingSpec
-from ddco_pyro.spec.user_code import user_code
-from ddco_pyro.spec.whole import Spec, parse_spec, with_overrides
+from ddco_pyro.spec.spec import Spec, parse_spec, with_overrides
+from ddco_pyro.spec.training import DurationSpec, LabelsSpec, OptimizerSpec, RidgeSpec, TrainingSpec
+from ddco_pyro.spec.yaml import dump_spec, load_spec, spec_schema, user_code
 
 __all__ = [
     "STEP",
@@ -39,7 +38,6 @@ __all__ = [
     "LabelsSpec",
     "LearnedStd",
     "LevelSpec",
-    "MetaPolicySpec",
     "NetworkSpec",
     "ObservationSpec",
     "OptimizerSpec",
@@ -48,6 +46,7 @@ __all__ = [
     "PolicySpec",
     "Pool",
     "ReportSpec",
+    "RidgeSpec",
     "RolloutSpec",
     "SelectionSpec",
     "Spec",
@@ -55,6 +54,7 @@ __all__ = [
     "TrainingSpec",
     "dump_spec",
     "load_spec",
+    "network_spec",
     "parse_spec",
     "spec_schema",
     "user_code",

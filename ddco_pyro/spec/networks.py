@@ -1,29 +1,30 @@
-"""The networks that a spec can name, the settings of each, and the policies made of them.
+"""Settings of networks: one model for each kind, joined in the tagged union :data:`NetworkSpec`.
 
-The settings of a network are the keyword arguments of its class in :mod:`ddco_pyro.model.networks`. Their types,
-defaults and bounds stand here and nowhere else: reading a spec, or its schema, is to do without importing torch.
+The settings are the keyword arguments of the network's class in :mod:`ddco_pyro.model.networks`. Types, defaults and
+bounds are declared here alone, so that a spec and its schema are read without importing torch.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
-    ConfigDict,
+    Discriminator,
     Field,
     SerializerFunctionWrapHandler,
-    ValidationInfo,
+    Tag,
+    TypeAdapter,
     field_validator,
     model_serializer,
     model_validator,
 )
 
 from ddco_pyro.errors import nearest
-from ddco_pyro.spec.messages import invalid
-from ddco_pyro.spec.types import Count, Emission, Items, Model, NetworkName, Share, Text
+from ddco_pyro.spec.base import Count, Emission, Importable, Items, Model, Share, Text, invalid, tag_of
 
 USER_DEFINED = "module:Class"
 _USER_DEFINED_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
@@ -34,7 +35,7 @@ Sizes = Annotated[
         lambda value: (value,) if type(value) is int else value, json_schema_input_type=Count | Items[Count]
     ),
 ]
-"""Sizes of layers; a bare number is a single one."""
+"""Sizes of layers; a bare number is a single layer."""
 Pool = Literal["mean", "flatten", "spatial_softmax"]
 Activation = Literal["relu", "leaky_relu", "elu", "tanh"]
 
@@ -42,183 +43,39 @@ Activation = Literal["relu", "leaky_relu", "elu", "tanh"]
 class Network(Model):
     """The settings that every network has."""
 
-    network: NetworkName = "mlp"
-    """The kind of network; ``module:Class`` for a network of your own."""
+    network: str
+    """The kind of network; ``module:Class`` for your own class."""
     inputs: Items[Text] = ()
-    """Names of the observations that it reads; all of them where none is named."""
+    """Names of the observations that the network reads; empty: all of them."""
     shared: bool = False
-    """Whether all options have this network in common, with the same weights; for a trunk, and for networks in ``of``
-    and ``over``, of which every option makes its own."""
-
-
-class Perceptron(Network):
-    """Settings of a multi-layer perceptron."""
-
-    hidden: Sizes = Field(default=(64,), validate_default=True)
-    """Sizes of the hidden layers, first one first; a bare number is a single layer. Those of ``lstm`` remember."""
-    dropout: Share = 0.0
-    """Probability with which a unit is dropped while training."""
-    activation: Activation = "relu"
-    """What follows every hidden layer and every convolution. A unit of ``relu`` that is 0 for all that is observed has
-    no gradient any more and stays so; those of ``leaky_relu`` (slope 0.01 below 0), ``elu`` and ``tanh`` keep one."""
-
-
-class ConvolutionLayer(Model):
-    """One convolution, with the activation of its network after it."""
-
-    filters: Count
-    """Number of filters."""
-    kernel: Count
-    """Height and width of each filter."""
-    stride: Count = 1
-    """Rows and columns from one place of a filter to the next."""
-    padding: int = Field(default=0, ge=0)
-    """Zeros added on each side."""
-
-
-class Convolution(Perceptron):
-    """Settings of convolutions followed by a perceptron."""
-
-    filters: Count = 64
-    """Number of filters of a single convolution with stride 2."""
-    kernel: Count = 5
-    """Height and width in pixels of each filter of a single convolution."""
-    layers: Items[ConvolutionLayer] = ()
-    """Several convolutions, first one first, in place of ``filters`` and ``kernel``."""
-    pool: Pool = "mean"
-    """What is read of each map: ``mean`` of ``pooled`` × ``pooled`` fields, ``flatten`` for all of it, or the place
-    where it is active, ``spatial_softmax``."""
-    pooled: Count = 8
-    """Fields by side."""
-    standardize: bool = False
-    """Whether each picture is shifted and scaled to mean 0 and standard deviation 1 over its own pixels and colours."""
-
-
-class Recurrent(Network):
-    """Settings of an LSTM."""
-
-    over: NetworkSpec | None = None
-    """The network whose last hidden layer it reads; null: it reads the observed vectors."""
-    hidden: Sizes = (64,)
-    horizon: Count | None = None
-    """The memory starts anew every so many steps of a trajectory, counted from its first; null: never."""
-
-
-class Branched(Perceptron):
-    """Settings of several networks whose last hidden layers are joined by a perceptron."""
-
-    of: dict[str, NetworkSpec] = Field(default={})
-    """A network for each observation, by the observation's name; under another name one that says what it reads in
-    ``inputs``."""
-
-
-class UserDefined(Network):
-    """Settings of a user's class."""
-
-    options: dict[str, Any] = Field(default={})
-    """Keyword arguments of the class."""
-    features: Count = 64
-    """Outputs of each copy where another network reads them."""
-
-
-SETTINGS: dict[str, type[Network]] = {
-    "linear": Network,
-    "mlp": Perceptron,
-    "per_timestep": Perceptron,
-    "conv": Convolution,
-    "lstm": Recurrent,
-    "branches": Branched,
-}
-"""The built-in networks by name; every other name is a user's ``module:Class``."""
-LAYERED = ("lstm", "branches")
-"""Those that need a hidden layer."""
-
-
-def foreign_keys(network: Any) -> tuple[str, ...]:
-    """The settings that do not apply to a network of this kind."""
-    kind = SETTINGS.get(network, UserDefined) if isinstance(network, str) else Network
-    return tuple(key for key in NetworkSpec.model_fields if key not in kind.model_fields)
-
-
-def _describe_kinds(schema: dict[str, Any]) -> None:
-    """Adds to a JSON Schema which networks there are, and which of them have each setting."""
-    properties = schema["properties"]
-    del properties["network"]["type"]
-    properties["network"]["anyOf"] = [{"enum": list(SETTINGS)}, {"type": "string", "pattern": _USER_DEFINED_PATTERN}]
-    kinds: dict[str, type[Network]] = {**SETTINGS, USER_DEFINED: UserDefined}
-    for key in NetworkSpec.model_fields.keys() - Network.model_fields.keys():
-        names = ", ".join(f"``{name}``" for name, kind in kinds.items() if key in kind.model_fields)
-        properties[key]["description"] += f" For {names}."
-
-
-class NetworkSpec(UserDefined, Convolution, Recurrent, Branched):
-    """A network from observations to the parameters of a distribution. Settings of other networks are refused."""
-
-    model_config = ConfigDict(json_schema_extra=_describe_kinds)
+    """Whether all options use one copy of the network. For trunks, and for networks in ``of`` and ``over``."""
+    emits: Items[Emission] = Field(default=(), min_length=1)
+    """For policies: what they choose. The lowest level emits ``[control]``. Policies above emit ``options`` (the
+    default), ``control``, or both, which makes a hybrid policy."""
 
     @property
     def settings(self) -> dict[str, Any]:
         """Keyword arguments of the network's class."""
-        if self.network not in SETTINGS:
-            return self.options
-        kind = SETTINGS[self.network]
-        return {key: getattr(self, key) for key in kind.model_fields if key not in Network.model_fields}
+        return {key: getattr(self, key) for key in type(self).model_fields if key not in Network.model_fields}
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Names of the observations that it reads, itself or through others; all of them where there is none."""
-        if self.inputs:
-            return self.inputs
-        if self.over is not None:
-            return self.over.reads
-        branches = (branch.inputs or (name,) for name, branch in self.of.items())
-        return tuple(dict.fromkeys(name for names in branches for name in names))
+        """Names of the observations that the network and its parts read; empty: all of them."""
+        return self.inputs
 
-    @field_validator("network")
+    @property
+    def hidden_sizes(self) -> tuple[int, ...]:
+        """Sizes of the hidden layers; empty for networks without the setting ``hidden``."""
+        return getattr(self, "hidden", ())
+
+    @model_validator(mode="before")
     @classmethod
-    def _known_network(cls, name: str) -> str:
-        if name not in SETTINGS and (name == USER_DEFINED or not re.fullmatch(_USER_DEFINED_PATTERN, name)):
-            names = [*SETTINGS, USER_DEFINED]
-            raise invalid(("", f"no network is called {name!r}{nearest(name, names)}; use one of {', '.join(names)}"))
-        return name
-
-    @field_validator("hidden")
-    @classmethod
-    def _hidden_layers(cls, hidden: tuple[int, ...], info: ValidationInfo) -> tuple[int, ...]:
-        return () if "hidden" in foreign_keys(info.data.get("network")) else hidden
-
-    @model_validator(mode="after")
-    def _settings_apply(self) -> NetworkSpec:
-        given = [key for key in foreign_keys(self.network) if key in self.model_fields_set]
-        if given:
-            raise invalid(*((key, f"does not apply to network {self.network!r}; leave it out") for key in given))
-        if self.network in LAYERED and not self.hidden:
-            raise invalid(("hidden", f"{self.network} has one layer at least; give its size"))
-        if self.network == "branches" and not self.of:
-            raise invalid(("of", "missing; name an observation and its network, such as {state: {network: mlp}}"))
-        twice = [key for key in ("filters", "kernel") if self.layers and key in self.model_fields_set]
-        if twice:
-            raise invalid(*((key, "stands beside layers, which say it of each; leave it out") for key in twice))
-        return self
-
-    @model_serializer(mode="wrap")
-    def _without_foreign_keys(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        fields: dict[str, Any] = serialize(self)
-        unused = (*foreign_keys(self.network), *(key for key in ("inputs", "shared") if not getattr(self, key)))
-        unused += ("filters", "kernel") if self.layers else ("layers",)
-        return {key: value for key, value in fields.items() if key not in unused}
-
-
-Recurrent.model_rebuild()
-Branched.model_rebuild()
-
-
-class PolicySpec(NetworkSpec):
-    """The policy of a level: it emits the control (lowest level) or selects from the level below."""
-
-    emits: Items[Emission] = Field(default=(), min_length=1)
-    """What the policy chooses: ``[control]`` at the lowest level (filled in), above it ``options`` (the default),
-    ``control``, or both for a hybrid policy."""
+    def _settings_apply(cls, data: Any) -> Any:
+        if isinstance(data, dict) and (name := data.get("network", "mlp")) and isinstance(name, str):
+            foreign = [key for key in foreign_keys(name) if key in data]
+            if foreign:
+                raise invalid(*((key, f"does not apply to network {name!r}; leave it out") for key in foreign))
+        return data
 
     @field_validator("emits")
     @classmethod
@@ -228,9 +85,193 @@ class PolicySpec(NetworkSpec):
                 raise invalid(("", f"{name!r} is given twice; keep one"))
         return emits
 
+    @model_serializer(mode="wrap")
+    def _without_empty(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        optional = ("inputs", "shared", "emits")
+        return {key: value for key, value in serialize(self).items() if value or key not in optional}
 
-class MetaPolicySpec(PolicySpec):
-    """The policy at the top, η: it selects from the highest level."""
 
-    emits: Items[Emission] = Field(default=("options",), min_length=1)
-    """What the meta-policy chooses: ``options``, ``control``, or both for a hybrid policy."""
+class LinearSpec(Network):
+    """A linear map."""
+
+    network: Literal["linear"]
+
+
+class MlpSpec(Network):
+    """A multi-layer perceptron."""
+
+    network: Literal["mlp"] = "mlp"
+    hidden: Sizes = (64,)
+    """Sizes of the hidden layers, first layer first; a bare number is a single layer."""
+    dropout: Share = 0.0
+    """Probability with which a hidden unit is dropped in training."""
+    activation: Activation = "relu"
+    """Activation after every hidden layer and every convolution. A ``relu`` unit that is 0 for all observations gets no
+    gradient and stays 0; ``leaky_relu`` (slope 0.01 below 0), ``elu`` and ``tanh`` keep a gradient."""
+
+
+class PerTimestepSpec(MlpSpec):
+    """A perceptron for each time step."""
+
+    network: Literal["per_timestep"]  # type: ignore[assignment]
+
+
+class ConvolutionLayer(Model):
+    """One convolution, followed by the activation of its network."""
+
+    filters: Count
+    """Number of filters."""
+    kernel: Count
+    """Height and width of each filter, pixels."""
+    stride: Count = 1
+    """Pixels from one position of a filter to the next."""
+    padding: int = Field(default=0, ge=0)
+    """Zeros added on each side."""
+
+
+class ConvSpec(MlpSpec):
+    """Convolutions followed by a perceptron."""
+
+    network: Literal["conv"]  # type: ignore[assignment]
+    filters: Count = 64
+    """Number of filters of a single convolution with stride 2."""
+    kernel: Count = 5
+    """Height and width in pixels of each filter of a single convolution."""
+    layers: Items[ConvolutionLayer] = ()
+    """Several convolutions, first layer first, in place of ``filters`` and ``kernel``."""
+    pool: Pool = "mean"
+    """What is read of each map: the ``mean`` of ``pooled`` × ``pooled`` fields, all of the map (``flatten``), or the
+    place where the map is active (``spatial_softmax``)."""
+    pooled: Count = 8
+    """Number of fields along each side of a map."""
+    standardize: bool = False
+    """Whether each picture is shifted and scaled to mean 0 and standard deviation 1 over its pixels and channels."""
+
+    @model_validator(mode="after")
+    def _one_kind_of_layers(self) -> ConvSpec:
+        twice = [key for key in ("filters", "kernel") if self.layers and key in self.model_fields_set]
+        if twice:
+            raise invalid(*((key, "each of layers has its own; leave it out") for key in twice))
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_empty(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        unused = ("filters", "kernel") if self.layers else ("layers",)
+        return {key: value for key, value in super()._without_empty(serialize).items() if key not in unused}
+
+
+class LstmSpec(Network):
+    """An LSTM."""
+
+    network: Literal["lstm"]
+    over: NetworkSpec | None = None
+    """The network whose last hidden layer the LSTM reads; null: the LSTM reads the vector observations."""
+    hidden: Annotated[Sizes, Field(min_length=1)] = (64,)
+    """Sizes of the recurrent layers, first layer first; a bare number is a single layer."""
+    horizon: Count | None = None
+    """Number of steps after which the state is reset, counted from a trajectory's first step; null: never."""
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Names of the observations that the LSTM or the network below it reads."""
+        return self.inputs or (self.over.reads if self.over else ())
+
+
+class BranchesSpec(MlpSpec):
+    """Several networks whose last hidden layers are joined by a perceptron."""
+
+    network: Literal["branches"]  # type: ignore[assignment]
+    of: dict[str, NetworkSpec] = Field(min_length=1)
+    """A network for each observation, by the observation's name. A network under another name lists its observations in
+    ``inputs``."""
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Names of the observations that the branches read."""
+        names = (name for key, branch in self.of.items() for name in branch.inputs or (key,))
+        return self.inputs or tuple(dict.fromkeys(names))
+
+
+class UserNetworkSpec(Network):
+    """A network class of your own."""
+
+    network: Annotated[str, Importable(), Field(json_schema_extra={"pattern": _USER_DEFINED_PATTERN})]
+    """The class, as ``module:Class``."""
+    options: dict[str, Any] = Field(default={})
+    """Keyword arguments of the class."""
+    features: Count = 64
+    """Number of outputs of each copy where another network reads the class as a trunk."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Keyword arguments of the class."""
+        return self.options
+
+    @field_validator("network")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        if name == USER_DEFINED or not re.fullmatch(_USER_DEFINED_PATTERN, name):
+            names = [*SETTINGS, USER_DEFINED]
+            raise invalid(("", f"no network is called {name!r}{nearest(name, names)}; use one of {', '.join(names)}"))
+        return name
+
+
+SETTINGS: dict[str, type[Network]] = {
+    "linear": LinearSpec,
+    "mlp": MlpSpec,
+    "per_timestep": PerTimestepSpec,
+    "conv": ConvSpec,
+    "lstm": LstmSpec,
+    "branches": BranchesSpec,
+}
+"""The built-in networks by name; any other name is a :class:`UserNetworkSpec`."""
+
+
+def foreign_keys(network: str) -> tuple[str, ...]:
+    """The settings of other networks that do not apply to ``network``."""
+    kinds: tuple[type[Network], ...] = (*SETTINGS.values(), UserNetworkSpec)
+    own = SETTINGS.get(network, UserNetworkSpec).model_fields
+    return tuple(dict.fromkeys(key for kind in kinds for key in kind.model_fields if key not in own))
+
+
+def _tag(value: Any) -> str:
+    name = value.get("network", "mlp") if isinstance(value, dict) else getattr(value, "network", "mlp")
+    return tag_of(SETTINGS.get(name, UserNetworkSpec) if isinstance(name, str) else UserNetworkSpec)
+
+
+def _emits_nothing(network: Network) -> Network:
+    if network.emits:
+        raise invalid(("emits", "is a setting of policies; leave it out"))
+    return network
+
+
+PolicySpec: TypeAlias = Annotated[
+    Annotated[LinearSpec, Tag(tag_of(LinearSpec))]
+    | Annotated[MlpSpec, Tag(tag_of(MlpSpec))]
+    | Annotated[PerTimestepSpec, Tag(tag_of(PerTimestepSpec))]
+    | Annotated[ConvSpec, Tag(tag_of(ConvSpec))]
+    | Annotated[LstmSpec, Tag(tag_of(LstmSpec))]
+    | Annotated[BranchesSpec, Tag(tag_of(BranchesSpec))]
+    | Annotated[UserNetworkSpec, Tag(tag_of(UserNetworkSpec))],
+    Discriminator(_tag),
+]
+"""A network that is a policy: its setting ``emits`` says what the policy chooses."""
+
+NetworkSpec: TypeAlias = Annotated[PolicySpec, AfterValidator(_emits_nothing)]
+"""A network from observations to numbers, such as the parameters of a distribution or features."""
+
+LstmSpec.model_rebuild()
+BranchesSpec.model_rebuild()
+
+_ANY: TypeAdapter[NetworkSpec] = TypeAdapter(NetworkSpec)
+
+
+def network_spec(**settings: Any) -> NetworkSpec:
+    """The validated settings of a network.
+
+    >>> network_spec(network="mlp", hidden=32).hidden
+    (32,)
+
+    :raises pydantic.ValidationError: a setting is invalid or does not apply to the network.
+    """
+    return _ANY.validate_python(settings)

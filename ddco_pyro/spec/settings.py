@@ -1,4 +1,4 @@
-"""What a spec says beside the model and its training: data, control, evaluation."""
+"""Settings of data, control and evaluation."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, TypeAdapter, model_validator
 
-from ddco_pyro.spec.messages import invalid
-from ddco_pyro.spec.types import Count, Items, Model, Positive, Seed, Share, TaskName, Text, bare, nested
+from ddco_pyro.spec.base import Count, Items, Model, Positive, Seed, Share, TaskName, Text, bare, invalid, nested
 
 LabelNames = Annotated[Items[Text], Field(min_length=1)]
 Labels = Annotated[
@@ -22,12 +21,12 @@ Labels = Annotated[
 
 
 class DemonstrationsSpec(Model):
-    """Where the demonstrations come from: a file, or the task's supervisor."""
+    """The demonstrations: read from a file, or collected from the task's supervisor."""
 
     path: Text | None = None
-    """HDF5 file in robomimic's layout; without it they are collected in the task."""
+    """HDF5 file in robomimic's layout; null: demonstrations are collected in the task."""
     task: TaskName | None = None
-    """Task in which they are collected, such as one whose episodes are single demonstrations; null: the spec's own."""
+    """Task in which demonstrations are collected; null: the spec's ``task``."""
     count: int = Field(default=100, ge=2)
     """Number of demonstrations to collect."""
     seed: Seed = 0
@@ -35,21 +34,21 @@ class DemonstrationsSpec(Model):
     supervisor: Text = "supervisor"
     """Which of the task's scripted policies is recorded."""
     valid_fraction: Share = 0.1
-    """Part of the demonstrations held out for validation, where the file has no ``mask/valid``; 0 for none."""
+    """Fraction of the demonstrations held out for validation, unless the file has ``mask/valid``; 0 for none."""
     exclude: Items[Text] = ()
-    """Names of demonstrations that are left out, whatever they hold."""
+    """Names of demonstrations that are not read."""
     labels: Labels | None = None
-    """Ground-truth labels in the file with which the discovered options are compared: a name for every level, or a list
-    with a name for each, the lowest level first. Steps labelled −1 are left out."""
+    """Ground-truth labels in the file, with which discovered options are compared: one name for all levels, or a list
+    with a name for each level, lowest first. Steps labelled −1 are ignored."""
 
     @property
     def label_names(self) -> tuple[str, ...]:
-        """Names of all labels that the demonstrations have to hold, each once."""
+        """Names of all labels that the demonstrations must hold, without duplicates."""
         names = (self.labels,) if isinstance(self.labels, str) else self.labels or ()
         return tuple(dict.fromkeys(names))
 
     def labels_by_level(self, levels: int) -> tuple[str, ...]:
-        """The name of each level's labels, lowest first; nothing where there are none."""
+        """The name of each level's labels, lowest first; empty without labels."""
         return (self.labels,) * levels if isinstance(self.labels, str) else self.labels or ()
 
 
@@ -58,14 +57,14 @@ STEP = "step"
 
 
 class AugmentSpec(Model):
-    """How an observation is varied while networks are trained, and at no other time."""
+    """Data augmentation of an observation, in training alone."""
 
     shift: int = Field(default=0, ge=0)
-    """Pictures alone: pixels, at most, by which all pictures of a trajectory are moved in an epoch, along either axis;
-    the edge is repeated."""
+    """For pictures: the largest shift in pixels along either axis. In an epoch all pictures of a trajectory have the
+    same shift; edge pixels are repeated."""
     versions: Text | None = None
-    """Vectors alone: the key of other versions of it, [T, V, ...], such as features of pictures that were moved. In an
-    epoch all of a trajectory is seen as it is or as one of them, each equally likely."""
+    """For vectors: the key of V other versions, [T, V, ...], such as features of shifted pictures. In an epoch a whole
+    trajectory is read as it is or as one of the versions, all equally likely."""
 
 
 Size = Annotated[Items[Count], Field(min_length=2, max_length=2)]
@@ -73,56 +72,49 @@ Part = Annotated[Items[Annotated[int, Field(ge=0)]], Field(min_length=4, max_len
 
 
 class ObservationSpec(Model):
-    """One observation that the networks see."""
+    """One observation that the networks read."""
 
     key: Text
-    """Name of the observation in the demonstrations; ``step`` is built in, and not read from them."""
+    """Name of the observation in the demonstrations; ``step`` is built in."""
     differences: bool = False
     """Append x_t − x_{t−1}."""
     standardize: bool = True
-    """Shift and scale to mean 0 and standard deviation 1 over the training demonstrations; dimensions that vary by
-    rounding alone, or not at all, are only shifted."""
-
+    """Shift and scale to mean 0 and standard deviation 1 over the training demonstrations. Dimensions that are constant
+    up to rounding are only shifted."""
     bins: Annotated[int, Field(ge=0, le=64)] = 0
-    """Vectors alone: behind its numbers and their differences, each of them again as often as this, cut off at the
-    ends of one of as many parts of its range, which hold as many different values each (a piecewise-linear encoding).
-    So networks see what small differences say in a part of a wide range, as of jaws that are nearly closed, and what
-    differs among the few steps in which a number is not 0."""
-
+    """For vectors: bins of a piecewise-linear encoding, appended to each number and each difference. A bin holds the
+    number clipped to one part of its range; the parts hold equally many distinct values. Networks can then read small
+    differences within a wide range, such as those of nearly closed jaws."""
     crop: Part | None = None
-    """Pictures alone: top, left, height and width of the part that is seen, in the file's pixels; null: all of it."""
+    """For pictures: top, left, height and width of the crop, in the file's pixels; null: no crop."""
     resize: Size | None = None
-    """Pictures alone: height and width to which what is seen is scaled, by the mean over areas; null: as it is."""
+    """For pictures: height and width after the crop is scaled by area averaging; null: not scaled."""
     grey: bool = False
-    """Pictures alone: whether red, green and blue become one luminance."""
+    """For pictures: whether red, green and blue become one luminance channel."""
     frames: Count = 1
-    """Pictures alone: how many are seen together, the last one and those before it, along the channels; before the
-    first step the first one is repeated. A single picture does not tell how fast anything moves."""
+    """For pictures: number of successive pictures stacked along the channels, oldest first. Before the first step the
+    first picture is repeated. A single picture does not show velocities."""
     augment: AugmentSpec | None = None
-    """How it is varied in training; null: not at all."""
+    """Data augmentation in training; null: none."""
 
     @model_validator(mode="after")
-    def _something_is_left(self) -> ObservationSpec:
+    def _settings_apply(self) -> ObservationSpec:
         if self.crop is not None and 0 in self.crop[2:]:
-            raise invalid(("crop", "is top, left, height, width; height and width must be 1 at least"))
-        return self
-
-    @model_validator(mode="after")
-    def _steps_are_even(self) -> ObservationSpec:
+            raise invalid(("crop", "is top, left, height, width; height and width must be at least 1"))
         if self.key == STEP and self.differences:
             raise invalid(("differences", f"{STEP} grows by the same at each step; leave it out"))
         if self.key == STEP and self.augment:
-            raise invalid(("augment", f"{STEP} is made from nothing that could be varied; leave it out"))
+            raise invalid(("augment", f"{STEP} is computed and has no versions; leave it out"))
         return self
 
     @property
     def given(self) -> int:
-        """Of a vector: how many numbers there are for each that is observed."""
+        """For vectors: numbers before bins for each observed number."""
         return 2 if self.differences else 1
 
     @property
     def seen(self) -> int:
-        """Of a vector: how many numbers networks see for each that is observed."""
+        """For vectors: network inputs for each observed number."""
         return self.given * (1 + self.bins)
 
 
@@ -130,23 +122,23 @@ Observation = Annotated[ObservationSpec, bare("key", str | ObservationSpec)]
 
 
 class LearnedStd(Model):
-    """A standard deviation that is learned, one for each level and control dimension."""
+    """A learned standard deviation σ, one for each level and control dimension."""
 
     learn: Literal[True]
     """Always true; for a fixed standard deviation give a number instead of this mapping."""
     floor: Positive = 0.01
     """Lower bound, in scaled units."""
     per_option: bool = False
-    """Whether each option has its own. With ``gaussian`` controls that sit on a bound or a value, one option may
-    collect those steps, whatever the skill; ``clipped``, ``hurdle`` and ``binary`` ones are safe."""
+    """Whether each option has its own σ. ``gaussian`` controls that often equal a bound or value let one option collect
+    those steps, independent of the skill; ``clipped``, ``hurdle`` and ``binary`` controls do not."""
     per_state: bool = False
-    """Whether it depends on the observations: the policy's network gives it beside the mean. Each option, and a flat
-    policy, has its own."""
+    """Whether σ depends on the observations: the policy's network outputs σ beside the mean. Each option, and a flat
+    policy, has its own σ."""
 
     @model_validator(mode="after")
     def _one_of_both(self) -> LearnedStd:
         if self.per_option and self.per_state:
-            raise invalid(("per_option", "per_state gives each option a σ of its own already; leave per_option out"))
+            raise invalid(("per_option", "per_state gives each option its own σ already; leave per_option out"))
         return self
 
 
@@ -170,45 +162,43 @@ Kind = Literal["auto", "gaussian", "clipped", "hurdle", "binary", "categorical"]
 
 
 class PartSpec(Model):
-    """Dimensions of the control that have a distribution of their own."""
+    """Control dimensions with their own distribution."""
 
     name: Text
-    """What the dimensions are called."""
+    """Name of the part."""
     dims: Annotated[Items[Annotated[int, Field(ge=0)]], Field(min_length=1)]
-    """Which dimensions of the control, counted from 0."""
+    """Control dimensions, counted from 0."""
     kind: Kind = "auto"
     """As ``control.kind``."""
     std: Std | None = None
-    """As ``control.std``, which null stands for."""
+    """As ``control.std``; null: the same."""
     scale: Scale | None = None
-    """As ``control.scale``, which null stands for; a list has a number for each of these dimensions."""
+    """As ``control.scale``; null: the same. A list has a number for each dimension of the part."""
     bounds: Annotated[Items[float], Field(min_length=2, max_length=2)] | None = None
-    """``clipped`` and ``hurdle`` alone: the lower and the upper bound, in the control's own units; null: the extremes
-    on which the demonstrations sit."""
+    """For ``clipped`` and ``hurdle``: lower and upper bound, in the control's units; null: the extremes that the
+    demonstrations often reach."""
     value: float | None = None
-    """``hurdle`` alone: the value that each of these dimensions often has exactly; null: the commonest inside its
-    range."""
+    """For ``hurdle``: the value that each dimension often has exactly; null: the commonest value inside the range."""
 
 
 class ControlSpec(Model):
-    """The distribution of the control that a caller emits."""
+    """The distribution of the control."""
 
     kind: Kind = "auto"
-    """``gaussian``: free; ``clipped``: a Gaussian with bounds that it reaches; ``hurdle``: exactly one value with a
-    probability, else free or clipped; ``binary``: a switch between two values; ``categorical``: discrete actions, as
-    integers or rows with a single 1; ``auto``: decided for each dimension from the demonstrations, and shown by
-    ``check``."""
+    """``gaussian``: unbounded; ``clipped``: a Gaussian censored at bounds; ``hurdle``: one exact value with some
+    probability, else Gaussian or clipped; ``binary``: two values; ``categorical``: discrete actions, as integers or
+    one-hot rows; ``auto``: chosen for each dimension from the demonstrations and shown by ``check``."""
     std: Std = 0.1
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``."""
     scale: Scale = "standardize"
-    """``standardize`` (by the training demonstrations), ``none``, or one positive number for each control dimension,
-    by which it is divided."""
+    """``standardize`` (by the training demonstrations), ``none``, or a list with a positive divisor for each control
+    dimension."""
     parts: Items[PartSpec] = ()
-    """Groups of dimensions with a distribution of their own; what is in none of them is as above."""
+    """Groups of dimensions with their own distribution; the settings above hold for all other dimensions."""
 
     @property
     def learned_stds(self) -> dict[str, LearnedStd]:
-        """Every σ that is learned, by its key path in the spec."""
+        """Every learned σ by its key path in the spec."""
         stds = {"control.std": self.std} | {f"control.parts.{n}.std": part.std for n, part in enumerate(self.parts)}
         return {path: std for path, std in stds.items() if isinstance(std, LearnedStd)}
 
@@ -228,7 +218,7 @@ class ControlSpec(Model):
                 raise invalid((f"parts.{number}.scale", problem))
             for setting in ("scale", "std"):
                 if part.kind in ("binary", "categorical") and getattr(part, setting) is not None:
-                    raise invalid((f"parts.{number}.{setting}", f"is of no use to kind: {part.kind}; leave it out"))
+                    raise invalid((f"parts.{number}.{setting}", f"does not apply to kind: {part.kind}; leave it out"))
             if part.bounds is not None and part.kind not in ("clipped", "hurdle"):
                 raise invalid((f"parts.{number}.bounds", "are for kind: clipped or hurdle"))
             if part.bounds is not None and part.bounds[0] >= part.bounds[1]:
@@ -244,7 +234,7 @@ class InferenceSpec(Model):
     """How the latent variables are eliminated."""
 
     engine: Literal["fused", "enumerate"] = "fused"
-    """``fused``: in one compiled pass; ``enumerate``: Pyro's enumeration. Both give the same numbers."""
+    """``fused``: one compiled pass; ``enumerate``: Pyro's enumeration. Both give the same numbers."""
 
 
 class SelectionSpec(Model):
@@ -253,30 +243,30 @@ class SelectionSpec(Model):
     folds: int = Field(default=10, ge=2)
     """Number of folds."""
     grid: dict[str, Annotated[Items[Any], Field(min_length=1)]] = Field(default={})
-    """Key path of this spec to the values to try there."""
+    """Key path in this spec to the values to try."""
 
 
 OptionExecution = Literal["sample", "most_likely", "marginal"]
 
 
 class RolloutSpec(Model):
-    """How the fitted policy is tried in the task."""
+    """How the fitted policy is rolled out in the task."""
 
     episodes: Count = 50
     """Number of episodes."""
     seed: Seed = 1000
-    """Seed of the first episode; the next ones count up from it."""
+    """Seed of the first episode; each following episode adds 1."""
     control: Literal["mean", "sample"] = "mean"
     """Whether the control is the mean of its distribution or a sample."""
     options: OptionExecution = "marginal"
-    """``sample`` selections and terminations, take the ``most_likely`` of each, or act with the options of the largest
-    ``marginal`` probability given all observations so far, in which small probabilities of having ended add up."""
+    """``sample``: sample selections and terminations. ``most_likely``: take the likeliest of each. ``marginal``: act
+    with the options of the largest filtered probability given all observations so far."""
     policies: Items[Text] = ()
-    """Scripted policies of the task that are rolled out beside, such as ``open_loop``."""
+    """Scripted policies of the task that are rolled out for comparison, such as ``open_loop``."""
 
 
 class ReportSpec(Model):
     """What the report shows."""
 
     trajectory: Text | None = None
-    """Observation whose first three numbers are drawn as trajectories in space; null: the one that moves the most."""
+    """Observation whose first three numbers are drawn as spatial trajectories; null: the one that moves most."""

@@ -1,4 +1,4 @@
-"""How a spec has a model trained: optimiser, stages, when to stop, labels and durations."""
+"""Settings of training: optimiser, stages, early stopping, labels and durations."""
 
 from __future__ import annotations
 
@@ -6,48 +6,61 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field, TypeAdapter, model_validator
 
-from ddco_pyro.spec.messages import invalid
-from ddco_pyro.spec.types import Count, Fraction, Items, Model, Positive, Seed, Share, Text, nested
+from ddco_pyro.spec.base import Count, Fraction, Items, Model, Positive, Seed, Share, Text, invalid, nested
+
+
+class RidgeSpec(Model):
+    """Ridges of EM: precisions of a normal prior on the weights of linear maps, biases left out."""
+
+    policy: float = Field(default=1.0, ge=0)
+    """Of the means of controls: as many steps, of observations with unit variance, that say 0; in units of 1/σ²."""
+    gate: float = Field(default=1.0, ge=0)
+    """Of logits: of options, switches and discrete actions."""
+    termination: float = Field(default=1.0, ge=0)
+    """Of terminations."""
 
 
 class OptimizerSpec(Model):
     """The optimiser of the expectation-gradient steps."""
 
-    name: Literal["adam", "adamw", "momentum"] = "adam"
-    """``adam``, ``adamw``, or ``momentum`` for gradient descent with momentum."""
+    name: Literal["adam", "adamw", "momentum", "em"] = "adam"
+    """``adam``, ``adamw``, ``momentum`` for gradient descent with momentum, or ``em``: expectation-maximisation where
+    every network of a model is linear, ``adam`` for other models."""
+    ridge: RidgeSpec = RidgeSpec()
+    """Ridges (``em`` only)."""
     lr: Positive = 1e-3
     """Learning rate."""
     schedule: Literal["constant", "cosine"] = "constant"
-    """``cosine``: in each stage the learning rate falls to 0 at the last epoch that its budget allows, along half a
-    cosine; it needs ``training.epochs``."""
+    """``cosine``: in each stage the learning rate falls along half a cosine to 0 at the last epoch of the stage's
+    budget; needs ``training.epochs``."""
     warmup: int = Field(default=0, ge=0)
-    """Epochs at the beginning of each stage over which the learning rate rises to its value."""
+    """Epochs at the start of each stage over which the learning rate rises to ``lr``."""
     momentum: Share = 0.9
     """Momentum (``momentum`` only)."""
     weight_decay: float = Field(default=0.0, ge=0)
-    """L2 penalty; of ``adamw`` by which part, times the learning rate, every weight shrinks in a step."""
+    """L2 penalty; for ``adamw`` the decoupled weight decay: every weight shrinks by ``lr`` × this in a step."""
 
     @model_validator(mode="after")
     def _momentum_has_its_optimizer(self) -> OptimizerSpec:
         if self.name != "momentum" and self.momentum != type(self).model_fields["momentum"].default:
-            raise invalid(("momentum", f"is for name: momentum, and {self.name} would not use it; leave it out"))
+            raise invalid(("momentum", f"is for name: momentum, and {self.name} does not use it; leave it out"))
         return self
 
 
 class LabelsSpec(Model):
-    """Labels of demonstrations that say which option of a level is active; at steps where a label is -1 it is free."""
+    """Labels that fix the active option of one level; steps labelled −1 are free."""
 
     model_config = ConfigDict(serialize_by_alias=True)
 
     level: Text
     """Name of the level."""
     source: Text = Field(alias="from")
-    """Name of the labels in the file, integers: those from 0 on, sorted, are the options 1, 2, ..."""
+    """Name of the integer labels in the file; the sorted labels from 0 on are the options 1, 2, ..."""
     count: Count | None = None
-    """Number of demonstrations whose labels are used: the first ones in training, those to tune with last; null: all.
-    Those of held-out demonstrations never are."""
+    """Number of demonstrations whose labels are used: training demonstrations in order, then tuning demonstrations.
+    Null: all. Labels of held-out demonstrations are never used."""
     hold: bool = True
-    """Whether labels say which option is active in all of training; false: in initialisation alone."""
+    """Whether labels fix the active option throughout training; false: in initialisation alone."""
 
 
 Duration = Annotated[float, Field(ge=1)]
@@ -55,7 +68,7 @@ Durations = Annotated[Items[Duration], Field(min_length=1)]
 
 
 class DurationSpec(Model):
-    """A prior on how long options last: a Beta distribution of each option's probability ψ to terminate at a step."""
+    """A prior on option durations: a Beta distribution of each option's termination probability ψ."""
 
     mean: Annotated[
         Duration | Durations,
@@ -65,77 +78,88 @@ class DurationSpec(Model):
             "a number of steps, at least 1, or a list of them",
         ),
     ]
-    """Steps that an option lasts on average, 1 / E[ψ]; a list has one for each level, lowest first. A level above the
-    lowest counts the options below it that end instead."""
+    """Mean duration of an option in steps, 1 / E[ψ]; a list has one number for each level, lowest first. Levels above
+    the lowest count terminated options of the level below instead of steps."""
     weight: float = Field(default=1.0, ge=0, le=1e30)
-    """How many selections of each option the prior counts as, beside those in the training demonstrations; 0 for no
-    prior."""
+    """Strength of the prior: the number of pseudo-selections of each option, beside the selections in the training
+    demonstrations; 0 for no prior."""
 
 
 class TrainingSpec(Model):
     """How the model is trained."""
 
     initialize: Literal["vq", "vq_controls", "equal_parts", "random"] = "vq"
-    """``vq``: by vector quantisation of the observations that the options' policies read (SM 2.2); ``vq_controls``: of
-    these and controls; ``equal_parts``: each demonstration cut into as many parts of equal length as there are options,
-    for skills that follow one another; ``random``: random weights."""
+    """``vq``: vector quantisation of the observations that the options' policies read (SM 2.2). ``vq_controls``: vector
+    quantisation of these observations and the controls. ``equal_parts``: each demonstration cut into k parts of equal
+    length, for skills that follow one another. ``random``: random weights."""
     layerwise: bool = True
-    """Discover level after level, lowest first, rather than all at once."""
+    """Whether levels are discovered one after another, lowest first, rather than all at once."""
     upper_levels: Literal["clusters", "segments"] = "clusters"
-    """How levels above the lowest are discovered, layer by layer: ``clusters``: each as the lowest is, after the one
-    below it; ``segments``: all together, from which options of the lowest level follow each other."""
+    """How layer-wise training discovers the levels above the lowest. ``clusters``: each level as the lowest, after the
+    level below. ``segments``: all together, from the order of the lowest level's options."""
     lower_levels: Literal["fine_tuned", "frozen"] = "fine_tuned"
-    """Layer-wise training: whether a last stage trains all levels together, or what was discovered stays as it is."""
+    """Whether a last stage of layer-wise training trains all levels together, or discovered levels stay frozen."""
     optimizer: OptimizerSpec = OptimizerSpec()
     """The optimiser."""
     epochs: Count | None = 800
-    """Passes over the training demonstrations in all stages together, at most: the same budget of gradient steps for
-    every model, whatever its number of stages. A stage may take an even share of what is left; null for no limit but
-    patience."""
+    """Budget of passes over the training demonstrations, all stages together; every model has the same budget. A stage
+    may take an even share of the remaining budget. Null: no limit except ``patience``."""
     average: Annotated[float, Field(gt=0, lt=1)] | None = None
-    """Decay, in every gradient step of a stage, of the running mean of the weights that is evaluated and kept in the
-    place of the last weights; null for the last ones."""
+    """Decay per gradient step of an exponential moving average of the weights, which is evaluated and kept in place of
+    the last weights; null: the last weights."""
     batch_size: Count = 16
     """Trajectories in each gradient step."""
     shards: Count = 1
-    """Parts of a minibatch, which at most as many processes may share (``fit --processes``). Results depend on this
-    number, by rounding and by what dropout draws, and not on that of processes."""
+    """Number of parts of a minibatch, and the most processes that can share it (``fit --processes``). Results depend on
+    the number of shards, by rounding and dropout, and not on the number of processes."""
     restarts: Count = 1
-    """Independent initialisations; the best on the tuning demonstrations is kept."""
+    """Number of independent initialisations; the best on the tuning demonstrations is kept."""
     halving: Count | None = 50
-    """With more restarts: epochs of the last stage after which the worse half of them, on the tuning demonstrations, is
-    stopped; of those that are left again after twice as many, and so on. Null: all are trained to the end."""
+    """Successive halving of several restarts: after so many epochs of the last stage the worse half on the tuning
+    demonstrations is stopped, again after twice as many epochs, and so on. Null: all restarts train to the end."""
     seed: Seed | None = None
-    """Seed of what is random in training: first weights, clusters, the order of demonstrations, dropout; null: that of
-    the spec. What is held out or tuned on does not depend on it."""
+    """Seed of initial weights, clusters, the order of demonstrations, and dropout; null: the spec's ``seed``. The split
+    into training, tuning and held-out demonstrations does not depend on this seed."""
     tune_fraction: Fraction = 0.1
-    """Part of the training demonstrations set aside for tuning: to stop early and to choose among restarts."""
+    """Fraction of the training demonstrations used for tuning: early stopping and the choice among restarts."""
     tune_by: Literal["mean", "median"] = "mean"
-    """What of the tuning demonstrations decides: the ``mean`` over their steps of what is maximised, or the ``median``
-    over demonstrations, which one odd demonstration among a few cannot decide."""
+    """The tuning score: ``mean`` of the objective over steps, or ``median`` over demonstrations, which is robust to a
+    single outlier."""
     patience: Count | None = 20
-    """Epochs without improvement before a stage stops; null for never."""
+    """Epochs without improvement after which a stage stops; null: never."""
     workers: int = Field(default=0, ge=0)
-    """Processes that read pictures ahead; 0: they are read in between. The result is the same for any number."""
+    """Number of processes that prefetch pictures; 0: no prefetching. Results do not depend on the number."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
-    """Where networks are trained and evaluated: ``cpu``, ``cuda`` (a GPU), or ``auto``: a GPU where there is one."""
+    """Device of the networks: ``cpu``, ``cuda`` (a GPU), or ``auto`` (a GPU if there is one)."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """``bfloat16``: networks multiply in it in gradient steps alone (torch's autocast)."""
+    """Precision of matrix products in gradient steps (torch's autocast)."""
     clip_gradient: Positive | None = None
-    """Largest norm of a gradient; null for no limit."""
+    """Largest norm of a gradient; null: no limit."""
     labels: LabelsSpec | None = None
-    """Labels that say which option is active in some demonstrations; null for none."""
+    """Labels that fix active options in some demonstrations; null: none."""
     duration: DurationSpec | None = None
-    """A prior on how long options last; null for none."""
+    """A prior on option durations; null: none."""
+
+    @model_validator(mode="after")
+    def _em_has_no_gradient_steps(self) -> TrainingSpec:
+        if self.optimizer.name == "em":
+            unused = [name for name in ("average", "clip_gradient") if getattr(self, name) is not None]
+            unused += ["optimizer.warmup"] if self.optimizer.warmup else []
+            unused += ["optimizer.schedule"] if self.optimizer.schedule != "constant" else []
+            if unused:
+                raise invalid((unused[0], "em takes no gradient steps and would not use it; leave it out"))
+        return self
 
     @model_validator(mode="after")
     def _ends(self) -> TrainingSpec:
         if self.epochs is None and self.patience is None:
-            raise invalid(("epochs", "null trains until training.patience, which is null too; give one of them"))
+            raise invalid(("epochs", "epochs and training.patience are both null; give one of them"))
         if self.epochs is None and self.optimizer.schedule == "cosine":
-            raise invalid(("optimizer.schedule", "cosine falls to 0 at the end of training.epochs, which is null"))
+            raise invalid(("optimizer.schedule", "cosine ends at training.epochs, which is null"))
         if self.upper_levels == "segments" and not self.layerwise:
-            raise invalid(("upper_levels", "segments are those of a lowest level found before; say layerwise: true"))
+            raise invalid(("upper_levels", "segments needs the lowest level discovered first; say layerwise: true"))
         if self.labels is not None and not self.labels.hold and self.initialize == "random":
-            raise invalid(("labels.hold", "false uses labels in initialisation alone, which is random; say vq there"))
+            raise invalid(
+                ("labels.hold", "false uses labels in initialisation alone, and that is random; say vq there")
+            )
         return self

@@ -1,10 +1,10 @@
-"""Where the training of a restart stands, in memory and as a file."""
+"""What restarts are trained on, and the training state of one restart, in memory and as a file (a checkpoint)."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +12,89 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ddco_pyro.data.pictures import Readers
 from ddco_pyro.data.tensors import read_tensors, write_tensors
+from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.spec import Spec
+from ddco_pyro.training.devices import device_of, room
+from ddco_pyro.training.labels import Labels
+from ddco_pyro.training.networks import Dimensions, build_hierarchy
 
 State = dict[str, Tensor]
 
 
+@dataclass(frozen=True)
+class TrainingData:
+    """What all restarts of a model share: demonstrations to train and to tune on, as they are encoded and scaled.
+
+    :param names: of the training demonstrations.
+    :param encoder: the state of the fitted observation encoder.
+    :param scaling: the state of the fitted scaling of the control.
+    :param labels: the labels that say which options are active; None where there are none.
+    """
+
+    spec: Spec
+    dimensions: Dimensions
+    train: Batch
+    tune: Batch
+    names: Sequence[str]
+    encoder: State
+    scaling: State
+    labels: Labels | None = None
+
+    def hierarchy(self, restart: int, state: State | None = None) -> Hierarchy:
+        """A restart's hierarchy in evaluation mode, with its networks on the spec's device.
+
+        :param state: of the hierarchy; None for the restart's first weights.
+        """
+        hierarchy = build_hierarchy(self.spec, self.dimensions, self.seed(restart))
+        hierarchy.encoder.load_state_dict(self.encoder)
+        hierarchy.scaling.load_state_dict(self.scaling)
+        if state is not None:
+            hierarchy.load_state_dict(state)
+        return hierarchy.place(device_of(self.spec.training)).eval()
+
+    def read_by(self, readers: Readers) -> TrainingData:
+        """The same data, with pictures in files read by these processes."""
+        return replace(self, train=self.train.read_by(readers), tune=self.tune.read_by(readers))
+
+    def held(self, device: torch.device) -> TrainingData:
+        """The same data, with all pictures on the networks' device where there is room for them.
+
+        :raises DemonstrationsError: a file cannot be read.
+        """
+        if self.train.picture_bytes + self.tune.picture_bytes > room(device):
+            return self
+        return replace(self, train=self.train.held(device), tune=self.tune.held(device))
+
+    def seed(self, *place: int) -> int:
+        """The seed of a restart, of one of its stages, of an epoch of a stage, or of a shard of a minibatch.
+
+        numpy pads with zeros: a stage has the seed of its first epoch, and the first stage that of its restart. Those
+        seeds draw different things: weights, clusters, the order of minibatches. No two restarts, stages of a restart,
+        epochs or shards have the same seed.
+        """
+        own, training = self.spec.seed, self.spec.training.seed
+        return int(np.random.SeedSequence([own if training is None else training, *place]).generate_state(1)[0])
+
+
 @dataclass
 class Progress:
-    """Where a restart stands at the end of an epoch; with the tensors of a checkpoint it is all that is needed.
+    """How far a restart has been trained, at the end of an epoch.
 
-    ``start`` is the tuning log-likelihood per step from before this stage, ``best`` that of its best epoch, ``ended``
-    has a :class:`ddco_pyro.training.convergence.StageEnd` for each stage that has ended, ``history`` a row for each
-    epoch. Where all stages have ended (``done``), ``epoch``, ``start`` and ``best`` are still those of the last.
-    ``device`` is the kind of device that its networks were trained on. ``diverged`` says where a log-likelihood became
-    NaN or infinite in a further epoch, which ended the restart.
+    Where all stages have ended (``done``), ``epoch``, ``start`` and ``best`` are those of the last stage.
+
+    :param restart: its number.
+    :param stage: the number of the current stage.
+    :param epoch: epochs of the current stage.
+    :param stale: epochs since the best one.
+    :param start: tuning log-likelihood per step before the current stage.
+    :param best: the best tuning log-likelihood per step of the current stage.
+    :param ended: a :class:`ddco_pyro.training.stages.StageEnd` for each stage that has ended.
+    :param history: a row for each epoch.
+    :param device: the kind of device that its networks are trained on.
+    :param diverged: where a log-likelihood became NaN or infinite, which ended the restart.
     """
 
     restart: int
@@ -42,15 +111,26 @@ class Progress:
 
     @property
     def tune(self) -> Sequence[float]:
-        """Tuning log-likelihood per step from before this stage, and of each of its epochs."""
+        """Tuning log-likelihood per step before the current stage, and of each of its epochs."""
         return [self.start, *(row["tune"] for row in self.history[len(self.history) - self.epoch :])]
+
+    @property
+    def spent(self) -> int:
+        """Epochs of the stages that have ended."""
+        return sum(end["epochs"] for end in self.ended)
+
+    def reached(self, last: int, until: int | None) -> bool:
+        """Whether training is over, or has come to epoch ``until`` of the stage ``last``."""
+        return self.done or (until is not None and self.stage == last and self.epoch >= until)
 
 
 @dataclass
 class Restart:
-    """A restart that is being trained: its progress, and the tensors of its ``model``, its ``optimizer``, of the
-    ``best`` epoch of this stage, and the ``average`` of weights and the ``constants`` that it takes over, if any. One
-    that is done has the best alone, one that has diverged nothing.
+    """A restart in training: its progress and its tensors.
+
+    :param states: tensors of the ``model``, of its ``optimizer`` and of the ``best`` epoch of the current stage; where
+        there are any, of the ``average`` of weights, and the ``known`` choices and the ``constants`` of the objective.
+        A restart that is done has the best alone, one that has diverged nothing.
     """
 
     progress: Progress
@@ -65,7 +145,7 @@ class Restart:
     def read(cls, path: Path) -> Restart:
         """Read a checkpoint.
 
-        :raises Damaged: it does not hold what was written.
+        :raises Damaged: the file does not hold what was written.
         """
         tensors, metadata = read_tensors(path, "remove it and do the same again: this restart begins anew")
         states: dict[str, State] = {"optimizer": {}}
@@ -76,12 +156,12 @@ class Restart:
 
 
 def copy_of(model: nn.Module) -> State:
-    """The tensors of a model as they are now, on the host."""
+    """A copy of a model's tensors, on the host."""
     return {name: value.detach().cpu().clone() for name, value in model.state_dict().items()}
 
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> State:
-    """The optimiser's tensors by ``<parameter>.<name>``, as they are now, on the host."""
+    """A copy of the optimiser's tensors by ``<parameter>.<name>``, on the host."""
     state = optimizer.state_dict()["state"]
     return {
         f"{index}.{name}": torch.as_tensor(value).cpu().clone()

@@ -1,41 +1,33 @@
-"""The demonstrations a spec asks for, and what is known of their shapes before any work starts."""
+"""The demonstrations that a spec names, and their shapes before any work starts."""
 
 from __future__ import annotations
 
-import math
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from ddco_pyro.data.checks import check, check_trained, problem_of_pictures
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, extent
-from ddco_pyro.data.memory import Work, refuse_too_much
+from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.sources.recording import Recording
 from ddco_pyro.data.sources.robomimic import open_robomimic
 from ddco_pyro.errors import nearest
 from ddco_pyro.events import OnEvent, ignore
-from ddco_pyro.model.encoding import STEPS_AT_ONCE
-from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.simulation.collect import cache_path, collect
 from ddco_pyro.simulation.task import find_task
-from ddco_pyro.spec import Spec, SpecError
-from ddco_pyro.training.initialization import most_rows
-from ddco_pyro.training.networks import Dimensions, baselines, build_hierarchy
+from ddco_pyro.spec import Spec
+from ddco_pyro.training.networks import Dimensions
 
 
 def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
-    """The dimensions of what the spec names, without collecting anything.
+    """The dimensions of the demonstrations that a spec names, without collecting any.
 
-    They are those of its file, or else of its task; of the control then what is known of demonstrations that have been
-    collected already.
+    They are read from the headers of the spec's file, or else from its task. A task whose episodes have no fixed length
+    counts as having one step. The control of a task is described where demonstrations have been collected already.
 
-    A task that does not say how long its episodes are counts as having one step.
-
-    :param demos: the demonstrations, where they have been read; of a file no observation is read otherwise.
+    :param demos: the demonstrations, where they have been read.
     """
     if demos is None and in_file(spec):
         demos = outline(spec)
@@ -58,7 +50,7 @@ def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
 
 
 def parts(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
-    """The demonstrations to train with, ``train``, and those held out, ``valid``, left out where there are none."""
+    """The demonstrations to train with, ``train``, and the held-out ones, ``valid``, where there are any."""
     if spec.demonstrations.valid_fraction == 0 and not demos.masks.keys() & {"train", "valid"}:
         return {"train": demos}
     train, valid = demos.split(spec.demonstrations.valid_fraction, spec.seed)
@@ -66,9 +58,9 @@ def parts(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
 
 
 def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:
-    """See that networks take the observations, and that the spec's division leaves enough demonstrations for each part.
+    """Refuse pictures that networks cannot read, and a division that leaves too few demonstrations to train with.
 
-    :raises DemonstrationsError: they do not, or it does not.
+    :raises DemonstrationsError: one of both is the case.
     """
     for key in spec.observed:
         observed = demos[0].observations[key]
@@ -78,7 +70,7 @@ def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:
 
 
 def in_file(spec: Spec) -> bool:
-    """Whether the demonstrations are read from the file that the spec names; else they are a task's."""
+    """Whether the demonstrations are read from a file; otherwise they are collected in a task."""
     path = spec.demonstrations.path
     return spec.demonstrated_task is None or (path is not None and Path(path).exists())
 
@@ -89,10 +81,10 @@ def known_demonstrations(spec: Spec) -> Demonstrations | None:
 
 
 def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
-    """The spec's demonstrations: read from its file, collected from its task's supervisor where there is none.
+    """The spec's demonstrations, read from its file or collected from its task's supervisor.
 
-    :raises DemonstrationsError: the file is missing or wrong, lacks an observation or label that the spec names, or a
-        fit to it would take more memory than is allowed.
+    :raises DemonstrationsError: the file is missing or damaged, lacks an observation or label that the spec names, or
+        a fit to it takes more memory than is allowed.
     """
     own = spec.demonstrations
     if in_file(spec):
@@ -105,10 +97,9 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
 
 
 def outline(spec: Spec) -> Demonstrations:
-    """The demonstrations in the spec's file with their controls and labels, but with zeros for observations, of which
-    headers alone are read.
+    """The demonstrations in the spec's file, with zeros in place of observations, of which the headers alone are read.
 
-    :raises DemonstrationsError: as :func:`demonstrations`, but for the values of observations.
+    :raises DemonstrationsError: as :func:`demonstrations`, except for values of observations.
     """
     path = Path(str(spec.demonstrations.path))
     _refuse_what_cannot_be_read(spec, path)
@@ -129,9 +120,9 @@ def _outlined(recording: Recording, demo: Demonstration) -> Demonstration:
 
 
 def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
-    """What the spec names of demonstrations in memory: its observations and labels, without those that it excludes.
+    """Demonstrations in memory, reduced to the observations and labels that a spec names, without the excluded ones.
 
-    :raises DemonstrationsError: they lack one of them.
+    :raises DemonstrationsError: an observation, a label or an excluded demonstration is missing.
     """
     keys, labels, exclude = spec.trained_with, _labels(spec), set(spec.demonstrations.exclude)
     first = demos[0]
@@ -158,13 +149,13 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
 
 
 def _labels(spec: Spec) -> tuple[str, ...]:
-    """Names of the labels to compare with and to train from."""
+    """Names of the labels to compare segments with, and to train from."""
     trained = spec.training.labels
     return tuple(dict.fromkeys((*spec.demonstrations.label_names, *([trained.source] if trained else []))))
 
 
 def _needed(spec: Spec) -> str:
-    """What to do about a file that is not there."""
+    """The remedy for a missing file."""
     read = ["actions", *(f"obs/{key}" for key in spec.trained_with), *(f"labels/{name}" for name in _labels(spec))]
     return (
         "put it there, or fit to another with --set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, "
@@ -173,39 +164,9 @@ def _needed(spec: Spec) -> str:
 
 
 def _refuse_what_cannot_be_read(spec: Spec, path: Path) -> None:
-    """There is a file, and a fit to it takes no more memory than is allowed."""
+    """See that there is a file, and that its demonstrations fit into memory, by the file's headers."""
     if not path.exists():
         raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
-    remedy = (
-        "leave observations out, make its demonstrations fewer, shorter or equally long, scale pictures down, or lower "
-        "filters or hidden"
-    )
+    remedy = "leave observations out, or make its demonstrations fewer, shorter or equally long"
     what = f"{path}: a fit to {', '.join(spec.trained_with)}"
-    refuse_too_much(memory_needed(spec, path), what, remedy)
-
-
-def memory_needed(spec: Spec, path: Path) -> float:
-    """Bytes that a fit of the spec and its baselines to a file of demonstrations takes, about, by the file's headers.
-
-    :raises DemonstrationsError: the file cannot be read or does not hold what the spec names.
-    """
-    stored = extent(path, spec.trained_with, spec.demonstrations.exclude)
-    shapes = {place.removeprefix("obs/"): shape for place, shape in stored.shapes.items() if place != "actions"}
-    size = Dimensions(shapes, math.prod(stored.shapes["actions"]), max(1, *stored.lengths))
-    try:
-        with torch.random.fork_rng(devices=[]):
-            models = (spec, build_hierarchy(spec, size)), *baselines(spec, size)
-            works = [_work(*model, size, sum(stored.lengths)) for model in models]
-    except SpecError:  # it is said where networks are checked
-        works = [Work(spec.training.batch_size, STEPS_AT_ONCE, STEPS_AT_ONCE, 0, 0)]
-    return stored.fit(works, spec.seen)
-
-
-def _work(spec: Spec, hierarchy: Hierarchy, dimensions: Dimensions, steps: int) -> Work:
-    """What training a model on so many steps takes."""
-    features = len(hierarchy.encoder.mean) + sum(shape[-1] * POOLED**2 for shape in hierarchy.encoder.images.values())
-    kind = spec.training.initialize if hierarchy.depth else "random"
-    numbers = {"random": 0, "equal_parts": 0, "vq": features, "vq_controls": features + dimensions.control_size}[kind]
-    clustered = min(steps, most_rows(numbers)) * numbers
-    chunk = hierarchy.steps_in_memory
-    return Work(spec.training.batch_size, hierarchy.steps_at_once, chunk, hierarchy.step_bytes, clustered)
+    refuse_too_much(extent(path, spec.trained_with, spec.demonstrations.exclude).fitting, what, remedy)

@@ -1,4 +1,4 @@
-"""On which device networks live: what ``training.device`` stands for on this machine."""
+"""The device of the networks (``training.device``), and bit-for-bit repeatable work on it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from ddco_pyro.model.seeding import HOST
 from ddco_pyro.spec import SpecError, TrainingSpec
 
 WORKSPACE = "CUBLAS_WORKSPACE_CONFIG"
-"""Without it cuBLAS may add in another order each time; read when CUDA is used first."""
+"""The environment variable that makes the order of sums in cuBLAS fixed; CUDA reads it at its first use."""
 
 
 def device_of(training: TrainingSpec) -> torch.device:
-    """The device that a spec asks for; of several GPUs each process of a machine has its own (``LOCAL_RANK``).
+    """The device that a spec asks for; of several GPUs each process takes one (``LOCAL_RANK``).
 
-    :raises SpecError: there is none.
+    :raises SpecError: the machine has no such device.
     """
     if training.device == "cpu" or (training.device == "auto" and not torch.cuda.is_available()):
         return HOST
@@ -31,18 +31,18 @@ def device_of(training: TrainingSpec) -> torch.device:
 
 
 def described(device: torch.device) -> str:
-    """Its kind, and which of that kind where it matters: what a run's bits depend on."""
+    """The kind of a device, with the model of a GPU: the bits of a run depend on both."""
     return f"cuda ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else device.type
 
 
 def room(device: torch.device) -> float:
-    """Bytes that pictures may take on a device, half of those that are free; none on the host, where they are."""
+    """Bytes that pictures may take on a device: half of a GPU's free memory, none on the host, where they are."""
     return torch.cuda.mem_get_info(device)[0] / 2 if device.type == "cuda" else 0.0
 
 
 @contextmanager
 def repeatable(device: torch.device) -> Iterator[None]:
-    """Inside, a GPU gives the same bits each time, and float32 is float32 (no TF32); nothing changes on the host."""
+    """Inside, a GPU gives the same bits each time, without TF32; nothing changes on the host."""
     if device.type != "cuda":
         yield
         return

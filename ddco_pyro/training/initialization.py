@@ -1,9 +1,11 @@
-"""Vector quantisation (SM 2.2): clusters of the observations say, to begin with, which option is active when.
+"""Initial segments of a level: clusters of observations (vector quantisation, SM 2.2), or parts of equal length.
 
 The paper clones one policy from each cluster. Here the whole model is trained with the choices of a level clamped to
-the clusters, which clones those policies and starts the terminations from the clusters' boundaries in the same way,
-at any level. Where every option has labelled steps, what tells those apart names all others (multinomial logistic
-regression); where some options have, their clusters start from the means of those (seeded k-means, Basu et al. 2002).
+the clusters. This clones the policies and starts the terminations from the clusters' boundaries, at any level.
+
+Labels name clusters. Where every option has labelled steps, multinomial logistic regression assigns the other steps.
+Where some options have labelled steps, their clusters start from the means of these steps (seeded k-means, Basu et al.
+2002).
 """
 
 from __future__ import annotations
@@ -18,26 +20,24 @@ from sklearn.metrics import euclidean_distances
 from torch import Tensor
 
 from ddco_pyro.data.memory import share
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import BYTES_AT_ONCE
 from ddco_pyro.model.networks.conv import POOLED
 
 ITERATIONS = 300
-"""Of k-means, or of logistic regression, at most."""
+"""The most iterations of k-means or logistic regression."""
 
 
 class Clusters:
     """k-means clusters of the observations of every step of a batch, named as the options 1 to k.
 
-    :param controls: cluster observations and controls together, with as much weight on the controls as on the
-        observations: steps that look alike but are acted on differently are then told apart.
-    :param labels: the options of the steps that have one, 1 to m, -1 for the others, [N, T]. Where every option has
-        labelled steps, a step belongs to the option that logistic regression of those gives it to. Where not, the
-        clusters of these options start from the means of their steps, the others as k-means++ does from there.
-    :param read: names of the observations that are clustered, those of the options' policies; all where there is none.
+    Fewer than ``options`` clusters are found where there are fewer distinct observations. The clusters are fitted to at
+    most :func:`most_rows` steps, drawn at random.
 
-    Fewer than ``options`` clusters are found where there are fewer distinct observations. Of more steps than
-    :func:`most_rows` as many are drawn at random, and the clusters are theirs.
+    :param controls: cluster observations and controls together, with equal weight on either. Steps with similar
+        observations and different controls are then in different clusters.
+    :param labels: the options of labelled steps, 1 to m, and -1 for the others, [N, T].
+    :param read: names of the observations that are clustered; all where it is empty.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Clusters:
         return choices
 
     def _blocks(self, batch: Batch) -> Iterator[np.ndarray]:
-        """What is clustered of consecutive steps [B, F], trajectory after trajectory."""
+        """The features of consecutive steps [B, F], trajectory after trajectory."""
         for row, length in enumerate(batch.lengths.tolist()):
             alone, first = batch.inputs.part(torch.tensor([row]), slice(0, length)), 0
             for inputs in alone.chunks(FRAMES_AT_ONCE if alone.images else length):
@@ -93,7 +93,7 @@ def _only(chosen: np.ndarray, blocks: Iterable[np.ndarray]) -> Iterator[np.ndarr
 
 
 def _together(blocks: Iterable[np.ndarray], rows: int) -> Iterator[np.ndarray]:
-    """Blocks one below the other, a new one from about so many rows on."""
+    """Blocks joined to blocks of about so many rows."""
     waiting: list[np.ndarray] = []
     for block in blocks:
         waiting.append(block)
@@ -105,7 +105,7 @@ def _together(blocks: Iterable[np.ndarray], rows: int) -> Iterator[np.ndarray]:
 
 
 def most_rows(numbers: int) -> int:
-    """The most steps, of so many numbers each, that are clustered together, for the sake of memory."""
+    """The most steps, with so many numbers each, that are clustered together: memory bounds them."""
     return max(1, int(min(BYTES_AT_ONCE, share())) // (8 * max(1, numbers)))
 
 
@@ -115,9 +115,9 @@ def joined(seen: np.ndarray, actions: np.ndarray) -> np.ndarray:
 
 
 class EqualParts:
-    """Every trajectory cut into ``options`` parts of equal length, in order named as the options 1 to k.
+    """Every trajectory cut into ``options`` parts of equal length, named as the options 1 to k in order.
 
-    The uniform segmentation that training of left-to-right hidden Markov models starts from.
+    Training of left-to-right hidden Markov models starts from this uniform segmentation.
     """
 
     def __init__(self, options: int) -> None:
@@ -130,7 +130,7 @@ class EqualParts:
 
 
 class _Start:
-    """Where k-means starts: from the mean of each labelled option's rows, and from rows drawn far from all before."""
+    """Initial centres of k-means: the means of labelled options, then rows far from them (as k-means++ draws them)."""
 
     def __init__(self, labels: np.ndarray) -> None:
         self.labels = labels
@@ -145,7 +145,7 @@ class _Start:
 
 
 def _labelled(labels: np.ndarray, options: int) -> list[int]:
-    """The first so many options that have labels, sorted."""
+    """The options that have labels, sorted."""
     return [int(option) for option in np.unique(labels) if 0 < option <= options]
 
 
@@ -154,11 +154,11 @@ def _alive(batch: Batch) -> Tensor:
 
 
 FRAMES_AT_ONCE = 64
-"""Pictures whose pixels are floating-point numbers at the same time."""
+"""Pictures that are converted to floating-point numbers together."""
 
 
 def block_means(frames: Tensor) -> Tensor:
-    """uint8 [T, H, W, C] to [T, C · POOLED²], in [0, 1]: as many numbers as a convolutional network keeps of a map."""
+    """Pictures uint8 [T, H, W, C] averaged over POOLED × POOLED blocks, in [0, 1], [T, C · POOLED²]."""
     pooled = [
         torch.nn.functional.adaptive_avg_pool2d(block.permute(0, 3, 1, 2).float() / 255, POOLED).flatten(1)
         for block in frames.split(FRAMES_AT_ONCE)
@@ -167,7 +167,7 @@ def block_means(frames: Tensor) -> Tensor:
 
 
 def distinct(rows: np.ndarray, most: int) -> int:
-    """How many different rows there are, counted up to ``most``."""
+    """The number of different rows, counted up to ``most``."""
     seen: set[bytes] = set()
     for row in rows:
         seen.add((row + 0.0).tobytes())  # + 0.0: minus zero is zero

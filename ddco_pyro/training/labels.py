@@ -18,14 +18,14 @@ from ddco_pyro.training.stages import Stage
 
 @dataclass(frozen=True)
 class Labels:
-    """What labels say of the options of a level.
+    """Labels of the options of a level.
 
     :param level: 1 is the lowest.
-    :param hold: whether they are used in all of training, or in its initialisation alone.
+    :param hold: whether all of training uses the labels, or the initialisation alone.
     :param values: the labels that the options 1, 2, ... stand for.
-    :param demonstrations: the names of those whose labels are used.
-    :param train: the option of each step of the demonstrations to train with, -1 where it is free, [N, T].
-    :param tune: that of those to tune with.
+    :param demonstrations: the names of the demonstrations whose labels are used.
+    :param train: the option of each step of the demonstrations to train with, [N, T]; -1 where it is free.
+    :param tune: the same of the demonstrations to tune with.
     """
 
     level: int
@@ -39,7 +39,7 @@ class Labels:
     def of(cls, spec: Spec, train: Demonstrations, tune: Demonstrations) -> Labels | None:
         """The labels that training uses; None where the spec names none.
 
-        :raises SpecError: there are none in the demonstrations to train with, or more than options.
+        :raises SpecError: the demonstrations to train with have no labels, or there are more labels than options.
         """
         own = spec.training.labels
         if own is None or spec.hierarchy is None:
@@ -58,7 +58,7 @@ class Labels:
         return cls(number, own.hold, values, names, *each)
 
     def matter_in(self, stage: Stage) -> bool:
-        """Whether a stage of training uses them."""
+        """Whether a stage of training uses the labels."""
         seen = stage.discovering is None or self.level <= stage.discovering
         return seen if self.hold else stage.clamped == self.level or (stage.from_constants and self.level > 1)
 
@@ -74,7 +74,7 @@ def used(spec: Spec, demos: Demonstrations) -> Labels | None:
 
 
 def _known(labels: Any) -> tuple[int, ...]:
-    """The different labels from 0 on, sorted."""
+    """The distinct labels, sorted, without -1."""
     return tuple(sorted({int(value) for array in labels for value in np.unique(array) if value >= 0}))
 
 

@@ -1,4 +1,4 @@
-"""The processes of a fit that train together: started here, or by ``torchrun``."""
+"""Starting the processes of a fit that train together, here or by ``torchrun``, and noticing which of them fail."""
 
 from __future__ import annotations
 
@@ -16,30 +16,28 @@ from multiprocessing.process import BaseProcess
 from torch import distributed
 
 from ddco_pyro.errors import Failed
-from ddco_pyro.training.jobs import BackendError
-from ddco_pyro.training.ranks import ALONE, LostProcess, Ranks, connected
+from ddco_pyro.training.processes import ALONE, BackendError, LostProcess, Ranks, connected
 from ddco_pyro.training.restarts import follow
 
 HERE = "127.0.0.1"
 
 PATIENCE = timedelta(days=1)
-"""How long a process waits for the others, which may have much to do between exchanges. That one has ended is noticed
-at once, since its connections are closed."""
-
+"""How long a process waits for the others between exchanges. A process that ends is noticed at once, since its
+connections close."""
 
 LAUNCHED = {"RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"}
-"""What ``torchrun`` says to the processes that it starts, in their environment."""
+"""The environment variables of processes that ``torchrun`` starts."""
 
 
 def launched() -> Ranks | None:
-    """Which process of ``torchrun`` this is; None where it was not started by it."""
+    """This process among those of ``torchrun``; None where ``torchrun`` did not start it."""
     if not os.environ.keys() >= LAUNCHED:
         return None
     return Ranks(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]))
 
 
 def requested(processes: int | None, launched: Ranks | None) -> int:
-    """How many processes train together: as many as were asked for, 1 by default, under ``torchrun`` its own.
+    """The number of processes that train together: ``torchrun``'s own, else as many as asked for, 1 by default.
 
     :raises BackendError: ``torchrun`` started another number.
     """
@@ -51,9 +49,9 @@ def requested(processes: int | None, launched: Ranks | None) -> int:
 
 
 def check_processes(processes: int, jobs: int, shards: int) -> None:
-    """See that so many processes can train together.
+    """Refuse a number of processes that cannot train together.
 
-    :raises BackendError: they cannot.
+    :raises BackendError: it is such a number.
     """
     if processes < 1:
         raise BackendError(f"--processes {processes}: give a number of processes")
@@ -70,26 +68,26 @@ def check_processes(processes: int, jobs: int, shards: int) -> None:
 
 @contextmanager
 def together(processes: int) -> Iterator[Ranks]:
-    """So many processes, of which this is the first: inside, the others train along (:func:`follow`).
+    """Inside, other processes train along with this one (:func:`follow`), ``processes`` in all.
 
     :raises LostProcess: another process has ended.
     :raises FailedProcess: another process has failed.
     """
     if processes == 1:
         yield ALONE
-    elif distributed.is_initialized():  # by `leading`, which also says when that was all
+    elif distributed.is_initialized():  # by `leading`, which also ends it
         yield Ranks(0, processes)
     else:
         with _started(processes) as ranks:
             yield ranks
-            ranks.share(None)  # that was all
+            ranks.share(None)  # no further model
 
 
 @contextmanager
 def leading(launched: Ranks | None) -> Iterator[None]:
-    """Inside, the other processes of ``torchrun`` follow this one (:func:`follow_torchrun`); after it, they end.
+    """Inside, the other processes of ``torchrun`` follow this one (:func:`follow_torchrun`); afterwards they end.
 
-    All that the first does belongs inside, refusals too: otherwise the others wait for it.
+    Everything that the first process does belongs inside, refusals too: otherwise the others wait for it.
     """
     if launched is None or launched.size == 1:
         yield
@@ -98,7 +96,7 @@ def leading(launched: Ranks | None) -> Iterator[None]:
     try:
         with _joined(store, launched) as ranks:
             yield
-            ranks.share(None)  # that was all
+            ranks.share(None)  # no further model
     except LostProcess:
         raise
     except BaseException:
@@ -108,13 +106,13 @@ def leading(launched: Ranks | None) -> Iterator[None]:
 
 
 LAST_WORDS = timedelta(seconds=5)
-"""How long the first process waits, where it fails, for the others to read the reason: the store can end with it."""
+"""How long a failing first process waits for the others to read the reason from the store, which may end with it."""
 
 
 def follow_torchrun(launched: Ranks) -> None:
-    """Train along with the first of the processes that ``torchrun`` started, until it ends or something fails.
+    """Train along with the first process of ``torchrun``, until it ends or something fails.
 
-    The first alone says what has failed, and ends with status 1 or 2: ``torchrun`` ends all as soon as one does.
+    The first process alone reports a failure, and ends with status 1 or 2; ``torchrun`` then ends the others.
 
     :raises LostProcess: another process has ended.
     """
@@ -136,7 +134,7 @@ def _left(rank: int) -> str:
 
 
 class FailedProcess(Failed):
-    """A process that trained together with this one has failed by itself."""
+    """A process that trained together with this one has raised an error."""
 
     def __init__(self, rank: int, error: str) -> None:
         super().__init__(f"process {rank}, which trained together with this one, has failed: {error}")
@@ -151,10 +149,10 @@ def _launchers(launched: Ranks) -> distributed.Store:
 
 @contextmanager
 def _joined(store: distributed.Store, ranks: Ranks) -> Iterator[Ranks]:
-    """Connected with the others. Where this process fails, the reason is left in the store for them.
+    """Inside, the processes are connected. The reason for which this process fails is left in the store.
 
     :raises LostProcess: another process has ended.
-    :raises FailedProcess: it has left a reason.
+    :raises FailedProcess: another process has left a reason.
     """
     try:
         with connected():
@@ -172,7 +170,7 @@ def _joined(store: distributed.Store, ranks: Ranks) -> Iterator[Ranks]:
         rank, _, error = reason.partition(" ")
         raise FailedProcess(int(rank), error) from None
     except BaseException as error:
-        with suppress(RuntimeError):  # where the others have gone there is nobody to tell
+        with suppress(RuntimeError):  # the store may have ended with the others
             store.set(FAILED, f"{ranks.rank} {type(error).__name__}: {' '.join(str(error).split())}")
         raise
     finally:
@@ -181,20 +179,20 @@ def _joined(store: distributed.Store, ranks: Ranks) -> Iterator[Ranks]:
 
 
 FAILED = "failed"
-"""The key of a store for the rank of a process that failed, and its reason."""
+"""The key of the store for the rank of a failed process and its reason."""
 
 
 ANSWERED_HERE = {signal.SIGINT, signal.SIGTERM}
-"""Signals that the first process answers; it ends the others."""
+"""Signals that the first process handles: it ends the others."""
 
 
 @contextmanager
 def _started(size: int) -> Iterator[Ranks]:
-    """Connected with processes that are started, and ended, here."""
+    """Inside, the processes are connected that this function starts and ends."""
     store = distributed.TCPStore(HERE, 0, size, is_master=True, wait_for_workers=False)
     context = multiprocessing.get_context("spawn")
     others = [context.Process(target=_follow, args=(Ranks(rank, size), store.port)) for rank in range(1, size)]
-    resource_tracker.ensure_running()  # it would be started with the first of them, and unblock the signals
+    resource_tracker.ensure_running()  # or the first process starts it, which unblocks the signals
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ANSWERED_HERE)  # they inherit it
     try:
         for other in others:
@@ -228,7 +226,7 @@ def _name(rank: int) -> str:
 
 
 def _follow(ranks: Ranks, port: int) -> None:
-    """What a process that was started here does."""
+    """The main function of a process that :func:`_started` starts."""
     try:
         with connected():
             store = distributed.TCPStore(HERE, port, ranks.size, is_master=False)
@@ -237,4 +235,4 @@ def _follow(ranks: Ranks, port: int) -> None:
         with _joined(store, ranks):
             follow(ranks)
     except Exception:
-        sys.exit(1)  # the first process says what went wrong
+        sys.exit(1)  # the first process reports the reason

@@ -1,162 +1,304 @@
-"""Expectation-gradient training (paper §4.1) of a restart, in stages (SM 2.2, SM 2.3), with early stopping.
+"""The training loop of one restart (paper §4.1, SM 2.2, SM 2.3): stages, epochs, gradient steps, early stopping.
 
-The gradient of the marginal log-likelihood *is* the expectation-gradient step: the E-step's posteriors weight the
-networks' gradients. A gradient step sees a minibatch of whole trajectories.
+The gradient of the marginal log-likelihood *is* the expectation-gradient step: the posteriors of the E-step weight the
+gradients of the networks. A gradient step sees a minibatch of whole trajectories.
 
-Everything random in an epoch is seeded by (seed, restart, stage, epoch), so a restart that was interrupted and resumed
-from the end of any epoch, in this process or another, gives the same result, bit for bit, as without interruption.
-Checkpoints are of ends of epochs.
+The random numbers of an epoch are seeded by (seed, restart, stage, epoch). A restart that is continued from the end of
+any epoch, in this process or another, therefore has the same bits as one without an interruption. The gradients of a
+minibatch's shards (``training.shards``) are added in the order of the shards, so that the number of processes that
+compute them changes no bit either.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from dataclasses import asdict
+from collections.abc import Iterator
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from ddco_pyro.data.reading import Readers
+from ddco_pyro.data.pictures import Readers
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
 from ddco_pyro.inference.threads import one_thread
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.seeding import seeded
-from ddco_pyro.training.ascent import Ascent, learning_rate
-from ddco_pyro.training.checkpoint import Restart, copy_of
-from ddco_pyro.training.convergence import StageEnd, share
+from ddco_pyro.model.seeding import seed, seeded
+from ddco_pyro.model.tables import Tables
+from ddco_pyro.spec import OptimizerSpec
+from ddco_pyro.training.checkpoint import Restart, State, TrainingData, copy_of, optimizer_state, restore_optimizer
 from ddco_pyro.training.devices import device_of, repeatable
-from ddco_pyro.training.material import Material
-from ddco_pyro.training.objective import Diverged, Objective
-from ddco_pyro.training.ranks import ALONE, Ranks
-from ddco_pyro.training.shards import cut
-from ddco_pyro.training.stages import Stage, plan
-from ddco_pyro.training.upper import Constants
+from ddco_pyro.training.em import Expectation, is_linear
+from ddco_pyro.training.objective import Diverged, Objective, read_ahead
+from ddco_pyro.training.processes import ALONE, Ranks
+from ddco_pyro.training.stages import Stage, StageEnd, plan, share
 
-SAVE_EVERY = 1.0  # s between checkpoints, at least: an epoch of a small model takes less time than its checkpoint
+SAVE_EVERY = 1.0
+"""Seconds between checkpoints, at least: an epoch of a small model takes less time than its checkpoint."""
+
+Gradients = list[np.ndarray | None]
+"""The gradient of each parameter; None for a parameter without one."""
 
 
-def advance(
-    material: Material,
+def train(
+    data: TrainingData,
     restart: Restart,
-    until: int | None,
+    until: int | None = None,
     seconds: float = math.inf,
     checkpoint: Path | None = None,
     on_event: OnEvent = ignore,
     ranks: Ranks = ALONE,
-) -> tuple[Restart, bool]:
-    """Train a restart further, on one thread; the restart, and whether it came as far as it was to.
+) -> Restart:
+    """Train a restart further, on one thread.
 
-    :param until: so many epochs of the last stage; None for all that patience and budget allow.
-    :param seconds: about how long it may take; an epoch of each stage that it comes to is made in any case.
-    :param checkpoint: where it is kept at the end of epochs.
-    :param ranks: the processes that do this together, all of them without a limit of time.
+    :param until: epochs of the last stage after which training pauses; None to train until patience or budget end it.
+    :param seconds: training also pauses after about this time, at the end of an epoch.
+    :param checkpoint: the file that the restart is written to at the end of epochs.
+    :param ranks: the processes that train this restart together, none of them with a limit of ``seconds``.
     """
-    deadline = time.monotonic() + seconds
-    device = device_of(material.spec.training)
-    with one_thread(), repeatable(device), Readers(material.spec.training.workers) as readers:
-        training = Training(material.read_by(readers).held(device), restart, checkpoint, on_event, ranks)
-        return restart, training.run(until, deadline)
-
-
-class Training:
-    """A restart in training."""
-
-    def __init__(
-        self, material: Material, restart: Restart, checkpoint: Path | None, on_event: OnEvent, ranks: Ranks
-    ) -> None:
-        self.spec, self.progress = material.spec, restart.progress
-        self._material, self._restart, self._checkpoint, self._on_event = material, restart, checkpoint, on_event
-        self._ranks = ranks
-        self._saved_at = -np.inf  # the first epoch is saved
-
-    def run(self, until: int | None, deadline: float) -> bool:
-        """Whether it came as far as it was to, or has diverged, before the deadline."""
+    now, states, spec = restart.progress, restart.states, data.spec.training
+    device, deadline, saved = device_of(spec), time.monotonic() + seconds, -math.inf
+    with one_thread(), repeatable(device), Readers(spec.workers) as readers:
+        data = data.read_by(readers).held(device)
+        model = data.hierarchy(now.restart, states.get("model"))
+        stages = plan(data.spec, model.depth)
         try:
-            return self._run(until, deadline)
+            while not now.done:
+                last = now.stage == len(stages) - 1
+                cap = share(spec.epochs, now.spent, len(stages) - now.stage)
+                stage, begun = StageTraining(data, model, stages[now.stage], restart, ranks), now.epoch
+                while (cap is None or now.epoch < cap) and not stage.converged:
+                    overdue = now.epoch > begun and time.monotonic() > deadline
+                    if overdue or (last and until is not None and now.epoch >= until):
+                        states |= stage.states()
+                        return restart
+                    on_event(stage.epoch(cap))
+                    if checkpoint is not None and time.monotonic() - saved > SAVE_EVERY:
+                        states |= stage.states()
+                        restart.write(checkpoint)
+                        saved = time.monotonic()
+                stage.end(cap)
+                now.stage, now.epoch, now.done = (now.stage, now.epoch, True) if last else (now.stage + 1, 0, False)
+            restart.states = {"best": states["best"]}
         except Diverged as error:
-            now = self.progress
-            now.done, now.diverged, now.best, self._restart.states = True, str(error), -math.inf, {}
-            return True
+            now.done, now.diverged, now.best, restart.states = True, str(error), -math.inf, {}
+    return restart
 
-    def _run(self, until: int | None, deadline: float) -> bool:
-        now, model = self.progress, self._material.hierarchy(self.progress.restart)
-        if "model" in self._restart.states:
-            model.load_state_dict(self._restart.states["model"])
-        stages = plan(self.spec, model.depth)
-        while not now.done:
-            last = now.stage == len(stages) - 1
-            if not self._run_stage(
-                model, stages[now.stage], len(stages) - now.stage, until if last else None, deadline
-            ):
-                return until is not None and last and now.epoch >= until
-            if last:
-                now.done, self._restart.states = True, {"best": self._restart.states["best"]}
-            else:
-                now.stage, now.epoch = now.stage + 1, 0
-        return True
 
-    def _run_stage(self, model: Hierarchy, stage: Stage, stages_left: int, until: int | None, deadline: float) -> bool:
-        """Whether it has ended, rather than come to the epoch ``until`` or the deadline."""
-        now, training, states = self.progress, self.spec.training, self._restart.states
-        cap = share(training.epochs, sum(end["epochs"] for end in now.ended), stages_left)
-        objective = Objective(self._material, now, stage, self._ranks)
-        ascent = Ascent(model, stage, training, objective)
+class StageTraining:
+    """A stage of a restart in training: the model, the objective, the optimiser, and the running mean of the weights.
+
+    The stage begins, or goes on from the restart's checkpoint.
+
+    :ivar kept: the model that is evaluated and kept: the exponential running mean of the weights over gradient steps
+        (Polyak and Juditsky 1992) where ``training.average`` asks for it, the trained model otherwise.
+    """
+
+    def __init__(self, data: TrainingData, model: Hierarchy, stage: Stage, restart: Restart, ranks: Ranks) -> None:
+        self.data, self.model, self.stage, self.restart, self.ranks = data, model, stage, restart, ranks
+        self.spec, now = data.spec.training, restart.progress
+        self.objective = Objective(data, now, stage, ranks, restart.states if now.epoch else None)
+        self.parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
+        self.optimizer = _optimizer(self.spec.optimizer, self.parameters)
+        self.em = None
+        if uses_em(self.spec.optimizer, model):
+            self.em = Expectation(model, stage.trained, self._score, self.spec.optimizer.ridge, stage.discovering)
+        decay = self.spec.average
+        self.mean = None if decay is None else AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(decay))
         if now.epoch > 0:
-            ascent.restore(states)
-            objective.constants = Constants.of(states.get("constants", {}))
+            if self.em is not None:
+                self.em.load_states(restart.states["em"])
+            else:
+                restore_optimizer(self.optimizer, restart.states["optimizer"])
+            if self.mean is not None:
+                self.mean.load_state_dict(restart.states["average"])
         else:
-            objective.find_constants(model)
-            states["constants"] = objective.constants.state() if objective.constants else {}
-            now.start, now.stale = objective.tune(model), 0
+            self.objective.find_constants(model)
+            restart.states |= self.objective.states()
+            now.start, now.stale = self.objective.tune(model), 0
             now.best = now.start
-            states["best"] = copy_of(model)
-        first = now.epoch
-        while (cap is None or now.epoch < cap) and (training.patience is None or now.stale < training.patience):
-            over = now.epoch > first and time.monotonic() > deadline
-            if over or (until is not None and now.epoch >= until):
-                states |= ascent.states()
-                return False
-            ascent.set_rate(learning_rate(training.optimizer, now.epoch, cap))
-            train, kept = self._epoch(ascent), ascent.average.model
-            self._record(stage, train, objective.tune(kept), kept)
-            self._save(ascent)
-        model.load_state_dict(states["best"])
-        now.ended.append(asdict(StageEnd.of(stage.name, cap, now.tune, training.patience)))
-        return True
+            restart.states["best"] = copy_of(model)
 
-    def _epoch(self, ascent: Ascent) -> float:
-        """One pass over the training demonstrations; the log-likelihood per step seen on the way."""
-        now, model, total = self.progress, ascent.model, 0.0
+    @property
+    def converged(self) -> bool:
+        """Whether patience has run out, or EM gains nothing more."""
+        patience = self.spec.patience
+        out = patience is not None and self.restart.progress.stale >= patience
+        return out or (self.em is not None and self.em.converged)
+
+    @property
+    def kept(self) -> Hierarchy:
+        if self.mean is None:
+            return self.model
+        mean = self.mean.module
+        assert isinstance(mean, Hierarchy)  # a copy of the model
+        return mean.eval()
+
+    def epoch(self, cap: int | None) -> EpochEnded:
+        """One pass over the training demonstrations, and what it gained on the tuning demonstrations.
+
+        :param cap: the epochs that the stage may take.
+        """
+        now, train = self.restart.progress, self.data.train
         place = now.restart, now.stage, now.epoch
-        with seeded(self._material.seed(*place), model.device):
-            model.train()
-            minibatches = torch.randperm(len(self._material.train)).split(self.spec.training.batch_size)
-            seeds = (partial(self._material.seed, *place, number) for number in range(len(minibatches)))
-            shards = [cut(rows, self.spec.training.shards, seed) for rows, seed in zip(minibatches, seeds, strict=True)]
-            ascent.objective.read_ahead(model, [shard.rows for each in shards for shard in self._ranks.own(each)])
-            for rows, each in zip(minibatches, shards, strict=True):
-                total += ascent.step(each, int(self._material.train.lengths[rows].sum()))
-            model.eval()
-        return total / self._material.train.steps
-
-    def _record(self, stage: Stage, train: float, tune: float, model: Hierarchy) -> None:
-        now = self.progress
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.spec.optimizer, now.epoch, cap)
+        varied, total = train.varied(self.model.encoder.shifts, self.data.seed(*place)), 0.0
+        if self.em is not None:
+            total = self.em.step(train) / self.objective.likelihoods
+        else:
+            total = self._gradient_steps(varied, place)
+        tune = self.objective.tune(self.kept)
         now.epoch += 1
         if tune > now.best:
             now.best, now.stale = tune, 0
-            self._restart.states["best"] = copy_of(model)
+            self.restart.states["best"] = copy_of(self.kept)
         else:
             now.stale += 1
-        row = EpochEnded(now.restart, stage.name, now.epoch, train, tune)
-        now.history.append(asdict(row))
-        self._on_event(row)
+        ended = EpochEnded(now.restart, self.stage.name, now.epoch, total / train.steps, tune)
+        now.history.append(asdict(ended))
+        return ended
 
-    def _save(self, ascent: Ascent) -> None:
-        """Keep it as a checkpoint, unless that was done just before."""
-        if self._checkpoint is not None and time.monotonic() - self._saved_at > SAVE_EVERY:
-            self._saved_at = time.monotonic()
-            self._restart.states |= ascent.states()
-            self._restart.write(self._checkpoint)
+    def _score(self, tables: Tables, piece: Batch, rows: Tensor) -> Tensor:
+        return self.objective.value(self.objective.clamped(tables, rows), piece.lengths)
+
+    def _gradient_steps(self, varied: Batch, place: tuple[int, int, int]) -> float:
+        """A gradient step on each minibatch; the log-likelihood on the way, nats.
+
+        :param place: the restart, stage and epoch, which seed what is random.
+        """
+        train, total = self.data.train, 0.0
+        with seeded(self.data.seed(*place), self.model.device):
+            self.model.train()
+            minibatches = torch.randperm(len(train)).split(self.spec.batch_size)
+            if train.picture_bytes:
+                read_ahead(self.model, varied, self._pieces(varied, minibatches))
+            for number, rows in enumerate(minibatches):
+                total += self.step(varied, rows, number)
+            self.model.eval()
+        return total
+
+    def step(self, batch: Batch, rows: Tensor, number: int) -> float:
+        """A gradient step on a minibatch; the log-likelihood of the minibatch before it, nats.
+
+        :param rows: the training demonstrations of the minibatch, [M].
+        :param number: of the minibatch in its epoch.
+        """
+        self.optimizer.zero_grad()
+        if self.spec.shards == 1:
+            value = backward(self.objective, self.model, batch, rows)
+        else:
+            value = self._backward_in_shards(batch, rows, number)
+        if self.spec.clip_gradient is not None:
+            nn.utils.clip_grad_norm_(self.parameters, self.spec.clip_gradient)
+        self.optimizer.step()
+        if self.mean is not None:
+            self.mean.update_parameters(self.model)
+        return value
+
+    def _backward_in_shards(self, batch: Batch, rows: Tensor, number: int) -> float:
+        """:func:`backward`, shard after shard; the processes take turns in computing them."""
+        steps, now, total = int(batch.lengths[rows].sum()), self.restart.progress, 0.0
+        sums: Gradients = [None] * len(self.parameters)
+        seeds = (self.data.seed(now.restart, now.stage, now.epoch, number, shard) for shard in range(self.spec.shards))
+        shards = zip(self._shards(rows), seeds, strict=False)
+        for value, gradients in self.ranks.each(partial(self._shard, batch, *shard, steps) for shard in shards):
+            total += value
+            sums = [_sum(*pair) for pair in zip(sums, gradients, strict=True)]
+        for parameter, gradient in zip(self.parameters, sums, strict=True):
+            parameter.grad = None if gradient is None else torch.from_numpy(gradient).to(parameter.device)
+        return total
+
+    def _shards(self, rows: Tensor) -> tuple[Tensor, ...]:
+        """A minibatch in parts as equal as they can be, none of them empty."""
+        return rows.tensor_split(min(self.spec.shards, len(rows)))
+
+    def _shard(self, batch: Batch, rows: Tensor, own: int, steps: int) -> tuple[float, Gradients]:
+        """What a shard adds to what is maximised, and to the gradient of each parameter.
+
+        :param own: the seed of the shard's random numbers.
+        """
+        self.optimizer.zero_grad()
+        seed(own, self.model.device)
+        value = backward(self.objective, self.model, batch, rows, steps)
+        return value, [None if p.grad is None else p.grad.cpu().numpy() for p in self.parameters]
+
+    def _pieces(self, batch: Batch, minibatches: tuple[Tensor, ...]) -> Iterator[Batch]:
+        """The pieces that this process computes in an epoch, in order."""
+        for rows in minibatches:
+            for shard in self.ranks.own(self._shards(rows)):
+                for _, piece in batch.select(shard).pieces(self.model.steps_at_once):
+                    yield piece
+
+    def states(self) -> dict[str, State]:
+        """What a checkpoint keeps of the stage, beside the best epoch and the objective."""
+        average = {} if self.mean is None else {"average": copy_of(self.mean)}
+        if self.em is not None:
+            return {"model": copy_of(self.model), "em": self.em.states(), **average}
+        return {"model": copy_of(self.model), "optimizer": optimizer_state(self.optimizer), **average}
+
+    def end(self, cap: int | None) -> None:
+        """The best epoch is the model that the stage gives."""
+        now = self.restart.progress
+        self.model.load_state_dict(self.restart.states["best"])
+        end = StageEnd.of(self.stage.name, cap, now.tune, self.spec.patience)
+        if self.em is not None and self.em.converged:
+            end = replace(end, rising=0.0)  # at an optimum of the penalised likelihood
+        now.ended.append(asdict(end))
+
+
+def backward(objective: Objective, model: Hierarchy, batch: Batch, rows: Tensor, steps: int | None = None) -> float:
+    """Add the gradient of the loss of some demonstrations to the parameters' gradients.
+
+    The loss is minus the objective per step. A batch that is long is processed in pieces.
+
+    :param rows: the demonstrations, [M].
+    :param steps: of the minibatch of which the demonstrations are a shard; None where they are all of it.
+    :returns: what the demonstrations add to the objective, nats.
+    :raises Diverged: the objective is not finite.
+    """
+    batch, total = batch.select(rows), 0.0
+    for part, piece in batch.pieces(model.steps_at_once):
+        tables = objective.tables(model, piece, rows[part])  # networks → tables
+        value = objective.value(tables, piece.lengths)  # exact log-likelihood, all options summed out
+        if not bool(torch.isfinite(value.detach())):
+            raise objective.diverged(tables, piece.lengths, rows[part])
+        (-value / (steps or batch.steps)).backward()  # posteriors weight the networks' gradients
+        total += float(value.detach())
+    return total / objective.likelihoods
+
+
+def uses_em(spec: OptimizerSpec, model: Hierarchy) -> bool:
+    """Whether a model is trained by EM: where the spec asks for it, and every network is linear."""
+    return spec.name == "em" and is_linear(model)
+
+
+def learning_rate(spec: OptimizerSpec, epoch: int, cap: int | None) -> float:
+    """The learning rate of a stage's epoch, counted from 0.
+
+    :param cap: the epochs that the stage may take.
+    """
+    rate = spec.lr * min(1.0, (epoch + 1) / (spec.warmup + 1))
+    if spec.schedule == "constant":
+        return rate
+    assert cap is not None  # a spec with this schedule has a budget
+    return rate * 0.5 * (1 + math.cos(math.pi * epoch / cap))
+
+
+def _optimizer(spec: OptimizerSpec, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
+    if spec.name == "momentum":
+        return torch.optim.SGD(parameters, lr=spec.lr, momentum=spec.momentum, weight_decay=spec.weight_decay)
+    kind = torch.optim.AdamW if spec.name == "adamw" else torch.optim.Adam
+    return kind(parameters, lr=spec.lr, weight_decay=spec.weight_decay)
+
+
+def _sum(before: np.ndarray | None, gradient: np.ndarray | None) -> np.ndarray | None:
+    if before is None or gradient is None:
+        return gradient if before is None else before
+    before += gradient
+    return before

@@ -1,35 +1,40 @@
-"""The networks that a spec asks for, and those of its baselines, for observations and a control of known dimensions."""
+"""The networks of a spec and of its baselines, for observations and a control of known dimensions."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import nn
 
-from ddco_pyro.data.control_dimensions import ControlDimension, all_constant, control_dimensions
-from ddco_pyro.data.control_parts import ControlPart, control_parts, refuse_unknown_dimensions
+from ddco_pyro.data.controls import (
+    ControlDimension,
+    ControlPart,
+    all_constant,
+    control_dimensions,
+    control_parts,
+    refuse_unknown_dimensions,
+)
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
-from ddco_pyro.model.encoding import Shapes
+from ddco_pyro.model.encoder import Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import ShapeError
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code, with_overrides
 from ddco_pyro.training.devices import device_of
-from ddco_pyro.training.widths import nearest_widths
 
 
 @dataclass(frozen=True)
 class Dimensions:
-    """Shapes of the observations by name, control dimensions A, and the longest demonstration where it is known.
+    """Shapes of the observations by name, control dimensions A, and steps of the longest demonstration.
 
-    :param constant: the control dimensions that are constant in all demonstrations, and their values: they are no part
-        of the model.
-    :param control: what each control dimension does in the demonstrations; empty where that is not known.
-    :param parts: how a fitted model has the control; None where that is still to be decided.
+    :param constant: control dimensions that are constant in all demonstrations, with their values; the model leaves
+        them out.
+    :param control: statistics of each control dimension in the demonstrations; empty where they are unknown.
+    :param parts: the parts of the control in a fitted model; None before they are decided.
     """
 
     shapes: Shapes
@@ -56,7 +61,7 @@ class Dimensions:
 def build_hierarchy(spec: Spec, dimensions: Dimensions, seed: int | None = None) -> Hierarchy:
     """The spec's networks for these dimensions, randomly initialised; torch's generator is left as it was.
 
-    :param seed: of their numbers; None for the spec's.
+    :param seed: of the initial weights; None for the spec's.
     :raises SpecError: something in the spec does not fit the observations or the control.
     """
     missing = [key for key in spec.observed if key not in dimensions.shapes]
@@ -69,31 +74,34 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions, seed: int | None = None)
         raise SpecError(
             f"report.trajectory: {drawn!r} has shape {list(shape)} at each step; name a vector of three numbers or more"
         )
-    scale = spec.control.scale
-    if isinstance(scale, tuple) and len(scale) != dimensions.control_size:
-        raise SpecError(
-            f"control.scale: has {len(scale)} numbers, but the control has {dimensions.control_size} dimensions"
-        )
-    refuse_unknown_dimensions(spec.control, dimensions.control_size)
-    _refuse_giants(spec, dimensions)
+    scale, size = spec.control.scale, dimensions.control_size
+    if isinstance(scale, tuple) and len(scale) != size:
+        raise SpecError(f"control.scale: has {len(scale)} numbers, but the control has {size} dimensions")
+    refuse_unknown_dimensions(spec.control, size)
+    parts = dimensions.parts
+    if parts is None and dimensions.control:
+        parts = control_parts(spec.control, dimensions.control)
     try:
         with seeded(spec.seed if seed is None else seed):
-            return _hierarchy(spec, dimensions)
+            return Hierarchy(spec, dimensions.shapes, size, dimensions.steps, dimensions.constant, parts)
     except ShapeError as error:
         raise SpecError(str(error)) from error
 
 
 MOST_PARAMETERS = 50_000_000
-"""Of all networks together. Training holds each five times: itself, its gradient, Adam's moments, the best so far."""
+"""Of all networks together. Training holds each five times: weights, gradient, Adam's moments, the best so far."""
 
 MOST_CHOICES = 10_000
-"""Joint choices of all levels, Π(1 + k): every step of a demonstration has so many entries in the inference."""
+"""Joint choices of all levels, Π(1 + k): the inference has so many entries for every step of a demonstration."""
 
 
-def _refuse_giants(spec: Spec, dimensions: Dimensions) -> None:
-    """A typing error in a size is refused before it fills the memory: networks are made without their numbers first.
+def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
+    """The spec's networks, made without weights unless there is user code among them, which needs some.
 
-    :raises SpecError: the model is larger than any that can be trained here.
+    A typing error in a size is refused before it fills the memory.
+
+    :raises SpecError: something in the spec does not fit the observations, the control or this machine, or the model is
+        larger than any that can be trained.
     """
     choices = math.prod(1 + level.count for level in spec.hierarchy.levels) if spec.hierarchy else 1
     if choices > MOST_CHOICES:
@@ -101,33 +109,19 @@ def _refuse_giants(spec: Spec, dimensions: Dimensions) -> None:
             f"hierarchy.levels: the levels have {choices} joint choices, at most {MOST_CHOICES} can be summed over; "
             "lower count"
         )
+    device_of(spec.training)
     if any(place.endswith(".network") for place in user_code(spec)):
-        return  # its sizes are its own affair
+        return build_hierarchy(spec, dimensions)
     try:
-        number = _counted(spec, dimensions)
-    except ShapeError:
-        return  # it is said better where the networks are made
+        with torch.device("meta"):
+            hierarchy = build_hierarchy(spec, dimensions)
     except (RuntimeError, MemoryError, TypeError):  # sizes that no tensor can have
-        said = "more parameters than a machine can count"
+        size = "more parameters than a machine can count"
     else:
-        if number <= MOST_PARAMETERS:
-            return
-        said = f"{number} parameters, more than {MOST_PARAMETERS}"
-    raise SpecError(f"the networks have {said}; lower count, hidden, filters or kernel, or scale the images down")
-
-
-def _counted(spec: Spec, dimensions: Dimensions) -> int:
-    """The number of parameters of the spec's networks, which are made without their numbers."""
-    with torch.device("meta"):
-        return parameters(_hierarchy(spec, dimensions))
-
-
-def _hierarchy(spec: Spec, dimensions: Dimensions) -> Hierarchy:
-    parts = dimensions.parts
-    if parts is None and dimensions.control:
-        parts = control_parts(spec.control, dimensions.control)
-    size = dimensions.shapes, dimensions.control_size, dimensions.steps, dimensions.constant
-    return Hierarchy(spec, *size, parts)
+        if parameters(hierarchy) <= MOST_PARAMETERS:
+            return hierarchy
+        size = f"{parameters(hierarchy)} parameters, more than {MOST_PARAMETERS}"
+    raise SpecError(f"the networks have {size}; lower count, hidden, filters or kernel, or scale the images down")
 
 
 def parameters(network: nn.Module) -> int:
@@ -135,35 +129,39 @@ def parameters(network: nn.Module) -> int:
     return sum(parameter.numel() for parameter in network.parameters())
 
 
-def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
-    """The spec's networks, after those of its baselines were made too.
+HIERARCHY = "ddco"
+"""The name of a hierarchy whose options last, in tables."""
 
-    :raises SpecError: something in the spec does not fit the observations, the control or this machine.
+
+def model_name(spec: Spec) -> str:
+    """The name of a model in tables: ``ddco``, or a baseline's (:attr:`~ddco_pyro.spec.BaselineSpec.name`)."""
+    if spec.hierarchy is None:
+        assert spec.baseline is not None  # a spec has one or the other
+        return spec.baseline.name
+    memoryless = [level.name for level in spec.hierarchy.levels if not level.lasts]
+    if not memoryless:
+        return HIERARCHY
+    return "_".join(("mixture", *(memoryless if len(memoryless) < len(spec.hierarchy.levels) else ())))
+
+
+def check_models(spec: Spec, dimensions: Dimensions) -> dict[str, tuple[Spec, Hierarchy]]:
+    """The specs and networks (:func:`check_networks`) of a spec's model and its baselines, by name, the model first.
+
+    :raises SpecError: as :func:`check_networks`.
     """
-    hierarchy = build_hierarchy(spec, dimensions)
-    baselines(spec, dimensions)
-    device_of(spec.training)
-    return hierarchy
-
-
-def baselines(spec: Spec, dimensions: Dimensions) -> list[tuple[Spec, Hierarchy]]:
-    """The spec and the networks of each baseline that is trained beside.
-
-    :raises SpecError: a baseline's network does not fit the observations.
-    """
-    built = []
-    for number, baseline in enumerate(spec.compare_with):
+    models = {model_name(spec): (spec, check_networks(spec, dimensions))}
+    for number, (name, baseline) in enumerate(named_baselines(spec).items()):
         try:
             beside = baseline_spec(spec, baseline, dimensions)
-            built.append((beside, build_hierarchy(beside, dimensions)))
-        except SpecError as error:  # what it shares with the spec is in order: it is about its own network
+            models[name] = beside, check_networks(beside, dimensions)
+        except SpecError as error:  # what the baseline shares with the spec is in order
             problems = (problem.removeprefix("baseline.") for problem in error.problems)
             raise SpecError(*(f"compare_with.{number}.{problem}" for problem in problems)) from error
-    return built
+    return models
 
 
 def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
-    """The baselines trained beside, by name, numbered from the second model of one name on: the spec's own counts."""
+    """The spec's baselines (``compare_with``) by name, numbered from the second model of one name on."""
     names: dict[str, BaselineSpec] = {}
     own = spec.baseline.name if spec.baseline else None
     for baseline in spec.compare_with:
@@ -173,8 +171,9 @@ def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
 
 
 def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) -> Spec:
-    """The spec of a baseline trained beside: another model, and the optimiser and σ that the baseline names; nothing
-    else differs. A mixture keeps labels and durations; policies without options have neither.
+    """The spec of a baseline: another model, with the optimiser and σ that the baseline names.
+
+    Nothing else differs. A mixture keeps labels and durations; policies without options have neither.
 
     :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
     """
@@ -194,6 +193,28 @@ def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) ->
         policy = baseline.policy.model_copy(update={"hidden": hidden})
         return alone(policy=policy.model_dump(exclude_unset=True))
 
-    build_hierarchy(resized(baseline.policy.hidden), dimensions)  # what is wrong with it is said here
-    target = parameters(build_hierarchy(spec, dimensions))
-    return resized(nearest_widths(baseline.policy.hidden, target, lambda hidden: _counted(resized(hidden), dimensions)))
+    def count(hidden: tuple[int, ...]) -> int:
+        with torch.device("meta"):
+            return parameters(build_hierarchy(resized(hidden), dimensions))
+
+    target = parameters(check_networks(spec, dimensions))
+    return resized(nearest_widths(baseline.policy.hidden_sizes, target, count))
+
+
+def nearest_widths(hidden: Sequence[int], target: int, parameters: Callable[[tuple[int, ...]], int]) -> tuple[int, ...]:
+    """Sizes of hidden layers, scaled by one factor, whose number of ``parameters`` is nearest to ``target``.
+
+    Of two equally near ones the narrower is taken.
+    """
+    widest = max(hidden)
+
+    def scaled(width: int) -> tuple[int, ...]:
+        return tuple(max(1, round(size * width / widest)) for size in hidden)
+
+    low, high = 1, 2  # the first width that has enough parameters lies above low and at or below high
+    while parameters(scaled(high)) < target:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if parameters(scaled(middle)) < target else (low, middle)
+    return min(scaled(low), scaled(high), key=lambda sizes: abs(parameters(sizes) - target))

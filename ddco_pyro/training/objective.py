@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from statistics import median
 
 import torch
 from torch import Tensor
 
-from ddco_pyro.data.reading import Job
+from ddco_pyro.data.pictures import Job
 from ddco_pyro.errors import Failed
 from ddco_pyro.inference.engines import log_likelihood
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.tables import Tables
-from ddco_pyro.training.checkpoint import Progress
-from ddco_pyro.training.duration import log_duration_prior
+from ddco_pyro.model.tables import Tables, always_ends
+from ddco_pyro.spec import DurationSpec
+from ddco_pyro.training.checkpoint import Progress, State, TrainingData
 from ddco_pyro.training.initialization import Clusters, EqualParts
-from ddco_pyro.training.material import Material
-from ddco_pyro.training.ranks import ALONE, Ranks
+from ddco_pyro.training.processes import ALONE, Ranks
 from ddco_pyro.training.stages import Stage
 from ddco_pyro.training.upper import Constants, expected, fitted
 
@@ -30,129 +29,133 @@ class TrainingError(Failed):
 
 
 class Diverged(TrainingError):
-    """A log-likelihood of training demonstrations that is NaN or infinite: this restart has no further epoch."""
+    """The log-likelihood of training demonstrations is NaN or infinite; its restart has no further epoch."""
 
 
 Known = dict[int, Tensor]
-"""By level: the choice of each step that is known, [N, T]; -1 where it is free."""
+"""Known choices of levels, by level (1 is the lowest): the choice of each step [N, T]; -1 where it is free."""
 
 
 class Objective:
-    """What a stage maximises: the log-likelihood with the choices that are known, and the log-prior of durations.
+    """What a stage maximises: the log-likelihood given the known choices, plus the log-prior of durations.
 
-    Where networks take over :attr:`constants`, the expected log-probability of selections and terminations is in the
-    place of the log-likelihood. Where levels and meta-policy are trained apart it is the sum of two, and their mean is
-    what is said of it.
+    In a stage with ``from_constants`` the expected log-probability of selections and terminations (an M-step) takes the
+    place of the log-likelihood. In a stage with ``selecting`` the levels and the meta-policy are trained apart: the
+    objective is the sum of two log-likelihoods, and their mean is what is reported.
+
+    :param states: the checkpoint from which the stage goes on; None at the beginning of the stage.
+    :ivar known: the known choices of the training and of the tuning demonstrations.
+    :ivar likelihoods: the number of log-likelihoods whose mean is reported.
     """
 
-    def __init__(self, material: Material, progress: Progress, stage: Stage, ranks: Ranks = ALONE) -> None:
-        self.material, self.progress, self.stage, self.ranks = material, progress, stage, ranks
+    def __init__(
+        self,
+        data: TrainingData,
+        progress: Progress,
+        stage: Stage,
+        ranks: Ranks = ALONE,
+        states: Mapping[str, State] | None = None,
+    ) -> None:
+        self.data, self.progress, self.stage, self.ranks = data, progress, stage, ranks
+        self.likelihoods = 2 if stage.selecting else 1
+        self.constants = Constants.of((states or {}).get("constants", {}))
         self.known: tuple[Known, Known] = {}, {}
-        self.constants: Constants | None = None
-        self._varied: tuple[tuple[int, int, int], Batch] | None = None
-        self._likelihoods = 2 if stage.selecting else 1
-        labels = material.labels
+        labels = data.labels
         if labels is not None and labels.matter_in(stage):
             self.known = {labels.level: labels.train}, {labels.level: labels.tune}
         if stage.clamped is not None:
-            self._clamp_to_start(stage.clamped)
+            if states is None:
+                self._clamp_to_start(stage.clamped)
+            else:  # clusters are found once
+                for known, part in zip(self.known, ("train", "tune"), strict=True):
+                    known[stage.clamped] = states["known"][part].long()
+
+    def states(self) -> dict[str, State]:
+        """What a checkpoint keeps of the objective."""
+        clamped = self.stage.clamped
+        parts = zip(("train", "tune"), self.known, strict=True)
+        known = {} if clamped is None else {part: known[clamped].short() for part, known in parts}
+        return {"known": known, "constants": self.constants.state() if self.constants else {}}
 
     def _clamp_to_start(self, level: int) -> None:
-        """Where a step has no label its cluster, or the part of the demonstration it is in, is its choice."""
-        material, hierarchy = self.material, self.material.spec.hierarchy
+        """A step without a label has its cluster, or the part of the demonstration it is in, as known choice."""
+        data, hierarchy = self.data, self.data.spec.hierarchy
         assert hierarchy is not None  # only levels are clamped
-        kind, count = material.spec.training.initialize, hierarchy.levels[level - 1].count
+        kind, count = data.spec.training.initialize, hierarchy.levels[level - 1].count
         if kind == "equal_parts":
             start: EqualParts | Clusters = EqualParts(count)
         else:
-            seed = material.seed(self.progress.restart, self.progress.stage)
+            seed = data.seed(self.progress.restart, self.progress.stage)
             labels, read = self.known[0].get(level), hierarchy.read_by(level)
-            start = Clusters(material.train, count, seed, kind == "vq_controls", labels, read)
-        for known, batch in zip(self.known, (material.train, material.tune), strict=True):
+            start = Clusters(data.train, count, seed, kind == "vq_controls", labels, read)
+        for known, batch in zip(self.known, (data.train, data.tune), strict=True):
             choices = start.choices(batch)
             labelled = known.get(level, choices)
             known[level] = torch.where(labelled < 0, choices, labelled)
 
     def find_constants(self, model: Hierarchy) -> None:
-        """Those that the networks are to take over, given the lowest level of the model; none in other stages."""
+        """Find the constants that the networks take over, given the lowest level of the model."""
         if self.stage.from_constants:
             with torch.no_grad():
                 pieces = [
-                    (self._tables(model, piece, self.known[0], rows), piece.lengths)
-                    for rows, piece in self.material.train.pieces(model.steps_at_once)
+                    (self.tables(model, piece, rows), piece.lengths)
+                    for rows, piece in self.data.train.pieces(model.steps_at_once)
                 ]
-            self.constants = fitted(pieces, self.material.seed(self.progress.restart, self.progress.stage))
+            self.constants = fitted(pieces, self.data.seed(self.progress.restart, self.progress.stage))
 
-    def ascend(self, model: Hierarchy, rows: Tensor, steps: int | None = None) -> float:
-        """Add the gradient of the loss of some training demonstrations to the parameters'; what they add to what is
-        maximised.
+    def tables(self, model: Hierarchy, batch: Batch, rows: Tensor, tuning: bool = False) -> Tables:
+        """The tables of demonstrations, with their known choices.
 
-        The loss is minus that per step. A batch that is long is processed in parts.
-
-        :param steps: of the minibatch that they are a shard of; None where they are all of it.
+        :param rows: of the demonstrations among those to train with, or to tune with, [N].
         """
-        batch, total = self._seen(model).select(rows), 0.0
-        for part, piece in batch.pieces(model.steps_at_once):
-            tables = self._tables(model, piece, self.known[0], rows[part])
-            value = self._total(tables, piece)
-            if not bool(torch.isfinite(value.detach())):
-                raise self._not_finite(tables, piece, rows[part])
-            (-value / (steps or batch.steps)).backward()
-            total += float(value.detach())
-        return total / self._likelihoods
+        tables = model.tabulate(batch, self.stage.discovering)
+        return self.clamped(tables, rows, tuning)
 
-    def read_ahead(self, model: Hierarchy, shards: Sequence[Tensor]) -> None:
-        """Have the pictures of shards of an epoch's minibatches read before :meth:`ascend` asks for them."""
-        seen = self._seen(model)
-        _read_ahead(
-            model, seen, (piece for rows in shards for _, piece in seen.select(rows).pieces(model.steps_at_once))
-        )
+    def clamped(self, tables: Tables, rows: Tensor, tuning: bool = False) -> Tables:
+        """The tables with the choices that are known clamped."""
+        for level, choices in self.known[tuning].items():
+            tables = tables.clamp(level, choices[rows, : tables.steps])
+        return tables
 
-    def _seen(self, model: Hierarchy) -> Batch:
-        """The training demonstrations as they are seen in this epoch."""
-        epoch = self.progress.restart, self.progress.stage, self.progress.epoch
-        if self._varied is None or self._varied[0] != epoch:
-            self._varied = epoch, self.material.train.varied(model.encoder.shifts, self.material.seed(*epoch))
-        return self._varied[1]
+    def value(self, tables: Tables, lengths: Tensor) -> Tensor:
+        """The objective of demonstrations, nats, a scalar.
+
+        :param lengths: steps of each demonstration, [N].
+        """
+        spec = self.data.spec
+        likelihood = partial(log_likelihood, lengths=lengths, engine=spec.inference.engine)
+        if self.constants is not None:
+            value = expected(tables, lengths, self.constants)
+        elif self.stage.selecting:
+            levels, meta_policy = tables.apart()
+            value = likelihood(levels).sum() + likelihood(meta_policy).sum()
+        else:
+            value = likelihood(tables).sum()
+        if spec.training.duration is None:
+            return value
+        prior = log_duration_prior(tables.termination, lengths, spec.training.duration)
+        return value + prior / self.data.train.steps
 
     def tune(self, model: Hierarchy) -> float:
-        """What is maximised of the tuning demonstrations, per step: the mean, or the median over demonstrations."""
-        tune, by_median = self.material.tune, self.material.spec.training.tune_by == "median"
+        """The objective per step of the tuning demonstrations: the mean, or the median over demonstrations."""
+        tune, by_median = self.data.tune, self.data.spec.training.tune_by == "median"
         pieces = list(tune.pieces(1 if by_median else model.steps_at_once))  # one demonstration each
         with torch.no_grad():
-            _read_ahead(model, tune, (piece for _, piece in self.ranks.own(pieces)))
+            if tune.picture_bytes:
+                read_ahead(model, tune, (piece for _, piece in self.ranks.own(pieces)))
             values = list(self.ranks.each(partial(self._tuned, model, *piece) for piece in pieces))
         if by_median:
             return median(value / piece.steps for value, (_, piece) in zip(values, pieces, strict=True))
         return sum(values) / tune.steps
 
     def _tuned(self, model: Hierarchy, rows: Tensor, batch: Batch) -> float:
-        return float(self._total(self._tables(model, batch, self.known[1], rows), batch)) / self._likelihoods
+        return float(self.value(self.tables(model, batch, rows, tuning=True), batch.lengths)) / self.likelihoods
 
-    def _tables(self, model: Hierarchy, batch: Batch, known: Known, rows: Tensor) -> Tables:
-        tables = model.tabulate(batch, self.stage.discovering)
-        for level, choices in known.items():
-            tables = tables.clamp(level, choices[rows, : batch.inputs.batch[1]])
-        return tables
-
-    def _total(self, tables: Tables, batch: Batch) -> Tensor:
-        likelihood = partial(log_likelihood, lengths=batch.lengths, engine=self.material.spec.inference.engine)
-        if self.constants is not None:
-            value = expected(tables, batch.lengths, self.constants)
-        elif self.stage.selecting:
-            levels, meta_policy = tables.apart()
-            value = likelihood(levels).sum() + likelihood(meta_policy).sum()
-        else:
-            value = likelihood(tables).sum()
-        prior = self.material.spec.training.duration
-        if prior is None:
-            return value
-        return value + log_duration_prior(tables.termination, batch.lengths, prior) / self.material.train.steps
-
-    def _not_finite(self, tables: Tables, batch: Batch, rows: Tensor) -> Diverged:
+    def diverged(self, tables: Tables, lengths: Tensor, rows: Tensor) -> Diverged:
+        """The error that names the training demonstrations whose log-likelihood is not finite."""
         with torch.no_grad():
-            values = log_likelihood(tables, batch.lengths)
-        bad = [self.material.names[int(row)] for row, ok in zip(rows, torch.isfinite(values), strict=True) if not ok]
+            values = log_likelihood(tables, lengths)
+        bad = [self.data.names[int(row)] for row, ok in zip(rows, torch.isfinite(values), strict=True) if not ok]
         where = ", ".join(bad) or "this minibatch (no trajectory alone)"
         return Diverged(
             f"stage {self.stage.name}, epoch {self.progress.epoch + 1}: the log-likelihood of {where} is not "
@@ -160,8 +163,30 @@ class Objective:
         )
 
 
-def _read_ahead(model: Hierarchy, whole: Batch, pieces: Iterable[Batch]) -> None:
-    """Have the pictures of these pieces of a batch read in the order in which the networks will ask for them."""
+def log_duration_prior(termination: Sequence[Tensor], lengths: Tensor, prior: DurationSpec) -> Tensor:
+    """Σ_d Σ_h Σ_n Σ_t w (log ψ_h(s_t) + (m_d - 1) log(1 - ψ_h(s_t))), nats, a scalar in float64.
+
+    ψ is that of option h of level d, w the prior's weight, m_d its mean. Divided by the number of steps this is the
+    mean over states of the log-density of Beta distributions of ψ with mean 1/m_d and w terminations, each as a
+    density of the logit of ψ and up to a constant. A level whose options end after every step has no such
+    distribution, and adds nothing.
+
+    :param termination: (log(1 - ψ), log ψ) of each level, lowest first, [N, T, k, 2].
+    :param lengths: steps of each trajectory, [N].
+    """
+    means = prior.mean if isinstance(prior.mean, tuple) else (prior.mean,) * len(termination)
+    total = torch.zeros((), dtype=torch.float64)
+    for table, mean in zip(termination, means, strict=False):  # lower levels alone, where those are discovered
+        if always_ends(table):
+            continue
+        alive = torch.arange(table.shape[1], device=lengths.device) < lengths[:, None]
+        counts = prior.weight * torch.tensor([mean - 1.0, 1.0], dtype=torch.float64)
+        total = total + (table.double() * counts)[alive].sum()
+    return total
+
+
+def read_ahead(model: Hierarchy, whole: Batch, pieces: Iterable[Batch]) -> None:
+    """Prefetch the pictures of pieces of a batch, in the order in which the networks will ask for them."""
     if isinstance(whole.inputs.images, Frames):
         whole.inputs.images.readers.plan(_jobs(model, pieces))
 

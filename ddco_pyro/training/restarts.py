@@ -1,41 +1,51 @@
-"""Restarts: independent initialisations, trained side by side, of which the worse half is stopped again and again.
+"""Restarts: independent initialisations of a model, of which the best on the tuning demonstrations is kept.
 
-Successive halving on tuning likelihood: all train until ``training.halving`` epochs of the last stage, the better half
-until twice as many, and so on; the last alone trains until patience or budget end it. Earlier stages are trained whole,
-since what they maximise cannot be compared. A restart whose log-likelihood becomes NaN or infinite ends there and is
-the worst of all. Who goes on follows from the histories alone, so that neither the number of processes nor an
-interruption changes it.
+Successive halving: all restarts train until ``training.halving`` epochs of the last stage, the better half until twice
+as many, and so on; the last restart alone trains until patience or budget end it. Earlier stages are trained whole,
+since their objectives cannot be compared. A restart whose log-likelihood becomes NaN or infinite ends there and ranks
+last. The histories alone decide which restarts go on, so that neither the number of processes nor an interruption
+changes the result.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
-from ddco_pyro.events import EpochEnded, OnEvent, RestartDiverged, RestartStopped, ignore
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.events import (
+    EpochEnded,
+    OnEvent,
+    RestartDiverged,
+    RestartStopped,
+    TrainingBegan,
+    TrainingEnded,
+    ignore,
+)
+from ddco_pyro.inference.engines import STEPS, TRAJECTORIES, EngineCheck, compare_engines
+from ddco_pyro.inference.threads import one_thread
+from ddco_pyro.model.batch import encode, refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import Spec
-from ddco_pyro.training.checkpoint import Progress, Restart
-from ddco_pyro.training.convergence import StageEnd, summary
+from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData
 from ddco_pyro.training.devices import described, device_of
-from ddco_pyro.training.jobs import pool, results, useful_jobs
 from ddco_pyro.training.labels import Labels
-from ddco_pyro.training.loop import advance
-from ddco_pyro.training.material import Material
-from ddco_pyro.training.networks import Dimensions, build_hierarchy
+from ddco_pyro.training.loop import train, uses_em
+from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
-from ddco_pyro.training.ranks import ALONE, Ranks
-from ddco_pyro.training.stages import plan
+from ddco_pyro.training.processes import ALONE, Ranks, pool, results, useful_jobs
+from ddco_pyro.training.stages import StageEnd, plan
 
 SLICE = 10.0
-"""Seconds that a process trains a restart before it tells how it went, and is given the next."""
+"""Seconds that a job trains a restart before it returns, so that progress is shown and a checkpoint written."""
 
 DEAD = (
     "a process that trained a restart was ended from outside (too little memory?); what was trained is kept in a run "
@@ -47,16 +57,52 @@ class OtherDevice(BadInput):
     """A restart was begun on another kind of device than it is to be continued on."""
 
 
+def train_model(
+    spec: Spec,
+    dimensions: Dimensions,
+    demos: Demonstrations,
+    on_event: OnEvent = ignore,
+    checkpoints: Path | None = None,
+    held_out: Demonstrations | None = None,
+    name: str | None = None,
+    jobs: int = 1,
+    ranks: Ranks = ALONE,
+) -> Trainer:
+    """Train a spec's model on demonstrations, of which ``training.tune_fraction`` are used to tune.
+
+    :param held_out: demonstrations to be evaluated; networks have to be able to read them.
+    :param name: of the model in events.
+    :param checkpoints: as of :class:`Trainer`, and so are the others.
+    :raises DemonstrationsError: a number is too large for networks.
+    :raises TrainingError: a log-likelihood is not finite, or the engines disagree.
+    """
+    budget = spec.training
+    with one_thread():
+        split = demos.split(budget.tune_fraction, spec.seed)
+        trainer = Trainer(spec, dimensions, *split, checkpoints, on_event, jobs, ranks)
+        if held_out is not None:
+            refuse_unusable(held_out, trainer.hierarchy.encoder, trainer.hierarchy.scaling)
+        trainer.check_engines()
+        epochs = None if budget.epochs is None else budget.epochs * budget.restarts
+        on_event(TrainingBegan(name or model_name(spec), epochs))
+        trainer.run()
+    on_event(TrainingEnded(name or model_name(spec)))
+    return trainer
+
+
 class Trainer:
-    """Trains a spec's hierarchy on ``train``, stopping and choosing among restarts by ``tune``.
+    """Trains restarts of a spec's hierarchy on ``train``, stopping and choosing among them by ``tune``.
 
-    ``first`` is the hierarchy before any training.
+    :ivar hierarchy: the model: before :meth:`run` without training, then the best restart's.
+    :ivar check: how far the engines are apart, once :meth:`check_engines` has compared them.
+    :ivar stopped: the restarts that were stopped early, with their epochs of the last stage.
 
-    :param checkpoints: the folder in which each restart is kept at the end of epochs; None for nowhere.
-    :param jobs: processes that train restarts; -1 is one for each core. The result is the same for any number.
+    :param checkpoints: the folder for a checkpoint of each restart; None for nowhere.
+    :param jobs: processes that train restarts side by side; -1 is one for each core. The result is the same for any
+        number.
     :param ranks: processes that train each restart together instead, of which this is the first (:func:`follow`).
     :raises DemonstrationsError: a number is too large for networks.
-    :raises SpecError: there are no labels where the spec names some, or more than options.
+    :raises SpecError: the demonstrations lack the labels that the spec names, or have more labels than options.
     """
 
     def __init__(
@@ -70,38 +116,58 @@ class Trainer:
         jobs: int = 1,
         ranks: Ranks = ALONE,
     ) -> None:
-        self.ranks = ranks
-        self.spec, self.checkpoints, self.on_event = spec, checkpoints, on_event
+        self.spec, self.checkpoints, self.on_event, self.ranks = spec, checkpoints, on_event, ranks
         self.jobs = useful_jobs(jobs, spec.training.restarts)
-        self.first = build_hierarchy(spec, dimensions)  # its encoder and scaling are those of all restarts
-        self.first.encoder.fit(train)
-        self.first.scaling.fit(train)
-        encoder, scaling = self.first.encoder, self.first.scaling
+        self.hierarchy = build_hierarchy(spec, dimensions)
+        encoder, scaling = self.hierarchy.encoder, self.hierarchy.scaling
+        encoder.fit(train)
+        scaling.fit(train)
         varied = replace(encode(train, encoder, scaling), versions=encoder.versions(train))
         encoded = varied, encode(tune, encoder, scaling)
         fitted = encoder.state_dict(), scaling.state_dict()
-        labels = Labels.of(spec, train, tune)
-        self.material = Material(spec, dimensions, *encoded, train.names, *fitted, labels)
+        self.data = TrainingData(spec, dimensions, *encoded, train.names, *fitted, Labels.of(spec, train, tune))
         self.restarts: list[Restart] = []
         self.stopped: dict[int, int] = {}
+        self.check = EngineCheck(math.nan, math.nan)
+        self._last = len(plan(spec, self.hierarchy.depth)) - 1  # the last stage
+
+    def check_engines(self) -> None:
+        """Compare the engines before any training, on a few of the training demonstrations.
+
+        :raises TrainingError: they disagree, or a network gives values that are not finite.
+        """
+        batch = self.data.train
+        few = batch.select(torch.arange(min(len(batch), TRAJECTORIES)), STEPS)
+        with seeded(self.spec.seed), torch.no_grad():
+            outputs = self.hierarchy(few.inputs)
+        if not all(bool(torch.isfinite(values).all()) for values in outputs.tensors()):
+            raise TrainingError(
+                "before any training a network gives values that are NaN or infinite; look at its code, or at the "
+                "ranges of the observations (ddco-pyro inspect)"
+            )
+        self.check = check = compare_engines(outputs, few.actions, few.lengths)
+        if not check.agrees:
+            raise TrainingError(
+                f"the engines disagree (value {check.value:.1e}, gradient {check.gradient:.1e}): "
+                "this is a defect; use inference.engine=enumerate and report it"
+            )
 
     def run(self) -> Hierarchy:
-        """The best restart's hierarchy, in evaluation mode.
+        """Train, and return the best restart's hierarchy in evaluation mode.
 
-        Where all that were left have diverged, the best of those that were stopped is trained to the end instead.
+        Where all restarts that were left have diverged, the best of the stopped ones is trained to the end instead.
 
         :raises OtherDevice: a restart was begun on another kind of device than it is to be continued on.
         :raises TrainingError: every restart has diverged.
         """
         self.restarts = [self._begun(number) for number in range(self.spec.training.restarts)]
-        self.ranks.share(self.material)
+        self.ranks.share(self.data)
         left, epochs = list(range(len(self.restarts))), self.spec.training.halving
         worse: list[int] = []  # the best first
         while epochs is not None and len(left) > 1:
             before = len(self.history)
             self._train(left, epochs)
-            last = len(plan(self.spec, self.first.depth)) - 1
-            order = ranked({number: best_until(self.restarts[number].progress, epochs, last) for number in left})
+            order = ranked({number: best_until(self.restarts[number].progress, epochs, self._last) for number in left})
             better, behind = sorted(order[: (len(order) + 1) // 2]), order[(len(order) + 1) // 2 :]
             self._stop(sorted(behind), tell=len(self.history) > before)
             left, worse, epochs = better, behind + worse, 2 * epochs
@@ -112,11 +178,10 @@ class Trainer:
             self._train([again], None)
         self.ranks.share(None)
         if (why := self.restarts[self.best].progress.diverged) is not None:
-            self.ranks.share(None)  # that was all
+            self.ranks.share(None)  # no further model
             raise TrainingError(why)
-        model = self.material.hierarchy(self.best)
-        model.load_state_dict(self.restarts[self.best].states["best"])
-        return model.eval()
+        self.hierarchy.load_state_dict(self.restarts[self.best].states["best"])
+        return self.hierarchy.place(device_of(self.spec.training)).eval()
 
     @property
     def best(self) -> int:
@@ -132,13 +197,28 @@ class Trainer:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """How the best restart was trained, and what all of them took, for ``metrics.json``."""
-        ends = [StageEnd(**end) for end in self.restarts[self.best].progress.ended]
-        updates = math.ceil(len(self.material.train) / self.spec.training.batch_size)
-        spent = [len(restart.progress.history) for restart in self.restarts]
-        diverged = [restart.progress.restart for restart in self.restarts if restart.progress.diverged is not None]
-        made = summary(self.spec.training, ends, updates, self.best, spent, self.stopped, diverged)
-        return made | {"device": self.restarts[self.best].progress.device}
+        """``training`` of ``metrics.json``: the budget, the best restart's stages, and the epochs of all restarts."""
+        by_em = uses_em(self.spec.training.optimizer, self.hierarchy)
+        best, updates = self.best, 1 if by_em else math.ceil(len(self.data.train) / self.spec.training.batch_size)
+        ends = [StageEnd(**end) for end in self.restarts[best].progress.ended]
+        each = [
+            {"epochs": len(restart.progress.history), "stopped": self.stopped.get(number)}
+            | ({} if restart.progress.diverged is None else {"diverged": True})
+            for number, restart in enumerate(self.restarts)
+        ]
+
+        def effort(epochs: int | None) -> dict[str, int | None]:
+            return {"epochs": epochs, "gradient_steps": None if epochs is None else epochs * updates}
+
+        return {
+            "budget": effort(self.spec.training.epochs),
+            "spent": effort(sum(end.epochs for end in ends)),
+            "stages": [asdict(end) | {"converged": end.converged} for end in ends],
+            "converged": ends[-1].converged,  # the last stage trains what acts in the end
+            "restarts": {"best": best, "spent": effort(len(self.history)), "each": each},
+            "device": self.restarts[best].progress.device,
+            "by_em": by_em,
+        }
 
     @property
     def _whole(self) -> list[Restart]:
@@ -155,13 +235,12 @@ class Trainer:
         return Restart.read(path)
 
     def _refuse_other_device(self, progress: Progress, until: int | None) -> None:
-        """What has come as far as it is to is taken from any device; what is trained further is not.
+        """A restart may be trained further on the kind of device alone that it was begun on.
 
         :raises OtherDevice: it was begun on another kind of device.
         """
-        device, last = described(device_of(self.spec.training)), len(plan(self.spec, self.first.depth)) - 1
-        arrived = until is not None and progress.stage == last and progress.epoch >= until
-        if progress.device != device and not arrived:
+        device = described(device_of(self.spec.training))
+        if progress.device != device and not progress.reached(self._last, until):
             raise OtherDevice(
                 f"{self._path(progress.restart)}: was trained on {progress.device}, and networks are on {device} here, "
                 "where the last digits differ; continue it there, or remove it: this restart then begins anew"
@@ -183,29 +262,36 @@ class Trainer:
                     self.on_event(RestartStopped(number, progress.epoch))
 
     def _train(self, numbers: Sequence[int], until: int | None) -> None:
-        """Train these restarts until so many epochs of the last stage, None for to the end; processes in slices.
+        """Train restarts until so many epochs of the last stage, None for to the end; jobs train slice after slice.
 
-        :raises OtherDevice: one of them was begun on another kind of device; nothing is trained then.
+        :raises OtherDevice: a restart was begun on another kind of device; nothing is trained then.
         """
         left = [number for number in numbers if not self.restarts[number].progress.done]
         for number in left:
             self._refuse_other_device(self.restarts[number].progress, until)
         if self.jobs == 1 or len(left) < 2:
             for number in left:
-                restart, path = self.restarts[number], self._path(number)
-                self.ranks.share((restart, until))
-                self._keep(advance(self.material, restart, until, math.inf, path, self.on_event, self.ranks)[0])
+                self.ranks.share((self.restarts[number], until))
+                self._keep(
+                    train(
+                        self.data,
+                        self.restarts[number],
+                        until,
+                        checkpoint=self._path(number),
+                        on_event=self.on_event,
+                        ranks=self.ranks,
+                    )
+                )
             return
         with pool(self.jobs) as parallel:
             while left:
-                calls = [partial(advance, self.material, self.restarts[number], until, SLICE) for number in left]
-                for restart, arrived in results(parallel, calls, DEAD):
+                calls = [partial(train, self.data, self.restarts[number], until, SLICE) for number in left]
+                for restart in results(parallel, calls, DEAD):
                     before = self.restarts[restart.progress.restart].progress
                     self._keep(restart)
                     for row in restart.progress.history[len(before.history) :]:
                         self.on_event(EpochEnded(**row))
-                    if arrived:
-                        left.remove(restart.progress.restart)
+                left = [number for number in left if not self.restarts[number].progress.reached(self._last, until)]
 
     def _keep(self, restart: Restart) -> None:
         number, why = restart.progress.restart, restart.progress.diverged
@@ -218,13 +304,11 @@ class Trainer:
 
 
 def follow(ranks: Ranks) -> None:
-    """Train along with the first process: each restart that its :class:`Trainer` trains, of each model, until it says
-    that this was all.
-    """
-    while (material := ranks.share()) is not None:
+    """Train along with the first process: every restart of every model that its :class:`Trainer` trains."""
+    while (data := ranks.share()) is not None:
         while (work := ranks.share()) is not None:
             restart, until = work
-            advance(material, restart, until, ranks=ranks)
+            train(data, restart, until, ranks=ranks)
 
 
 def best_until(progress: Progress, epochs: int, last: int) -> float:

@@ -1,21 +1,33 @@
-"""The stages of training (SM 2.2, SM 2.3): what each trains, and how much of the hierarchy it sees."""
+"""The stages of training (SM 2.2, SM 2.3): what each trains, its share of the budget, and how it ended.
+
+``training.epochs`` is a budget for all stages together, so that models compared have the same number of gradient steps
+whatever their number of stages.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from ddco_pyro.spec import Spec
+
+RISING = 0.01
+"""Nats per step. A stage whose tuning value rose by more than this over its last epochs has not converged."""
+
+WINDOW = 20
+"""The number of last epochs where ``training.patience`` is null."""
 
 
 @dataclass(frozen=True)
 class Stage:
     """One stage of training.
 
-    :param discovering: train levels 1 to d under a uniform meta-policy; None for the whole hierarchy.
+    :param discovering: d trains levels 1 to d under a uniform meta-policy; None trains the whole hierarchy.
     :param clamped: the level whose choices are clamped to clusters or parts of the demonstrations; None for no level.
     :param trained: prefixes of the names of the parameters that are trained.
-    :param selecting: the meta-policy is trained on the same choices, and the levels still have a uniform one.
-    :param from_constants: networks take over what :class:`ddco_pyro.training.upper.Constants` say.
+    :param selecting: train the meta-policy on the clamped choices, beside the levels under a uniform one.
+    :param from_constants: train the networks to :class:`ddco_pyro.training.upper.Constants`.
     """
 
     name: str
@@ -56,8 +68,51 @@ def plan(spec: Spec, depth: int) -> list[Stage]:
 
 
 def _meta_policy_begins(spec: Spec) -> bool:
-    """Whether the meta-policy is trained on the choices that the highest level is clamped to: where no stage trains it
-    before all are trained together, and it does not act itself, of which clusters and parts say nothing.
+    """Whether the meta-policy is trained on the clamped choices of the highest level.
+
+    That is so where no earlier stage trains it, and it does not emit the control itself, which clusters do not show.
     """
     assert spec.hierarchy is not None  # only levels are clamped
     return not spec.training.layerwise and "control" not in spec.hierarchy.meta_policy.emits
+
+
+@dataclass(frozen=True)
+class StageEnd:
+    """How a stage of training ended.
+
+    :param epochs: passes over the training demonstrations.
+    :param cap: the epochs that the stage might take; None for no limit.
+    :param rising: nats per step by which the best tuning value rose over the last ``over`` epochs
+        (``training.patience``, or all epochs where there are fewer): 0 where patience ended the stage.
+    """
+
+    stage: str
+    epochs: int
+    cap: int | None
+    rising: float
+    over: int
+
+    @property
+    def converged(self) -> bool:
+        """Whether the stage had epochs, and rose by at most :data:`RISING` over the last of them."""
+        return self.epochs > 0 and self.rising <= RISING
+
+    @classmethod
+    def of(cls, stage: str, cap: int | None, tune: Sequence[float], patience: int | None) -> StageEnd:
+        """The end of a stage with these tuning values: before the stage, and of each epoch."""
+        epochs = len(tune) - 1
+        over = min(patience or WINDOW, epochs)
+        return cls(stage, epochs, cap, max(tune) - max(tune[: epochs - over + 1]), over)
+
+
+def share(budget: int | None, spent: int, stages_left: int) -> int | None:
+    """A stage's cap: the rest of the budget, divided by the stages that are left; None without a budget."""
+    return None if budget is None else (budget - spent) // stages_left
+
+
+def effort(training: Mapping[str, Any] | None) -> str:
+    """The gradient or EM steps of training for tables, marked where training had not converged."""
+    if training is None:
+        return "–"
+    by_em = " (EM)" if training.get("by_em") else ""
+    return f"{training['spent']['gradient_steps']}{by_em}{'' if training['converged'] else ', not converged'}"

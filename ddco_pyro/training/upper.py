@@ -1,10 +1,10 @@
-"""Where the levels above the lowest start from: which options of the lowest level follow each other.
+"""Initialisation of the levels above the lowest, from which options of the lowest level follow each other.
 
-What an option above the lowest level does shows in what it selects, one selection after another, and not in any single
-step. So an AHMM is fitted in which the state says nothing of selections, nor of terminations above the lowest level: a
-hierarchical hidden Markov model (Fine, Singer, Tishby 1998) above the lowest level as it was discovered.
-EM (Baum et al. 1970) is exact there: the E-step is the elimination, the M-step divides expected counts. What it finds
-depends on where it starts, and it costs no gradient: the likeliest of many random starts is kept.
+An option above the lowest level shows in its sequence of selections, not in a single step. An AHMM is therefore fitted
+whose selections, and terminations above the lowest level, do not depend on the state: a hierarchical hidden Markov
+model (Fine, Singer, Tishby 1998) above the trained lowest level. EM (Baum et al. 1970) is exact in this model: the
+E-step is the elimination, the M-step divides expected counts. The result depends on the start, so the likeliest of many
+random starts is kept.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from ddco_pyro.inference import fused
 from ddco_pyro.model.tables import NEVER, Tables, always_ends
 
 STARTS = 16
-"""Random ones; of them the likelier half goes on, and so on. On planted levels about one in three reaches the best."""
+"""Random starts, halved again and again by likelihood. On planted levels about one in three reaches the best."""
 
 FIRST = 10
-"""Iterations before the first halving; then twice as many, and so on."""
+"""Iterations before the first halving; each further halving comes after twice as many."""
 
 MOST = 200
-"""Iterations of the last that is left."""
+"""The most iterations of the last start."""
 
 CONVERGED = 1e-6
-"""Nats per step that its last iteration has to gain, or it ends before."""
+"""EM stops where an iteration gains fewer nats per step."""
 
 PSEUDO = 0.1
-"""What every count has before anything is counted, so that nothing is impossible for good."""
+"""Added to every count: no probability becomes 0."""
 
 Piece = tuple[Tables, Tensor]
 """Tables of some demonstrations, and their lengths."""
@@ -41,7 +41,7 @@ Piece = tuple[Tables, Tensor]
 
 @dataclass(frozen=True)
 class Constants:
-    """Probabilities that are the same at every step, float64.
+    """Probabilities that do not depend on the state, float64.
 
     :param selection: of the options of each level, lowest first, given the caller, [K_d, k_d].
     :param termination: ψ of the options of each level above the lowest, [k_d].
@@ -52,7 +52,7 @@ class Constants:
 
     @classmethod
     def drawn(cls, tables: Tables, random: np.random.Generator) -> Constants:
-        """Random ones for a hierarchy with such tables."""
+        """Random constants for a hierarchy with such tables."""
         sizes = [table.shape[2:] for table in tables.selection]
         selection = (random.dirichlet(np.ones(choices - 1), size=callers) for callers, choices in sizes)
         termination = (
@@ -63,7 +63,7 @@ class Constants:
 
     @classmethod
     def of(cls, state: Mapping[str, Tensor]) -> Constants | None:
-        """Those of a :meth:`state`; None where it is empty."""
+        """The constants of a :meth:`state`; None where it is empty."""
         selection, termination = (
             tuple(state[name] for name in sorted(state) if name.startswith(kind))
             for kind in ("selection", "termination")
@@ -71,12 +71,12 @@ class Constants:
         return cls(selection, termination) if state else None
 
     def state(self) -> dict[str, Tensor]:
-        """As tensors by name."""
+        """The constants as tensors by name."""
         parts = {"selection": self.selection, "termination": self.termination}
         return {f"{kind}.{number:03}": table for kind, tables in parts.items() for number, table in enumerate(tables)}
 
     def within(self, tables: Tables) -> Tables:
-        """The tables with these probabilities in the place of what networks say; no caller has control."""
+        """The tables with these probabilities in place of the networks'; no caller emits the control."""
         selection, termination = list(tables.selection), list(tables.termination)
         for level, chosen in enumerate(self.selection):
             selection[level] = pad(chosen.log(), (1, 0), value=NEVER).expand(tables.selection[level].shape)
@@ -88,8 +88,8 @@ class Constants:
 def fitted(pieces: Sequence[Piece], seed: int) -> Constants:
     """The likeliest constants that EM finds from :data:`STARTS` random ones.
 
-    :param pieces: tables of all demonstrations; of their selections, and terminations above the lowest level, only the
-        shapes count.
+    :param pieces: tables of all demonstrations; only the shapes of their selections, and of their terminations above
+        the lowest level, are used.
     """
     random = np.random.default_rng(seed)
     left, iterations = [Constants.drawn(pieces[0][0], random) for _ in range(STARTS)], FIRST
@@ -100,13 +100,13 @@ def fitted(pieces: Sequence[Piece], seed: int) -> Constants:
 
 
 def converged(pieces: Sequence[Piece], constants: Constants) -> Constants:
-    """Where EM takes the constants, in :data:`MOST` iterations at most."""
+    """The constants after EM, with at most :data:`MOST` iterations."""
     steps = sum(int(lengths.sum()) for _, lengths in pieces)
     return _run(pieces, constants, MOST, CONVERGED * steps)[1]
 
 
 def _run(pieces: Sequence[Piece], constants: Constants, iterations: int, least: float) -> tuple[float, Constants]:
-    """Iterations of EM while they gain so many nats: the last log-likelihood, and the constants."""
+    """Iterate EM while an iteration gains ``least`` nats; the last log-likelihood, and the constants."""
     value = -np.inf
     for _ in range(iterations):
         before, (value, constants) = value, improved(pieces, constants)
@@ -116,7 +116,7 @@ def _run(pieces: Sequence[Piece], constants: Constants, iterations: int, least: 
 
 
 def improved(pieces: Sequence[Piece], constants: Constants) -> tuple[float, Constants]:
-    """An iteration of EM: the log-likelihood of the constants, and those that the expected counts make of them."""
+    """An iteration of EM: the log-likelihood of the constants, and the next constants."""
     value = 0.0
     selected = [torch.full_like(table, PSEUDO) for table in constants.selection]
     ended = [torch.stack([PSEUDO * (psi < 1), torch.full_like(psi, PSEUDO)], -1) for psi in constants.termination]
@@ -132,8 +132,9 @@ def improved(pieces: Sequence[Piece], constants: Constants) -> tuple[float, Cons
 
 
 def expected(tables: Tables, lengths: Tensor, constants: Constants) -> Tensor:
-    """Σ_n E[log p(ζ_n)] of selections, and of terminations above the lowest level, under the posterior of ζ_n that the
-    constants give, nats, a scalar in float64: what an M-step of networks maximises.
+    """The expected log-probability Σ_n E[log p(ζ_n)] that an M-step of the networks maximises, nats, a scalar, float64.
+
+    It is of selections, and of terminations above the lowest level, under the posterior of ζ_n given the constants.
     """
     counts = fused.eliminate(constants.within(tables), lengths).tables
     pairs = [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from ddco_pyro.model.encoding import Batch
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.spec import parse_spec

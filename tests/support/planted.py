@@ -8,9 +8,8 @@ from sklearn.metrics import normalized_mutual_info_score
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import ignore
 from ddco_pyro.inference import log_likelihood, segment
-from ddco_pyro.model.actor import Acting
-from ddco_pyro.model.ahmm import choose
-from ddco_pyro.model.encoding import encode
+from ddco_pyro.model.ahmm import Acting, choose
+from ddco_pyro.model.batch import encode
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import complete
 from ddco_pyro.spec import parse_spec

@@ -9,8 +9,8 @@ import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import CandidateGivenUp, FoldScored, SelectionBegan
+from ddco_pyro.selection.folds import Score
 from ddco_pyro.selection.grid import Candidate
-from ddco_pyro.selection.scoring import Score
 from ddco_pyro.spec import parse_spec
 
 

@@ -7,8 +7,8 @@ import torch
 from torch import nn
 
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
-from ddco_pyro.model.networks.stacked import StackedLinear
-from ddco_pyro.spec import NetworkSpec
+from ddco_pyro.model.networks.perceptrons import StackedLinear
+from ddco_pyro.spec import network_spec
 
 FEATURES, OUTPUTS, COPIES, LONGEST = 3, 2, 4, 5
 SHAPE = InputShape({"state": FEATURES}, {}, LONGEST)
@@ -17,7 +17,12 @@ PIXELS = (14, 18, 3)
 
 def make(shape=SHAPE, **settings):
     torch.manual_seed(0)
-    return build(NetworkSpec(**settings), shape, OUTPUTS, COPIES).eval()
+    return build(network_spec(**settings), shape, OUTPUTS, COPIES).eval()
+
+
+def answer(network, inputs, state=None):
+    """What a network gives; without a state, at the first step."""
+    return network(inputs, network.initial_state(inputs.batch[0]) if state is None else state)
 
 
 def make_inputs(trajectories=2, steps=LONGEST, start=0, images=()):

@@ -11,8 +11,8 @@ from ddco_tasks.bin_picking import task
 from ddco_tasks.bin_picking.supervisor import JAW_OPEN
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.fitting.run import fit
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import load_spec
 from ddco_pyro.training.data import dimensions

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ddco_pyro.simulation.task import Policy, Task, find_task
-from ddco_pyro.spec.types import TASKS
+from ddco_pyro.spec.base import TASKS
 
 NAMES = sorted(point.name for point in entry_points(group=TASKS))
 

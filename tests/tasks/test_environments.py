@@ -13,7 +13,7 @@ from ddco_pyro.simulation import environments
 from ddco_pyro.simulation.environments import TaskEnvironment
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.simulation.task import find_task
-from ddco_pyro.spec.types import TASKS
+from ddco_pyro.spec.base import TASKS
 
 NAMES = sorted(point.name for point in entry_points(group=TASKS))
 

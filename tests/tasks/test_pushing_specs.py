@@ -11,7 +11,7 @@ from ddco_tasks.pushing import environment as pushing
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.fitting.run import fit
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.simulation.episodes import play, run_episode
 from ddco_pyro.spec import Spec, load_spec
 from ddco_pyro.training.data import dimensions

@@ -1,6 +1,6 @@
-"""HDF5 files of ManiSkill, ACT and D4RL: other names and cuts of the same arrays, read in blocks.
+"""HDF5 files of ManiSkill, ACT and D4RL, read in blocks.
 
-A file is opened anew for each array: a folder can have more episodes than files may be open.
+Each pass over an array opens its file, because a folder can have more episodes than files may be open.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ import numpy as np
 
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, dataset_at, datasets, member, natural, opened
 from ddco_pyro.data.pictures import block_steps
-from ddco_pyro.data.sources.layouts import EPISODE, TRAJECTORY
+from ddco_pyro.data.sources import EPISODE, TRAJECTORY
 from ddco_pyro.data.sources.metadata import inside
 from ddco_pyro.data.sources.recording import Column, Format, Recording, of_array, of_dataset
 
 BARE = "state"
-"""Key of observations that are one array without a name."""
+"""Key of an observation array without a name."""
 
 
 class _Source(ABC):
-    """Demonstrations that are each a group of a file."""
+    """Demonstrations that are groups of HDF5 files."""
 
     format: Format
     frequency: float | None = None
@@ -49,7 +49,7 @@ class _Source(ABC):
     def recording(self, name: str) -> Recording:
         """One demonstration.
 
-        :raises DemonstrationsError: a part of it is missing.
+        :raises DemonstrationsError: a part is missing.
         """
         path, group = self._places[name]
         with opened(path) as file:
@@ -63,7 +63,7 @@ class _Source(ABC):
 class ManiSkill(_Source):
     """Groups ``traj_0``, ... with ``actions`` [T, A] and ``obs``, one array or a tree of arrays [T + 1, ...].
 
-    The last observation, after which nothing is done, is left out.
+    The observation after the last action is left out.
     """
 
     format: Format = "maniskill"
@@ -91,7 +91,8 @@ class ManiSkill(_Source):
 class Act(_Source):
     """Files ``episode_0.hdf5``, ... with ``action`` [T, A] and ``observations/<key>`` [T, ...].
 
-    The ``base_action`` [T, B] of a mobile base is part of the control. Pictures may be encoded, as bytes [T, longest].
+    The ``base_action`` [T, B] of a mobile base is appended to the control. Pictures may be encoded, as bytes
+    [T, longest].
     """
 
     format: Format = "act"
@@ -123,9 +124,9 @@ class Act(_Source):
 
 
 class D4RL(_Source):
-    """All steps one after another: ``observations`` [N, ...], ``actions`` [N, A], ``terminals`` [N], ``timeouts`` [N].
+    """Concatenated demonstrations: ``observations`` [N, ...], ``actions`` [N, A], ``terminals`` [N], ``timeouts`` [N].
 
-    A demonstration ends where one of the last two is true, and where the file ends.
+    A demonstration ends at a true terminal or timeout, and at the end of the file.
     """
 
     format: Format = "d4rl"
@@ -134,8 +135,8 @@ class D4RL(_Source):
         with opened(self.path) as file:
             if "timeouts" not in file:
                 raise DemonstrationsError(
-                    "has no timeouts, so nothing says where demonstrations end that do not end by themselves; take a "
-                    "later version of the dataset"
+                    "has no timeouts, which mark the ends of demonstrations without a terminal state; take a later "
+                    "version of the dataset"
                 )
             steps = len(dataset_at(file, "actions", ""))
             ends = np.zeros(steps, bool)
@@ -154,7 +155,7 @@ class D4RL(_Source):
 
 
 def _observed(group: h5py.Group, name: str) -> dict[str, str]:
-    """The observations of one of ManiSkill's trajectories by key, with their places."""
+    """Key and place of each observation of a ManiSkill trajectory."""
     if "obs" not in group:
         return {}
     obs = member(group, "obs", h5py.HLObject, f"{name}: ")
@@ -167,7 +168,7 @@ def _number(file: Path) -> int:
 
 
 def _column(group: h5py.Group, key: str, name: str, part: slice = slice(None)) -> Column:
-    """These steps of a dataset, read from the disk when they are wanted; one number a step is a vector of one."""
+    """A part of a dataset as a lazy column; one number per step becomes a vector."""
     dataset = dataset_at(group, key, f"{name}: " if name else "")
     known = of_dataset(dataset, f"{name}: {key}")
     path, place, bare = Path(dataset.file.filename), dataset.name, dataset.ndim == 1
@@ -184,7 +185,7 @@ def _column(group: h5py.Group, key: str, name: str, part: slice = slice(None)) -
 
 
 def _beside(actions: Column, base: Column, name: str) -> Column:
-    """The control of an arm [T, A] and of its base [T, B] as one [T, A + B]."""
+    """The controls of an arm [T, A] and its base [T, B], joined to [T, A + B]."""
     steps = actions.shape[0]
     if len(actions.shape) != 2 or len(base.shape) != 2 or base.shape[0] != steps:
         raise DemonstrationsError(f"{name}: base_action has shape {base.shape}, and action {actions.shape}")
@@ -192,7 +193,7 @@ def _beside(actions: Column, base: Column, name: str) -> Column:
 
 
 def _decoded(column: Column, where: str) -> Column:
-    """Encoded pictures [T, bytes] as uint8 [T, H, W, 3], their channels in the order in which they were encoded."""
+    """Encoded pictures [T, bytes] as uint8 [T, H, W, 3], in the encoded order of channels."""
 
     def decode(encoded: np.ndarray, shape: tuple[int, ...] | None = None) -> np.ndarray:
         picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
@@ -213,8 +214,8 @@ def _decoded(column: Column, where: str) -> Column:
 
 @contextmanager
 def open_layout(path: Path, form: Format) -> Iterator[ManiSkill | Act | D4RL]:
-    """Open a file of one of these formats, or a folder of ACT's.
+    """Open a file of one of these formats, or a folder of ACT.
 
-    :raises DemonstrationsError: it cannot be read or holds no demonstrations.
+    :raises DemonstrationsError: the source cannot be read, or holds no demonstrations.
     """
     yield ManiSkill(path) if form == "maniskill" else Act(path) if form == "act" else D4RL(path)

@@ -1,6 +1,6 @@
-"""LeRobot v3 datasets: parquet files of many episodes each, JSON and parquet under ``meta``, videos beside them.
+"""LeRobot v3 datasets: parquet files of several episodes, metadata in JSON and parquet, and videos.
 
-Read with pyarrow, without LeRobot itself; what is not used (videos, unless asked for) need not be there.
+The reader uses pyarrow and not LeRobot. Files that are not read, such as videos by default, may be missing.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ OBSERVATION = "observation."
 SUBTASK = "subtask_index"
 IMAGES_AT_ONCE = 32
 _LONGEST = 1e9
-"""Seconds: no video is longer."""
+"""Longest video, seconds."""
 _DAMAGE = (pyarrow.ArrowException, OSError, KeyError, ValueError, TypeError, IndexError)
 
 
 class LeRobot:
     """A dataset's folder: ``meta/info.json``, ``meta/episodes``, ``data`` and ``videos``.
 
-    ``observation.images.top`` becomes ``obs/images/top``; ``action`` becomes ``actions``; ``subtask_index``, where
-    there is one, ``labels/subtask``.
+    ``observation.images.top`` becomes ``obs/images/top``, ``action`` becomes ``actions``, and ``subtask_index`` becomes
+    ``labels/subtask``.
     """
 
     format: Format = "lerobot"
@@ -82,19 +82,14 @@ class LeRobot:
         self.files = (folder / "meta" / "info.json", *meta, *(path for path in data if path.is_file()))
 
     def _data_files(self) -> tuple[Path, ...]:
-        """The files that hold the episodes' rows, relative to the folder; some may be missing.
-
-        :raises DemonstrationsError: the metadata names one outside it.
-        """
+        """The files of the episodes' rows, relative to the folder; some may be missing."""
         named = {self.data_file(index) for index in self._episodes}
         return tuple(sorted(path.relative_to(self.folder) for path in named))
 
     def _check_frames(self) -> None:
-        """See that all rows, or all the episodes' lengths, add up to the number of frames in ``meta/info.json``.
+        """Refuse a dataset if neither its rows nor its episodes' lengths add up to ``total_frames``.
 
-        Where only one of the two does, the episode that differs says so itself.
-
-        :raises DemonstrationsError: neither does.
+        If one of the two does, reading the episode that differs reports the problem.
         """
         total, files = self.info.get("total_frames"), [self.folder / path for path in self.data_files]
         lengths = [length for row in self._episodes.values() if isinstance(length := row.get("length"), int)]
@@ -107,9 +102,9 @@ class LeRobot:
                 )
 
     def data_file(self, index: int) -> Path:
-        """The parquet file that holds an episode's rows.
+        """The parquet file of an episode's rows.
 
-        :raises DemonstrationsError: it lies outside the dataset's folder.
+        :raises DemonstrationsError: the file is outside the dataset's folder.
         """
         return self._path("data_path", index, "data")
 
@@ -122,7 +117,7 @@ class LeRobot:
         return inside(self.folder, path)
 
     def _masks(self) -> dict[str, tuple[str, ...]]:
-        """The splits, such as ``train: "0:40"``, that are not simply all of it."""
+        """The splits, such as ``train: "0:40"``, except splits of all episodes."""
         masks: dict[str, tuple[str, ...]] = {}
         splits = self.info.get("splits")
         for name, span in splits.items() if isinstance(splits, dict) else ():
@@ -136,7 +131,7 @@ class LeRobot:
     def recording(self, name: str) -> Recording:
         """One episode.
 
-        :raises DemonstrationsError: its rows are missing, out of order or damaged, or fewer or more than are named.
+        :raises DemonstrationsError: rows are missing, out of order or damaged, or their number is wrong.
         """
         index = int(name.removeprefix("demo_"))
         if index in self._missing:
@@ -158,14 +153,11 @@ class LeRobot:
         return Recording(name, observations, actions, labels, self._facts(index))
 
     def _check(self, rows: _Rows, index: int) -> None:
-        """See that an episode has as many rows as it is said to have, in the order in which they were recorded.
-
-        :raises DemonstrationsError: it has not.
-        """
-        said, there = self._episodes[index], len(rows)
-        start, stop = said.get("dataset_from_index"), said.get("dataset_to_index")
+        """Refuse an episode with a wrong number of rows, or with rows out of order."""
+        about, there = self._episodes[index], len(rows)
+        start, stop = about.get("dataset_from_index"), about.get("dataset_to_index")
         spanned = None if start is None or stop is None else stop - start
-        for what, length in (("length", said.get("length")), ("dataset_to_index - dataset_from_index", spanned)):
+        for what, length in (("length", about.get("length")), ("dataset_to_index - dataset_from_index", spanned)):
             if length is not None and length != there:
                 raise DemonstrationsError(
                     f"{rows.name}: {what} in meta/episodes is {length}, and {rows.path} has {there} rows of it"
@@ -180,8 +172,8 @@ class LeRobot:
 
     def _facts(self, index: int) -> dict[str, Attribute]:
         tasks = self._episodes[index].get("tasks")
-        said = {"task": "; ".join(map(str, tasks))} if isinstance(tasks, Sequence) and len(tasks) else {}
-        return {"episode_index": index, **said}
+        task = {"task": "; ".join(map(str, tasks))} if isinstance(tasks, Sequence) and len(tasks) else {}
+        return {"episode_index": index, **task}
 
     def _column(self, rows: _Rows, key: str, index: int) -> Column:
         kind = self.features[key]["dtype"]
@@ -196,7 +188,7 @@ class LeRobot:
         return rows.vectors(key, self.features[key]["shape"])
 
     def _size(self, key: str) -> tuple[int, int]:
-        """Height and width of an image, whose shape may have its channels first."""
+        """Height and width of an image, whose channels may come first."""
         shape, names = list(self.features[key]["shape"]), list(self.features[key].get("names") or ())
         first = names[:1] in (["channels"], ["channel"]) or (not names and shape[0] in (1, 3))
         height, width = shape[1:] if first else shape[:2]
@@ -204,7 +196,6 @@ class LeRobot:
 
 
 def _refuse_where(wrong: np.ndarray, rows: _Rows, what: str, values: np.ndarray, expected: np.ndarray) -> None:
-    """Refuse an episode with a row whose value is not what its place says."""
     if wrong.any():
         at = int(wrong.argmax())
         raise DemonstrationsError(
@@ -234,7 +225,7 @@ class _Rows:
         return self.stop - self.start
 
     def vectors(self, key: str, shape: Sequence[int] = (1,)) -> Column:
-        """A column of numbers, or of lists of numbers, whose steps have this shape."""
+        """A column of numbers or lists of numbers; ``shape`` is the shape of a step."""
         size = math.prod(shape)
         refuse_too_much(8 * size * len(self), f"{self.name}: {key}", "leave it out with --observation")
         parts = [_flat(batch.column(0), size).reshape(len(batch), *shape) for batch in self._batches(key, 4096)]
@@ -261,7 +252,7 @@ class _Rows:
         return np.ascontiguousarray(image[..., ::-1])
 
     def _batches(self, key: str, rows: int) -> Iterator[Any]:
-        """The episode's part of one column, from the row groups that it lies in."""
+        """The episode's part of a column, from the row groups that hold the episode."""
         file, _ = _open(self.path, self.path.stat().st_mtime_ns)
         ends = np.cumsum([file.metadata.row_group(group).num_rows for group in range(file.metadata.num_row_groups)])
         first, last = np.searchsorted(ends, [self.start, self.stop - 1], side="right")
@@ -274,9 +265,9 @@ class _Rows:
 
 
 def _flat(values: Any, size: int) -> np.ndarray:
-    """The numbers of a column, each row of which has ``size`` of them.
+    """The numbers of a column with ``size`` numbers in each row.
 
-    :raises ValueError: a row has another number of them.
+    :raises ValueError: a row has more or fewer numbers.
     """
     rows = len(values)
     while pyarrow.types.is_nested(values.type):
@@ -291,7 +282,7 @@ def _flat(values: Any, size: int) -> np.ndarray:
 
 @lru_cache(maxsize=2)
 def _open(path: Path, changed: int) -> tuple[parquet.ParquetFile, Mapping[int, list[tuple[int, int]]]]:
-    """A parquet file, and for each episode the spans of its rows; ``changed`` tells versions of the file apart."""
+    """A parquet file, and the spans of rows of each episode; ``changed`` identifies the version of the file."""
     file = parquet.ParquetFile(path)
     refuse_too_much(8 * file.metadata.num_rows, f"{path}: its {file.metadata.num_rows} rows", "divide it")
     index = file.read(["episode_index"]).column(0).to_numpy()
@@ -303,7 +294,7 @@ def _open(path: Path, changed: int) -> tuple[parquet.ParquetFile, Mapping[int, l
 
 
 def _count(path: Path) -> int:
-    """Rows of a parquet file, by its footer."""
+    """Number of rows of a parquet file, by its footer."""
     try:
         return parquet.read_metadata(path).num_rows
     except _DAMAGE as error:
@@ -311,14 +302,11 @@ def _count(path: Path) -> int:
 
 
 ROW_BYTES = 1000
-"""About what a row of ``meta/episodes`` takes in memory."""
+"""Memory of a row of ``meta/episodes``, about."""
 
 
 def _episodes(folder: Path) -> tuple[dict[int, dict[str, Any]], set[int]]:
-    """What ``meta/episodes`` says of each episode without its statistics, by number; and which episodes it names twice.
-
-    :raises DemonstrationsError: it is damaged.
-    """
+    """The rows of ``meta/episodes`` by episode, without statistics, and the episodes with two rows."""
     episodes: dict[int, dict[str, Any]] = {}
     twice: set[int] = set()
     for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
@@ -347,9 +335,9 @@ def _json(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def open_lerobot(path: Path) -> Iterator[LeRobot]:
-    """Open such a dataset.
+    """Open a dataset.
 
-    :raises DemonstrationsError: it is of another version, or damaged.
+    :raises DemonstrationsError: the dataset has another version, or is damaged.
     """
     try:
         yield LeRobot(path)

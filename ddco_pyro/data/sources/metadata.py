@@ -1,4 +1,4 @@
-"""Checks of what a foreign dataset's metadata says: paths stay in its folder, names can be stored, counts are right."""
+"""Checks of untrusted metadata: paths stay in the dataset's folder, names can be stored, counts are right."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _WIDEST = 12
 
 
 def inside(folder: Path, relative: str | Path) -> Path:
-    """The path ``folder / relative``, which lies in ``folder`` with all links followed; it need not exist.
+    """The path ``folder / relative``, which stays in ``folder`` with all links resolved; the path need not exist.
 
-    A dataset in the cache of the Hugging Face Hub may link to the cache's own ``blobs``, where its files lie.
+    A dataset in the cache of the Hugging Face Hub may link to the cache's ``blobs``.
 
-    :raises DemonstrationsError: it leaves the folder, or is no path.
+    :raises DemonstrationsError: the path leaves the folder, or is not a path.
     """
     pure = PurePosixPath(relative)
     try:
@@ -38,9 +38,9 @@ def inside(folder: Path, relative: str | Path) -> Path:
 
 
 def check_links(folder: Path) -> None:
-    """See that a dataset's folder holds files and folders, and links to files in itself alone.
+    """Refuse a dataset's folder with special files, links to folders, or links to files elsewhere.
 
-    :raises DemonstrationsError: a link leads out of it or to a folder, or something in it is no file.
+    :raises DemonstrationsError: the folder holds one of these.
     """
     for where, folders, files in os.walk(folder):
         for name in (*folders, *files):
@@ -57,11 +57,11 @@ def check_links(folder: Path) -> None:
 
 
 def filled(folder: Path, template: str, values: Mapping[str, int | str]) -> str:
-    """A template such as ``data/chunk-{chunk_index:03d}.parquet`` with its placeholders filled in.
+    """A template such as ``data/chunk-{chunk_index:03d}.parquet`` with its placeholders filled.
 
-    Numbers may be padded with zeros to a width of at most 12; no other format is known.
+    The only format is zero padding to a width of at most 12.
 
-    :raises DemonstrationsError: it has other placeholders or formats.
+    :raises DemonstrationsError: the template has other placeholders or formats.
     """
 
     def fill(found: re.Match[str]) -> str:
@@ -84,7 +84,7 @@ def _unknown(folder: Path, template: str, values: Iterable[str]) -> Demonstratio
 
 
 def _storable(key: str) -> bool:
-    """Whether HDF5 takes this path as it is."""
+    """Whether a key is a valid path in HDF5."""
     try:
         length = len(key.encode())
     except UnicodeEncodeError:
@@ -93,9 +93,9 @@ def _storable(key: str) -> bool:
 
 
 def check_keys(folder: Path, keys: Iterable[str]) -> None:
-    """See that observations can be stored under these keys beside each other.
+    """Refuse keys that HDF5 cannot store together.
 
-    :raises DemonstrationsError: one is no path in HDF5, stands twice, or lies below another.
+    :raises DemonstrationsError: a key is not a valid path, occurs twice, or is below another key.
     """
     known: set[str] = set()
     for key in keys:
@@ -114,12 +114,12 @@ def check_keys(folder: Path, keys: Iterable[str]) -> None:
 
 
 def first_missing(folder: Path, total: object, there: Collection[int], named: str) -> dict[int, str]:
-    """The first episode that a dataset counts and does not have, with what is wrong; empty where all are there.
+    """The number of the first missing episode and the problem; empty if no episode is missing.
 
-    :param total: the number of episodes that its metadata counts; not checked unless it is one.
-    :param there: the numbers of its episodes.
-    :param named: where they are, for messages.
-    :raises DemonstrationsError: there are more than are counted.
+    :param total: number of episodes by the metadata; ignored unless a whole number.
+    :param there: numbers of the episodes that exist.
+    :param named: where the episodes are, for messages.
+    :raises DemonstrationsError: more episodes exist than the metadata counts.
     """
     if not isinstance(total, int) or total == len(there):
         return {}

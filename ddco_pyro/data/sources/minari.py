@@ -1,4 +1,4 @@
-"""Minari datasets, read with Minari itself (``pip install 'ddco-pyro[minari]'``)."""
+"""Minari datasets, read with the package minari (``pip install 'ddco-pyro[minari]'``)."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from ddco_pyro.data.sources.metadata import check_keys, check_links, first_missi
 from ddco_pyro.data.sources.recording import Column, Format, Recording, damaged, of_array
 
 BARE = "observation"
-"""Key of observations that are one array without a name."""
+"""Key of an observation array without a name."""
 
 
 class Minari:
-    """Episodes of a dataset's folder; an observation of ``{"arm": {"joints": ...}}`` becomes ``obs/arm/joints``.
+    """Episodes of a dataset's folder. Nested observations ``{"arm": {"joints": ...}}`` become ``obs/arm/joints``.
 
-    An episode of T steps has T + 1 observations: the last, after which nothing is done, is left out.
+    An episode of T steps has T + 1 observations; the observation after the last action is left out.
     """
 
     format: Format = "minari"
@@ -39,10 +39,10 @@ class Minari:
         self.files = tuple(sorted(path for path in folder.rglob("*") if path.is_file()))
 
     def recording(self, name: str) -> Recording:
-        """One episode, wholly in memory.
+        """One episode, in memory.
 
-        :raises DemonstrationsError: it is missing or damaged, lies in another file, or its actions are not one array of
-            numbers.
+        :raises DemonstrationsError: the episode is missing, damaged or in another file, or its actions are not one
+            array of numbers.
         """
         index = int(name.removeprefix("demo_"))
         if index in self._missing:
@@ -59,12 +59,12 @@ class Minari:
             raise DemonstrationsError(
                 f"{self.folder}: {name}: actions are {what}, they have to be one array of numbers"
             )
-        steps, said = len(actions), facts.get("total_steps")
-        if said is not None and said != steps:
-            raise DemonstrationsError(f"{self.folder}: {name}: total_steps is {said}, and there are {steps} actions")
+        steps, total = len(actions), facts.get("total_steps")
+        if total is not None and total != steps:
+            raise DemonstrationsError(f"{self.folder}: {name}: total_steps is {total}, and there are {steps} actions")
         leaves = list(_leaves(episode["observations"], ""))
         check_keys(self.folder, (key for key, _ in leaves))
-        # an observation of another number of steps is left as it is, and refused for it
+        # an observation with another number of steps stays, and is refused later
         observations = {key: of_array(array[:-1] if len(array) == steps + 1 else array) for key, array in leaves}
         seed = facts.get("seed")
         known: dict[str, Attribute] = {"episode_index": index}
@@ -73,7 +73,7 @@ class Minari:
         return Recording(name, observations, _rows(actions), {}, known)
 
     def _check_stored(self, index: int) -> None:
-        """See that the arrays of an episode are stored, where Minari keeps them in HDF5."""
+        """Refuse an episode in HDF5 whose arrays are not stored."""
         path = self.folder / "main_data.hdf5"
         if path.is_file():
             with opened(path) as file:
@@ -88,7 +88,7 @@ def _rows(actions: np.ndarray) -> Column:
 
 
 def _leaves(observations: Any, key: str) -> Iterator[tuple[str, np.ndarray]]:
-    """The arrays of nested observations by their path; text is left out."""
+    """Path and array of each nested observation; text is left out."""
     if isinstance(observations, dict):
         for name, below in observations.items():
             yield from _leaves(below, f"{key}/{name}" if key else str(name))
@@ -100,7 +100,7 @@ def _leaves(observations: Any, key: str) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _stored(folder: Path) -> set[int]:
-    """The numbers of the episodes that a dataset has: groups of an HDF5 file, or folders of Arrow files."""
+    """The numbers of the episodes: groups of an HDF5 file, or folders of Arrow files."""
     main = folder / "main_data.hdf5"
     if main.is_file():
         with opened(main) as file:
@@ -112,10 +112,10 @@ def _stored(folder: Path) -> set[int]:
 
 @contextmanager
 def open_minari(path: Path, external: bool = False) -> Iterator[Minari]:
-    """Open a dataset's folder, its folder ``data``, or the ``main_data.hdf5`` in there.
+    """Open a dataset's folder, its folder ``data``, or the file ``main_data.hdf5``.
 
-    :param external: whether parts of that may lie in other files.
-    :raises DemonstrationsError: Minari is not installed, or cannot read it.
+    :param external: whether parts of the HDF5 file may be in other files.
+    :raises DemonstrationsError: Minari is not installed, or cannot read the dataset.
     """
     try:
         from minari.dataset.minari_storage import MinariStorage
@@ -127,7 +127,7 @@ def open_minari(path: Path, external: bool = False) -> Iterator[Minari]:
     check_links(folder)
     try:
         spaces = MinariStorage.read_raw_metadata(folder).keys() & {"observation_space", "action_space"}
-        if len(spaces) < 2:  # Minari would make the environment to ask for them, which runs the data's code
+        if len(spaces) < 2:  # Minari would make the environment, which runs code named by the data
             raise DemonstrationsError(f"{folder}: metadata.json does not say its observation and action spaces")
         storage = MinariStorage.read(folder)
     except (*DAMAGE, AssertionError, ImportError, AttributeError, RecursionError) as error:

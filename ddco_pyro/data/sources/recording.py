@@ -1,4 +1,4 @@
-"""One recorded episode as some library stored it: arrays that are read in blocks, not yet checked."""
+"""Recordings: one episode each, with arrays that are read in blocks and not yet checked."""
 
 from __future__ import annotations
 
@@ -15,7 +15,15 @@ from numpy.typing import ArrayLike
 
 from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
-from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, block_steps, channels_last, turned
+from ddco_pyro.data.pictures import (
+    PICTURE_DIMENSIONS,
+    Observed,
+    Pictures,
+    block_steps,
+    blocks,
+    channels_last,
+    turned,
+)
 
 Format = Literal["robomimic", "minari", "lerobot", "maniskill", "act", "d4rl"]
 
@@ -24,9 +32,9 @@ Format = Literal["robomimic", "minari", "lerobot", "maniskill", "act", "d4rl"]
 class Column:
     """An array [T, ...] of a recording, read in blocks of consecutive steps.
 
-    :param blocks: begins anew at each call; what it yields has T steps in all.
-    :param video: whether reading it means decoding a film.
-    :param kept: the same where it can be read slice by slice later on, pictures in HDF5; else None.
+    :param blocks: starts a new pass over the array at each call; the blocks have T steps in all.
+    :param video: whether reading decodes a video.
+    :param kept: the array as lazy pictures in an HDF5 file; None for other arrays.
     """
 
     shape: tuple[int, ...]
@@ -37,15 +45,15 @@ class Column:
 
     @property
     def image(self) -> bool:
-        """Whether a step of it is a picture: uint8 [H, W, C]."""
+        """Whether a step is a picture, uint8 [H, W, C]."""
         return is_image(self.shape, self.dtype)
 
     def observed(self) -> Observed:
-        """The whole array, or where to read it from."""
+        """The array, lazy if possible."""
         return self.array() if self.kept is None else self.kept
 
     def array(self) -> np.ndarray:
-        """The whole array."""
+        """The array, in memory."""
         whole, at = np.zeros(self.shape, self.dtype), 0
         for block in self.blocks():
             whole[at : at + len(block)] = block
@@ -58,9 +66,9 @@ class Recording:
     """One episode of T steps, under the names of the HDF5 layout.
 
     :param observations: key to [T, ...].
-    :param actions: [T, A]; discrete actions, integers [T], become [T, 1].
-    :param labels: name to [T]; a column [T, 1] becomes that.
-    :param attributes: what is known of the whole episode.
+    :param actions: [T, A]; integers [T] become [T, 1].
+    :param labels: name to [T]; [T, 1] becomes [T].
+    :param attributes: facts about the episode.
     """
 
     name: str
@@ -81,41 +89,40 @@ class Recording:
 
 
 def is_image(shape: tuple[int, ...], dtype: np.dtype) -> bool:
-    """Whether a step of an array [T, ...] is a picture: uint8 [H, W, C]."""
+    """Whether a step of an array [T, ...] is a picture, uint8 [H, W, C]."""
     return dtype == np.uint8 and len(shape) == 1 + PICTURE_DIMENSIONS
 
 
 def of_array(values: ArrayLike | Pictures) -> Column:
-    """A column that is in memory already, or of pictures in their file; pictures have their channels last."""
+    """A column of an array in memory or of lazy pictures; pictures have their channels last."""
     if isinstance(values, Pictures):
-        return Column(values.shape, values.dtype, values.blocks, kept=values)
+        return Column(values.shape, values.dtype, lambda: blocks(values), kept=values)
     array = turned(np.asarray(values))
     return Column(array.shape, array.dtype, lambda: iter([array]))
 
 
 def _discrete(actions: Column) -> Column:
-    """Discrete actions, integers [T], as [T, 1]; other actions as they are."""
     if len(actions.shape) != 1 or actions.dtype.kind not in "iu":
         return actions
     return Column((*actions.shape, 1), actions.dtype, lambda: (block[:, None] for block in actions.blocks()))
 
 
 def _flat(labels: Column) -> Column:
-    """Labels [T, 1] as [T]; others as they are."""
     if labels.shape[1:] != (1,):
         return labels
     return Column(labels.shape[:1], labels.dtype, lambda: (block[:, 0] for block in labels.blocks()))
 
 
 def of_dataset(dataset: h5py.Dataset, where: str) -> Column:
-    """A dataset of an open file, pictures with their channels last; reading it raises :class:`DemonstrationsError`
-    where the file is damaged.
+    """A column of a dataset in an open file; pictures have their channels last.
 
-    :raises DemonstrationsError: a step of it, or a chunk, which HDF5 reads whole, takes more memory than is allowed.
+    Reading the column raises :class:`DemonstrationsError` if the file is damaged.
+
+    :raises DemonstrationsError: one step, or one HDF5 chunk, takes more memory than is allowed.
     """
     length, at_once = len(dataset), block_steps(dataset.shape[1:], dataset.dtype)
     shape = channels_last(dataset.shape, dataset.dtype)
-    path = os.path.abspath(dataset.file.filename)  # it may be read by a process that runs elsewhere
+    path = os.path.abspath(dataset.file.filename)  # absolute for readers with another working directory
     kept = Pictures(path, dataset.name, where, dataset.shape) if is_image(shape, dataset.dtype) else None
     least = dataset.dtype.itemsize * max(math.prod(dataset.shape[1:]), math.prod(dataset.chunks or ()))
     refuse_too_much(least, f"{where}: to read one step", "store it in smaller steps or chunks")
@@ -132,9 +139,9 @@ def of_dataset(dataset: h5py.Dataset, where: str) -> Column:
 
 
 def damaged(path: Path, where: str, error: BaseException) -> DemonstrationsError:
-    """What a library says of a file that it cannot read, as one line; what is such a line already stays as it is.
+    """A library's error about an unreadable file, as one line; a :class:`DemonstrationsError` is unchanged.
 
-    :param where: the part of it; may be empty.
+    :param where: the part of the file; may be empty.
     """
     if isinstance(error, DemonstrationsError):
         return error

@@ -1,12 +1,13 @@
-"""HDF5 files of robomimic's layout, which is this project's own too: read and written here, and nowhere else.
+"""HDF5 files of robomimic's layout, which is also this project's: read, written, and written resumably.
 
-A file holds groups ``data/<name>`` with ``actions`` [T, A], ``obs/<key>`` [T, ...] and perhaps ``labels/<name>`` [T];
-beside them perhaps ``mask/<name>``: lists of names of demonstrations (robomimic: filter keys).
+A file holds groups ``data/<name>`` with ``actions`` [T, A], ``obs/<key>`` [T, ...] and optional ``labels/<name>`` [T].
+Optional datasets ``mask/<name>`` list names of demonstrations (robomimic: filter keys).
 """
 
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,7 +15,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ddco_pyro.data.files import whole_file
+from ddco_pyro.data.files import leftovers, only_one, whole_file, write_text
 from ddco_pyro.data.hdf5 import (
     Attribute,
     DemonstrationsError,
@@ -30,13 +31,15 @@ from ddco_pyro.data.hdf5 import (
 from ddco_pyro.data.sources.recording import Column, Format, Recording, of_dataset
 
 FREQUENCY = "control_frequency"
-"""Attribute of a file: control steps in a second, Hz."""
+"""Attribute of a file: control steps per second, Hz."""
 
 ENVIRONMENT = "env_args"
-"""Attribute of the group ``data``, where robomimic's own tools look for it: the environment, as JSON."""
+"""Attribute of the group ``data``, where robomimic's tools look for it: the environment, as JSON."""
 
 STEPS, ALL_STEPS = "num_samples", "total"
-"""Attributes of a demonstration and of the group ``data``: the number of steps."""
+"""Attributes of a demonstration and of the group ``data``: number of steps."""
+
+# --- reading ----------------------------------------------------------------------------------------------------------
 
 
 class Robomimic:
@@ -53,8 +56,8 @@ class Robomimic:
             raise DemonstrationsError("the group 'data' holds no demonstrations; at least one is needed")
         masks = member(file, "mask", h5py.Group, "", external) if named(file, "mask") else {}
         self.masks: Mapping[str, tuple[str, ...]] = {name: self._mask(masks, name) for name in masks}
-        said = attributes_of(self._data) | attributes_of(file)
-        self.attributes: Mapping[str, Attribute] = {name: said[name] for name in said if name != ALL_STEPS}
+        known = attributes_of(self._data) | attributes_of(file)
+        self.attributes: Mapping[str, Attribute] = {name: known[name] for name in known if name != ALL_STEPS}
         self.frequency = _frequency(self.attributes)
 
     def recording(
@@ -62,8 +65,9 @@ class Robomimic:
     ) -> Recording:
         """One demonstration.
 
-        :param observations: the keys to open; all of them if None. Likewise ``labels``, which need not be there then.
-        :raises DemonstrationsError: something of it is missing, lies in another file, or claims more than is stored.
+        :param observations: keys to open; all if None.
+        :param labels: names to open; all if None, and then none are required.
+        :raises DemonstrationsError: a part is missing, is in another file, or claims more than is stored.
         """
         group = member(self._data, name, h5py.Group, "", self._external)
         actions = self._column(group, "", "actions", name)
@@ -73,16 +77,10 @@ class Robomimic:
             raise DemonstrationsError(f"{name}: actions has {actions.shape[0]} steps, but {STEPS} is {claimed}")
         if labels is None and not named(group, "labels"):
             labels = ()
-        return Recording(
-            name,
-            self._columns(group, "obs", observations, name),
-            actions,
-            self._columns(group, "labels", labels, name),
-            attributes,
-        )
+        seen = self._columns(group, "obs", observations, name)
+        return Recording(name, seen, actions, self._columns(group, "labels", labels, name), attributes)
 
     def _columns(self, group: h5py.Group, folder: str, keys: Sequence[str] | None, name: str) -> dict[str, Column]:
-        """The arrays ``keys`` of a folder of a demonstration; all of them if None."""
         if keys is not None and not keys:
             return {}
         members = member(group, folder, h5py.Group, f"{name}: ", self._external)
@@ -94,14 +92,13 @@ class Robomimic:
         return of_dataset(dataset, f"{name}: {folder}{key}")
 
     def _mask(self, masks: h5py.Group, mask: str) -> tuple[str, ...]:
-        """The names of demonstrations that a mask lists."""
         dataset = dataset_at(masks, mask, "mask/", self._external)
         names = of_dataset(dataset, f"mask/{mask}").array().ravel().tolist()
         return tuple(name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names)
 
 
 def _may_be_group(data: h5py.Group, name: str) -> bool:
-    """Whether a name stands for a demonstration; a link that leads nowhere does, and is refused when it is read."""
+    """Whether a name may be a demonstration; broken links are, and reading refuses them."""
     plain = isinstance(data.get(name, getlink=True), h5py.HardLink)
     try:
         return not plain or data.get(name, getclass=True) not in (h5py.Dataset, h5py.Datatype)
@@ -110,7 +107,7 @@ def _may_be_group(data: h5py.Group, name: str) -> bool:
 
 
 def _frequency(attributes: Mapping[str, Attribute]) -> float | None:
-    """Said by the file itself, or by the environment that robomimic keeps."""
+    """The frequency in the file's own attribute, or in robomimic's description of the environment."""
     own = attributes.get(FREQUENCY)
     if own is None:
         try:
@@ -122,20 +119,23 @@ def _frequency(attributes: Mapping[str, Attribute]) -> float | None:
 
 @contextmanager
 def open_robomimic(path: Path, external: bool = False) -> Iterator[Robomimic]:
-    """Open such a file.
+    """Open a file.
 
-    :param external: whether parts of it may lie in other files.
-    :raises DemonstrationsError: it cannot be read or holds no demonstrations.
+    :param external: whether parts of the file may be in other files.
+    :raises DemonstrationsError: the file cannot be read, or holds no demonstrations.
     """
     with opened(path) as file:
         yield Robomimic(path, file, external)
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
 def robomimic_file(
     path: Path, attributes: Mapping[str, Attribute], masks: Mapping[str, Sequence[str]]
 ) -> Iterator[h5py.Group]:
-    """The group ``data`` of a new file, to be filled by :func:`write_recording`; written whole or not at all."""
+    """The group ``data`` of a new file, for :func:`write_recording`; the file is written whole or not at all."""
     with whole_file(path) as temporary, written(temporary) as file:
         data = file.create_group("data")
         yield data
@@ -147,18 +147,122 @@ def robomimic_file(
 
 
 def write_recording(data: h5py.Group, recording: Recording) -> None:
-    """Write a recording as a group of its own, block by block; its attributes keep their order."""
+    """Write a recording into a group of its own, block by block; pictures are compressed."""
     group = data.create_group(recording.name, track_order=True)
     group.attrs.update({**recording.attributes, STEPS: recording.actions.shape[0]})
     for place, column in recording.columns():
-        _write(group, place, column)
+        chunks = {"chunks": (1, *column.shape[1:]), "compression": "gzip", "compression_opts": 1}
+        dataset = group.create_dataset(place, column.shape, column.dtype, **(chunks if column.image else {}))
+        at = 0
+        for block in column.blocks():
+            dataset[at : at + len(block)] = block
+            at += len(block)
 
 
-def _write(group: h5py.Group, place: str, column: Column) -> None:
-    """Write an array block by block; pictures are compressed."""
-    settings = {"chunks": (1, *column.shape[1:]), "compression": "gzip", "compression_opts": 1} if column.image else {}
-    dataset = group.create_dataset(place, column.shape, column.dtype, **settings)
-    at = 0
-    for block in column.blocks():
-        dataset[at : at + len(block)] = block
-        at += len(block)
+# --- resumable writing ------------------------------------------------------------------------------------------------
+
+PART_BYTES = 64 * 2**20
+"""A part is closed from about this size on, or from ``at_most`` recordings on."""
+
+PART_RECORDINGS = 64
+
+_IDENTITY = "identity.json"
+
+
+class Parts:
+    """A file that is written in parts, made by :func:`parts_of`. ``done`` names the demonstrations that are safe.
+
+    While ``demos.hdf5`` is made, the folder ``.demos.hdf5.parts`` holds HDF5 files of some demonstrations each. A
+    killed process leaves whole parts, from which the next process goes on.
+    """
+
+    def __init__(self, path: Path, folder: Path, at_most: int = PART_RECORDINGS) -> None:
+        self.path, self.folder, self.at_most = path, folder, at_most
+        self.done = [name for part in self._files() for name in _names(part)]
+        self._open: list[Recording] = []
+        self._bytes = 0
+
+    def _files(self) -> list[Path]:
+        return sorted(self.folder.glob("*.hdf5"))
+
+    def add(self, recording: Recording) -> None:
+        """Add a demonstration, which is safe once its part is closed."""
+        self._open.append(recording)
+        self._bytes += sum(column.dtype.itemsize * int(np.prod(column.shape)) for _, column in recording.columns())
+        if self._bytes >= PART_BYTES or len(self._open) >= self.at_most:
+            self.close()
+
+    def close(self) -> None:
+        """Write the open part."""
+        if not self._open:
+            return
+        part = self.folder / f"{len(self._files()):06d}.hdf5"
+        with whole_file(part) as temporary, written(temporary) as file:
+            for recording in self._open:
+                write_recording(file, recording)
+        self.done += [recording.name for recording in self._open]
+        self._open, self._bytes = [], 0
+
+    def attributes(self) -> list[dict[str, Attribute]]:
+        """The attributes of every safe demonstration."""
+        attributes = []
+        for part in self._files():
+            with opened(part) as file:
+                attributes += [attributes_of(file[name]) for name in sorted(file, key=natural)]
+        return attributes
+
+    def finish(self, attributes: Mapping[str, Attribute], masks: Mapping[str, Sequence[str]]) -> None:
+        """Join the parts to the file."""
+        self.close()
+        with robomimic_file(self.path, attributes, masks) as data:
+            for part in self._files():
+                with opened(part) as source:
+                    for name in sorted(source, key=natural):
+                        source.copy(source[name], data, name)
+
+
+def _names(part: Path) -> list[str]:
+    with opened(part) as file:
+        return sorted(file, key=natural)
+
+
+@contextmanager
+def parts_of(path: Path, identity: str, wait: bool = False, at_most: int = PART_RECORDINGS) -> Iterator[Parts | None]:
+    """The parts of a file to be made; None if the file exists once no other process makes it.
+
+    :param identity: what determines the contents; parts with another identity are removed.
+    :param wait: wait for another process that makes the file, rather than refuse.
+    :param at_most: most demonstrations in a part, and most that an interruption can lose.
+    :raises Busy: another process is making this file.
+    """
+    folder = _folder(path)
+    with only_one(folder, wait):
+        if path.exists():
+            shutil.rmtree(folder)
+            yield None
+            return
+        known = folder / _IDENTITY
+        if not known.exists() or known.read_text(encoding="utf-8") != identity:
+            for old in folder.iterdir():
+                old.unlink()
+            write_text(known, identity)
+        for old in leftovers(folder):
+            old.unlink()
+        parts = Parts(path, folder, at_most)
+        try:
+            yield parts
+        finally:
+            if path.exists() or not parts.done:
+                shutil.rmtree(folder)
+
+
+def discard(path: Path) -> None:
+    """Remove the parts of a complete file, which a killed process may have left."""
+    folder = _folder(path)
+    if folder.exists():
+        with only_one(folder):
+            shutil.rmtree(folder)
+
+
+def _folder(path: Path) -> Path:
+    return path.with_name(f".{path.name}.parts")

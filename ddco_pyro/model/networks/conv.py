@@ -8,31 +8,31 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
-from ddco_pyro.model.networks.numpy_form import NumpyForm, arrays_of, joined, perceptrons, vectors
-from ddco_pyro.model.networks.stacked import ACTIVATIONS, Perceptrons, options_last
+from ddco_pyro.model.networks.numpy_form import NumpyForm, arrays_of, joined, vectors
+from ddco_pyro.model.networks.perceptrons import ACTIVATIONS, Network, Perceptrons, State, options_last
 from ddco_pyro.spec import Activation, ConvolutionLayer, Pool
 
 SHARPNESS = 10.0
-"""Under a softmax maps begin so many times as strong as drawn: under one of weak maps all places are nearly the same,
-and training is slow."""
+"""Factor on the last maps before training with a spatial softmax. Under weak maps all places weigh nearly
+the same, and training is slow."""
 
 POOLED = 8
-"""Blocks by side to whose means a picture is reduced where it is clustered."""
+"""Blocks a side to whose means a picture is reduced for clustering."""
 
 
-class Conv(nn.Module):
-    """K networks of convolutions over each picture, pooled, and a perceptron over that and the vectors.
+class Conv(Network):
+    """K networks of convolutions over each picture, pooled, and a perceptron over the pooled maps and the vectors.
 
-    :param layers: the convolutions; where there are none, a single one of ``filters`` and ``kernel``, stride 2.
-    :param pool: ``mean`` of ``pooled`` × ``pooled`` fields of each map, ``flatten`` for all of it, or where in the map
-        it is active, ``spatial_softmax``.
-    :param standardize: whether each picture is shifted and scaled to mean 0 and standard deviation 1.
+    :param layers: the convolutions; by default a single one of ``filters`` and ``kernel`` with stride 2.
+    :param pool: ``mean`` of ``pooled`` × ``pooled`` fields of each map, ``flatten`` for the whole map, or the expected
+        place under its softmax, ``spatial_softmax``.
+    :param standardize: whether each picture is scaled to mean 0 and standard deviation 1.
+    :raises ShapeError: there is no picture, or one is too small for the layers.
     """
 
     def __init__(
         self,
         shape: InputShape,
-        outputs: int | None,
         copies: int,
         hidden: tuple[int, ...],
         dropout: float,
@@ -51,38 +51,31 @@ class Conv(nn.Module):
         self.pictures = list(shape.images)
         self.activation, self.standardize = ACTIVATIONS[activation](), standardize
         first, *rest = layers or [ConvolutionLayer(filters=filters, kernel=kernel, stride=2, padding=kernel // 2)]
-        self.convolutions = nn.ModuleDict(
-            {_module(key): _convolution(first, size[-1], copies) for key, size in shape.images.items()}
-        )
-        self.deeper = nn.ModuleDict(
-            {
-                _module(key): nn.ModuleList(
-                    _convolution(layer, copies * before.filters, copies, copies)
-                    for before, layer in zip([first, *rest], rest, strict=False)
-                )
-                for key in shape.images
-                if rest
-            }
+        pairs = list(zip([first, *rest], rest, strict=False))
+        firsts = [_convolution(first, size[-1], copies) for size in shape.images.values()]
+        self.convolutions = nn.ModuleList(
+            nn.ModuleList(
+                [own, *(_convolution(layer, copies * above.filters, copies, copies) for above, layer in pairs)]
+            )
+            for own in firsts
         )
         if pool == "spatial_softmax":
             self.strengthen(SHARPNESS)
-        maps = sum(self._map_features(key, size) for key, size in shape.images.items())
-        self.layers = Perceptrons(copies, shape.vector + maps, hidden, outputs, dropout, activation)
-        self.features = self.layers.features
+        maps = sum(self._map_features(key, own, shape.images[key]) for key, own in self._layers().items())
+        self.layers = Perceptrons(copies, shape.vector + maps, hidden, dropout, activation)
 
-    def forward(self, inputs: Inputs) -> Tensor:
-        """[N, T, K, outputs]."""
+    def forward(self, inputs: Inputs, state: State = ()) -> tuple[Tensor, State]:
+        """[N, T, K, features], and the state."""
         vector = inputs.vector.flatten(0, 1).expand(self.copies, -1, -1)
-        maps = [self._map(key, image.flatten(0, 1)) for key, image in inputs.images.items()]
-        return options_last(self.layers(torch.cat([vector, *maps], dim=-1)), inputs.batch)
+        maps = [self._maps(layers, inputs.images[key].flatten(0, 1)) for key, layers in self._layers().items()]
+        return options_last(self.layers(torch.cat([vector, *maps], dim=-1)), inputs.batch), state
 
     def numpy_form(self) -> NumpyForm:
-        """What the numpy runner has to know of it."""
-        pictures = [self._picture_form(key) for key in self.pictures]
-        return perceptrons(self.layers, joined([vectors(self.reads, self.copies), *pictures]))
+        """Perceptrons over the vectors and the pooled maps of each picture."""
+        pictures = [self._picture_form(key, layers) for key, layers in self._layers().items()]
+        return self.layers.numpy_form(joined([vectors(self.reads, self.copies), *pictures]))
 
-    def _picture_form(self, key: str) -> NumpyForm:
-        layers = self._layers(key)
+    def _picture_form(self, key: str, layers: Sequence[nn.Conv2d]) -> NumpyForm:
         strides = [{"stride": layer.stride[0], "padding": int(layer.padding[0])} for layer in layers]
         facts = {"kind": "convolutions", "key": key, "copies": self.copies, "layers": strides}
         facts |= {"activation": self.layers.activation, "standardize": self.standardize}
@@ -90,36 +83,33 @@ class Conv(nn.Module):
         return facts | {"pool": self.pool, "pooled": self.pooled}, arrays
 
     def strengthen(self, factor: float) -> None:
-        """Make the last maps of each picture stronger by a factor."""
+        """Multiply the last maps of each picture by a factor."""
         with torch.no_grad():
-            for key in self.pictures:
-                for parameter in self._layers(key)[-1].parameters():
+            for layers in self._layers().values():
+                for parameter in layers[-1].parameters():
                     parameter.mul_(factor)
 
-    def _layers(self, key: str) -> list[nn.Conv2d]:
-        name = _module(key)
-        layers = [self.convolutions[name], *(self.deeper[name].children() if name in self.deeper else ())]
-        return [layer for layer in layers if isinstance(layer, nn.Conv2d)]
+    def _layers(self) -> dict[str, list[nn.Conv2d]]:
+        """The convolutions of each picture."""
+        each = ([layer for layer in own.children() if isinstance(layer, nn.Conv2d)] for own in self.convolutions)
+        return dict(zip(self.pictures, each, strict=True))
 
-    def _map(self, key: str, image: Tensor) -> Tensor:
+    def _maps(self, layers: Sequence[nn.Conv2d], image: Tensor) -> Tensor:
         """uint8 [M, H, W, C] to [K, M, features of the picture]."""
-        layers = self._layers(key)
         maps = image.permute(0, 3, 1, 2).to(layers[0].weight.dtype) / 255
         maps = _standardized(maps) if self.standardize else maps
         for layer in layers:
             maps = self.activation(layer(maps))
-        return self._pool(maps).reshape(len(image), self.copies, -1).transpose(0, 1)
-
-    def _pool(self, maps: Tensor) -> Tensor:
-        """[M, K · filters, H, W] to [M, K · filters, features of a map]."""
         if self.pool == "mean":
-            return _field_means(maps, self.pooled)
-        return maps if self.pool == "flatten" else _spatial_softmax(maps)
+            maps = _field_means(maps, self.pooled)
+        elif self.pool == "spatial_softmax":
+            maps = _spatial_softmax(maps)
+        return maps.reshape(len(image), self.copies, -1).transpose(0, 1)
 
-    def _map_features(self, key: str, size: tuple[int, ...]) -> int:
-        """How many features there are of a picture [H, W, C], for each option."""
+    def _map_features(self, key: str, layers: Sequence[nn.Conv2d], size: tuple[int, ...]) -> int:
+        """The number of features of a picture [H, W, C] for each option."""
         height, width, _ = size
-        for layer in self._layers(key):
+        for layer in layers:
             height, width = (
                 (length + 2 * int(layer.padding[0]) - layer.kernel_size[0]) // layer.stride[0] + 1
                 for length in (height, width)
@@ -127,13 +117,7 @@ class Conv(nn.Module):
             if min(height, width) < 1:
                 raise ShapeError(f"{key} of {size[0]} × {size[1]} is too small for its layers: take some out, or pad")
         each = {"mean": self.pooled**2, "flatten": height * width, "spatial_softmax": 2}[self.pool]
-        return layer.out_channels // self.copies * each
-
-
-def _module(key: str) -> str:
-    """The name of a picture's layers: the key, escaped where torch takes no module of that name."""
-    plain = "." not in key and not key.startswith("%") and not hasattr(nn.ModuleDict(), key)
-    return key if plain else "%" + key.replace("%", "%25").replace(".", "%2E")
+        return layers[-1].out_channels // self.copies * each
 
 
 def _convolution(layer: ConvolutionLayer, channels: int, copies: int, groups: int = 1) -> nn.Conv2d:
@@ -142,7 +126,7 @@ def _convolution(layer: ConvolutionLayer, channels: int, copies: int, groups: in
 
 
 def _standardized(pictures: Tensor) -> Tensor:
-    """Each picture [M, C, H, W] less its mean, over its standard deviation, that of a single bright number at least."""
+    """Each picture [M, C, H, W] less its mean, over its standard deviation or that of one bright number."""
     centred = pictures - pictures.mean((1, 2, 3), keepdim=True)
     variance = centred.square().mean((1, 2, 3), keepdim=True)  # torch.var_mean is several times as slow
     return centred / variance.clamp(min=1 / pictures[0].numel()).sqrt()
@@ -157,7 +141,7 @@ def _field_means(maps: Tensor, count: int) -> Tensor:
 
 
 def _shares(length: int, count: int) -> Tensor:
-    """Which part each place has in the mean of each field, cut as ``adaptive_avg_pool2d`` does, [count, length]."""
+    """The weight of each place in the mean of each field of ``adaptive_avg_pool2d``, [count, length]."""
     field, place = torch.arange(count)[:, None], torch.arange(length)
     inside = (place >= field * length // count) & (place < -(-(field + 1) * length // count))
     return inside / inside.sum(1, keepdim=True)

@@ -1,4 +1,4 @@
-"""What a network sees, and the shapes it is built for."""
+"""The inputs of networks, and their shapes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,16 @@ T = TypeVar("T")
 
 
 class ShapeError(ValueError):
-    """A network cannot read the observations it was given, lacks an option, or gives another shape than it has to."""
+    """A network cannot read its observations, lacks an option, or gives outputs of a wrong shape."""
 
 
 @dataclass(frozen=True)
 class InputShape:
-    """Shapes of :class:`Inputs` without the batch: ``vectors`` has the features of each vector observation, ``images``
-    [H, W, C] of each picture, both by name in the spec's order; ``steps`` is the longest demonstration.
+    """Shapes of :class:`Inputs` without the batch, by name in the spec's order.
+
+    :param vectors: the number of features of each vector observation.
+    :param images: [H, W, C] of each picture.
+    :param steps: of the longest demonstration.
     """
 
     vectors: Mapping[str, int]
@@ -36,7 +39,7 @@ class InputShape:
         return sum(self.vectors.values())
 
     def select(self, names: Sequence[str]) -> InputShape:
-        """The same of these observations alone, in this order.
+        """The shapes of these observations alone, in this order.
 
         :raises ShapeError: there is no such observation.
         """
@@ -50,8 +53,12 @@ class InputShape:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Observations of N trajectories by name: ``vectors`` float32 [N, T, F_key]; ``images`` uint8 [N, T, H, W, C];
-    ``time`` [T] counts steps. Images may be :class:`~ddco_pyro.model.frames.Frames`; networks are given tensors.
+    """Observations of N trajectories by name.
+
+    :param vectors: float32 [N, T, F_key].
+    :param images: uint8 [N, T, H, W, C]; in a batch perhaps :class:`~ddco_pyro.model.frames.Frames`, for a network
+        tensors.
+    :param time: the number of each step, [T].
     """
 
     vectors: Mapping[str, Tensor]
@@ -79,33 +86,33 @@ class Inputs:
         return Inputs(_of(self.vectors, names), _of(self.images, names), self.time)
 
     def chunks(self, steps: int) -> Iterator[Inputs]:
-        """Consecutive parts of at most so many steps of time each, one step at least."""
+        """Consecutive parts of at most ``steps`` steps, and of at least one."""
         size = max(steps, 1)
         for first in range(0, self.batch[1], size):
             yield self.part(slice(None), slice(first, first + size))
 
     def part(self, rows: Tensor | slice, steps: slice) -> Inputs:
-        """Some trajectories alone, and consecutive steps of them."""
+        """Consecutive steps of some trajectories."""
         vectors = {key: array[rows, steps] for key, array in self.vectors.items()}
         if isinstance(self.images, Frames):
             return Inputs(vectors, self.images.part(rows, steps), self.time[steps])
         return Inputs(vectors, {key: array[rows, steps] for key, array in self.images.items()}, self.time[steps])
 
     def loaded(self) -> Inputs:
-        """The same with all images in memory.
+        """These inputs with all images in memory.
 
         :raises DemonstrationsError: a file cannot be read.
         """
         return Inputs(self.vectors, self.images.loaded(), self.time) if isinstance(self.images, Frames) else self
 
     def to(self, device: torch.device) -> Inputs:
-        """The same on a device; images, which have to be in memory, go there as they are, uint8."""
+        """These inputs on a device; images have to be in memory."""
         if self.time.device == device:
             return self
         return self.map(lambda array: array.to(device), self.time.to(device))
 
     def map(self, change: Callable[[Tensor], Tensor], time: Tensor) -> Inputs:
-        """The same of changed arrays, at other times."""
+        """Inputs of changed arrays, at other times."""
         vectors, images = (
             {key: change(array) for key, array in arrays.items()} for arrays in (self.vectors, self.images)
         )

@@ -11,49 +11,45 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape
-from ddco_pyro.model.networks.mlp import Linear
-from ddco_pyro.model.networks.numpy_form import NumpyForm, numpy_form, over_layers, perceptrons
-from ddco_pyro.model.networks.stacked import Perceptrons, StackedLinear, options_first, options_last
-from ddco_pyro.model.networks.state import State, Trunk, answer, initial_state
+from ddco_pyro.model.networks.numpy_form import NumpyForm, over_layers
+from ddco_pyro.model.networks.perceptrons import (
+    Linear,
+    Network,
+    Perceptrons,
+    StackedLinear,
+    State,
+    options_first,
+    options_last,
+)
 
 
-class Lstm(nn.Module):
-    """K LSTMs, of a layer for each size in ``hidden``, and a linear map of what the last layer gives.
+class Lstm(Network):
+    """K LSTMs, of a layer for each size in ``hidden``, over the features of ``over``, or over the vectors.
 
-    They read what ``over`` gives, or else the vectors. The state is that of ``over``, then h and c [N, K, size] of each
-    layer.
+    The state holds that of ``over``, then h and c [N, K, size] of each layer.
 
-    :param horizon: h and c are zeros again before every step whose number in its trajectory is a multiple of it.
+    :param horizon: steps of a window; h and c are zeros again before the first step of each. None for no windows.
     """
 
     def __init__(
-        self,
-        shape: InputShape,
-        outputs: int | None,
-        copies: int,
-        over: Trunk | None,
-        hidden: tuple[int, ...],
-        horizon: int | None,
+        self, shape: InputShape, copies: int, over: Network | None, hidden: tuple[int, ...], horizon: int | None
     ) -> None:
         super().__init__()
-        self.horizon = horizon
-        below = over or Trunk(Linear(shape, None, copies), shape.vector, copies)
-        self.over = below.network
-        sizes = zip([below.features, *hidden], hidden, strict=False)
+        self.copies, self.horizon = copies, horizon
+        self.over = over or Linear(shape, copies)
+        sizes = zip([self.over.features, *hidden], hidden, strict=False)
         self.memory = nn.ModuleList(StackedLstm(copies, *pair) for pair in sizes)
-        self.layers = Perceptrons(copies, hidden[-1], (), outputs)
-        self.features = self.layers.features
+        self.layers = Perceptrons(copies, hidden[-1], ())
 
     def initial_state(self, trajectories: int) -> State:
-        """Zeros, after the state of what it reads."""
+        """Zeros, after the state of ``over``."""
         own = [layer.recurrent.new_zeros(trajectories, *layer.size) for layer in self._memory() for _ in "hc"]
-        return (*initial_state(self.over, trajectories), *own)
+        return (*self.over.initial_state(trajectories), *own)
 
-    def forward(self, inputs: Inputs, state: State | None = None) -> tuple[Tensor, State]:
-        """[N, T, K, outputs], and the state after the last step."""
-        state = self.initial_state(inputs.batch[0]) if state is None else state
+    def forward(self, inputs: Inputs, state: State) -> tuple[Tensor, State]:
+        """[N, T, K, features], and the state after the last step."""
         within = len(state) - 2 * len(self.memory)
-        features, after = answer(self.over, inputs, state[:within])
+        features, after = self.over(inputs, state[:within])
         values = options_first(features)
         for number, layer in enumerate(self._memory()):
             h, c = state[within + 2 * number :][:2]
@@ -65,20 +61,20 @@ class Lstm(nn.Module):
         return options_last(self.layers(values), inputs.batch), after
 
     def numpy_form(self) -> NumpyForm | None:
-        """What the numpy runner has to know of it."""
-        of = numpy_form(self.over)
+        """Layers that remember, over the form of ``over``; None where that has none."""
+        of = self.over.numpy_form()
         if of is None:
             return None
         layers = {str(number): layer for number, layer in enumerate(self.memory)}
         facts = {"kind": "lstm", "layers": len(layers), "horizon": self.horizon}
-        return perceptrons(self.layers, over_layers(of, facts, layers))
+        return self.layers.numpy_form(over_layers(of, facts, layers))
 
     def _memory(self) -> list[StackedLstm]:
         return [layer for layer in self.memory if isinstance(layer, StackedLstm)]
 
 
 class StackedLstm(nn.Module):
-    """K LSTM layers as one. Gates stand in torch's order (input, forget, cell, output) and have one bias, not two."""
+    """K LSTM layers as one, with gates in torch's order (input, forget, cell, output) and one bias each."""
 
     def __init__(self, copies: int, inputs: int, size: int) -> None:
         super().__init__()
@@ -102,7 +98,7 @@ class StackedLstm(nn.Module):
         return outputs.flatten(1, 2), h[:, 0].transpose(0, 1), c[:, 0].transpose(0, 1)
 
     def _step(self, values: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """A single step of all K at once, which a program of one step can hold.
+        """A single step of all K at once, which can be exported.
 
         For many steps torch's own loop, copy by copy, takes a half to a fifth of the time (5 copies of size 64 over
         16 × 100 and 1 × 1000 steps).
@@ -127,8 +123,9 @@ class StackedLstm(nn.Module):
 def _in_windows(
     layer: StackedLstm, values: Tensor, inputs: Inputs, h: Tensor, c: Tensor, horizon: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What a layer gives where each window of ``horizon`` steps of a trajectory begins with zeros. Windows that are
-    there from their first step to their last are sequences of their own, all together.
+    """A layer's outputs where each window of ``horizon`` steps of a trajectory begins with zeros.
+
+    Windows that are complete in these inputs go through the layer together, as sequences.
     """
     trajectories, steps = inputs.batch
     if steps == 1:  # without a branch, which a program of one step cannot hold
@@ -149,8 +146,9 @@ def _in_windows(
 
 
 def _for_loop(device: torch.device) -> AbstractContextManager[None]:
-    """Not every processor has what torch's loop takes in bfloat16, so there it is float32 on all of them. A GPU warns
-    that it brings weights together each time.
+    """The context of torch's loop: float32 on CPUs, not all of which support it in bfloat16.
+
+    On GPUs a warning about scattered weights is suppressed.
     """
     return torch.autocast("cpu", enabled=False) if device.type == "cpu" else _without_warning()
 

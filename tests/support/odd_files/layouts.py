@@ -198,7 +198,7 @@ ROWS = {
         act_twice, r"episode_1\.hdf5: has the number of episode_01\.hdf5|episode_01\.hdf5: has the number"
     ),
     "d4rl": Row(d4rl(), IMPORT),
-    "d4rl without timeouts": Row(d4rl("timeouts"), "has no timeouts, so nothing says where demonstrations end"),
+    "d4rl without timeouts": Row(d4rl("timeouts"), "has no timeouts, which mark the ends of demonstrations"),
     "robosuite": Row(
         robosuite(False), r"conversion\.convert_robosuite --dataset .* && .*dataset_states_to_obs --dataset"
     ),

@@ -1,0 +1,544 @@
+"""Controls: statistics of each dimension over demonstrations, and the kind of distribution each dimension gets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ddco_pyro.spec import ControlSpec, PartSpec, SpecError
+
+OFTEN = 0.01
+"""A dimension often equals an extreme if more than this share of the steps does."""
+
+ATOM = 0.05
+"""A dimension has an atom inside its range if at least this share of the steps equals one value there."""
+
+FEWEST = 3
+"""Fewest steps of an atom: rounded numbers coincide now and then."""
+
+TOGETHER = 0.9
+"""Two dimensions rest together if this share of the steps in which either rests is shared."""
+
+MOST_DISTINCT = 64
+"""Most distinct values of a dimension that are kept."""
+
+
+@dataclass(frozen=True)
+class ControlDimension:
+    """Statistics of one control dimension over all steps of some demonstrations.
+
+    :param number: index of the dimension, from 0.
+    :param minimum: the smallest value, in the control's units; ``maximum`` likewise.
+    :param at_minimum: number of steps that equal the minimum; ``at_maximum`` likewise.
+    :param steps: number of steps with finite values.
+    :param distinct: the sorted values if there are at most :data:`MOST_DISTINCT`; else empty.
+    :param inside: the commonest value strictly between the extremes; None without a common value.
+    :param at_inside: number of steps that equal ``inside``.
+    :param together: other dimensions that equal their ``inside`` in the same steps (:data:`TOGETHER`).
+    :param integer: whether the controls have an integer type.
+    """
+
+    number: int
+    minimum: float
+    maximum: float
+    at_minimum: int
+    at_maximum: int
+    steps: int
+    distinct: tuple[float, ...] = ()
+    inside: float | None = None
+    at_inside: int = 0
+    together: tuple[int, ...] = ()
+    integer: bool = False
+
+    @property
+    def whole(self) -> bool:
+        """Whether the values are few whole numbers from 0 on."""
+        return bool(self.distinct) and self.minimum >= 0 and all(value.is_integer() for value in self.distinct)
+
+    @property
+    def discrete(self) -> bool:
+        """Whether the values are few and of an integer type."""
+        return self.integer and bool(self.distinct)
+
+    @property
+    def constant(self) -> bool:
+        """Whether all steps have the same value."""
+        return self.minimum == self.maximum
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """The values if there are one or two; else empty."""
+        if self.constant:
+            return (self.minimum,)
+        return (self.minimum, self.maximum) if self.at_minimum + self.at_maximum == self.steps else ()
+
+    @property
+    def extremes(self) -> tuple[tuple[str, float, float], ...]:
+        """(``minimum`` or ``maximum``, its value, share of the steps that equal it) for extremes that are common.
+
+        Empty for discrete dimensions and for one or two values. An extreme that occurs once does not count.
+        """
+        ends = (("minimum", self.minimum, self.at_minimum), ("maximum", self.maximum, self.at_maximum))
+        often = [(name, value, at / self.steps) for name, value, at in ends if at > max(1, OFTEN * self.steps)]
+        return () if self.values or self.discrete else tuple(often)
+
+    @property
+    def atom(self) -> str:
+        """The atom inside the range and its share of the steps, in words; empty without an atom."""
+        if self.inside is None or self.discrete or self.at_inside < max(FEWEST, ATOM * self.steps):
+            return ""
+        return f"exactly {number(self.inside)} in {100 * self.at_inside / self.steps:.1f} % of the steps"
+
+    @property
+    def note(self) -> str:
+        """What is unusual about the dimension, in a few words; may be empty."""
+        if self.constant:
+            return f"constant ({number(self.minimum)}): no part of the model, emitted as it is"
+        if self.values:
+            return f"takes two values, {number(self.minimum)} and {number(self.maximum)}"
+        ends = ", at its ".join(
+            f"{name} {number(value)} in {100 * share:.1f} % of the steps" for name, value, share in self.extremes
+        )
+        return "; ".join(filter(None, (self.atom, ends and f"exactly at its {ends}")))
+
+    def as_data(self) -> dict[str, Any]:
+        """The main statistics as plain data."""
+        left_out = ("distinct", "together", "integer")
+        return {key: value for key, value in asdict(self).items() if key not in left_out}
+
+
+def number(value: float) -> str:
+    """A value with as few digits as identify it in its type, single or double; never as minus zero."""
+    value = float(value) + 0.0
+    if value.is_integer() and abs(value) < 1e16:
+        return str(int(value))
+    with np.errstate(over="ignore"):
+        single = np.float32(value)
+    return str(single) if float(single) == value else str(value)
+
+
+class ControlStatistics:
+    """Streaming :class:`ControlDimension` statistics of controls; NaN and infinite values are ignored."""
+
+    def __init__(self) -> None:
+        self._columns: list[np.ndarray] = []  # minimum, maximum, steps there, steps: each [A]
+        self._distinct: list[np.ndarray] = []
+        self._common = _CommonValues()
+        self._integer = True
+
+    def add(self, controls: np.ndarray) -> None:
+        """Add some steps [T, ...]."""
+        self._integer &= controls.dtype.kind in "iu"
+        values = np.asarray(controls, dtype=np.float64).reshape(len(controls), -1)
+        finite = np.isfinite(values)
+        if not len(values):
+            return
+        low, high = np.where(finite, values, np.inf).min(0), np.where(finite, values, -np.inf).max(0)
+        new = [low, high, (values == low).sum(0), (values == high).sum(0), finite.sum(0)]
+        self._columns = _merged(self._columns, new) if self._columns else new
+        before = self._distinct or [np.empty(0)] * values.shape[1]
+        self._distinct = [
+            old if len(old) > MOST_DISTINCT else np.union1d(old, column[use])[: MOST_DISTINCT + 1]
+            for old, column, use in zip(before, values.T, finite.T, strict=True)
+        ]
+        self._common.add(values)
+
+    def dimensions(self) -> tuple[ControlDimension, ...]:
+        """The statistics of all dimensions that have a finite value."""
+        columns = [column.tolist() for column in self._columns]
+        few = [tuple(values.tolist()) if len(values) <= MOST_DISTINCT else () for values in self._distinct]
+        inside = self._common.inside(*self._columns[:2]) if columns else {}
+        nowhere: tuple[float | None, int, tuple[int, ...]] = (None, 0, ())
+        return tuple(
+            ControlDimension(
+                index,
+                low,
+                high,
+                at_low,
+                at_high,
+                steps,
+                distinct,
+                *inside.get(index, nowhere),
+                integer=self._integer,
+            )
+            for index, (low, high, at_low, at_high, steps, distinct) in enumerate(zip(*columns, few, strict=True))
+            if steps
+        )
+
+
+def _merged(before: Sequence[np.ndarray], new: Sequence[np.ndarray]) -> list[np.ndarray]:
+    low, high = np.minimum(before[0], new[0]), np.maximum(before[1], new[1])
+    at_low, at_high = (
+        sum(np.where(part[end] == value, part[end + 2], 0) for part in (before, new))
+        for end, value in ((0, low), (1, high))
+    )
+    return [low, high, np.asarray(at_low), np.asarray(at_high), before[4] + new[4]]
+
+
+CHUNK = 4096
+"""Steps that are searched together for common values."""
+
+KEPT = 3
+"""Common values of a dimension that are counted: possibly both extremes, and one between."""
+
+MOST_DIMENSIONS = 256
+"""Largest control whose common values are counted."""
+
+
+class _CommonValues:
+    """The commonest values of each dimension, and in how many steps each pair of them occurs together.
+
+    Counting of a value starts with the first chunk in which its share is :data:`ATOM`. Counts of up to :data:`CHUNK`
+    steps are exact; counts of more steps are exact for values that are common in the first chunk.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: list[np.ndarray] = []
+        self._values: list[tuple[int, float]] = []
+        self._counts = np.zeros((0, 0))
+
+    def add(self, controls: np.ndarray) -> None:
+        """Add some steps [T, A]."""
+        if controls.shape[1] <= MOST_DIMENSIONS:
+            self._waiting.append(controls)
+        if sum(map(len, self._waiting)) >= CHUNK:
+            rows = np.concatenate(self._waiting)
+            whole = len(rows) // CHUNK * CHUNK
+            for chunk in np.split(rows[:whole], whole // CHUNK):
+                self._count(chunk)
+            self._waiting = [rows[whole:]]
+
+    def inside(self, low: np.ndarray, high: np.ndarray) -> dict[int, tuple[float, int, tuple[int, ...]]]:
+        """By dimension: its commonest value between the extremes, the count, and the dimensions that rest with it."""
+        if waiting := [rows for rows in self._waiting if len(rows)]:
+            self._count(np.concatenate(waiting))
+            self._waiting = []
+        places: dict[int, int] = {}
+        for place, (dimension, value) in enumerate(self._values):  # the commonest come first
+            if low[dimension] < value < high[dimension]:
+                places.setdefault(dimension, place)
+        return {
+            dimension: (
+                self._values[place][1],
+                int(self._counts[place, place]),
+                tuple(other for other, at in sorted(places.items()) if at != place and self._together(place, at)),
+            )
+            for dimension, place in places.items()
+        }
+
+    def _together(self, first: int, second: int) -> bool:
+        both = self._counts[first, second]
+        either = self._counts[first, first] + self._counts[second, second] - both
+        return bool(both >= TOGETHER * either)
+
+    def _count(self, rows: np.ndarray) -> None:
+        for dimension, column in enumerate(rows.T):
+            values, times = np.unique(column[np.isfinite(column)], return_counts=True)
+            often = np.argsort(-times, kind="stable")[:KEPT]
+            often = often[times[often] >= max(FEWEST, ATOM * len(rows))]
+            found = ((dimension, value + 0.0) for value in values[often].tolist())  # + 0.0: minus zero is zero
+            self._values += [each for each in found if each not in self._values]
+        at = np.zeros((len(rows), len(self._values)), np.float32)
+        for place, (dimension, value) in enumerate(self._values):
+            at[:, place] = rows[:, dimension] == value
+        counts = (at.T @ at).astype(np.float64)
+        counts[: len(self._counts), : len(self._counts)] += self._counts
+        order = np.argsort(-counts.diagonal(), kind="stable").tolist()
+        owners = [self._values[place][0] for place in order]
+        kept = [place for rank, place in enumerate(order) if owners[:rank].count(owners[rank]) < KEPT]
+        self._values = [self._values[place] for place in kept]
+        self._counts = counts[np.ix_(kept, kept)]
+
+
+def control_dimensions(controls: Iterable[np.ndarray]) -> tuple[ControlDimension, ...]:
+    """The statistics of each control dimension in blocks of steps [T, A]."""
+    statistics = ControlStatistics()
+    for block in controls:
+        statistics.add(block)
+    return statistics.dimensions()
+
+
+def all_constant(dimensions: Sequence[ControlDimension]) -> str:
+    """The problem with controls that never vary, in words."""
+    values = ", ".join(number(dimension.minimum) for dimension in dimensions[:5]) + ", ..." * (len(dimensions) > 5)
+    return f"actions: every dimension is constant ({values}) in all demonstrations, so there is no control to model"
+
+
+def notes(dimensions: Iterable[ControlDimension]) -> list[str]:
+    """A line for each unusual dimension."""
+    return [f"control dimension {dimension.number}: {dimension.note}" for dimension in dimensions if dimension.note]
+
+
+# --- kinds of distribution --------------------------------------------------------------------------------------------
+
+KINDS = ("gaussian", "clipped", "hurdle", "binary", "categorical")
+
+
+@dataclass(frozen=True)
+class ControlPart:
+    """Control dimensions whose distribution is of one kind.
+
+    The dimensions of a ``hurdle`` part share one probability: that all of them equal their ``exact`` values.
+
+    :param dims: indices of the control dimensions; constant dimensions belong to no part.
+    :param kind: one of :data:`KINDS`.
+    :param low: for each dimension, in the control's units: the lower bound (-inf for none) of a ``clipped`` or
+        ``hurdle`` part, the lower value of a ``binary`` part; ``high`` likewise. Empty for other kinds.
+    :param values: the actions of a one-dimensional ``categorical`` part; empty for one-hot rows.
+    :param exact: the value of each ``hurdle`` dimension that has a probability; empty for other kinds.
+    :param why: the reason for the kind, in words.
+    """
+
+    name: str
+    dims: tuple[int, ...]
+    kind: str
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
+    values: tuple[float, ...] = ()
+    why: str = ""
+    exact: tuple[float, ...] = ()
+
+    @property
+    def continuous(self) -> bool:
+        """Whether the distribution has a σ."""
+        return self.kind in ("gaussian", "clipped", "hurdle")
+
+    @property
+    def bounded(self) -> bool:
+        """Whether the part is continuous with a finite bound."""
+        return self.continuous and any(map(math.isfinite, (*self.low, *self.high)))
+
+    @property
+    def size(self) -> int:
+        """Number of network outputs for the part."""
+        return len(self.values) or len(self.dims) + bool(self.exact)
+
+    def as_data(self) -> dict[str, Any]:
+        """The part as plain data."""
+        return asdict(self)
+
+    @classmethod
+    def of(cls, data: dict[str, Any]) -> ControlPart:
+        """The part that :meth:`as_data` gave."""
+        lists = {key: tuple(value) for key, value in data.items() if isinstance(value, list)}
+        return cls(**{**data, **lists})
+
+
+def described(parts: Sequence[ControlPart]) -> list[str]:
+    """A line for each part: dimensions, kind, and reason."""
+    return [f"control {listed(part.dims)}: {part.kind}" + (f" ({part.why})" if part.why else "") for part in parts]
+
+
+def listed(dims: Sequence[int]) -> str:
+    """``dimension 3``, or ``dimensions 0-2, 5``."""
+    runs: list[list[int]] = []
+    for dimension in sorted(dims):
+        if runs and dimension == runs[-1][-1] + 1:
+            runs[-1].append(dimension)
+        else:
+            runs.append([dimension])
+    texts = (str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+    return ("dimension " if len(dims) == 1 else "dimensions ") + ", ".join(texts)
+
+
+def measure(parts: Sequence[ControlPart]) -> dict[str, list[Any]]:
+    """The reference measure of a log-likelihood by dimension. Log-likelihoods compare only under equal measures.
+
+    Each entry is the kind, followed by the bounds of a ``clipped`` dimension (None for no bound) or the values of a
+    discrete dimension. For ``hurdle``: bounds, exact value, and the dimensions of the part.
+    """
+    dimensions: dict[str, list[Any]] = {}
+    for part in parts:
+        for place, dimension in enumerate(part.dims):
+            ends = [part.low[place], part.high[place]] if part.low else []
+            about = [end if math.isfinite(end) else None for end in ends] or list(part.values)
+            exact = [part.exact[place], list(part.dims)] if part.exact else []
+            dimensions[str(dimension)] = [part.kind, *about, *exact]
+    return dimensions
+
+
+def difference(ours: Sequence[ControlPart], theirs: Sequence[ControlPart]) -> str:
+    """The first control dimension in which two measures differ, in words; empty if the measures are equal."""
+    first, second = measure(ours), measure(theirs)
+    for dimension in sorted(set(first) | set(second), key=int):
+        if first.get(dimension) != second.get(dimension):
+            one, other = (_measured(each.get(dimension)) for each in (first, second))
+            return f"control dimension {dimension} is {one} in one and {other} in the other"
+    return ""
+
+
+def _measured(measured: Sequence[Any] | None) -> str:
+    if measured is None:
+        return "no part of the likelihood"
+    kind, *about = measured
+    ends = " and ".join("none" if end is None else number(end) for end in about[:2])
+    text = f"{kind} with bounds {ends}" if kind in ("clipped", "hurdle") else str(kind)
+    return f"{text} at {number(about[2])}, of {listed(about[3])}" if kind == "hurdle" else text
+
+
+def all_gaussian(varying: Sequence[int]) -> tuple[ControlPart, ...]:
+    """One Gaussian part of these dimensions: the model before any demonstrations are known."""
+    return (ControlPart("gaussian", tuple(varying), "gaussian"),)
+
+
+def control_parts(spec: ControlSpec, dimensions: Sequence[ControlDimension]) -> tuple[ControlPart, ...]:
+    """The parts of a control: the parts of the spec, then all other varying dimensions by kind.
+
+    :raises SpecError: the spec does not fit the demonstrations.
+    """
+    refuse_unknown_dimensions(spec, len(dimensions))
+    varying = {dim.number: dim for dim in dimensions if not dim.constant}
+    named = []
+    for place, part in enumerate(spec.parts):
+        own = [varying.pop(dimension) for dimension in part.dims if dimension in varying]
+        named += list(_parts(part.kind, own, f"control.parts.{place}", part))
+    return (*named, *_parts(spec.kind, list(varying.values()), "control", None))
+
+
+def refuse_unknown_dimensions(spec: ControlSpec, size: int) -> None:
+    """Refuse a spec that names a dimension beyond a control of this size.
+
+    :raises SpecError: it does.
+    """
+    for place, part in enumerate(spec.parts):
+        unknown = [dimension for dimension in part.dims if dimension >= size]
+        if unknown:
+            raise SpecError(
+                f"control.parts.{place}.dims: there is no control dimension {unknown[0]}; the control has {size}, "
+                "counted from 0"
+            )
+
+
+def _parts(
+    kind: str, dimensions: Sequence[ControlDimension], place: str, spec: PartSpec | None
+) -> Iterator[ControlPart]:
+    """One part for each kind among the dimensions.
+
+    :param place: key path of the spec, for errors.
+    """
+    if kind == "categorical" and dimensions:
+        name, one_hot = spec.name if spec else kind, all(dim.values == (0.0, 1.0) for dim in dimensions)
+        if one_hot and len(dimensions) > 1:
+            dims = tuple(dim.number for dim in dimensions)
+            yield ControlPart(name, dims, "categorical", why=f"{len(dims)} discrete actions, as rows")
+        else:
+            yield from _actions(dimensions, place, name)
+        return
+    alone = len(dimensions) == 1
+    decided = {dim.number: _decided(dim, alone) if kind == "auto" else _declared(dim, kind) for dim in dimensions}
+    kinds = [each for each in KINDS if each in {kind for kind, _ in decided.values()}]
+    for each in kinds:
+        alike = [dim for dim in dimensions if decided[dim.number][0] == each]
+        name = each if spec is None else spec.name if len(kinds) == 1 else f"{spec.name} {each}"
+        if each == "categorical":
+            yield from (replace(part, why=decided[part.dims[0]][1]) for part in _actions(alike, place, name))
+            continue
+        exact = {dim.number: _exact(dim, place, spec) for dim in alike if each == "hurdle"}
+        for own in _resting_together(alike, exact) if exact else [alike]:
+            low, high = (), ()
+            if each != "gaussian":
+                ends = [_ends(dim, each, place, spec, exact.get(dim.number)) for dim in own]
+                low, high = zip(*ends, strict=True)
+            why = "; ".join(dict.fromkeys(decided[dim.number][1] for dim in own))
+            numbers = tuple(dim.number for dim in own)
+            rests = tuple(exact[number] for number in numbers if exact)
+            yield ControlPart(name, numbers, each, low, high, why=why, exact=rests)
+
+
+def _decided(dimension: ControlDimension, alone: bool) -> tuple[str, str]:
+    """The kind of a dimension under ``auto``, and the reason.
+
+    :param alone: whether there is no other dimension.
+    """
+    if dimension.values:
+        return "binary", f"takes two values, {number(dimension.minimum)} and {number(dimension.maximum)}"
+    if dimension.discrete:
+        return "categorical", f"takes {len(dimension.distinct)} values of an integer type"
+    if alone and dimension.whole:
+        return "categorical", f"takes {len(dimension.distinct)} whole numbers and is the only dimension"
+    if dimension.atom:
+        return "hurdle", dimension.atom + ("; often at an extreme" if dimension.extremes else "")
+    if dimension.extremes:
+        return "clipped", "often exactly at an extreme"
+    return "gaussian", "varies freely"
+
+
+def _declared(dimension: ControlDimension, kind: str) -> tuple[str, str]:
+    """A kind that the spec declares, with a warning where an atom makes the density unbounded."""
+    if not dimension.atom or kind not in ("gaussian", "clipped"):
+        return kind, "as declared"
+    return kind, f"as declared; {dimension.atom}, and options gain by collecting these steps, without any skill"
+
+
+def _exact(dim: ControlDimension, place: str, spec: PartSpec | None) -> float:
+    """The value of a ``hurdle`` dimension as the demonstrations have it; a spec may give it in float32."""
+    if spec is None or spec.value is None:
+        if dim.inside is None:
+            raise SpecError(
+                f"{place}.kind: control dimension {dim.number} is at no value inside its range in "
+                f"{100 * ATOM:g} % of the steps; it is no hurdle"
+            )
+        return dim.inside
+    for known in (dim.inside, dim.minimum, dim.maximum):
+        if known is not None and np.float32(known) == np.float32(spec.value):
+            return known
+    raise SpecError(
+        f"{place}.value: control dimension {dim.number} is hardly ever exactly {number(spec.value)} in the "
+        "demonstrations" + (f"; it is {dim.atom}" if dim.atom else "")
+    )
+
+
+def _resting_together(
+    dimensions: Sequence[ControlDimension], exact: Mapping[int, float]
+) -> Iterator[list[ControlDimension]]:
+    """Groups of dimensions that equal their commonest inside values in the same steps."""
+    groups: list[list[ControlDimension]] = []
+    for dim in dimensions:
+        rests = exact[dim.number] == dim.inside
+        own = next((own for own in groups if rests and dim.number in own[0].together), None)
+        if own is None or exact[own[0].number] != own[0].inside:
+            groups.append([dim])
+        else:
+            own.append(dim)
+    yield from groups
+
+
+def _ends(
+    dim: ControlDimension, kind: str, place: str, spec: PartSpec | None, exact: float | None
+) -> tuple[float, float]:
+    """The bounds of a dimension, or its two values."""
+    if kind == "binary":
+        if len(dim.values) != 2:
+            raise SpecError(f"{place}.kind: control dimension {dim.number} takes more than two values; it is no switch")
+        return dim.minimum, dim.maximum
+    if spec is not None and spec.bounds is not None:
+        low, high = spec.bounds
+        if dim.minimum < low or dim.maximum > high:
+            raise SpecError(
+                f"{place}.bounds: control dimension {dim.number} goes from {number(dim.minimum)} to "
+                f"{number(dim.maximum)} in the demonstrations, beyond these bounds"
+            )
+        return low, high
+    often = {name: value for name, value, _ in dim.extremes if value != exact}
+    if kind == "clipped" and not often:
+        often = {"minimum": dim.minimum, "maximum": dim.maximum}
+    return often.get("minimum", -math.inf), often.get("maximum", math.inf)
+
+
+def _actions(dimensions: Sequence[ControlDimension], place: str, name: str) -> Iterator[ControlPart]:
+    """A categorical part for each dimension."""
+    for dim in dimensions:
+        if not dim.distinct:
+            raise SpecError(f"{place}.kind: control dimension {dim.number} takes more than {MOST_DISTINCT} values")
+        if len(dimensions) > 1 and not all(value.is_integer() for value in dim.distinct):
+            raise SpecError(
+                f"{place}.kind: control dimension {dim.number} is not of whole numbers: discrete actions are such "
+                "dimensions, or rows with a single 1"
+            )
+        own = name if len(dimensions) == 1 else f"{name} {dim.number}"
+        why = f"{len(dim.distinct)} discrete actions"
+        yield ControlPart(own, (dim.number,), "categorical", values=dim.distinct, why=why)

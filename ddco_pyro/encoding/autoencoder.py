@@ -1,0 +1,147 @@
+"""The built-in encoders: convolutions with random weights, and those that an autoencoder trains."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ddco_pyro.data.tensors import read_tensors, write_tensors
+from ddco_pyro.encoding.pictures import AT_ONCE, Pictures
+from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, UpdatesDone
+from ddco_pyro.model.networks import Inputs, InputShape
+from ddco_pyro.model.networks.conv import SHARPNESS, Conv
+from ddco_pyro.model.seeding import seeded
+from ddco_pyro.spec import ConvolutionLayer
+from ddco_pyro.training.checkpoint import copy_of, optimizer_state, restore_optimizer
+
+_KEY = "picture"
+_FIRST = ConvolutionLayer(filters=16, kernel=5, stride=2, padding=2)
+BUILT_IN = {"random_conv": 64, "autoencoder": 32}
+"""Maps of the second convolution of each. The features are the expected row and column of every map under its
+softmax."""
+
+TARGET = 32
+"""Most rows and columns of the small picture that the decoder gives."""
+
+HIDDEN = 128
+
+UPDATES = 2000
+"""Gradient steps, each on :data:`ddco_pyro.encoding.pictures.AT_ONCE` pictures."""
+
+KEPT_EVERY = 50
+"""Gradient steps between two checkpoints."""
+
+LEARNING_RATE = 3e-3
+
+
+class Convolutions(nn.Module):
+    """uint8 pictures [N, H, W, C] to features [N, F].
+
+    :param kind: a name in :data:`BUILT_IN`.
+    :param shape: of a picture.
+    :param seed: of the weights.
+    """
+
+    def __init__(self, kind: str, shape: Sequence[int], seed: int) -> None:
+        super().__init__()
+        layers = (_FIRST, ConvolutionLayer(filters=BUILT_IN[kind], kernel=3, padding=1))
+        with seeded(seed):
+            images = InputShape({}, {_KEY: tuple(shape)})
+            self.maps = Conv(images, 1, (), 0.0, "relu", 0, 0, layers, "spatial_softmax", 0, False)
+        if kind == "random_conv":  # sharp maps help training alone; random ones say less
+            self.maps.strengthen(1 / SHARPNESS)
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """Features of each picture by itself."""
+        maps: Tensor = self.maps(Inputs({}, {_KEY: pictures[:, None]}, torch.zeros(1)))[0]
+        return maps[:, 0, 0]
+
+    def encode(self, pictures: np.ndarray) -> np.ndarray:
+        """Features of each picture by itself, float32."""
+        with torch.no_grad():
+            return self(torch.from_numpy(np.ascontiguousarray(pictures))).numpy()
+
+
+class Autoencoder(nn.Module):
+    """A deep spatial autoencoder (Finn et al., 2016): it gives the small picture from where each map is active.
+
+    :param encoder: pictures to features.
+    :param shape: of a picture.
+    :param seed: of the decoder's weights.
+    """
+
+    def __init__(self, encoder: Convolutions, shape: Sequence[int], seed: int) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.target = (min(TARGET, shape[0]), min(TARGET, shape[1]))
+        with seeded(seed + 1):
+            outputs = self.target[0] * self.target[1] * shape[2]
+            features = encoder.maps.features
+            self.decoder = nn.Sequential(nn.Linear(features, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, outputs))
+
+    def loss(self, pictures: Tensor) -> Tensor:
+        """Mean squared error of the small picture, whose numbers lie between 0 and 1."""
+        small = nn.functional.adaptive_avg_pool2d(pictures.permute(0, 3, 1, 2).float() / 255, self.target)
+        return nn.functional.mse_loss(self.decoder(self.encoder(pictures)), small.flatten(1))
+
+
+def train(
+    encoder: Convolutions, pictures: Pictures, seed: int, updates: int, checkpoint: Path, on_event: OnEvent
+) -> None:
+    """Train an encoder as the first half of an autoencoder, from the checkpoint on where there is one.
+
+    An interrupted training that is resumed ends with the same bits.
+
+    :raises Damaged: the checkpoint does not hold what was written.
+    """
+    model = Autoencoder(encoder, pictures.shape, seed)
+    optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
+    done = _restore(model, optimizer, checkpoint) if checkpoint.exists() else 0
+    on_event(TrainingBegan("the autoencoder", updates))
+    errors: list[float] = []
+    for batch in islice(_batches(pictures, seed, done), updates - done):
+        loss = model.loss(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        errors.append(loss.item())
+        done += 1
+        if done % KEPT_EVERY == 0 or done == updates:
+            _keep(model, optimizer, done, checkpoint)
+            on_event(UpdatesDone(done, float(np.mean(errors))))
+            errors.clear()
+    on_event(TrainingEnded("the autoencoder"))
+
+
+def _batches(pictures: Pictures, seed: int, done: int) -> Iterator[Tensor]:
+    """Pictures of the gradient steps after the first ``done``, epoch after epoch without end."""
+    size = min(AT_ONCE, pictures.number)
+    each = pictures.number // size
+    epoch, skip = divmod(done, each)
+    while True:
+        frames = islice(pictures.at_random(seed, epoch), skip * size, None)
+        yield from (torch.from_numpy(np.stack(list(islice(frames, size)))) for _ in range(skip, each))
+        epoch, skip = epoch + 1, 0
+
+
+def _keep(model: Autoencoder, optimizer: torch.optim.Optimizer, done: int, path: Path) -> None:
+    tensors = {f"model/{name}": value for name, value in copy_of(model).items()}
+    tensors |= {f"optimizer/{name}": value for name, value in optimizer_state(optimizer).items()}
+    write_tensors(path, tensors, {"updates": str(done)})
+
+
+def _restore(model: Autoencoder, optimizer: torch.optim.Optimizer, path: Path) -> int:
+    """The gradient steps that are done."""
+    tensors, metadata = read_tensors(path, "remove it and do the same again: the autoencoder begins anew")
+    parts: dict[str, dict[str, Tensor]] = {"model": {}, "optimizer": {}}
+    for name, value in tensors.items():
+        part, _, rest = name.partition("/")
+        parts[part][rest] = value
+    model.load_state_dict(parts["model"])
+    restore_optimizer(optimizer, parts["optimizer"])
+    return int(metadata["updates"])

@@ -1,0 +1,204 @@
+"""How options are used and how differently they act, and the signs of a degenerate solution (SM 2.1) therein."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import combinations
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ddco_pyro.inference import Posterior
+from ddco_pyro.model.outputs import CallerOutputs, Outputs
+
+
+@dataclass(frozen=True)
+class OptionUse:
+    """The use of one choice of a level (0 is control) in demonstrations.
+
+    :param share: mean of u_t, the share of steps in which the choice is active.
+    :param selected: Σ v_t, the expected number of selections.
+    :param demonstrations: the expected number of demonstrations with a selection, Σ_n min(1, Σ_t v_t).
+    :param duration: expected steps from a selection to the next, Σ u_t / Σ v_t; None without a selection.
+    """
+
+    choice: int
+    share: float
+    selected: float
+    demonstrations: float
+    duration: float | None
+
+
+def option_use(posterior: Posterior) -> list[list[OptionUse]]:
+    """The use of every choice of each level, lowest first."""
+    uses = []
+    for u, v in zip(posterior.u, posterior.v, strict=True):
+        active, selected = u.sum((0, 1)).numpy(), v.sum(1).numpy()
+        total = float(active.sum())
+        uses.append([_use(choice, float(active[choice]), selected[:, choice], total) for choice in range(len(active))])
+    return uses
+
+
+def _use(choice: int, active: float, selected: np.ndarray, total: float) -> OptionUse:
+    """The use of a choice that is ``active`` in so many of ``total`` steps; ``selected`` is by demonstration."""
+    often = float(selected.sum())
+    duration = active / often if often > 1e-6 else None
+    return OptionUse(choice, active / total, often, float(selected.clip(max=1.0).sum()), duration)
+
+
+def as_rows(use: Sequence[Sequence[OptionUse]]) -> list[list[dict[str, float | int | None]]]:
+    """The uses as plain data."""
+    return [[asdict(choice) for choice in level] for level in use]
+
+
+def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[dict[str, Any]]]:
+    """The ``divergence`` of each pair of ``options`` of each level, lowest first, nats per step.
+
+    The divergence is the mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i), averaged over steps with weights u_t(i) + u_t(j);
+    None where neither option is ever active. Two options with divergence 0 are one skill under two numbers.
+
+    :param pieces: outputs of the networks and posteriors of demonstrations.
+    """
+    levels: list[dict[tuple[int, int], Tensor]] = []
+    for outputs, posterior in pieces:
+        levels = levels or [{} for _ in posterior.u]
+        for level, own, u in zip(levels, outputs.callers[:-1], posterior.u, strict=True):
+            for pair in combinations(range(u.shape[-1] - 1), 2):
+                level[pair] = level.get(pair, 0.0) + _divergence(own, *pair, u)
+    return [
+        [
+            {"options": [i + 1, j + 1], "divergence": float(total / weight) if weight > 0 else None}
+            for (i, j), (total, weight) in level.items()
+        ]
+        for level in levels
+    ]
+
+
+def _divergence(own: CallerOutputs, i: int, j: int, u: Tensor) -> Tensor:
+    """Weighted sum over the steps, and the sum of the weights, [2]."""
+    steps = torch.zeros(u.shape[:2], dtype=torch.float64)
+    control = torch.ones_like(steps)  # mean probability of emitting the control
+    if own.selection is not None:
+        p, q = (own.selection[:, :, option].double() for option in (i, j))
+        both = torch.isfinite(p) & torch.isfinite(q)  # callers of a level emit the same kinds of choices
+        steps = torch.where(both, 0.5 * (p.exp() - q.exp()) * (p - q), 0.0).sum(-1)
+        control = 0.5 * (p[..., 0].exp() + q[..., 0].exp())
+    if own.emission is not None:
+        steps = steps + control * own.emission.divergence(i, j)
+    weight = u[..., i + 1] + u[..., j + 1]
+    return torch.stack([(weight * steps).sum(), weight.sum()])
+
+
+UNUSED_SHARE = 0.01
+DOMINATING_SHARE = 0.9
+SHORTEST_DURATION = 1.5
+AGAIN_AND_AGAIN = 3.0
+"""Selections in each demonstration with the option; one selection of a single step may be meant, such as a grasp."""
+
+HIGH_FITTING_SHARE = 0.5
+SMALLEST_DIVERGENCE = 0.1
+"""Nats per step; two Gaussian policies whose means are 0.45 σ apart."""
+
+Use = Sequence[Mapping[str, Any]]
+"""The uses of the choices of one level, control (0) first: rows of ``metrics["options"]``."""
+
+Alike = Sequence[Mapping[str, Any]]
+"""The pairs of ``options`` of one level with their ``divergence``: rows of ``metrics["divergences"]``."""
+
+Kind = Literal["unused", "redundant", "dominating", "never_persisting", "high_fitting"]
+
+ADVICE: Mapping[Kind, str] = {
+    "unused": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select), or start "
+    "from clusters with training.initialize: vq and try more restarts.",
+    "redundant": "Make them one and see what it costs (ddco-pyro merge), or compare hierarchy.levels.*.count by "
+    "cross-validation (ddco-pyro select). If "
+    "they should differ, start from clusters of observations and controls (training.initialize: vq_controls) or lower "
+    "control.std, below which differences do not count.",
+    "dominating": "Start from clusters (training.initialize: vq), train layer by layer (training.layerwise: true), or "
+    "give the options' policies less capacity, so that one of them cannot do all the work.",
+    "never_persisting": "A simpler termination (network: linear), fewer options, or observations that change more "
+    "slowly (differences: false) let options last.",
+    "high_fitting": "Train layer by layer (training.layerwise: true), give the calling policy less capacity, or let it "
+    "emit options only (emits: [options]).",
+}
+"""The usual remedies."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A sign of a degenerate solution.
+
+    :param level: the level, 1 is the lowest.
+    :param choice: the choice of the level.
+    :param value: a share of the time, a duration in steps, or nats per step.
+    :param other: the option that acts like a redundant one.
+    :param selections: of an option that never persists, in each demonstration with the option.
+    """
+
+    kind: Kind
+    level: int
+    choice: int
+    value: float
+    other: int = 0
+    selections: float = 0.0
+
+    @property
+    def advice(self) -> str:
+        """The usual remedy."""
+        return ADVICE[self.kind]
+
+
+def diagnose(options: Sequence[Use], divergences: Sequence[Alike] = ()) -> list[Finding]:
+    """The signs of a degenerate solution in ``metrics["options"]`` and ``metrics["divergences"]``, lowest level first.
+
+    - unused: an option that is active less than 1 % of the time;
+    - dominating: one of several options that is active more than 90 % of the time;
+    - never persisting: an option with an expected duration below 1.5 steps and at least three selections in each
+      demonstration with the option, so that its caller does all the work;
+    - redundant: two used options with a divergence below 0.1 nats per step;
+    - high-fitting: a caller that emits the control itself more than half of the time that it acts.
+    """
+    findings: list[Finding] = []
+    for level, use in enumerate(options, start=1):
+        for option in use[1:]:
+            findings += _of_option(level, option, alone=len(use) == 2)
+        findings += _of_pairs(level, use, divergences[level - 1] if divergences else ())
+        above = options[level] if level < len(options) else None
+        findings += _of_caller(level, float(use[0]["share"]), float(above[0]["share"]) if above else 0.0)
+    return findings
+
+
+def _of_option(level: int, use: Mapping[str, Any], alone: bool) -> list[Finding]:
+    choice, share, duration = int(use["choice"]), float(use["share"]), use["duration"]
+    if share < UNUSED_SHARE:
+        return [Finding("unused", level, choice, share)]
+    findings = []
+    if share > DOMINATING_SHARE and not alone:
+        findings.append(Finding("dominating", level, choice, share))
+    within = float(use["demonstrations"])
+    selections = float(use["selected"]) / within if within else 0.0
+    if duration is not None and duration < SHORTEST_DURATION and selections >= AGAIN_AND_AGAIN:
+        findings.append(Finding("never_persisting", level, choice, float(duration), selections=selections))
+    return findings
+
+
+def _of_pairs(level: int, use: Use, alike: Alike) -> list[Finding]:
+    used = {int(row["choice"]) for row in use if float(row["share"]) >= UNUSED_SHARE}
+    return [
+        Finding("redundant", level, second, float(pair["divergence"]), first)
+        for pair in alike
+        for first, second in [pair["options"]]
+        if {first, second} <= used and pair["divergence"] is not None and pair["divergence"] < SMALLEST_DIVERGENCE
+    ]
+
+
+def _of_caller(level: int, control: float, not_acting: float) -> list[Finding]:
+    """The caller of a level acts unless the level above emits the control, ``not_acting`` of the time."""
+    acting = 1.0 - not_acting
+    if acting < UNUSED_SHARE:
+        return []
+    own = (control - not_acting) / acting
+    return [Finding("high_fitting", level, 0, own)] if own > HIGH_FITTING_SHARE else []

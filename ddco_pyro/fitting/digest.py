@@ -1,0 +1,174 @@
+"""The digest of the demonstrations of a run, and the version of its folder's format: ``demonstrations.json``."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.files import write_text
+from ddco_pyro.data.pictures import Observed, Pictures, blocks
+from ddco_pyro.errors import BadInput
+from ddco_pyro.evaluation.schema import Record, read_record
+
+NAME = "demonstrations.json"
+
+TRAINED = ("checkpoints", "model.safetensors", "folds.json")
+"""Files that a run or a selection has as soon as training begins."""
+
+
+FORMAT = 2
+"""The version of the run folder's format."""
+
+
+class OtherDemonstrations(BadInput):
+    """Demonstrations are not those of a run."""
+
+
+class OtherVersion(BadInput):
+    """A run folder has another format."""
+
+    def __init__(self, folder: Path, version: int) -> None:
+        super().__init__(
+            f"{folder}: this run was written by version {version} of the run folder's format, and version {FORMAT} is "
+            "read here: fit again"
+        )
+
+
+class Digest(Record):
+    """The digest of demonstrations: ``names`` in order, SHA-256 of controls, observations and labels, and ``masks``.
+
+    :param format: the version of the run folder's format.
+    :param files: size, time of the last change (ns) and inode of the file with the pictures of an observation.
+    """
+
+    names: list[str]
+    format: int = 1
+    controls: str
+    observations: dict[str, str]
+    labels: dict[str, str]
+    masks: dict[str, list[str]]
+    files: dict[str, list[int]]
+
+    def places(self) -> dict[str, Any]:
+        """The digests by place in a file of demonstrations."""
+        kinds: dict[str, Mapping[str, Any]] = {"obs": self.observations, "labels": self.labels, "mask": self.masks}
+        each = {f"{kind}/{key}": value for kind, values in kinds.items() for key, value in values.items()}
+        return {"actions": self.controls} | each
+
+
+def digest(demos: Demonstrations, known: Digest | None = None) -> Digest:
+    """The digest of demonstrations.
+
+    :param known: an earlier digest; pictures in a file that has not changed since are not read again.
+    :raises DemonstrationsError: a file of pictures cannot be read.
+    """
+    seen = {key: [demo.observations[key] for demo in demos] for key in sorted(demos[0].observations)}
+    files = {key: found for key, arrays in seen.items() if (found := _file(arrays))}
+    unchanged = {key for key in files if known and (known.names, known.files.get(key)) == ([*demos.names], files[key])}
+    return Digest(
+        names=[*demos.names],
+        format=FORMAT,
+        controls=_sha256(demo.actions for demo in demos),
+        observations={
+            key: known.observations[key] if known and key in unchanged else _sha256(arrays)
+            for key, arrays in seen.items()
+        },
+        labels={name: _sha256(demo.labels[name] for demo in demos) for name in sorted(demos[0].labels)},
+        masks={name: [*demos.masks[name]] for name in ("train", "valid") if name in demos.masks},
+        files=files,
+    )
+
+
+def _sha256(arrays: Iterable[Observed]) -> str:
+    """SHA-256 of arrays one after the other; pictures in files are read block by block."""
+    sha256 = hashlib.sha256()
+    for array in arrays:
+        sha256.update(json.dumps([array.dtype.str, *array.shape]).encode())
+        for block in blocks(array):
+            sha256.update(np.ascontiguousarray(block).data)
+    return sha256.hexdigest()
+
+
+def _file(arrays: Sequence[Observed]) -> list[int] | None:
+    """Size, time and inode of the file with all of these pictures; None without such a file."""
+    paths = {array.path if isinstance(array, Pictures) else None for array in arrays}
+    path = paths.pop()
+    if paths or path is None:
+        return None
+    state = os.stat(path)
+    return [state.st_size, state.st_mtime_ns, state.st_ino]
+
+
+def recorded(folder: Path) -> Digest | None:
+    """The digest of the demonstrations of a run or a selection; None where nothing is kept yet.
+
+    :raises Damaged: ``demonstrations.json`` is damaged.
+    :raises OtherVersion: the folder was written in another format.
+    """
+    path = folder / NAME
+    if path.exists():
+        kept = read_record(path, Digest, "fit again into another --out")
+        if kept.format != FORMAT:
+            raise OtherVersion(folder, kept.format)
+        return kept
+    if any((folder / name).exists() for name in TRAINED):
+        raise OtherVersion(folder, 1)
+    return None
+
+
+def record(folder: Path, demos: Demonstrations, known: Digest | None = None) -> None:
+    """Write the digest of demonstrations into a new run folder, or compare it with the folder's.
+
+    :param known: an earlier digest, as in :func:`digest`.
+    :raises OtherDemonstrations: the folder is a run of other demonstrations.
+    :raises Damaged: ``demonstrations.json`` is damaged.
+    """
+    kept = recorded(folder)
+    if kept is None:
+        write_text(folder / NAME, digest(demos, known).model_dump_json(indent=1) + "\n")
+    else:
+        _compare(folder, kept, demos)
+
+
+def refuse_others(folder: Path, demos: Demonstrations) -> None:
+    """Refuse demonstrations other than those of a finished run.
+
+    :raises OtherDemonstrations: the folder is a run of other demonstrations.
+    :raises Damaged: ``demonstrations.json`` is damaged.
+    """
+    kept = recorded(folder)
+    assert kept is not None  # or it would not be finished
+    _compare(folder, kept, demos)
+
+
+def _compare(folder: Path, kept: Digest, demos: Demonstrations) -> None:
+    if different := difference(kept, digest(demos, kept)):
+        raise OtherDemonstrations(
+            f"{folder}: is a run of other demonstrations ({different}); bring back those that it was fitted to, or "
+            "choose another --out for these"
+        )
+
+
+def difference(kept: Digest, now: Digest) -> str:
+    """What differs between two digests, in words; empty where they are equal."""
+    missing = [name for name in kept.names if name not in now.names]
+    new = [name for name in now.names if name not in kept.names]
+    if missing or new:
+        said = ((missing, "missing"), (new, "new"))
+        return " and ".join(f"{_some(names)} {what}" for names, what in said if names)
+    if kept.names != now.names:
+        return "their order differs"
+    ours, theirs = kept.places(), now.places()
+    places = [place for place in {**ours, **theirs} if ours.get(place) != theirs.get(place)]
+    return f"{' and '.join(places)} changed" if places else ""
+
+
+def _some(names: Sequence[str]) -> str:
+    return f"{names[0]} and {len(names) - 1} more are" if len(names) > 1 else f"{names[0]} is"

@@ -1,0 +1,263 @@
+"""Observations by name to the features that networks see."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ddco_pyro.data.checks import rounding
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, Transform, TransformError
+from ddco_pyro.model.frames import Frames
+from ddco_pyro.model.networks import Inputs, InputShape, ShapeError
+from ddco_pyro.spec import STEP, AugmentSpec, ObservationSpec
+
+Shapes = Mapping[str, tuple[int, ...]]
+
+NARROWEST = 1e-6
+"""Least width of a bin that counts as a feature, as a part of the whole range; a narrower bin is only centred."""
+
+
+class ObservationEncoder(nn.Module):
+    """Observations by name to one feature vector: differences appended, standardised where the spec says so.
+
+    Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model. A
+    dimension that varies by rounding alone (:func:`~ddco_pyro.data.checks.rounding`) is only centred, and so are
+    differences whose dimension does so within each demonstration. What moves later moves in its own units, not in
+    multiples of a rounding.
+
+    ``bins`` add, for a number x, min(max(x, q_k), q_{k+1}) between each two neighbouring quantiles q of its distinct
+    values, standardised as x is. This is a piecewise-linear encoding (Gorishniy, Rubachev and Babenko, On embeddings
+    for numerical features in tabular deep learning, 2022).
+
+    Pictures are cropped and scaled as the spec says when they are read, from a file or from memory.
+
+    The built-in observation :data:`~ddco_pyro.spec.STEP` is made here: the number of the step divided by ``longest``,
+    the steps of the longest demonstration given to :meth:`fit`.
+
+    :raises ShapeError: an observation cannot be cropped, scaled, binned or augmented as the spec says.
+    """
+
+    mean: Tensor
+    std: Tensor
+    longest: Tensor
+    low: Tensor
+    high: Tensor
+    places: Tensor
+
+    def __init__(self, specs: Sequence[ObservationSpec], shapes: Shapes) -> None:
+        super().__init__()
+        shapes = {**shapes, STEP: (1,)}
+        self.shapes = {spec.key: tuple(shapes[spec.key]) for spec in specs if spec.key != STEP}
+        self.specs = tuple(spec for spec in specs if len(shapes[spec.key]) < PICTURE_DIMENSIONS)
+        pictures = [spec for spec in specs if len(shapes[spec.key]) == PICTURE_DIMENSIONS]
+        self.transforms = {spec.key: _transform(spec) for spec in pictures}
+        self.shifts = {spec.key: spec.augment.shift for spec in pictures if spec.augment}
+        seen = {spec.key: _seen_shape(spec, shapes) for spec in specs}
+        self.images = {spec.key: seen[spec.key] for spec in pictures}
+        self.given = [int(np.prod(shapes[spec.key])) * spec.given for spec in self.specs]
+        self.sizes = [int(np.prod(shapes[spec.key])) * spec.seen for spec in self.specs]
+        self.register_buffer("mean", torch.zeros(sum(self.sizes), dtype=torch.float64))
+        self.register_buffer("std", torch.ones(sum(self.sizes), dtype=torch.float64))
+        if self.has_bins:
+            self.register_buffer("places", torch.as_tensor(self._places()), persistent=False)
+            self.register_buffer("low", torch.full_like(self.mean, -torch.inf))
+            self.register_buffer("high", torch.full_like(self.mean, torch.inf))
+        if STEP in self.keys:
+            self.register_buffer("longest", torch.ones((), dtype=torch.float64))
+
+    @property
+    def steps_seen(self) -> int:
+        """Steps that the features and pictures of one step are made of: this step and those before it."""
+        return max([2, *(transform.frames for transform in self.transforms.values())])
+
+    @property
+    def keys(self) -> list[str]:
+        """The vectors, in the spec's order."""
+        return [spec.key for spec in self.specs]
+
+    def shape(self, steps: int) -> InputShape:
+        """The shapes that networks are built for."""
+        return InputShape(dict(zip(self.keys, self.sizes, strict=True)), self.images, steps)
+
+    def fit(self, demonstrations: Demonstrations) -> None:
+        """Take mean, standard deviation, bins and the longest demonstration from these demonstrations."""
+        if STEP in self.keys:
+            self.longest.fill_(max(demonstrations.lengths))
+        each = [self.features(demo.observations) for demo in demonstrations]
+        moves, rows = self._moves(each, demonstrations), np.concatenate(each)
+        if self.has_bins:
+            self._fit_bins(rows)
+            places, cut = self.places.numpy(), self._cut(torch.as_tensor(rows)).numpy()
+            moves = moves[places] & (np.ptp(cut, axis=0) > NARROWEST * np.ptp(rows, axis=0)[places])
+            rows = cut
+        standardize = np.repeat(np.array([spec.standardize for spec in self.specs], dtype=bool), self.sizes)
+        changes = standardize & moves
+        self.mean.copy_(torch.as_tensor(np.where(standardize, rows.mean(0), 0.0)))
+        self.std.copy_(torch.as_tensor(np.where(changes, rows.std(0), 1.0)))
+
+    @property
+    def has_bins(self) -> bool:
+        """Whether any observation has bins."""
+        return any(spec.bins for spec in self.specs)
+
+    def _places(self) -> np.ndarray:
+        """The feature of :meth:`features` behind each number that networks see, [F']: a key's own, then its bins'."""
+        firsts = np.cumsum([0, *self.given])
+        rows = zip(self.specs, firsts, self.given, strict=False)
+        return np.concatenate([np.tile(np.arange(first, first + count), 1 + spec.bins) for spec, first, count in rows])
+
+    def _fit_bins(self, rows: np.ndarray) -> None:
+        """Take the ends of each bin from ``rows`` [T, F]: quantiles of the distinct values.
+
+        A value that most steps have counts once, so that the other values do not share a single bin.
+        """
+        at = 0
+        for spec, count, size in zip(self.specs, self.given, self.sizes, strict=True):
+            own = rows[:, self.places[at : at + count].numpy()]
+            ends = torch.as_tensor(np.column_stack([_ends(values, spec.bins) for values in own.T]))
+            self.low[at + count : at + size] = ends[:-1].flatten()
+            self.high[at + count : at + size] = ends[1:].flatten()
+            at += size
+
+    def _cut(self, features: Tensor) -> Tensor:
+        """Features [..., F], and again clipped to each bin, [..., F']."""
+        if not self.has_bins:
+            return features
+        return torch.minimum(torch.maximum(features[..., self.places], self.low), self.high)
+
+    def scaled(self, features: np.ndarray) -> np.ndarray:
+        """Features [T, F] as networks see them [T, F'], in double precision."""
+        return ((self._cut(torch.as_tensor(features)) - self.mean) / self.std).numpy()
+
+    def _moves(self, rows: Sequence[np.ndarray], demonstrations: Demonstrations) -> np.ndarray:
+        """Which features [F] of these demonstrations' ``rows`` [T_n, F] vary by more than rounding.
+
+        Differences do where their dimension does within a demonstration.
+        """
+        low, high = (np.stack([end(part, axis=0) for part in rows]) for end in (np.min, np.max))
+        moves, first = [np.zeros(0, dtype=bool)], 0
+        for spec, size in zip(self.specs, self.given, strict=True):
+            arrays = [] if spec.key == STEP else [demo.observations[spec.key] for demo in demonstrations]
+            dtype = np.result_type(*arrays) if arrays else np.dtype(np.float64)
+            own = slice(first, first + size // spec.given)
+            lowest, highest = low[:, own].min(0), high[:, own].max(0)
+            most = rounding(lowest, highest, dtype)
+            moves.append(highest - lowest > most)
+            if spec.differences:
+                moves.append((high - low)[:, own].max(0) > most)
+            first += size
+        return np.concatenate(moves)
+
+    def features(self, observations: Mapping[str, Observed], times: np.ndarray | None = None) -> np.ndarray:
+        """Observations [T, ...] by name to features [T, F], not yet standardised.
+
+        :param times: the number of each step [T]; by default 0 to T - 1.
+        """
+        steps = len(next(iter(observations.values())))
+        times = np.arange(steps) if times is None else times
+        columns: list[np.ndarray] = [np.zeros((steps, 0))]
+        for spec in self.specs:
+            values = times / float(self.longest) if spec.key == STEP else observations[spec.key]
+            column = np.asarray(values, dtype=np.float64).reshape(steps, -1)
+            columns.append(column)
+            if spec.differences:
+                columns.append(np.diff(column, axis=0, prepend=column[:1]))
+        return np.concatenate(columns, axis=1)
+
+    def standardized(self, features: Tensor) -> dict[str, Tensor]:
+        """Features [..., F] as networks see them, [..., F_key] by name."""
+        vector = ((self._cut(features) - self.mean) / self.std).float()
+        # A split into nothing cannot be read again from an exported program.
+        return dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)) if self.sizes else {}
+
+    def inputs(self, observations: Iterable[Mapping[str, Observed]], times: np.ndarray | None = None) -> Inputs:
+        """Sequences of observations, each [T_n, ...] by name, to padded network inputs.
+
+        Pictures are read when a network asks for them.
+
+        :param times: as in :meth:`features`.
+        """
+        sequences = list(observations)
+        vectors = [self.scaled(self.features(sequence, times)) for sequence in sequences]
+        vector = padded(vectors).float()
+        by_key, steps = dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)), vector.shape[1]
+        pictures = {key: tuple(_as_pictures(sequence[key]) for sequence in sequences) for key in self.images}
+        rows = tuple(range(len(sequences)))
+        images = Frames(pictures, self.transforms, rows, slice(0, steps)) if pictures else {}
+        return Inputs(by_key, images, torch.arange(steps))
+
+    def versions(self, demonstrations: Demonstrations) -> dict[str, Tensor]:
+        """The versions of the vectors that ``augment.versions`` names, as networks see them, [N, V, T, F_key]."""
+        named = {spec.key: spec.augment.versions for spec in self.specs if spec.augment and spec.augment.versions}
+        return {
+            key: torch.stack(
+                [
+                    self.inputs(
+                        {**demo.observations, key: np.asarray(demo.observations[name])[:, version]}
+                        for demo in demonstrations
+                    ).vectors[key]
+                    for version in range(demonstrations.observation_shapes[name][0])
+                ],
+                dim=1,
+            )
+            for key, name in named.items()
+        }
+
+
+def _ends(values: np.ndarray, bins: int) -> np.ndarray:
+    """The ends [bins + 1] of bins of ``values`` [T] that hold equally many distinct values."""
+    return np.asarray(np.quantile(np.unique(values), np.linspace(0, 1, bins + 1), method="nearest"))
+
+
+def _transform(spec: ObservationSpec) -> Transform:
+    return Transform(spec.crop, spec.resize, spec.grey, spec.frames)
+
+
+def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
+    """The shape of a step of an observation as networks see it.
+
+    :raises ShapeError: it cannot be cropped, scaled, binned or augmented as the spec says.
+    """
+    stored = shapes[spec.key]
+    if spec.bins and len(stored) == PICTURE_DIMENSIONS:
+        raise ShapeError(f"observations: {spec.key!r} has pictures: bins are for vectors")
+    if spec.augment:
+        _refuse_other_versions(spec.key, spec.augment, shapes)
+    try:
+        return _transform(spec).shape(stored)
+    except TransformError as error:
+        raise ShapeError(f"observations: {spec.key!r} {error}") from error
+
+
+def _refuse_other_versions(key: str, augment: AugmentSpec, shapes: Shapes) -> None:
+    """Check that an observation can be augmented so; a model that is loaded has no versions.
+
+    :raises ShapeError: it cannot.
+    """
+    stored, versions = shapes[key], augment.versions
+    picture = len(stored) == PICTURE_DIMENSIONS
+    if augment.shift and not picture:
+        raise ShapeError(f"observations: {key!r} has shape {list(stored)} at each step: augment.shift is for pictures")
+    if versions is None:
+        return
+    if picture:
+        raise ShapeError(f"observations: {key!r} has pictures: augment.versions is for vectors; shift moves pictures")
+    there = shapes.get(versions)
+    if there is not None and (not there or not there[0] or there[1:] != stored):
+        raise ShapeError(
+            f"observations: {key!r} augment.versions: {versions!r} has shape {list(there)} at each step, it has to be "
+            f"[versions{''.join(f', {size}' for size in stored)}]"
+        )
+
+
+def _as_pictures(values: Observed) -> Observed:
+    return values if isinstance(values, Pictures) else np.asarray(values)
+
+
+def padded(sequences: Sequence[np.ndarray]) -> Tensor:
+    """Arrays [T_n, ...] as one tensor [N, max T_n, ...], zeros past their ends."""
+    return nn.utils.rnn.pad_sequence([torch.as_tensor(sequence) for sequence in sequences], batch_first=True)

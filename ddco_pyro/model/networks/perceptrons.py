@@ -1,0 +1,261 @@
+"""Stacked networks, K of them evaluated in one pass: the base class, and those that are made of perceptrons."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
+from ddco_pyro.model.networks.numpy_form import NumpyForm, joined, over_layers, vectors
+from ddco_pyro.spec import Activation
+
+State = tuple[Tensor, ...]
+"""What a network remembers of the steps before, tensors [N, ...]; () for a network without memory."""
+
+States = Mapping[str, State]
+"""The states of several networks by name."""
+
+ACTIVATIONS: dict[Activation, type[nn.Module]] = {
+    "relu": nn.ReLU,
+    "leaky_relu": nn.LeakyReLU,
+    "elu": nn.ELU,
+    "tanh": nn.Tanh,
+}
+
+
+class StackedLinear(nn.Module):
+    """y_k = x_k W_k + b_k for k = 1..K; each map is initialised as ``torch.nn.Linear`` would be."""
+
+    def __init__(self, copies: int, inputs: int, outputs: int) -> None:
+        super().__init__()
+        bound = 1 / math.sqrt(max(inputs, 1))
+        self.weight = nn.Parameter(torch.empty(copies, inputs, outputs).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(copies, 1, outputs).uniform_(-bound, bound))
+
+    def forward(self, x: Tensor, maps: Tensor | None = None) -> Tensor:
+        """[K, M, inputs], or [1, M, inputs] shared by all K, to [K, M, outputs].
+
+        :param maps: indices of the K maps to apply; None for all maps.
+        """
+        if maps is not None:
+            return torch.baddbmm(self.bias[maps], x, self.weight[maps])
+        if x.shape[0] > 1:
+            return torch.baddbmm(self.bias, x, self.weight)
+        copies, inputs, outputs = self.weight.shape
+        side_by_side = self.weight.transpose(0, 1).reshape(inputs, copies * outputs)
+        return (x[0] @ side_by_side).reshape(-1, copies, outputs).transpose(0, 1) + self.bias
+
+
+class Perceptrons(nn.Sequential):
+    """K multi-layer perceptrons, with activation and dropout after every hidden layer; they give ``features`` numbers.
+
+    Without hidden layers they give their inputs.
+    """
+
+    def __init__(
+        self, copies: int, inputs: int, hidden: tuple[int, ...], dropout: float = 0.0, activation: Activation = "relu"
+    ) -> None:
+        layers: list[nn.Module] = []
+        sizes = (inputs, *hidden)
+        for size, following in zip(sizes, hidden, strict=False):
+            layers += [StackedLinear(copies, size, following), ACTIVATIONS[activation](), nn.Dropout(dropout)]
+        super().__init__(*layers)
+        self.copies, self.features = copies, sizes[-1]
+        self.hidden, self.activation = len(hidden), activation
+
+    def forward(self, values: Tensor) -> Tensor:
+        """[K, M, inputs], or [1, M, inputs] shared by all K, to [K, M, features]."""
+        features: Tensor = super().forward(values)
+        return features.expand(self.copies, -1, -1)
+
+    def numpy_form(self, of: NumpyForm) -> NumpyForm:
+        """The numpy form of these layers over what ``of`` gives."""
+        linear = [layer for layer in self if isinstance(layer, StackedLinear)]
+        facts = {"kind": "perceptrons", "layers": len(linear), "hidden": self.hidden, "activation": self.activation}
+        facts |= {"copies": self.copies, "steps": 1}
+        return over_layers(of, facts, {str(number): layer for number, layer in enumerate(linear)})
+
+
+class Network(nn.Module):
+    """K networks side by side, a trunk for others to read; :meth:`add_head` makes it one that gives outputs.
+
+    Every network is called as ``network(seen, state)``. It maps T steps of N trajectories to [N, T, K, features] and
+    the state after them; ``seen`` are :class:`Inputs`, or the features of another trunk [N, T, K or 1, F]. A call on T
+    steps gives what T calls on one step each give, with the state carried from each to the next.
+
+    :ivar copies: K; 1 where all options read the same features.
+    :ivar layers: the last layers, which the head joins.
+    :ivar trunk_size: (copies, features) of the trunk that it reads; None for a network of observations.
+    """
+
+    copies: int
+    layers: Perceptrons
+    trunk_size: tuple[int, int] | None = None
+
+    @property
+    def features(self) -> int:
+        """How many numbers each of the K networks gives at a step."""
+        return self.layers.features
+
+    def initial_state(self, trajectories: int) -> State:
+        """The state before the first step of N trajectories."""
+        return ()
+
+    def add_head(self, outputs: int) -> Self:
+        """End in K linear maps to ``outputs`` numbers."""
+        self.layers.append(StackedLinear(self.layers.copies, self.layers.features, outputs))
+        self.layers.features = outputs
+        return self
+
+    def begin_at_zero(self, outputs: int) -> None:
+        """Have the last ``outputs`` numbers of the head start at 0."""
+        with torch.no_grad():
+            for parameter in self.layers[-1].parameters():
+                parameter[..., -outputs:] = 0
+
+    def numpy_form(self) -> NumpyForm | None:
+        """Facts and arrays for the numpy runner of an exported controller; None where it cannot evaluate this."""
+        return None
+
+
+class Mlp(Network):
+    """K perceptrons over all vectors side by side, or over the features of a trunk (SM 1.1, SM 1.3).
+
+    :raises ShapeError: there are images, which only a convolution can read.
+    """
+
+    def __init__(
+        self,
+        shape: InputShape | Network,
+        copies: int,
+        hidden: tuple[int, ...] = (),
+        dropout: float = 0.0,
+        activation: Activation = "relu",
+    ) -> None:
+        super().__init__()
+        self.copies, self.reads = copies, [] if isinstance(shape, Network) else _vectors_of(shape)
+        self.trunk_size = (shape.copies, shape.features) if isinstance(shape, Network) else None
+        size = shape.features if isinstance(shape, Network) else shape.vector
+        self.layers = Perceptrons(copies, size, hidden, dropout, activation)
+
+    def forward(self, seen: Inputs | Tensor, state: State = ()) -> tuple[Tensor, State]:
+        """[N, T, K, features], and the state."""
+        if isinstance(seen, Tensor):
+            return options_last(self.layers(options_first(seen)), (seen.shape[0], seen.shape[1])), state
+        return options_last(self.layers(seen.vector.flatten(0, 1).unsqueeze(0)), seen.batch), state
+
+    def numpy_form(self) -> NumpyForm:
+        """Perceptrons over vectors or a trunk."""
+        return self.layers.numpy_form(({"kind": "trunk"}, {}) if self.trunk_size else vectors(self.reads, self.copies))
+
+
+class Linear(Mlp):
+    """The vectors, or a trunk's features, themselves; with a head K linear maps of them."""
+
+    def __init__(self, shape: InputShape | Network, copies: int) -> None:
+        super().__init__(shape, copies)
+
+
+class PerTimestep(Network):
+    """K × T perceptrons over the vectors: the per-timestep policy of SM 1.3.
+
+    The t-th reads step t; the last reads the steps past the longest demonstration.
+
+    :raises ShapeError: there are images, which only a convolution can read.
+    """
+
+    def __init__(
+        self, shape: InputShape, copies: int, hidden: tuple[int, ...], dropout: float, activation: Activation
+    ) -> None:
+        super().__init__()
+        self.reads, self.copies, self.steps = _vectors_of(shape), copies, shape.steps
+        self.layers = Perceptrons(shape.steps * copies, shape.vector, hidden, dropout, activation)
+
+    def forward(self, inputs: Inputs, state: State = ()) -> tuple[Tensor, State]:
+        """[N, T, K, features], and the state."""
+        times = inputs.time.clamp(max=self.steps - 1)
+        maps = torch.stack([times * self.copies + copy for copy in range(self.copies)], dim=1)
+        values = inputs.vector.transpose(0, 1).repeat_interleave(self.copies, dim=0)
+        for layer in self.layers:
+            values = layer(values, maps.flatten()) if isinstance(layer, StackedLinear) else layer(values)
+        return values.unflatten(0, maps.shape).permute(2, 0, 1, 3), state
+
+    def numpy_form(self) -> NumpyForm:
+        """Perceptrons of every step over the vectors."""
+        facts, arrays = self.layers.numpy_form(vectors(self.reads, self.copies))
+        return facts | {"copies": self.copies, "steps": self.steps}, arrays
+
+
+class Branches(Network):
+    """K perceptrons over the features of several networks, side by side: the policy of SM 1.4.
+
+    The state holds those of the branches, one after another.
+    """
+
+    def __init__(
+        self,
+        shape: InputShape,
+        copies: int,
+        hidden: tuple[int, ...],
+        dropout: float,
+        activation: Activation,
+        of: Mapping[str, Network],
+    ) -> None:
+        super().__init__()
+        self.names, self.copies = tuple(of), copies
+        self.of = nn.ModuleList(of.values())
+        features = sum(branch.features for branch in of.values())
+        self.layers = Perceptrons(copies, features, hidden, dropout, activation)
+
+    def branches(self) -> list[Network]:
+        """The networks that are joined."""
+        return [branch for branch in self.of if isinstance(branch, Network)]
+
+    def initial_state(self, trajectories: int) -> State:
+        """The states of the branches."""
+        return tuple(tensor for branch in self.branches() for tensor in branch.initial_state(trajectories))
+
+    def forward(self, inputs: Inputs, state: State) -> tuple[Tensor, State]:
+        """[N, T, K, features], and the state after the last step."""
+        values: list[Tensor] = []
+        after: State = ()
+        for branch in self.branches():
+            features, own = branch(inputs, state[len(after) :][: len(branch.initial_state(1))])
+            values.append(options_first(features).expand(self.copies, -1, -1))
+            after = (*after, *own)
+        return options_last(self.layers(torch.cat(values, -1)), inputs.batch), after
+
+    def numpy_form(self) -> NumpyForm | None:
+        """Perceptrons over the branches; None where a branch has no form."""
+        forms = [
+            form if branch.copies == self.copies else over_layers(form, {"kind": "shared", "copies": self.copies}, {})
+            for branch in self.branches()
+            if (form := branch.numpy_form()) is not None
+        ]
+        return self.layers.numpy_form(joined(forms)) if len(forms) == len(self.of) else None
+
+
+def _vectors_of(shape: InputShape) -> list[str]:
+    """The names of the vectors.
+
+    :raises ShapeError: there are images.
+    """
+    if shape.images:
+        names = ", ".join(sorted(shape.images))
+        remedy = "use network: conv, or name the vectors that it is to read in inputs"
+        raise ShapeError(f"reads vectors, but {names} are images: {remedy}")
+    return list(shape.vectors)
+
+
+def options_last(values: Tensor, batch: tuple[int, int]) -> Tensor:
+    """[K, N · T, F] to [N, T, K, F]."""
+    return values.transpose(0, 1).unflatten(0, batch)
+
+
+def options_first(values: Tensor) -> Tensor:
+    """[N, T, K, F] to [K, N · T, F]."""
+    return values.flatten(0, 1).transpose(0, 1)

@@ -1,0 +1,181 @@
+"""Networks on made-up observations: which users' networks are refused, and how much memory training takes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from operator import itemgetter
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
+from ddco_pyro.model.networks.perceptrons import Network, State
+
+TRAJECTORIES, STEPS = 2, 3
+
+TOLERANCE = 1e-3
+"""Largest difference between a step alone and in its trajectory, as a part of the largest output (float32)."""
+
+
+def try_network(name: str, network: Network, shape: InputShape) -> None:
+    """Compare a network's outputs for whole trajectories with those for one step after the other.
+
+    Training calls a network in the first way, a controller in the second. Where both agree, no trajectory changes
+    another, and no later step, padding included, changes an earlier one.
+
+    :raises ShapeError: the network fails, gives another shape than [N, T, K, features], or the two differ.
+    """
+    inputs = _random_inputs(shape)
+    with _evaluating(network), torch.no_grad():
+        _output(name, network, inputs)  # lazy modules have parameters from here on
+        with _without_zeros(network):
+            whole = _output(name, network, inputs)[0].double()
+            rows = []
+            for steps in _trajectories(inputs):
+                state: State | None = None
+                for step in steps:
+                    row, state = _output(name, network, step, state)
+                    rows.append(row.double())
+            alone = torch.cat(rows, dim=1).reshape(whole.shape)
+    largest = float(torch.where(whole.isfinite(), whole, 0.0).abs().max())
+    if not torch.allclose(alone, whole, rtol=0.0, atol=1e-5 + TOLERANCE * largest, equal_nan=True):
+        if network.initial_state(1):
+            raise ShapeError(
+                f"network {name!r} gives other outputs step by step than for a whole trajectory: its state has to hold "
+                "all that it knows of earlier steps, each trajectory's apart, and of later ones it can know nothing"
+            )
+        raise ShapeError(
+            f"network {name!r} gives a step alone other outputs than within its trajectory: it depends on earlier "
+            "steps (or later ones, other trajectories, or chance); one that remembers has to have initial_state(N), "
+            "and to be called with a state and give the next one"
+        )
+
+
+def _output(name: str, network: Network, inputs: Inputs, state: State | None = None) -> tuple[Tensor, Any]:
+    """The outputs and the state after them, both checked; ``state`` is None at the first step."""
+    trajectories, steps = inputs.batch
+    try:
+        before: Any = network.initial_state(trajectories) if state is None else state
+        given: Any = network(inputs, before)
+    except Exception as error:  # whatever the user's code raises
+        what = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise ShapeError(
+            f"network {name!r} fails for random observations, N = {trajectories}, T = {steps}: {what}"
+        ) from error
+    output, after = given if isinstance(given, tuple) and len(given) == 2 else (given, None)
+    if not _is_state(before, trajectories) or not _is_state(after, trajectories) or _shapes(before) != _shapes(after):
+        raise ShapeError(
+            f"network {name!r} has initial_state(N), which has to give a tuple of tensors [N, ...]; each call then "
+            f"has to give outputs and such a tuple of the same shapes, here N = {trajectories}"
+        )
+    found = f"shape {list(output.shape)}" if isinstance(output, Tensor) else f"a {type(output).__name__}"
+    needed = [trajectories, steps, network.copies, network.features]
+    if found != f"shape {needed}":
+        raise ShapeError(
+            f"network {name!r} gives {found}; it has to be a tensor [N, T, copies, outputs], here {needed}"
+        )
+    return output, after
+
+
+def _is_state(state: Any, trajectories: int) -> bool:
+    return isinstance(state, tuple) and all(
+        isinstance(tensor, Tensor) and tensor.shape[:1] == (trajectories,) for tensor in state
+    )
+
+
+def _shapes(state: Any) -> list[torch.Size]:
+    return [tensor.shape for tensor in state]
+
+
+def _random_inputs(shape: InputShape) -> Inputs:
+    """Vectors between 0 and 1, and images."""
+    generator, batch = torch.Generator().manual_seed(0), (TRAJECTORIES, STEPS)
+    vectors = {key: torch.rand(*batch, size, generator=generator) for key, size in shape.vectors.items()}
+    images = {
+        key: torch.randint(256, (*batch, *image), generator=generator, dtype=torch.uint8)
+        for key, image in shape.images.items()
+    }
+    return Inputs(vectors, images, _times(shape, STEPS))
+
+
+def _times(shape: InputShape, steps: int) -> Tensor:
+    """Numbers of steps that a network has parameters for."""
+    return torch.arange(steps).clamp(max=shape.steps - 1)
+
+
+def _trajectories(inputs: Inputs) -> Iterator[list[Inputs]]:
+    """Every step of each trajectory as inputs of their own, N = T = 1."""
+    for trajectory in range(TRAJECTORIES):
+        places = [(slice(trajectory, trajectory + 1), slice(step, step + 1)) for step in range(STEPS)]
+        yield [inputs.map(itemgetter(place), inputs.time[place[1]]) for place in places]
+
+
+@contextmanager
+def _evaluating(network: Network) -> Iterator[None]:
+    """In evaluation mode, in which running statistics stay."""
+    training = network.training
+    network.eval()
+    try:
+        yield
+    finally:
+        network.train(training)
+
+
+@contextmanager
+def _without_zeros(network: Network) -> Iterator[None]:
+    """Parameters that are 0 are random meanwhile: an output layer that starts at 0 would hide a memory before it."""
+    generator = torch.Generator().manual_seed(1)
+    kept = [(parameter, parameter.clone()) for parameter in network.parameters()]
+    for parameter, values in kept:
+        noise = 0.1 * torch.randn(values.shape, generator=generator).to(values)
+        parameter.copy_(torch.where(values == 0, noise, values))
+    try:
+        yield
+    finally:
+        for parameter, values in kept:
+            parameter.copy_(values)
+
+
+def training_bytes(networks: Iterable[Network], shape: InputShape) -> int:
+    """Bytes that these networks take for a step while all of them are trained together.
+
+    Each keeps tensors until its gradient is computed. While that happens, what one network computed and its gradient
+    are there too: measured with convolutions, at most twice what the largest network keeps.
+    """
+    kept = [_kept(network, shape, *_one_more(network)) - _kept(network, shape, 1, 1) for network in networks]
+    return sum(kept) + 2 * max(kept)
+
+
+def _one_more(network: Network) -> tuple[int, int]:
+    """(N, T) one trajectory or step more than (1, 1).
+
+    A step, since a network may have parameters for each; a trajectory where the network remembers, since what torch
+    keeps of several steps grows in leaps.
+    """
+    return (2, 1) if network.initial_state(1) else (1, 2)
+
+
+def _kept(network: Network, shape: InputShape, trajectories: int, steps: int) -> int:
+    """Bytes of all tensors, parameters included, that torch keeps for the gradient."""
+    batch = (trajectories, steps)
+    dtype = next((parameter.dtype for parameter in network.parameters()), torch.float32)
+    if network.trunk_size is None:
+        vectors = {key: torch.zeros(*batch, size, dtype=dtype) for key, size in shape.vectors.items()}
+        images = {key: torch.zeros(*batch, *image, dtype=torch.uint8) for key, image in shape.images.items()}
+        seen: Inputs | Tensor = Inputs(vectors, images, _times(shape, steps))
+    else:
+        seen = torch.zeros(*batch, *network.trunk_size, dtype=dtype)
+    storages: dict[int, int] = {}
+
+    def keep(tensor: Tensor) -> Tensor:
+        storage = tensor.untyped_storage()
+        storages[storage._cdata] = storage.nbytes()
+        return tensor
+
+    with _evaluating(network), torch.enable_grad():
+        with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+            outputs, _ = network(seen, network.initial_state(trajectories))
+        del outputs  # kept until here: no two tensors that are kept share an address
+    return sum(storages.values())

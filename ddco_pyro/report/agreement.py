@@ -1,0 +1,53 @@
+"""Agreement of options with ground-truth labels, in the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ddco_pyro.drawing.page import Block, Section, Table, Text, note
+from ddco_pyro.drawing.words import option_name, percent
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.report.options import quoted
+from ddco_pyro.segmenting.agreement import EXPLAINED, agreement_table
+
+PARTS = {"valid": "held out", "train": "training"}
+
+
+def section(fit: Fit) -> Section | None:
+    """The measures of each level, and where the steps of each label lie; None where the spec names no labels."""
+    record = fit.metrics.get("agreement")
+    if not record or fit.spec.hierarchy is None:
+        return None
+    names = [level.name for level in fit.spec.hierarchy.levels]
+    scores = {
+        f"{level}, {words}" if len(names) > 1 else words: record[part][place]
+        for place, level in enumerate(names)
+        for part, words in PARTS.items()
+        if part in record
+    }
+    labels = quoted(list(dict.fromkeys(record["labels"])))
+    blocks: list[Block] = [Text(f"Options and the ground-truth {labels}."), agreement_table(scores), note(EXPLAINED)]
+    for level, label, own in zip(names, record["labels"], record.get("confusion", ()), strict=False):
+        title = f"Where each label’s steps lie: level “{level}”, label “{label}”"
+        blocks += [Text(title, "heading"), confusion_table(own)]
+    if record.get("confusion"):
+        part = "held-out" if "valid" in record else "training"
+        blocks.append(
+            note(
+                f"Share of the steps of each label, {part} demonstrations. “Stands for”: the label matched with the "
+                "option in all demonstrations; – for an option without a label. The steps of a label without an option "
+                "lie in options that stand for other labels."
+            )
+        )
+    return Section("agreement", "Agreement with ground truth", blocks)
+
+
+def confusion_table(record: Mapping[str, Any]) -> Table:
+    """Share of each label's steps in each option, and the label of each option."""
+    rows = [
+        [str(label), str(sum(steps)), *(percent(count / sum(steps)) if count else "" for count in steps)]
+        for label, steps in zip(record["labels"], record["steps"], strict=True)
+    ]
+    matched = ["–" if label is None else str(label) for label in record["matched"]]
+    return Table(["Label", "Steps", *map(option_name, record["options"])], [*rows, ["stands for", "", *matched]])

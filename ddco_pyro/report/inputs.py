@@ -1,0 +1,126 @@
+"""Inputs in the report: saliency of pictures, and the use of each branch of the networks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from ddco_pyro.acting.saliency import Saliency
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.drawing.colours import option_colour, with_heat
+from ddco_pyro.drawing.figures import FAINT, WIDTH, blank, save
+from ddco_pyro.drawing.page import Section, Table, note
+from ddco_pyro.drawing.words import number
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.training.data import parts
+
+COLUMNS, ROWS = 4, 3
+
+SHADES = ("#1f3b73", "#6f8fc9", "#c9a227", "#8c4a32", "#5b8c5a", "#7d6b91")
+"""One for each branch, in turn."""
+
+
+def saliency(fit: Fit, demos: Demonstrations) -> Section | None:
+    """Saliency over a held-out demonstration, or over the first one where none is held out; None without pictures."""
+    keys = fit.hierarchy.encoder.images
+    if not keys:
+        return None
+    split = parts(fit.spec, demos)
+    part = "valid" if "valid" in split else "train"
+    chosen = split[part].select(split[part].names[:1])
+    paths = [level[0] for level in fit.segment(chosen)]
+    demo, gradients = chosen[0], Saliency(fit.hierarchy)
+    shown = np.unique(np.linspace(0, len(demo) - 1, COLUMNS * ROWS).round().astype(int))
+    panels = []
+    for step in range(shown[-1] + 1):
+        choices = [int(path[step]) for path in paths]
+        looks = gradients.step({key: values[step] for key, values in demo.observations.items()}, choices)
+        if step in shown:
+            title = f"step {step}" + (f", option {choices[0]}" if choices else "")
+            panels.append(
+                (title, choices[0] if choices else 0, np.hstack([with_heat(*look) for look in looks.values()]))
+            )
+    height, width = panels[0][2].shape[:2]
+    figure = blank(ROWS * (WIDTH / COLUMNS * height / width + 0.25))
+    for axes, (title, choice, drawn) in zip(figure.subplots(ROWS, COLUMNS, squeeze=False).flat, panels, strict=False):
+        axes.imshow(drawn)
+        axes.set(xticks=[], yticks=[], title=title)
+        axes.spines[:].set(visible=True, linewidth=3, color=option_colour(choice))
+    for axes in figure.axes[len(panels) :]:
+        axes.remove()
+    caption = (
+        f"Pictures of {demo.name}, {'held out' if part == 'valid' else 'a training demonstration'}, as networks see "
+        "them, paler. Colours: how much the control of the active option changes with each pixel, the norm of its "
+        "gradient, from yellow to dark red on a scale of each picture's own. The frame has the colour of the option on "
+        "the most likely path."
+    )
+    alt = f"Saliency of {', '.join(keys)} over {demo.name}"
+    command = Markup("<code>ddco-pyro rollout --video</code>")
+    limits = Markup(
+        "A gradient is the effect of a small change, not of the absence of a thing. {} films the saliency of an "
+        "episode (<code>videos/saliency</code>)."
+    ).format(command)
+    picture = save(figure, fit.run_folder / "figures" / "looks.png", alt, caption)
+    return Section("looks", "What it looks at", [picture, note(limits)])
+
+
+def branches(fit: Fit) -> Section | None:
+    """The use of each branch of the networks; None where no network has branches."""
+    uses = fit.metrics.get("branches")
+    if not uses:
+        return None
+    levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
+    names = [
+        [f"{levels[use['level']].name} {number + 1}" for number in range(len(use["loss"]))]
+        if use["level"] < len(levels)
+        else ["meta-policy" if levels else "policy"]
+        for use in uses
+    ]
+    caption = (
+        "Left: mean size of each branch's output to the joint layer while the option is active. Right: loss in nats "
+        "per step when the branch reads the observation of another step."
+    )
+    explained = (
+        "Held-out demonstrations, or all where none is held out, weighted by the posterior of the options. Activations "
+        "can be compared between the options of a branch, not between branches. Nats lost can be compared everywhere."
+    )
+    picture = save(draw_branches(uses, names), fit.run_folder / "figures" / "branches.png", "Branches", caption)
+    return Section("branches", "Which inputs matter", [picture, branch_table(uses, names), note(explained)])
+
+
+def branch_table(uses: Sequence[Mapping[str, Any]], names: Sequence[Sequence[str]]) -> Table:
+    """Activation and loss of each branch, a row for each option and branch.
+
+    :param uses: as :func:`ddco_pyro.evaluation.branch_use.branch_use` gives them.
+    :param names: the options of each.
+    """
+    rows = [
+        [option, branch, number(use["activation"][row][column], 3), number(use["loss"][row][column], 3)]
+        for use, options in zip(uses, names, strict=True)
+        for row, option in enumerate(options)
+        for column, branch in enumerate(use["branches"])
+    ]
+    return Table(["Option", "Branch", "Mean activation", "Nats per step lost"], rows, {0, 1})
+
+
+def draw_branches(uses: Sequence[Mapping[str, Any]], names: Sequence[Sequence[str]]) -> Figure:
+    """The numbers of :func:`branch_table` as bars: a row of panels for each level."""
+    figure = blank(2.6 * len(uses))
+    axes = figure.subplots(len(uses), 2, squeeze=False)
+    for row, (use, options) in enumerate(zip(uses, names, strict=True)):
+        width, places = 0.8 / len(use["branches"]), np.arange(len(options))
+        for panel, key, title in zip(
+            axes[row], ("activation", "loss"), ("mean activation", "nats per step lost"), strict=True
+        ):
+            for place, branch in enumerate(use["branches"]):
+                heights = [np.nan if value[place] is None else value[place] for value in use[key]]
+                panel.bar(places + place * width, heights, width, label=branch, color=SHADES[place % len(SHADES)])
+            panel.set_xticks(places + 0.4 - width / 2, options)
+            panel.set_ylabel(title)
+            panel.axhline(0, color=FAINT, linewidth=0.6)
+        axes[row, 0].legend(fontsize="small")
+    return figure

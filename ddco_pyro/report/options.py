@@ -1,0 +1,333 @@
+"""Options in the report: when each is active, how it is used, where it is active in space, and its segments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.ticker import MaxNLocator
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.drawing.colours import add_legend, option_colour
+from ddco_pyro.drawing.figures import FAINT, GRID, Picture, blank, hide_frame, save
+from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, Timeline, note
+from ddco_pyro.drawing.words import number, option_name, percent
+from ddco_pyro.evaluation.schema import option_labels
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.report import trajectories
+from ddco_pyro.report.activity import Activity, Bins, LevelActivity, bins
+from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
+
+EXAMPLES = 4
+"""Demonstrations whose posterior is shown step by step."""
+
+MOST_POINTS = 400
+"""Steps that are drawn of a posterior; longer demonstrations are averaged over groups of steps."""
+
+LEAST_SHARE = 0.01
+"""A termination is drawn where its option is active in at least this share of the demonstrations."""
+
+MOST_SEGMENTS = 20_000
+"""Segments on the page, about; ``ddco-pyro segment --html`` makes a page of more."""
+
+LABEL_SHADES = ("#ffffff", "#d4d4d4")
+"""Shades of ground-truth segments, in turn: colours belong to options."""
+
+
+def section(fit: Fit, demos: Demonstrations, activity: Activity) -> Section:
+    """When each option is active, and how it is used."""
+    assert fit.spec.hierarchy is not None  # or there is no activity
+    labels = [
+        {name: demo.labels[name] for name in fit.spec.demonstrations.label_names if name in demo.labels}
+        for demo in demos
+    ]
+    pictures = (
+        _posterior_picture(fit, demos, activity, labels),
+        _rows_picture(fit, activity, labels),
+        trajectories.picture(fit, demos, activity),
+        _timing_picture(fit, activity),
+    )
+    names = [level.name for level in fit.spec.hierarchy.levels]
+    count = sum(fit.metrics["demonstrations"][part] for part in ("train", "tune", "valid"))
+    used = note(
+        "Over all demonstrations. Expected steps: from one selection of the option to the next selection of any option."
+    )
+    blocks: list[Block] = [picture for picture in pictures if picture is not None]
+    if len(names) > 1:
+        blocks.insert(0, Text("Each level numbers its own options: equal colours in two levels mean nothing."))
+    blocks.append(Text("Use of the options", "heading"))
+    blocks.append(use_table(names, fit.metrics["options"], count, option_labels(fit.metrics)))
+    link = Markup('<a href="#segments">segments of every demonstration</a>')
+    blocks += [used, Text(Markup("Step by step: {}.").format(link))]
+    return Section("options", "Which option is active when", blocks)
+
+
+def use_table(
+    levels: Sequence[str],
+    options: Sequence[Sequence[Mapping[str, Any]]],
+    demonstrations: int,
+    labels: Mapping[str, Mapping[int, int]] | None = None,
+) -> Table:
+    """The use of each choice of each level, the highest level first; control only where it is chosen.
+
+    :param labels: the label of each option, by level, where the run was trained from labels.
+    """
+    rows = []
+    for level, use in reversed(list(zip(levels, options, strict=True))):
+        for row in use:
+            if row["choice"] or row["share"] > 0:
+                named = option_name(row["choice"], (labels or {}).get(level))
+                each = number(row["selected"] / demonstrations)
+                numbers = [percent(row["share"], 1), number(row["selected"], 1), each, number(row["duration"], 1)]
+                rows.append([level, Cell(named, colour=option_colour(row["choice"])), *numbers])
+    head = ["Level", "Choice", "Share of steps", "Selections", "Selections per demonstration", "Expected steps"]
+    return Table(head, rows, {0, 1})
+
+
+def quoted(names: Mapping[str, Any] | Sequence[str]) -> str:
+    """``label “phase” and “grasp”``."""
+    return "label " + " and ".join(f"“{name}”" for name in names)
+
+
+# --- the posterior along a few demonstrations -------------------------------------------------------------------------
+
+
+def _posterior_picture(
+    fit: Fit, demos: Demonstrations, activity: Activity, labels: Sequence[Mapping[str, np.ndarray]]
+) -> Picture:
+    held_out = [demo["name"] for demo in fit.metrics["valid"] if demo["name"] in demos.names]
+    names = (held_out or list(demos.names))[:EXAMPLES]
+    examples = {name: demos.names.index(name) for name in names}
+    caption = (
+        f"Posterior probability of each option at each step of {len(names)} {'held-out ' if held_out else ''}"
+        "demonstrations (u in the paper), stacked. Path: the most likely sequence of options."
+    )
+    if known := labels[examples[names[0]]]:
+        caption += f" Boxes: ground-truth {quoted(known)}."
+    figure = draw_posteriors(activity, examples, labels)
+    alt = f"Stacked probabilities of the options over time in {', '.join(names)}"
+    return save(figure, fit.run_folder / "figures" / "posterior.png", alt, caption)
+
+
+def draw_posteriors(
+    activity: Activity, examples: Mapping[str, int], labels: Sequence[Mapping[str, np.ndarray]]
+) -> Figure:
+    """Two demonstrations side by side: for each level u_t, stacked, over the most likely path.
+
+    :param examples: name and row of each demonstration.
+    :param labels: of every demonstration, name to [T].
+    """
+    rows = -(-len(examples) // 2)
+    known = len(labels[next(iter(examples.values()))])
+    figure = blank(0.35 + rows * (0.55 + 1.25 * len(activity.levels) + 0.2 * known))
+    for part, (name, row) in zip(figure.subfigures(rows, 2, squeeze=False).flat, examples.items(), strict=False):
+        _example(part, activity, row, labels[row])
+        part.axes[0].set_title(name)
+    add_legend(figure, activity.choices)
+    return figure
+
+
+def _example(figure: SubFigure, activity: Activity, row: int, labels: Mapping[str, np.ndarray]) -> None:
+    length = int(activity.lengths[row])
+    heights = [*([5, 0.8] * len(activity.levels)), *([0.9] * len(labels))]
+    panels = iter(figure.subplots(len(heights), 1, height_ratios=heights, gridspec_kw={"hspace": 0.02}))
+    beside: dict[str, Any] = {"rotation": 0, "ha": "right", "va": "center", "fontsize": 7.5}
+    for level in reversed(activity.levels):
+        stack, strip = next(panels), next(panels)
+        size = -(-length // MOST_POINTS)
+        starts = np.arange(0, length, size)
+        active = np.add.reduceat(level.active[row, :length], starts) / np.diff([*starts, length])[:, None]
+        _stack(stack, active, np.array([*starts, length]) - 0.5)
+        stack.set(xticks=[], yticks=[0, 0.5, 1])
+        stack.set_ylabel(f"{level.name}\nprobability" if len(activity.levels) > 1 else "probability")
+        path, extent = level.path[row : row + 1, :length], (-0.5, length - 0.5, 0, 1)
+        strip.imshow(colour_image(path), aspect="auto", interpolation="nearest", extent=extent)
+        hide_frame(strip)
+        strip.set_ylabel("path", **beside)
+    for strip, (name, values) in zip(panels, labels.items(), strict=True):
+        _labels(strip, values)
+        strip.set_ylabel("label" if len(labels) == 1 else name, **beside)
+    last = figure.axes[-1]
+    last.set_xlim(-0.5, length - 0.5)
+    last.xaxis.set_major_locator(MaxNLocator(7, integer=True))
+    last.set_xlabel("step t", labelpad=1)
+
+
+def _stack(axes: Axes, shares: np.ndarray, edges: np.ndarray) -> None:
+    """Shares of choices [B, C] stacked over bins with these edges [B + 1]."""
+    top = np.cumsum(shares, axis=1)
+    for choice in range(shares.shape[1]):
+        lower = top[:, choice] - shares[:, choice]
+        axes.stairs(top[:, choice], edges, baseline=lower, fill=True, color=option_colour(choice), linewidth=0)
+    axes.set(xlim=(edges[0], edges[-1]), ylim=(0, 1))
+
+
+def _labels(axes: Axes, labels: np.ndarray) -> None:
+    """One demonstration's labels [T] as boxes, with their text where there is room."""
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(labels)) + 1, [len(labels)]])
+    for place, (start, end) in enumerate(pairwise(edges.tolist())):
+        axes.axvspan(start - 0.5, end - 0.5, facecolor=LABEL_SHADES[place % 2], edgecolor=FAINT, linewidth=0.5)
+        if end - start > 0.03 * len(labels):
+            axes.text((start + end - 1) / 2, 0.45, str(labels[start]), ha="center", va="center", fontsize=7.5)
+    axes.set_xlim(-0.5, len(labels) - 0.5)
+    hide_frame(axes)
+
+
+# --- the most likely path of every demonstration ----------------------------------------------------------------------
+
+
+def _rows_picture(fit: Fit, activity: Activity, labels: Sequence[Mapping[str, np.ndarray]]) -> Picture:
+    count = len(labels)
+    caption = (
+        f"Most likely options of all {count} demonstrations, one row each, sorted by length, then by the step at which "
+        "the option first changes."
+    )
+    if labels[0]:
+        caption += " Ground-truth labels in shades of grey."
+    figure = draw_rows(activity, {name: [each[name] for each in labels] for name in labels[0]})
+    alt = f"Rows of colour: the most likely option at each step of {count} demonstrations"
+    return save(figure, fit.run_folder / "figures" / "segments.png", alt, caption)
+
+
+def row_order(activity: Activity) -> np.ndarray:
+    """Demonstrations by length, then by the step at which the option of the lowest level first changes [N]."""
+    path = activity.levels[0].path
+    changed = np.diff(path, axis=1, append=-1) != 0  # at the end at the latest
+    first = np.where(changed[:, :-1].any(1), changed.argmax(1), path.shape[1])
+    return np.lexsort((first, activity.lengths))
+
+
+def draw_rows(activity: Activity, labels: Mapping[str, Sequence[np.ndarray]]) -> Figure:
+    """A panel for each level, the highest first, and each kind of labels; a row of colour for each demonstration."""
+    rows = row_order(activity)
+    images = [(f"level “{level.name}”", colour_image(level.path[rows])) for level in reversed(activity.levels)]
+    for name, values in labels.items():
+        title = "ground-truth labels" if len(labels) == 1 else f"labels “{name}”"
+        images.append((title, label_image([values[row] for row in rows], activity.lengths.max())))
+    figure = blank(float(np.clip(0.9 + 0.045 * len(rows), 2.2, 7)))
+    panels = figure.subplots(1, len(images), sharey=True, squeeze=False)[0]
+    for axes, (title, image) in zip(panels, images, strict=True):
+        extent = (-0.5, image.shape[1] - 0.5, len(rows) + 0.5, 0.5)
+        axes.imshow(image, aspect="auto", interpolation="nearest", extent=extent)
+        axes.set(title=title, xlabel="step t")
+        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
+    panels[0].set_ylabel("demonstration")
+    add_legend(figure, activity.choices)
+    return figure
+
+
+def colour_image(path: np.ndarray) -> np.ndarray:
+    """Choices [N, T] as colours [N, T, 3]; white where there is none (-1)."""
+    palette = np.array([to_rgb(option_colour(choice)) for choice in range(max(int(path.max()), 0) + 1)] + [(1, 1, 1)])
+    image: np.ndarray = palette[path]  # -1 is the last entry
+    return image
+
+
+def label_image(labels: Sequence[np.ndarray], steps: int) -> np.ndarray:
+    """Labels [T_n] of N demonstrations as shades of grey [N, steps, 3]; white past the end."""
+    values = sorted({int(value) for array in labels for value in np.unique(array)})
+    shades = np.linspace(0.86, 0.1, len(values))
+    image = np.ones((len(labels), steps, 3))
+    for row, array in zip(image, labels, strict=True):
+        row[: len(array)] = shades[np.searchsorted(values, array), None]
+    return image
+
+
+# --- shares and terminations over time --------------------------------------------------------------------------------
+
+
+def _timing_picture(fit: Fit, activity: Activity) -> Picture:
+    caption = (
+        "Left: mean probability of each option over all demonstrations. Right: probability that an active option ends "
+        "at a step (its termination condition, ψ in the paper); not drawn where the option is hardly ever active."
+    )
+    if len(activity.levels) > 1:
+        caption += " Above the lowest level an option can end only where the option below it ends."
+    alt = f"Share of each option and termination probabilities over time, {len(activity.lengths)} demonstrations"
+    return save(draw_timing(activity), fit.run_folder / "figures" / "timing.png", alt, caption)
+
+
+def draw_timing(activity: Activity) -> Figure:
+    """For each level, the highest first: share of each choice and termination probability of each option over time."""
+    gathered = bins(activity.lengths)
+    figure = blank(0.5 + 2.1 * len(activity.levels))
+    panels = figure.subplots(len(activity.levels), 2, sharex=True, squeeze=False)
+    middles = (gathered.edges[:-1] + gathered.edges[1:]) / 2
+    for (left, right), level in zip(panels, reversed(activity.levels), strict=True):
+        _stack(left, shares(level, gathered), gathered.edges)
+        left.set(title=f"share of each choice, level “{level.name}”", ylabel="share")
+        for option, values in enumerate(terminations(level, gathered).T, start=1):
+            right.plot(middles, values, color=option_colour(option), linewidth=1.5, marker="o", markersize=2.5)
+        right.set(title=f"probability of ending, level “{level.name}”", ylabel="probability", ylim=(-0.02, 1.02))
+        right.grid(axis="y", color=GRID)
+    for axes in panels[-1]:
+        axes.set_xlabel(gathered.axis)
+    add_legend(figure, activity.choices)
+    return figure
+
+
+def shares(level: LevelActivity, gathered: Bins) -> np.ndarray:
+    """Mean of u_t in each bin [B, C]."""
+    alive = (gathered.index >= 0).astype(float)
+    return np.stack([gathered.mean(level.active[..., c], alive) for c in range(level.active.shape[2])], axis=1)
+
+
+def terminations(level: LevelActivity, gathered: Bins) -> np.ndarray:
+    """Mean of ψ_h(s_t) in each bin [B, k], weighted by u_{t-1}(h), the probability that h may end at t.
+
+    NaN in bins in which the option is hardly active.
+    """
+    before = np.zeros_like(level.active[..., 1:])
+    before[:, 1:] = level.active[:, :-1, 1:]
+    steps = gathered.total(np.ones(gathered.index.shape))
+    means = []
+    for option in range(before.shape[2]):
+        weights = before[..., option]
+        mean = gathered.mean(level.termination[..., option], weights)
+        means.append(np.where(gathered.total(weights) >= LEAST_SHARE * steps, mean, np.nan))
+    return np.stack(means, axis=1)
+
+
+# --- segments ---------------------------------------------------------------------------------------------------------
+
+
+def segmented(fit: Fit, demos: Demonstrations, activity: Activity) -> Segmented:
+    """Segments of the demonstrations in the order of ``demonstrations_by_likelihood``."""
+    entries = {entry["name"]: entry for entry in fit.metrics["demonstrations_by_likelihood"]}
+    places = {name: row for row, name in enumerate(demos.names)}
+    segments = []
+    for name, entry in entries.items():
+        if name in places:
+            demo, row = demos[places[name]], places[name]
+            levels = {
+                level.name: LevelLabels.of(
+                    *(array[row, : len(demo)] for array in (level.path, level.ended, level.active)), lasts=level.lasts
+                )
+                for level in activity.levels
+            }
+            labels = {label: demo.labels[label] for label in fit.spec.demonstrations.label_names}
+            value = entry["log_likelihood_per_step"][fit.name]
+            segments.append(Segments(name, levels, value, entry["part"] == "valid", labels))
+    counts = {level.name: level.active.shape[2] - 1 for level in activity.levels}
+    return Segmented(tuple(segments), counts, None, option_labels=option_labels(fit.metrics))
+
+
+def segments(timelines: Sequence[Timeline], demonstrations: int) -> Section:
+    """The timelines; a note on the others where not all of so many demonstrations have one."""
+    explained = Markup(
+        'In the order of the <a href="#demonstrations">list</a>, on one scale of time. Colours are options; a white '
+        "line is a new choice. Grey rows are ground-truth labels. Rest the pointer on a segment for its steps and its "
+        "probability."
+    )
+    blocks: list[Block] = [note(explained), *timelines]
+    if len(timelines) < demonstrations:
+        command = Markup("<code>ddco-pyro segment RUN FILE --html PAGE</code>")
+        blocks.append(note(Markup("The others would make this page slow; {} makes a page of them.").format(command)))
+    return Section("segments", "Segments of every demonstration", blocks)

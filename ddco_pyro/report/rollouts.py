@@ -1,0 +1,131 @@
+"""Rollouts in the report: success in the task, and films."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ddco_pyro.data.sources.video import frames
+from ddco_pyro.drawing.figures import WIDTH, Interval, Panel, blank, data_uri, hide_frame, interval_plot, save
+from ddco_pyro.drawing.page import Block, Film, Films, Section, Table, Text, note
+from ddco_pyro.drawing.words import interval, measure, method, number, p_value, rate
+from ddco_pyro.evaluation.schema import read_successes
+from ddco_pyro.fitting.fit import Fit
+
+MOST_BYTES = 4_000_000
+"""Films are held in the page up to this size together; the page links to the others."""
+
+MOST_FRAMES = 16
+COLUMNS = 4
+
+
+def success(fit: Fit) -> Section | None:
+    """The measures of all methods and the paired comparison of success; None where nothing was rolled out."""
+    record = fit.metrics.get("rollouts")
+    if not record:
+        return None
+    methods = record["methods"]
+    explained = (
+        "Rates: successes of trials (Wilson 95 % interval). Other measures: mean ± standard deviation [95 % interval "
+        "of the mean], n episodes in which the measure is known."
+    )
+    text = f"{record['episodes']} episodes of each method from the same initial states (seeds from {record['seed']})."
+    blocks: list[Block] = [Text(text), measures_table(methods), note(explained)]
+    found = {name: results["measures"].get("success", {}) for name, results in methods.items()}
+    if rates := {name: one for name, one in found.items() if one.get("interval") and "rate" in one}:
+        alt = "Success. " + "; ".join(f"{method(name)}: {rate(one)}" for name, one in rates.items())
+        rows = [Interval(100 * one["rate"], *(100 * end for end in one["interval"])) for one in rates.values()]
+        panel = Panel("", "success rate (%), 95 % interval", rows)
+        figure = interval_plot(list(map(method, rates)), [panel])
+        figure.axes[0].set_xlim(-1, 101)
+        caption = "Success rate of each method with its Wilson 95 % interval."
+        blocks.append(save(figure, fit.run_folder / "figures" / "success.png", alt, caption))
+    if paired := paired_table(methods, fit.metrics["model"]):
+        p = "p: McNemar’s exact test, two-sided, not corrected for the number of comparisons."
+        blocks += [Text("Paired comparison of success", "heading"), paired, note(p)]
+    return Section("rollouts", "Success in the task", blocks)
+
+
+def measures_table(methods: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Every measure of every method, as in the paper's table."""
+    names = list(dict.fromkeys(name for entry in methods.values() for name in entry["measures"]))
+    rows = [[method(key), *(_cell(entry["measures"].get(name)) for name in names)] for key, entry in methods.items()]
+    return Table(["Method", *map(measure, names)], rows)
+
+
+def _cell(summary: Mapping[str, Any] | None) -> str:
+    if summary is None:
+        return "–"
+    if "mean" not in summary:
+        return rate(summary)
+    if not summary["trials"]:
+        return "– (n = 0)"
+    spread = "" if summary["std"] is None else f" ± {number(summary['std'])} [{interval(summary['interval'])}]"
+    return f"{number(summary['mean'])}{spread}, n = {summary['trials']}"
+
+
+def paired_table(methods: Mapping[str, Mapping[str, Any]], ours: str) -> Table | None:
+    """The paired comparison of success on the same initial states; None where there is none."""
+    pairs = {name: results["against"] for name, results in methods.items() if "against" in results}
+    rows = [
+        [method(name), str(pair["only_ours"]), str(pair["only_theirs"]), str(pair["trials"]), p_value(pair["p_value"])]
+        for name, pair in pairs.items()
+    ]
+    head = [f"{method(ours)} against", f"Only {method(ours)} succeeds", "Only the other succeeds", "Episodes", "p"]
+    return Table(head, rows) if rows else None
+
+
+def films(fit: Fit) -> Section | None:
+    """Filmed rollouts, the model's first, with a strip of frames of the first; None where nothing was filmed."""
+    folder = fit.run_folder
+    paths = sorted((folder / "videos").glob("*.mp4"), key=lambda path: (_named(path)[0] != fit.name, *_named(path)))
+    if not paths:
+        return None
+    blocks: list[Block] = []
+    shown = films_of(folder, paths)
+    if _named(paths[0])[0] == fit.name:
+        caption = (
+            f"Frames of {shown[0].caption}. The border has the colour of the lowest level’s option; h1 is its number."
+        )
+        alt = f"Film strip of one rollout, seed {_named(paths[0])[1]}"
+        blocks.append(save(draw_strip(paths[0]), folder / "figures" / "film.png", alt, caption))
+    return Section("films", "Films", [*blocks, Films(shown)])
+
+
+def films_of(folder: Path, paths: list[Path]) -> list[Film]:
+    """The films of a run folder with their outcomes, the first ones held in the page."""
+    outcomes = {key: ": success" if value == 1 else ": failure" for key, value in read_successes(folder).items()}
+    left, films = MOST_BYTES, []
+    for path in paths:
+        name, seed = _named(path)
+        held = path.stat().st_size <= left
+        left -= path.stat().st_size if held else 0
+        uri = data_uri(path.read_bytes(), "video/mp4") if held else None
+        films.append(Film(uri, f"videos/{path.name}", f"{method(name)}, seed {seed}{outcomes.get((name, seed), '')}"))
+    return films
+
+
+def _named(path: Path) -> tuple[str, int]:
+    """The method and the seed of a film."""
+    name, _, seed = path.stem.rpartition("-")
+    return name, int(seed)
+
+
+def draw_strip(path: Path) -> Figure:
+    """Frames of a film, evenly over time, in rows."""
+    film = np.stack(list(frames(path)))
+    chosen = film[np.unique(np.linspace(0, len(film) - 1, min(len(film), MOST_FRAMES)).round().astype(int))]
+    rows = -(-len(chosen) // COLUMNS)
+    height, width = film.shape[1:3]
+    figure = blank(rows * WIDTH / COLUMNS * height / width)
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0, hspace=0)  # type: ignore[union-attr, call-arg]
+    panels = figure.subplots(rows, COLUMNS, squeeze=False)
+    for axes in panels.flat:
+        hide_frame(axes)
+    for axes, frame in zip(panels.flat, chosen, strict=False):
+        axes.imshow(frame)
+    return figure

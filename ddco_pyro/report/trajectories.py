@@ -1,0 +1,147 @@
+"""Trajectories in space, coloured by option (paper, SM 1.3, figure B)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.drawing.colours import add_legend, option_colour
+from ddco_pyro.drawing.figures import FAINT, INK, Picture, blank, save
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.report.activity import Activity, LevelActivity
+
+MOST_TRAJECTORIES = 40
+MOST_POINTS = 300
+TURN = 70.0
+LEAST_OBLIQUE = 15.0
+"""Degrees between the view and an axis, at least; a view along an axis hides the axis' scale."""
+
+MOST_STRETCHED = 4.0
+"""Axes whose ranges differ by more than this factor are not drawn to one scale."""
+
+CHOSEN = (
+    "Among observations of three numbers or more, it moves the most within demonstrations; report.trajectory in the "
+    "spec names another. "
+)
+
+
+def picture(fit: Fit, demos: Demonstrations, activity: Activity) -> Picture | None:
+    """The demonstrations in space; None where no observation looks like a position."""
+    named = fit.spec.report.trajectory
+    key = named or position_key(demos)
+    if key is None:
+        return None
+    caption = (
+        f"{min(len(demos), MOST_TRAJECTORIES)} demonstrations in space, coloured by the most likely option: first "
+        f"three numbers of observation “{key}”, in its own units. {'' if named else CHOSEN}Circles: first steps. Seen "
+        "from the direction in which the trajectories spread the most."
+    )
+    figure = draw(activity, [np.asarray(demo.observations[key])[:, :3] for demo in demos], key)
+    alt = f"Trajectories of {key} in three dimensions, coloured by option"
+    return save(figure, fit.run_folder / "figures" / "trajectories.png", alt, caption)
+
+
+def position_key(demos: Demonstrations) -> str | None:
+    """The vector of three numbers or more with the most :func:`movement`; None where none moves."""
+    keys = [key for key, shape in demos.observation_shapes.items() if len(shape) == 1 and shape[0] >= 3]
+    moves = {key: movement([np.asarray(demo.observations[key]) for demo in demos]) for key in keys}
+    best = max(moves, key=moves.__getitem__, default=None)
+    return best if best is not None and moves[best] > 0 else None
+
+
+def movement(values: Sequence[np.ndarray]) -> float:
+    """How much the first three of n numbers [T, n] move like a position, 0 to 1. The product of three factors:
+
+    - Standard deviation within demonstrations over the total one: 0 for a goal that is constant in a demonstration.
+    - Diagonal of the box around a demonstration over the length of T steps of its root mean square step: 1 along a
+      straight line at one speed, near 0 for a velocity or noise.
+    - The share of the numbers that is drawn, 3 / n.
+    """
+    points = [array[:, :3].astype(float) for array in values]
+    reach = float(np.mean([_reach(path) for path in points]))
+    if reach == 0:
+        return 0.0
+    within = np.mean([path.var(0).sum() for path in points])
+    between = np.array([path.mean(0) for path in points]).var(0).sum()
+    return float(np.sqrt(within / (within + between))) * reach * 3 / values[0].shape[1]
+
+
+def _reach(points: np.ndarray) -> float:
+    """The diagonal of the box around positions [T, 3], over T - 1 times the root mean square of their steps."""
+    steps = np.diff(points, axis=0)
+    length = np.sqrt(np.square(steps).sum() * len(steps))
+    return float(np.linalg.norm(np.ptp(points, axis=0)) / length) if length > 0 else 0.0
+
+
+def draw(activity: Activity, positions: Sequence[np.ndarray], key: str) -> Figure:
+    """The positions [T_n, 3] of each demonstration, a panel for each level; a single level is seen from two sides."""
+    figure = blank(0.55 + 4.2 * -(-max(2, len(activity.levels)) // 2))
+    figure.set_layout_engine("none")  # it leaves too little room for labels of 3D axes
+    turns = (0.0, TURN) if len(activity.levels) == 1 else (0.0,)
+    panels = [(level, turn) for level in reversed(activity.levels) for turn in turns]
+    for place, (level, turn) in zip(_places(len(panels), figure.get_figheight()), panels, strict=True):
+        axes = figure.add_axes(place, projection="3d", proj_type="ortho")
+        panel(axes, level, positions, key, turn)
+        axes.set_title(f"level “{level.name}”" + (f", turned by {turn:.0f}°" if turn else ""))
+    add_legend(figure, activity.choices, "lower center")
+    return figure
+
+
+def panel(axes: Axes3D, level: LevelActivity, positions: Sequence[np.ndarray], key: str, turn: float = 0.0) -> None:
+    """One level over the positions [T_n, 3], of at most :data:`MOST_TRAJECTORIES` demonstrations."""
+    chosen = np.unique(np.linspace(0, len(positions) - 1, min(len(positions), MOST_TRAJECTORIES)).round().astype(int))
+    for row in chosen:
+        _trajectory(axes, positions[row], level.path[row])
+    _frame(axes, np.concatenate([positions[row] for row in chosen]), key, turn)
+
+
+def _places(count: int, height: float) -> list[tuple[float, float, float, float]]:
+    """Panels, two in a row, as (left, bottom, width, height) in shares of the figure, titles and legend left out."""
+    rows = -(-count // 2)
+    bottom, each = 0.55 / height, (1 - 0.55 / height) / rows
+    return [(0.5 * (n % 2), bottom + (rows - 1 - n // 2) * each, 0.5, 0.93 * each) for n in range(count)]
+
+
+def _trajectory(axes: Axes3D, positions: np.ndarray, path: np.ndarray) -> None:
+    steps = np.arange(0, len(positions), -(-len(positions) // MOST_POINTS))
+    points = positions[steps]
+    colours = [to_rgba(option_colour(int(choice))) for choice in path[steps]]
+    if len(points) > 1:
+        axes.add_collection3d(
+            Line3DCollection(np.stack([points[:-1], points[1:]], axis=1), colors=colours, linewidths=1.3)
+        )
+    axes.scatter(*points[0], color="white", edgecolor=INK, s=12, linewidth=0.7, depthshade=False)
+
+
+def _frame(axes: Axes3D, points: np.ndarray, key: str, turn: float) -> None:
+    low, high = points.min(0), points.max(0)
+    span = np.where(high > low, high - low, 1.0)
+    axes.set(xlim=(low[0], low[0] + span[0]), ylim=(low[1], low[1] + span[1]), zlim=(low[2], low[2] + span[2]))
+    if span.max() <= MOST_STRETCHED * span.min():
+        axes.set_box_aspect(span / span.max(), zoom=0.88)
+    elevation, azimuth = view(points, span if span.max() > MOST_STRETCHED * span.min() else np.ones(3))
+    axes.view_init(elev=elevation, azim=azimuth + turn)
+    for number, axis in enumerate((axes.xaxis, axes.yaxis, axes.zaxis)):
+        axis.set_pane_color((1, 1, 1, 1))
+        axis.set_label_text(f"{key}[{number}]")
+        axis.line.set_color(FAINT)
+    axes.locator_params(nbins=5)
+    axes.tick_params(labelsize=7)
+
+
+def view(points: np.ndarray, span: np.ndarray) -> tuple[float, float]:
+    """Elevation and azimuth (degrees) of a view along the direction in which positions [M, 3] spread the least.
+
+    The third axis stays upright: the elevation is between 15 and 45 degrees. No view is along an axis.
+    """
+    normal = np.linalg.eigh(np.cov((points / span).T))[1][:, 0] if len(points) > 1 else np.array([1.0, 1.0, 1.0])
+    normal = -normal if normal[2] < 0 else normal
+    elevation = float(np.clip(np.degrees(np.arcsin(normal[2])), 15, 45))
+    quarter, rest = divmod(float(np.degrees(np.arctan2(normal[1], normal[0]))), 90)
+    return elevation, 90 * quarter + float(np.clip(rest, LEAST_OBLIQUE, 90 - LEAST_OBLIQUE))

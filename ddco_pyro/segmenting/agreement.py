@@ -1,0 +1,115 @@
+"""Agreement of segments with ground-truth labels: the measures of options and of baselines, as tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ddco_pyro.data.sources import Source
+from ddco_pyro.drawing.page import Table
+from ddco_pyro.drawing.words import number
+from ddco_pyro.errors import BadInput
+from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED, agreement
+from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.segmenting import Segmented, Segments, demonstrations
+from ddco_pyro.segmenting.baselines import BASELINES, segment
+from ddco_pyro.training.data import parts
+
+Scores = Mapping[str, Any] | None
+"""Measures as :func:`ddco_pyro.evaluation.agreement.agreement` gives them; None where no label is known."""
+
+MATCHINGS = {"matched_globally": "one for all", "matched_per_demonstration": "each its own"}
+
+EXPLAINED = (
+    "All measures are at most 1, which is perfect. NMI (normalised mutual information) and ARI (adjusted Rand index, 0 "
+    "by chance) compare steps without regard to the options' names. Boundary F1 compares the steps at which segments "
+    "begin, within so many steps. The other measures match options with labels so that most steps agree. The match is "
+    "the same in all demonstrations (one for all) or separate in each (each its own). Accuracy: share of steps that "
+    "agree. IoU: intersection over union, mean over labels. F1@P: a segment is right where it overlaps one of its "
+    "label by P % or more. Edit: 1 − edit distance of the sequences of segments."
+)
+
+
+def measure_names(keys: Iterable[str]) -> list[str]:
+    """The names of measures as heads of columns.
+
+    >>> measure_names(["nmi", "boundary_f1_1", "boundary_f1_3", "accuracy", "f1_10", "f1_25"])
+    ['NMI', 'boundary F1 ±1', '±3', 'accuracy', 'F1@10', '@25']
+    """
+    names, before = [], ""
+    for key in keys:
+        base, _, parameter = key.rpartition("_")
+        if base:
+            prefix = {"boundary_f1": "boundary F1 ±", "f1": "F1@"}[base]
+            names.append((prefix[-1] if base == before else prefix) + parameter)
+        else:
+            names.append({"nmi": "NMI", "ari": "ARI", "iou": "IoU"}.get(key, key))
+        before = base
+    return names
+
+
+def agreement_table(scores: Mapping[str, Scores], title: str | None = None) -> Table:
+    """Two rows for each name of segments, one for each way to match options with labels."""
+    head = ["Segments", *measure_names(UNMATCHED), "matching", *measure_names(MATCHED)]
+    rows = []
+    for name, known in scores.items():
+        found = known or {}
+        first = [name, *(number(found.get(key)) for key in UNMATCHED)]
+        for key in [key for key in MATCHINGS if key in found] or [""]:
+            matched = [number(found.get(key, {}).get(measure)) for measure in MATCHED]
+            rows.append([*first, MATCHINGS.get(key, "–"), *matched])
+            first = [""] * len(first)
+    return Table(head, rows, {0, 1 + len(UNMATCHED)}, title)
+
+
+@dataclass(frozen=True)
+class LevelAgreement:
+    """Agreement of one level with the labels so named: the measures of each kind of segments, by its name."""
+
+    labels: str
+    scores: dict[str, Scores]
+
+
+def level_agreements(
+    fit: Fit, source: Source, segmented: Segmented, baselines: bool = False, gripper: int = -1
+) -> dict[str, LevelAgreement]:
+    """Agreement of each level that has labels, by the level's name.
+
+    Baselines have as many kinds of segments as the level has options. They are fitted to the run's training
+    demonstrations and compared on the held-out ones, or on all where none is held out.
+
+    :param gripper: the control dimension whose changes divide demonstrations in the baseline ``gripper``.
+    :raises BadInput: ``baselines`` are asked for, and the demonstrations lack the labels that the spec names.
+    """
+    agreements = {}
+    for level, truth in segmented.truth.items():
+        groups = _groups(segmented, truth)
+        if not groups:
+            continue
+        scores: dict[str, Scores] = {}
+        for part, group in groups.items():
+            options = [demo.levels[level].options for demo in group]
+            scores[f"options, {part}"] = agreement(options, [demo.labels[truth] for demo in group])
+        if baselines:
+            part, group = next(iter(groups.items()))
+            train, count = parts(fit.spec, fit.demonstrations)["train"], segmented.counts[level]
+            demos = demonstrations(source, [demo.name for demo in group], fit)
+            labels = [demo.labels[truth] for demo in group]
+            for name, words in BASELINES.items():
+                found = segment(name, train, demos, count, fit.spec.seed, fit.spec.observations, gripper)
+                scores[f"{words}, {part}"] = agreement(found, labels)
+        agreements[level] = LevelAgreement(truth, scores)
+    if baselines and not agreements:
+        named = ", ".join(f"labels/{name}" for name in fit.spec.demonstrations.label_names)
+        missing = f"the demonstrations have no {named}" if named else "the run's spec has no demonstrations.labels"
+        raise BadInput(f"--baselines: {missing}, with which baselines are compared")
+    return agreements
+
+
+def _groups(segmented: Segmented, truth: str) -> dict[str, Sequence[Segments]]:
+    """The demonstrations that have these labels, by part: the held-out ones first, then the others."""
+    labelled = [demo for demo in segmented.segments if truth in demo.labels]
+    held_out, others = ([demo for demo in labelled if demo.held_out is held] for held in (True, False))
+    named = {f"{len(held_out)} held out": held_out, f"{len(others)} {'others' if held_out else 'in all'}": others}
+    return {name: group for name, group in named.items() if group}

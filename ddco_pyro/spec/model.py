@@ -1,0 +1,205 @@
+"""The model that a spec declares: a hierarchy of options, or a baseline without options that last."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    TypeAdapter,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
+
+from ddco_pyro.spec.base import Count, Emission, Items, Model, Text, bare, invalid, nested
+from ddco_pyro.spec.networks import LinearSpec, MlpSpec, Network, NetworkSpec, PolicySpec
+from ddco_pyro.spec.settings import LearnedStd
+from ddco_pyro.spec.training import OptimizerSpec
+
+HEADS = ("linear", "mlp")
+"""The networks that can read a trunk."""
+
+Reader = tuple[str, Network]
+"""Key of a network and its settings."""
+
+ALWAYS: Literal["always"] = "always"
+"""The termination of options that end after every step, ψ = 1."""
+
+_NETWORK: TypeAdapter[NetworkSpec] = TypeAdapter(NetworkSpec)
+Termination = Annotated[
+    NetworkSpec | Literal["always"],
+    nested((Mapping, Network), _NETWORK.validate_python, "a network, such as {network: linear}, or always"),
+]
+
+
+class LevelSpec(Model):
+    """One level of options."""
+
+    name: str = Field(default="option", pattern=r"^[A-Za-z][\w-]*$")
+    """Name of the level in reports and files: a letter, then letters, digits, ``_`` and ``-``."""
+    count: Count
+    """Number of options, k."""
+    trunk: NetworkSpec | None = None
+    """A network for each option whose last hidden layer ``policy`` and ``termination`` read. Both are then ``linear``
+    or ``mlp``. Null: ``policy`` and ``termination`` read the observations."""
+    policy: PolicySpec = MlpSpec()
+    """The options' policies, π: one network for each option."""
+    termination: Termination = LinearSpec(network="linear")
+    """The options' termination conditions, ψ: one network for each option. ``always``: ψ = 1, every option ends after
+    every step; a single such level is a memoryless mixture of experts, with the meta-policy as its gate."""
+
+    @model_validator(mode="after")
+    def _heads(self) -> LevelSpec:
+        if self.trunk is not None:
+            _check_readers(*self._own)
+        return self
+
+    @property
+    def lasts(self) -> bool:
+        """Whether options can be active for more than one step."""
+        return self.termination != ALWAYS
+
+    @property
+    def readers(self) -> tuple[Reader, ...]:
+        """The networks that read the observations or the hierarchy's trunk."""
+        return self._own if self.trunk is None else (("trunk", self.trunk),)
+
+    @property
+    def _own(self) -> tuple[Reader, ...]:
+        networks = (("policy", self.policy), ("termination", self.termination))
+        return tuple((key, network) for key, network in networks if isinstance(network, Network))
+
+
+def _check_readers(*heads: Reader) -> None:
+    for place, head in heads:
+        if head.network not in HEADS:
+            text = f"reads the trunk: use one of {', '.join(HEADS)}, got {head.network!r}"
+            raise invalid((f"{place}.network", text))
+        if head.inputs:
+            raise invalid((f"{place}.inputs", "the trunk reads the observations; give inputs there"))
+
+
+class HierarchySpec(Model):
+    """Levels of options below a meta-policy."""
+
+    trunk: NetworkSpec | None = None
+    """A single network whose last hidden layer replaces the observations for all other networks: the levels' trunks,
+    policies and terminations without a trunk, and the meta-policy. These are then ``linear`` or ``mlp``. Null: every
+    network reads the observations."""
+    levels: Items[LevelSpec] = Field(min_length=1)
+    """The levels, lowest first."""
+    meta_policy: PolicySpec = MlpSpec(emits=("options",))
+    """The policy that selects from the highest level, η."""
+
+    def read_by(self, level: int) -> tuple[str, ...]:
+        """Names of the observations that the policies of a level read; empty: all of them.
+
+        :param level: 1 for the lowest.
+        """
+        own = self.levels[level - 1]
+        return (self.trunk or own.trunk or own.policy).reads
+
+    @field_validator("levels")
+    @classmethod
+    def _consistent(cls, levels: tuple[LevelSpec, ...]) -> tuple[LevelSpec, ...]:
+        problems = []
+        first: dict[str, int] = {}
+        for index, level in enumerate(levels):
+            if level.name in first:
+                text = f"{level.name!r} is also the name of level {first[level.name]}; give each level its own"
+                problems.append((f"{index}.name", text))
+            first.setdefault(level.name, index)
+        if levels[0].policy.emits not in ((), ("control",)):
+            problems.append(("0.policy.emits", "the lowest level emits the control and nothing else; leave it out"))
+        if problems:
+            raise invalid(*problems)
+        policies = [_emitting(level.policy, "options" if index else "control") for index, level in enumerate(levels)]
+        pairs = zip(levels, policies, strict=True)
+        return tuple(level.model_copy(update={"policy": policy}) for level, policy in pairs)
+
+    @field_validator("meta_policy")
+    @classmethod
+    def _selecting(cls, policy: PolicySpec) -> PolicySpec:
+        return _emitting(policy, "options")
+
+    @model_validator(mode="after")
+    def _heads(self) -> HierarchySpec:
+        if self.trunk is not None:
+            levels = (level.readers for level in self.levels)
+            named = ((f"levels.{index}.{at}", head) for index, own in enumerate(levels) for at, head in own)
+            _check_readers(*named, ("meta_policy", self.meta_policy))
+            for index, level in enumerate(self.levels):
+                if level.trunk is not None and level.trunk.shared:
+                    text = "all options share the hierarchy's trunk; put these layers there"
+                    raise invalid((f"levels.{index}.trunk.shared", text))
+        return self
+
+
+def _emitting(policy: PolicySpec, default: Emission) -> PolicySpec:
+    return policy if policy.emits else policy.model_copy(update={"emits": (default,)})
+
+
+Kind = Literal["flat", "flat_equal", "per_timestep", "mixture"]
+
+_OF_A_MIXTURE = ("levels", "count", "meta_policy")
+
+
+class BaselineSpec(Model):
+    """A model to compare a hierarchy with: without options, or with options that do not last."""
+
+    kind: Kind
+    """``flat``: one policy for all time steps. ``flat_equal``: a flat policy whose hidden layers are scaled by one
+    factor until the policy has as many parameters as the hierarchy. ``per_timestep``: one perceptron for each time
+    step, with the settings in ``policy``. ``mixture``: several policies, of which the meta-policy selects one at every
+    step (ψ = 1); in ``compare_with`` a mixture is the hierarchy with all its networks except the terminations."""
+    policy: NetworkSpec = MlpSpec()
+    """The policy's network, π. For a ``mixture`` in place of ``hierarchy``: the network of each expert."""
+    levels: Items[Text] = ()
+    """For a ``mixture`` in ``compare_with``: names of the levels whose options end after every step; empty: all."""
+    count: Count | None = None
+    """For a ``mixture`` in place of ``hierarchy``: number of experts."""
+    meta_policy: PolicySpec | None = None
+    """For a ``mixture`` in place of ``hierarchy``: the gate, which selects the expert; null: the default network."""
+    optimizer: OptimizerSpec | None = None
+    """In ``compare_with``: settings that differ from ``training.optimizer`` for this baseline; null: none."""
+    std: LearnedStd | None = None
+    """In ``compare_with``: the σ of this baseline wherever σ is learned in ``control.std`` and ``control.parts``. Null:
+    as in ``control``. The floor stays unless ``floor`` is given. With ``{learn: true, per_state: true}`` the σ of a
+    flat policy depends on the state, as the σ of options differs between options."""
+
+    @property
+    def name(self) -> str:
+        """The baseline's name in tables."""
+        return "_".join((self.kind, *self.levels))
+
+    @property
+    def as_hierarchy(self) -> HierarchySpec:
+        """The hierarchy that a ``mixture`` in place of ``hierarchy`` is: one level, whose options end every step."""
+        assert self.count is not None  # checked where the property is read
+        expert = LevelSpec(name="expert", count=self.count, policy=self.policy, termination=ALWAYS)
+        return HierarchySpec(levels=(expert,), meta_policy=self.meta_policy or MlpSpec())
+
+    @model_validator(mode="after")
+    def _settings_apply(self) -> BaselineSpec:
+        network = self.policy.network
+        if self.kind == "flat_equal" and not self.policy.hidden_sizes:
+            text = f"flat_equal widens hidden layers, and network {network!r} has none; give it some"
+            raise invalid(("policy", f"{text}, such as {{network: mlp, hidden: [64]}}"))
+        if self.kind == "per_timestep" and network not in (*HEADS, "per_timestep"):
+            text = f"per_timestep has a perceptron for each step: use one of {', '.join(HEADS)}"
+            raise invalid(("policy.network", f"{text}, got {network!r}, or say kind: flat"))
+        given = [key for key in _OF_A_MIXTURE if key in self.model_fields_set]
+        if given and self.kind != "mixture":
+            raise invalid(*((key, f"is a setting of mixture, not of {self.kind}; leave it out") for key in given))
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_foreign_keys(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        foreign = ("policy", *_OF_A_MIXTURE[1:]) if self.kind == "mixture" else _OF_A_MIXTURE
+        return {key: value for key, value in serialize(self).items() if key not in foreign}
+
+
+Baseline = Annotated[BaselineSpec, bare("kind", Kind | BaselineSpec)]

@@ -1,0 +1,224 @@
+"""Specs in YAML files, the JSON Schema of such files, and the user code that a spec names."""
+
+from __future__ import annotations
+
+import re
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, get_args
+
+import yaml
+
+from ddco_pyro.spec.base import Importable, Model, SpecError, show
+from ddco_pyro.spec.spec import Spec, parse_spec, plain, with_overrides
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads numbers as YAML 1.2 does, ``1e-3``, ``010`` (ten) and ``1:30`` (text), and refuses duplicate keys."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"key {key.value!r} is given twice", key.start_mark)
+            seen.add(key.value if isinstance(key, yaml.ScalarNode) else None)
+        return super().construct_mapping(node, deep=deep)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes text that :class:`_Loader` would read as a number, and writes no anchors."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+_INT, _FLOAT = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
+_WHOLE = re.compile(r"[-+]?(?:0x[0-9a-fA-F]+|[0-9][0-9_]*)$")
+_NUMBER = re.compile(
+    r"[-+]?(?:[0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?$|[-+]?[0-9][0-9_]*[eE][-+]?[0-9]+$"
+    r"|[-+]?\.(?:inf|Inf|INF)$|\.(?:nan|NaN|NAN)$"
+)
+for _yaml in (_Loader, _Dumper):
+    _yaml.yaml_implicit_resolvers = {  # in YAML 1.1, 010 is eight and 1:30 is ninety
+        first: [(tag, pattern) for tag, pattern in known if tag not in (_INT, _FLOAT)]
+        for first, known in _yaml.yaml_implicit_resolvers.items()
+    }
+    _yaml.add_implicit_resolver(_INT, _WHOLE, list("-+0123456789"))
+    _yaml.add_implicit_resolver(_FLOAT, _NUMBER, list("-+.0123456789"))
+
+
+def _whole(loader: _Loader, node: yaml.ScalarNode) -> int:
+    text = loader.construct_scalar(node)
+    return int(text, 16 if "x" in text else 10)
+
+
+_Loader.add_constructor(_INT, _whole)
+
+
+def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool = False) -> Spec:
+    """The spec in a YAML file, after ``overrides`` such as ``"hierarchy.levels.0.count=3"`` (the value is YAML).
+
+    Code that the spec names is not imported.
+
+    >>> spec = ddco_pyro.load_spec("mine.yaml", ["hierarchy.levels.0.count=3"])
+    >>> spec.hierarchy.levels[0].count, spec.training.batch_size
+    (3, 16)
+
+    :param allow_code: whether the spec may name user code (``module:name``), which later use of the spec imports.
+    :raises SpecError: the file cannot be read, is not YAML, is not a valid spec, or names code that is not allowed; one
+        line for each problem.
+    """
+    try:
+        about = Path(path).stat()
+        if not stat.S_ISREG(about.st_mode) or about.st_size > MOST_BYTES:
+            raise SpecError(f"{path}: is no file of at most {MOST_BYTES // 1024} kB; a spec is a YAML file")
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise SpecError(f"{path}: cannot be read: {error.strerror}; check the path") from error
+    try:
+        data = read_yaml(content)
+        if data is None:
+            raise SpecError("the file is empty; it has to hold a spec")
+        if not isinstance(data, dict):
+            raise SpecError(f"the file holds {show(data)}, not a mapping (key: value)")
+        spec = parse_spec(data, dict(_parse_override(text) for text in overrides))
+    except SpecError as error:
+        raise SpecError(*(f"{path}: {problem}" for problem in error.problems)) from None
+    if not allow_code:
+        _refuse_user_code(spec, path)
+    return spec
+
+
+def dump_spec(spec: Spec) -> str:
+    """The spec as YAML with all defaults written out; reading the YAML gives an equal spec."""
+    return yaml.dump(
+        spec.model_dump(), Dumper=_Dumper, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120
+    )
+
+
+def spec_schema() -> dict[str, Any]:
+    """The JSON Schema of a spec file, for editors."""
+    schema = Spec.model_json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "ddco-pyro spec"}
+
+
+def read_yaml(content: bytes | str) -> Any:
+    """Plain data in YAML text.
+
+    :raises SpecError: the text is not YAML, or expands to more than a spec can be.
+    """
+    try:
+        return plain(_constructed(content))
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+        raise SpecError(f"{where}not valid YAML: {error.problem or error.context}") from None
+    except RecursionError:
+        raise SpecError("not valid YAML: nested too deeply") from None
+    except (yaml.YAMLError, ValueError) as error:  # not text, or a date or number that Python cannot represent
+        raise SpecError(f"not valid YAML: {' '.join(str(error).split())}") from None
+
+
+MOST_BYTES = 256 * 1024
+"""Largest spec file; an ordinary one has a few thousand bytes. Reading the largest takes seconds."""
+
+MOST_VALUES = 10_000
+"""Most keys and values of a spec with its aliases expanded; an ordinary spec has a few hundred."""
+
+DEEPEST = 100
+
+
+def _constructed(content: bytes | str) -> Any:
+    loader = _Loader(content)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        _extent(node, {})
+        return loader.construct_document(node)
+    finally:
+        loader.dispose()
+
+
+def _extent(node: yaml.Node, known: dict[yaml.Node, tuple[int, int]]) -> tuple[int, int]:
+    """Number of keys and values of a node with its aliases expanded, and their depth.
+
+    :param known: results for earlier nodes; an alias is the node that it refers to.
+    :raises RecursionError: the node is nested too deeply, or contains itself.
+    """
+    if node not in known:
+        parts = [] if isinstance(node, yaml.ScalarNode) else node.value
+        nodes = [part for pair in parts for part in pair] if isinstance(node, yaml.MappingNode) else parts
+        extents = [_extent(part, known) for part in nodes]
+        size, depth = 1 + sum(size for size, _ in extents), 1 + max((depth for _, depth in extents), default=0)
+        if depth > DEEPEST:
+            raise RecursionError
+        if size > MOST_VALUES:
+            problem = f"holds more than {MOST_VALUES} values where its aliases are written out; refer to it less often"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
+        known[node] = size, depth
+    return known[node]
+
+
+def _parse_override(text: str) -> tuple[str, Any]:
+    path, equals, value = text.partition("=")
+    if not equals or not path.strip():
+        raise SpecError(f"override {text!r}: write it as key.path=value")
+    try:
+        return path.strip(), read_yaml(value)
+    except SpecError as error:
+        raise SpecError(f"override {text!r}: {error}") from None
+
+
+# --- user code --------------------------------------------------------------------------------------------------------
+
+
+def user_code(spec: Spec) -> dict[str, str]:
+    """Key path to ``module:name`` of the code that using the spec imports, its grid excluded.
+
+    Names registered by installed packages are not user code.
+    """
+    return dict(_named(spec, ""))
+
+
+def _refuse_user_code(spec: Spec, path: str | Path) -> None:
+    """Refuse a spec that names user code, in its grid included."""
+    places = user_code(spec)
+    for key, values in spec.selection.grid.items():
+        for value in values:
+            candidate = with_overrides(spec, {"selection.grid": {}, key: value})
+            places |= {f"selection.grid.{key}": name for name in user_code(candidate).values()}
+    if places:
+        raise SpecError(
+            *(
+                f"{path}: {place}: would import user code ({name}); pass --allow-code if you trust it "
+                "(in Python: allow_code=True)"
+                for place, name in places.items()
+            )
+        )
+
+
+def _named(value: Any, place: str) -> Iterator[tuple[str, str]]:
+    """Key paths and names of user code below a part of the spec."""
+    if isinstance(value, Model):
+        for key, field in type(value).model_fields.items():
+            below, part = f"{place}.{key}" if place else key, getattr(value, key)
+            for mark in (*field.metadata, *_metadata(field.annotation)):
+                if isinstance(mark, Importable) and isinstance(part, str) and ":" in part:
+                    group = entry_points(group=mark.entry_points) if mark.entry_points else ()
+                    if part not in {point.name for point in group}:
+                        yield below, part
+            yield from _named(part, below)
+    elif isinstance(value, tuple | Mapping):
+        items = value.items() if isinstance(value, Mapping) else enumerate(value)
+        for name, part in items:
+            yield from _named(part, f"{place}.{name}")
+
+
+def _metadata(annotation: Any) -> Iterator[Any]:
+    """The metadata within a type such as ``Annotated[str, mark] | None``."""
+    yield from getattr(annotation, "__metadata__", ())
+    for argument in get_args(annotation):
+        yield from _metadata(argument)

@@ -1,0 +1,501 @@
+"""Expectation-maximisation (§4.1) for hierarchies whose networks are linear: exact E-steps, closed or Newton M-steps.
+
+Every output of a network is z = W^T x, where x has a 1 at its end. One backward pass of the exact log-likelihood gives
+its gradient g in every output, and the posterior in every table (the E-step). The M-step then solves, for each network,
+
+    (Σ_t h_t x_t x_t^T + R) (W' - W) = Σ_t x_t g_t^T - R W
+
+where h is the information that the posterior expects of an output and R a ridge. For the mean of a Gaussian, clipped or
+not, this is the weighted least squares of the M-step (for a clipped one: of the censored moments, by Fisher's
+identity). For switches, categories, terminations and gates it is one Fisher scoring step. σ follows in closed form.
+A step that lowers the penalised log-likelihood is halved.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.hierarchy import Caller, Hierarchy
+from ddco_pyro.model.links import TERMINATION_BOUND, bounded
+from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.networks.perceptrons import Mlp, StackedLinear
+from ddco_pyro.model.outputs import CallerOutputs, Outputs
+from ddco_pyro.model.tables import Tables
+from ddco_pyro.spec import RidgeSpec
+
+LARGEST = 3.0
+"""The most that a weight of a logit changes in a step: Fisher scoring overshoots where a logistic curve is flat."""
+HALVINGS = 10
+"""How often a step that lowers the penalised log-likelihood is halved before it is given up."""
+ABOVE_FLOOR = 1e-4
+"""A learned σ stays so far above its floor."""
+TOLERANCE = 1e-5
+"""EM has converged where a step gains less, in nats per step of the demonstrations."""
+BIAS = 1e-6
+"""Ridge of biases: an option that is never active keeps its own."""
+
+Score = Callable[[Tables, Batch, Tensor], Tensor]
+"""What is maximised of a piece of the demonstrations, nats: its tables, itself, and its rows."""
+
+
+def is_linear(model: Hierarchy) -> bool:
+    """Whether every network of a hierarchy is linear in the observations, so that EM applies."""
+    return model.trunk is None and all(
+        isinstance(network, Mlp) and network.trunk_size is None and len(network.layers) == 1
+        for network in model.networks().values()
+    )
+
+
+@dataclass(frozen=True)
+class Information:
+    """The information that the posterior expects of some outputs of a network.
+
+    :param columns: the outputs.
+    :param weight: h of each output [N, T, K, n]. Or a weight of all outputs, [N, T, K]: h is the weight times 1/σ² for
+        means, and times diag(p) - pp^T for logits of probabilities p.
+    :param probabilities: p, [N, T, K, n].
+    :param std: the places of σ of these means; a σ that depends on the state is in ``weight`` instead.
+    """
+
+    columns: slice
+    weight: Tensor
+    probabilities: Tensor | None = None
+    std: tuple[int, ...] = ()
+
+
+@dataclass
+class Sums:
+    """Sums over all steps for one network: the gradient of W, [K, F, n], and the information of each group."""
+
+    gradient: Tensor | float = 0.0
+    groups: list[Information] = field(default_factory=list)
+    information: list[Tensor] = field(default_factory=list)
+    count: list[Tensor] = field(default_factory=list)
+    std: Tensor | float = 0.0
+
+    def add(self, x: Tensor, gradient: Tensor, groups: Sequence[Information], std: Tensor | None) -> None:
+        """Add those of a piece: features x [N, T, F] and gradients of outputs [N, T, K, n]."""
+        rows = x.flatten(0, 1)
+        self.gradient = self.gradient + torch.einsum("mf,mkn->kfn", rows, gradient.flatten(0, 1))
+        self.std = self.std + (0.0 if std is None else std)
+        found = [_information(rows, group) for group in groups]
+        counts = [group.weight.flatten(0, 1).sum(0) for group in groups]
+        if not self.groups:
+            self.groups, self.information, self.count = list(groups), found, counts
+        else:
+            self.information = [one + more for one, more in zip(self.information, found, strict=True)]
+            self.count = [one + more for one, more in zip(self.count, counts, strict=True)]
+
+
+def _information(rows: Tensor, group: Information) -> Tensor:
+    """Σ_t h_t x_t x_t^T: [K, F, F] for a weight of all outputs, [K, n, F, F] for one of each, [K, nF, nF] of logits."""
+    weight = group.weight.flatten(0, 1)
+    if group.probabilities is None:
+        weighted = weight.movedim(0, -1).unsqueeze(-2) * rows.T  # [K, (n,) F, M]
+        return weighted @ rows
+    p = group.probabilities.flatten(0, 1)
+    copies, outputs = p.shape[1:]
+    features = rows.shape[1]
+    whole = rows.new_empty(copies, outputs, features, outputs, features)
+    for i in range(outputs):
+        for j in range(i, outputs):
+            own = weight * p[..., i] * (float(i == j) - p[..., j])
+            block = (own.T.unsqueeze(1) * rows.T) @ rows
+            whole[:, i, :, j], whole[:, j, :, i] = block, block.mT
+    return whole.reshape(copies, outputs * features, outputs * features)
+
+
+class Linear:
+    """One network of K linear maps, its weights in float64, the bias as the last row: [K, F, n].
+
+    :param ridge: of all outputs but those whose ridge is in units of 1/σ².
+    """
+
+    def __init__(self, network: nn.Module, ridge: float, trained: bool) -> None:
+        assert isinstance(network, Mlp)  # is_linear
+        (layer,) = network.layers
+        assert isinstance(layer, StackedLinear)
+        self.layer, self.ridge, self.trained, self._reads = layer, ridge, trained, network.reads
+        self.weight = torch.cat([layer.weight.detach(), layer.bias.detach()], dim=1).double()
+
+    def features(self, inputs: Inputs) -> Tensor:
+        """x, [N, T, F]."""
+        vector = inputs.select(self._reads).vector.double()
+        return torch.cat([vector, vector.new_ones(*vector.shape[:-1], 1)], dim=-1)
+
+    def outputs(self, x: Tensor) -> Tensor:
+        """W^T x, [N, T, K, n]."""
+        copies, features, outputs = self.weight.shape
+        joined = self.weight.transpose(0, 1).reshape(features, copies * outputs)
+        return (x.flatten(0, 1) @ joined).reshape(*x.shape[:2], copies, outputs)
+
+    def store(self) -> None:
+        """Give the network these weights."""
+        with torch.no_grad():
+            self.layer.weight.copy_(self.weight[:, :-1])
+            self.layer.bias.copy_(self.weight[:, -1:])
+
+
+class Std:
+    """σ of a caller's continuous dimensions, [K, C] float64, but for what depends on the state."""
+
+    def __init__(self, caller: Caller, trained: bool) -> None:
+        assert caller.std is not None
+        self.module, self.trained = caller.std, trained
+        copies = caller.copies
+        self.value = self.module.table().detach().double().expand(copies, -1).clone()
+
+    def updated(self, square: Tensor, count: Tensor, places: Sequence[int]) -> Tensor:
+        """σ from sums of squares [K, C'] and counts [K] at these places."""
+        value = self.value.clone()
+        for column, place in enumerate(places):
+            if place in self.module.own:
+                mean = square[:, column] / count
+            elif place in self.module.shared:
+                mean = (square[:, column].sum() / count.sum()).expand(len(count))
+            else:
+                continue
+            least = float(self.module.floor[place]) + ABOVE_FLOOR
+            value[:, place] = torch.where(count > 0, mean, value[:, place] ** 2).clamp(min=0).sqrt().clamp(min=least)
+        return value
+
+    def store(self) -> None:
+        """Give the module these values."""
+        module = self.module
+        with torch.no_grad():
+            raw = (self.value - module.floor).clamp(min=ABOVE_FLOOR).expm1().log()
+            if module.shared:
+                module.raw.copy_(raw[0, module.shared])
+            if module.own:
+                module.raw_own.copy_(raw[:, module.own])
+
+
+class Expectation:
+    """EM steps of some networks of a hierarchy.
+
+    :param trained: prefixes of the names of the parameters that change.
+    :param score: what is maximised of a piece of the demonstrations.
+    :param discovering: d has levels 1 to d alone under a uniform meta-policy.
+    :ivar value: the penalised log-likelihood of the weights that the last step began at.
+    :ivar gain: what the step before gained, nats per step.
+    """
+
+    def __init__(
+        self,
+        model: Hierarchy,
+        trained: tuple[str, ...],
+        score: Score,
+        ridge: RidgeSpec,
+        discovering: int | None = None,
+    ) -> None:
+        self.model, self._score, self._discovering, self._ridge = model, score, discovering, ridge
+        self.networks: dict[str, Linear] = {}
+        self.stds: dict[str, Std] = {}
+        for name, network in model.networks().items():
+            kind = ridge.termination if name.endswith("termination") else ridge.gate
+            self.networks[name] = Linear(network, kind, f"{name}.".startswith(trained))
+        for name, caller in self._callers():
+            if caller.std is not None:
+                self.stds[name] = Std(caller, f"{name}.".startswith(trained))
+        self._before: dict[str, Tensor] | None = None
+        self.value, self.gain = -math.inf, math.inf
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last step gained less than :data:`TOLERANCE`."""
+        return self.gain < TOLERANCE
+
+    def _callers(self) -> Iterator[tuple[str, Caller]]:
+        for number, level in enumerate(self.model.option_levels()):
+            yield f"levels.{number}.policy", level.policy
+        yield "meta_policy", self.model.meta_policy
+
+    def states(self) -> dict[str, Tensor]:
+        """What a checkpoint keeps: the weights in float64, and those before the last step with their value."""
+        before = {f"before.{name}": value for name, value in (self._before or {}).items()}
+        numbers = {"value": self.value, "gain": self.gain}
+        kept = {**self._state(), **before, **{name: torch.tensor(one).double() for name, one in numbers.items()}}
+        return {name: one.clone() for name, one in kept.items()}
+
+    def load_states(self, states: Mapping[str, Tensor]) -> None:
+        """Go on from what :meth:`states` kept."""
+        self.value, self.gain = float(states["value"]), float(states["gain"])
+        self._before = {name.removeprefix("before."): one for name, one in states.items() if name.startswith("before.")}
+        self._before = self._before or None
+        self._restore(states)
+
+    def step(self, batch: Batch) -> float:
+        """One EM step over all demonstrations; their log-likelihood before the step, nats.
+
+        Where the last step lowered the penalised log-likelihood, that step is halved first.
+        """
+        value, sums = self._expect(batch)
+        penalised = value + self._penalty()
+        for _ in range(HALVINGS):
+            if self._before is None or penalised >= self.value - 1e-9 * abs(self.value):
+                break
+            self._restore({name: 0.5 * (old + new) for (name, old), new in self._both()})
+            value, sums = self._expect(batch)
+            penalised = value + self._penalty()
+        else:
+            assert self._before is not None
+            self._restore(self._before)
+            value, sums = self._expect(batch)
+            penalised = value + self._penalty()
+        self.gain, self.value, self._before = (penalised - self.value) / batch.steps, penalised, self._state()
+        self._maximise(sums)
+        for network in self.networks.values():
+            if network.trained:
+                network.store()
+        for std in self.stds.values():
+            if std.trained:
+                std.store()
+        return value
+
+    def _state(self) -> dict[str, Tensor]:
+        weights = {name: network.weight for name, network in self.networks.items()}
+        return weights | {f"{name}.std": std.value for name, std in self.stds.items()}
+
+    def _both(self) -> Iterator[tuple[tuple[str, Tensor], Tensor]]:
+        assert self._before is not None
+        now = self._state()
+        return ((item, now[item[0]]) for item in self._before.items())
+
+    def _restore(self, state: Mapping[str, Tensor]) -> None:
+        for name, network in self.networks.items():
+            network.weight = state[name]
+        for name, std in self.stds.items():
+            std.value = state[f"{name}.std"]
+
+    def _penalty(self) -> float:
+        """The log-density of the prior that the ridges stand for, up to a constant, of what is trained."""
+        total = 0.0
+        for name, network in self.networks.items():
+            if not network.trained:
+                continue
+            weight = network.weight[:, :-1]
+            squares = weight.square().sum(1)  # [K, n]
+            own = torch.full_like(squares, network.ridge)
+            if name in self.stds:
+                std = self.stds[name]
+                for columns, places in self._means(name):
+                    scale = std.value[:, list(places)]
+                    own[:, columns] = self._ridge.policy / scale.square()
+                    total -= weight.shape[1] * float(self._free_log(std, places)) * bool(self._ridge.policy)
+            total -= 0.5 * float((own * squares).sum())
+        return total
+
+    @staticmethod
+    def _free_log(std: Std, places: Sequence[int]) -> Tensor:
+        learned = [place for place in places if place in (*std.module.own, *std.module.shared)]
+        return std.value[:, learned].log().sum()
+
+    def _means(self, name: str) -> Iterator[tuple[slice, tuple[int, ...]]]:
+        """The columns of means whose σ does not depend on the state, and the places of σ."""
+        caller = dict(self._callers())[name]
+        for group in _layout(caller, self.model):
+            if group.std and not set(group.std) & set(self.stds[name].module.of_state):
+                yield group.means, group.std
+
+    def _expect(self, batch: Batch) -> tuple[float, dict[str, Sums]]:
+        """The E-step: the score, and the sums that the M-step solves for each network that is trained."""
+        total, sums = 0.0, {name: Sums() for name, network in self.networks.items() if network.trained}
+        for rows, piece in batch.pieces(self.model.steps_at_once):
+            total += self._expect_piece(rows, piece, sums)
+        return total, sums
+
+    def _expect_piece(self, rows: Tensor, piece: Batch, sums: dict[str, Sums]) -> float:
+        levels = self.model.option_levels()[: self._discovering]
+        xs: dict[tuple[str, ...], Tensor] = {}
+        said: dict[str, Tensor] = {}
+        for name, network in self.networks.items():
+            key = tuple(network._reads)
+            xs.setdefault(key, network.features(piece.inputs))
+            said[name] = network.outputs(xs[key]).requires_grad_()
+        stds = {name: std.value.clone().requires_grad_() for name, std in self.stds.items()}
+        callers = {name: caller(said[name], self.model.scaling, stds.get(name)) for name, caller in self._callers()}
+        named = [f"levels.{number}" for number in range(len(levels))]
+        logits = [said[f"{name}.termination"].squeeze(-1) if f"{name}.termination" in said else None for name in named]
+        top = callers["meta_policy"]
+        if self._discovering:
+            uniform = torch.zeros(*piece.inputs.batch, 1, levels[-1].count, dtype=torch.float64)
+            top = CallerOutputs(levels[-1].count, uniform, None)
+        outputs = Outputs((*(callers[f"{name}.policy"] for name in named), top), tuple(logits))
+        tables = outputs.tables(piece.actions)
+        value = self._score(tables, piece, rows)
+        leaves = [*said.values(), *stds.values()]
+        present = [table for table in tables.leaves() if table is not None and table.requires_grad]
+        gradients = iter(torch.autograd.grad(value, [*leaves, *present], allow_unused=True))
+        of = {name: next(gradients) for name in said}
+        of_std = {name: next(gradients) for name in stds}
+        of_table = {id(table): next(gradients) for table in present}
+
+        def posterior(table: Tensor | None) -> Tensor | None:
+            return None if table is None else of_table.get(id(table))
+
+        every = [*(f"{name}.policy" for name in named), *([] if self._discovering else ["meta_policy"])]
+        selecting = [name for name in every if callers[name].options]
+        selection = dict(zip(selecting, tables.selection[-len(selecting) :] if selecting else (), strict=False))
+        for place, name in enumerate(every):
+            if name not in sums or of[name] is None:
+                continue
+            caller, groups = dict(self._callers())[name], []
+            choices = posterior(selection.get(name))
+            if caller.sizes[0] and choices is not None:
+                extra = choices.shape[-1] - caller.sizes[0]
+                probabilities = selection[name].detach().exp()[..., extra:]
+                groups.append(Information(slice(0, caller.sizes[0]), choices.sum(-1).double(), probabilities))
+            acting = posterior(tables.control[place])
+            if caller.std is not None and acting is not None:
+                emitted = _emitted(
+                    caller, self.model, said[name].detach(), self.stds[name].value, acting, piece.actions
+                )
+                groups.extend(emitted)
+            x = xs[tuple(self.networks[name]._reads)]
+            sums[name].add(x, of[name], groups, of_std.get(name))
+        for place, prefix in enumerate(named):
+            name = f"{prefix}.termination"
+            if name in sums and of[name] is not None:
+                table = posterior(tables.termination[place])
+                assert table is not None
+                within = bounded(said[name].detach())
+                slope = 1 - (within / TERMINATION_BOUND).square()
+                ending = within.sigmoid()
+                weight = table.sum(-1, keepdim=True).double() * ending * (1 - ending) * slope.square()
+                x = xs[tuple(self.networks[name]._reads)]
+                sums[name].add(x, of[name], [Information(slice(0, 1), weight)], None)
+        return float(value.detach())
+
+    def _maximise(self, sums: dict[str, Sums]) -> None:
+        """The M-step."""
+        for name, own in sums.items():
+            if isinstance(own.gradient, float):
+                continue  # nothing depends on it in this stage
+            network = self.networks[name]
+            change = torch.zeros_like(network.weight)
+            std = self.stds.get(name)
+            value = None if std is None else std.value
+            for group, information, count in zip(own.groups, own.information, own.count, strict=True):
+                columns = group.columns
+                gradient, weight = own.gradient[..., columns], network.weight[..., columns]
+                if group.std:
+                    assert std is not None
+                    scale = std.value[:, list(group.std)].unsqueeze(1)  # [K, 1, n]
+                    ridge = _ridges(weight, self._ridge.policy)
+                    solved = torch.linalg.solve(
+                        information + torch.diag_embed(ridge), scale.square() * gradient - ridge.unsqueeze(-1) * weight
+                    )
+                    square = self._squares(std, own.std, group, information, count, gradient, weight, solved)
+                    learned = weight.shape[1] - 1 if self._ridge.policy else 0
+                    value = _merged(value, std.updated(square, count + learned, group.std), group.std)
+                else:
+                    solved = _damped(information, gradient, weight, network.ridge)
+                change[..., columns] = solved
+            network.weight = network.weight + change
+            if std is not None and std.trained and value is not None:
+                std.value = value
+
+    def _squares(
+        self, std: Std, of_std: Tensor | float, group: Information, information: Tensor, count: Tensor,
+        gradient: Tensor, weight: Tensor, change: Tensor,
+    ) -> Tensor:  # fmt: skip
+        """Σ w E[(a - W'^T x)²] + ρ ‖W'‖² of each copy and dimension, [K, n], from the gradient in σ (Fisher's
+        identity).
+        """
+        assert isinstance(of_std, Tensor)
+        sigma = std.value[:, list(group.std)]
+        before = sigma.square() * (count.unsqueeze(-1) + sigma * of_std[:, list(group.std)])
+        moved = (change * (information @ change)).sum(1) - 2 * sigma.square() * (change * gradient).sum(1)
+        new = weight + change
+        return before + moved + self._ridge.policy * new[:, :-1].square().sum(1)
+
+
+def _ridges(weight: Tensor, ridge: float) -> Tensor:
+    """The ridge of each feature, [K, F]."""
+    each = torch.full(weight.shape[:2], max(ridge, BIAS), dtype=weight.dtype)
+    each[:, -1] = BIAS
+    return each
+
+
+def _damped(information: Tensor, gradient: Tensor, weight: Tensor, ridge: float) -> Tensor:
+    """A Fisher scoring step [K, F, n], at most :data:`LARGEST` in any weight of a copy."""
+    copies, features, outputs = weight.shape
+    each = _ridges(weight, ridge)
+    right = gradient - each.unsqueeze(-1) * weight
+    if information.dim() == 4:  # a weight for each output
+        solved = torch.linalg.solve(information + torch.diag_embed(each).unsqueeze(1), right.mT.unsqueeze(-1))
+        step = solved.squeeze(-1).mT
+    else:
+        joint = information + torch.diag_embed(each.repeat(1, outputs))
+        step = torch.linalg.solve(joint, right.mT.reshape(copies, -1)).reshape(copies, outputs, features).mT
+    most = step.abs().amax((1, 2), keepdim=True)
+    return step * (LARGEST / most.clamp(min=LARGEST))
+
+
+def _merged(table: Tensor | None, other: Tensor, places: Sequence[int]) -> Tensor:
+    assert table is not None
+    merged = table.clone()
+    merged[:, list(places)] = other[:, list(places)]
+    return merged
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Where a part of the control stands in the outputs of a caller's network, and in σ."""
+
+    logits: slice
+    means: slice
+    std: tuple[int, ...]
+    dims: tuple[int, ...]
+    kind: str
+
+
+def _layout(caller: Caller, model: Hierarchy) -> Iterator[_Part]:
+    at, deviation = caller.sizes[0], 0
+    for dims, part in zip(model.scaling.groups, model.scaling.parts, strict=True):
+        first = at + 1 if part.continuous and part.exact else at
+        last = at + part.size
+        if part.continuous:
+            places = tuple(range(deviation, deviation + len(dims)))
+            deviation += len(dims)
+            yield _Part(slice(at, first), slice(first, last), places, dims, "continuous")
+        else:
+            yield _Part(slice(at, last), slice(last, last), (), dims, part.kind)
+        at = last
+
+
+def _emitted(
+    caller: Caller, model: Hierarchy, said: Tensor, std: Tensor, acting: Tensor, actions: Tensor
+) -> Iterator[Information]:
+    """What the posterior expects to learn of a caller's numbers, given how likely it acts, [N, T, K]."""
+    acting, seen = acting.double(), caller.std.of_state if caller.std is not None else []
+    last = said.shape[-1] - len(seen)
+    for part in _layout(caller, model):
+        if part.kind == "continuous":
+            weight = acting
+            if part.logits.stop > part.logits.start:  # a hurdle
+                at = (actions[..., list(part.dims)] == 0).all(-1, keepdim=True)
+                p = said[..., part.logits].sigmoid()
+                yield Information(part.logits, acting.unsqueeze(-1) * p * (1 - p))
+                weight = acting * ~at
+            if set(part.std) & set(seen):
+                columns = [last + seen.index(place) for place in part.std]
+                raw = said[..., columns] + caller.std.start[list(part.std)]  # type: ignore[union-attr]
+                sigma = caller.std.floor[list(part.std)] + softplus(raw)  # type: ignore[union-attr]
+                yield Information(part.means, weight.unsqueeze(-1) / sigma.square())
+                slope = raw.sigmoid() / sigma
+                yield Information(slice(columns[0], columns[-1] + 1), 2 * weight.unsqueeze(-1) * slope.square())
+            else:
+                yield Information(part.means, weight, std=part.std)
+        elif part.kind == "binary":
+            p = said[..., part.logits].sigmoid()
+            yield Information(part.logits, acting.unsqueeze(-1) * p * (1 - p))
+        else:
+            yield Information(part.logits, acting, said[..., part.logits].softmax(-1))

@@ -1,0 +1,150 @@
+"""Processes: jobs that work side by side (joblib), and ranks that train one restart together (``torch.distributed``).
+
+All ranks come to the same exchanges in the same order. Results are passed on in the order of the calls that gave them,
+whichever rank computed them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, TypeVar
+
+import joblib
+from joblib import Parallel, delayed
+from torch import distributed
+
+from ddco_pyro.errors import BadInput, Failed
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+ALL_CORES = -1
+"""The number of ``jobs`` that stands for one for each core."""
+
+
+class BackendError(BadInput):
+    """Work cannot be done by these processes or on this backend."""
+
+
+def check_jobs(jobs: int) -> None:
+    """Refuse what is no number of processes.
+
+    :raises BackendError: ``jobs`` is none.
+    """
+    if jobs != ALL_CORES and jobs < 1:
+        raise BackendError(f"--jobs {jobs}: give a number of processes, or -1 for one on each core")
+
+
+def useful_jobs(jobs: int, calls: int) -> int:
+    """The number of processes for so many calls, at most one for each call."""
+    return min(joblib.cpu_count() if jobs == ALL_CORES else jobs, calls)
+
+
+def pool(jobs: int) -> Parallel:
+    """Processes for :func:`results`, to be used in a ``with`` statement."""
+    # one call at a time: each takes long, and each result is kept at once
+    return Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1)
+
+
+def results(parallel: Parallel, calls: Iterable[Callable[[], Result]], dead: str) -> Iterator[Result]:
+    """The results of calls, as they are completed.
+
+    :param dead: the message for a process that dies.
+    :raises Failed: a process died.
+    """
+    try:
+        yield from parallel([delayed(call)() for call in calls])
+    except BrokenProcessPool as error:
+        raise Failed(dead) from error
+
+
+class LostProcess(Failed):
+    """A process that trained together with this one has ended."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "a process that trained together with this one was ended from outside (too little memory?); what was "
+            "trained is kept in a run folder: continue with the same command, with fewer --processes if memory was "
+            "short"
+        )
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """The processes that train a restart together.
+
+    :param rank: the number of this one; process 0 alone writes files and reports progress.
+    :param size: the number of processes.
+    """
+
+    rank: int = 0
+    size: int = 1
+
+    def share(self, value: Any = None) -> Any:
+        """The value that the first process gives, in each process.
+
+        :raises LostProcess: another process has ended.
+        """
+        if self.size == 1:
+            return value
+        values = [value]
+        with connected():
+            distributed.broadcast_object_list(values, src=0)
+        return values[0]
+
+    def own(self, items: Sequence[Item]) -> Sequence[Item]:
+        """The items that this process computes where :meth:`each` is called for all of them."""
+        return items[self.rank :: self.size]
+
+    def each(self, calls: Iterable[Callable[[], Result]]) -> Iterator[Result]:
+        """The results of calls in order, in each process; the processes take turns in computing them.
+
+        An error of a call is raised in each process.
+
+        :raises LostProcess: another process has ended.
+        """
+        if self.size == 1:
+            yield from (call() for call in calls)
+            return
+        left = iter(calls)
+        while turn := list(islice(left, self.size)):
+            for result in self._gathered(turn[self.rank] if self.rank < len(turn) else None)[: len(turn)]:
+                if isinstance(result, Exception):
+                    raise result
+                yield result
+
+    def _gathered(self, call: Callable[[], Any] | None) -> list[Any]:
+        """The result or error of each process's call; None without a call."""
+        result: Any = None
+        try:
+            result = None if call is None else call()
+        except Exception as error:  # the others wait for an answer
+            result = error
+        results: list[Any] = [None] * self.size
+        with connected():
+            distributed.all_gather_object(results, result)
+        return results
+
+
+ALONE = Ranks()
+"""A single process."""
+
+
+@contextmanager
+def connected() -> Iterator[None]:
+    """Inside, a closed connection raises :class:`LostProcess`; other errors are this process's own.
+
+    :raises LostProcess: a connection is closed.
+    """
+    try:
+        yield
+    except distributed.DistError as error:  # of a store
+        raise LostProcess from error
+    except RuntimeError as error:
+        if "/gloo/" not in str(error):  # gloo's errors begin with the place in its sources
+            raise
+        raise LostProcess from error

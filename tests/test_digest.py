@@ -1,0 +1,271 @@
+"""A run folder knows its demonstrations: what goes on from it, or shows it, refuses others in one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from command_line import call
+from selecting import DATA, data_at, two_skills
+
+import ddco_pyro
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.errors import BadInput
+from ddco_pyro.events import EpochEnded
+from ddco_pyro.fitting import digest as fitted_to
+from ddco_pyro.fitting.digest import difference, digest
+from ddco_pyro.fitting.merging import Pair, merge
+from ddco_pyro.spec import Spec, parse_spec, with_overrides
+
+FLAT = {"kind": "flat", "policy": {"network": "linear"}}
+REFUSED = (
+    "{folder}: is a run of other demonstrations ({what}); bring back those that it was fitted to, or choose another "
+    "--out for these"
+)
+
+
+def labelled() -> Demonstrations:
+    """With a label that is used, one that is not, and a mask."""
+    demos = two_skills()
+    records = tuple(
+        replace(one, labels={"phase": (np.arange(len(one)) > 3).astype(int), "other": np.zeros(len(one), int)})
+        for one in demos
+    )
+    return Demonstrations(records, {"valid": demos.names[:3], "few": demos.names[:2]})
+
+
+def spec_of(path: Path, **training: object) -> Spec:
+    data = {key: value for key, value in DATA.items() if key != "selection"}
+    return parse_spec(
+        {
+            **data,
+            "demonstrations": {"path": str(path), "labels": "phase"},
+            "compare_with": [FLAT],
+            "training": {**DATA["training"], "epochs": 4, **training},
+        }
+    )
+
+
+def edited(path: Path, edit: Callable[[h5py.File], object]) -> None:
+    with h5py.File(path, "r+") as file:
+        edit(file)
+
+
+def replaced(file: h5py.File, place: str, values: object) -> None:
+    del file[place]
+    file[place] = values
+
+
+CHANGES: dict[str, tuple[Callable[[h5py.File], object], str]] = {
+    "a control": (lambda file: file["data/demo_4/actions"].write_direct(np.ones((9, 2))), "actions changed"),
+    "an observation": (lambda file: file["data/demo_4/obs/turn"].__setitem__((0, 0), 7.0), "obs/turn changed"),
+    "two observations": (
+        lambda file: [file[f"data/demo_4/obs/{key}"].__setitem__((0, 0), 7.0) for key in ("place", "turn")],
+        "obs/place and obs/turn changed",
+    ),
+    "a label": (lambda file: file["data/demo_4/labels/phase"].__setitem__(0, 5), "labels/phase changed"),
+    "the mask": (lambda file: replaced(file, "mask/valid", [b"demo_7"]), "mask/valid changed"),
+    "no mask": (lambda file: file.__delitem__("mask/valid"), "mask/valid changed"),
+    "one more": (lambda file: file.copy("data/demo_4", file["data"], "demo_99"), "demo_99 is new"),
+    "others": (
+        lambda file: [file.move(f"data/demo_{n}", f"data/new_{n}") for n in (4, 5)],
+        "demo_4 and 1 more are missing and new_4 and 1 more are new",
+    ),
+}
+"""What of a file changes, and how that is said."""
+
+SAME: tuple[Callable[[h5py.File], object], ...] = (
+    lambda file: file["data/demo_4/labels/other"].__setitem__(0, 5),  # a label that is not used
+    lambda file: replaced(file, "mask/few", [b"demo_7"]),
+    lambda file: file.__setitem__("data/demo_4/obs/more", np.zeros((9, 1))),
+    lambda file: replaced(file, "data/demo_4/obs/turn", file["data/demo_4/obs/turn"][()].astype(np.float32)),
+)
+"""What makes no difference to a fit: turns are 1 and -1 in any type."""
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A spec, its demonstrations, their run, and one that was interrupted; nobody changes them."""
+    folder = tmp_path_factory.mktemp("finished")
+    labelled().write(folder / "demos.hdf5")
+    ddco_pyro.fit(spec_of(folder / "demos.hdf5"), out=folder / "run")
+    interrupt(spec_of(folder / "demos.hdf5"), folder / "interrupted")
+    return folder
+
+
+def interrupt(spec: Spec, folder: Path) -> None:
+    def stop(event: object) -> None:
+        if isinstance(event, EpochEnded) and event.epoch == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ddco_pyro.fit(spec, out=folder, on_event=stop)
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def changing(finished: Path):
+    """The same folder, whose file may be changed by a test; it is brought back."""
+    before = (finished / "demos.hdf5").read_bytes()
+    yield finished
+    (finished / "demos.hdf5").write_bytes(before)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_run_of_a_file_that_has_changed_is_not_continued_and_not_shown(changing: Path, change: str) -> None:
+    edit, what = CHANGES[change]
+    edited(changing / "demos.hdf5", edit)
+    before = contents(changing)
+    for name in ("run", "interrupted"):
+        ended = call("fit", changing / name / "spec.yaml", "--out", changing / name, "--resume")
+        assert (ended.status, ended.err) == (2, f"ddco-pyro: {REFUSED.format(folder=changing / name, what=what)}\n")
+    for command in (["report", changing / "run"], ["report", changing / "run" / "baselines" / "flat"],
+                    ["merge", changing / "run", "--out", changing / "merged"]):  # fmt: skip
+        ended = call(*command)
+        assert (ended.status, ended.err) == (2, f"ddco-pyro: {REFUSED.format(folder=command[1], what=what)}\n")
+    assert contents(changing) == before
+
+
+def test_what_makes_no_difference_is_not_refused(changing: Path, tmp_path: Path) -> None:
+    for edit in SAME:
+        edited(changing / "demos.hdf5", edit)
+    run = shutil.copytree(changing / "interrupted", tmp_path / "run")
+    ddco_pyro.fit(run / "spec.yaml", out=run)
+    assert (run / "model.safetensors").read_bytes() == (changing / "run" / "model.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda demos: replace(demos, masks={"valid": demos.names[3:5]}), "mask/valid changed"),
+        (
+            lambda demos: replace(
+                demos, demonstrations=tuple(replace(one, labels={"phase": np.ones(len(one), int)}) for one in demos)
+            ),
+            "labels/phase changed",
+        ),
+    ],
+    ids=["masks", "labels"],
+)
+def test_other_demonstrations_from_memory_are_refused(tmp_path: Path, change, what: str) -> None:
+    """A finished run of them is no result of these."""
+    spec = with_overrides(spec_of(tmp_path / "unused.hdf5"), {"compare_with": [], "training.epochs": 1})
+    fit = ddco_pyro.fit(spec, labelled(), out=tmp_path / "run")
+    assert ddco_pyro.fit(spec, labelled(), out=tmp_path / "run").metrics == fit.metrics
+    before = contents(tmp_path)
+    with pytest.raises(BadInput) as refused:
+        ddco_pyro.fit(spec, change(labelled()), out=tmp_path / "run")
+    assert str(refused.value) == REFUSED.format(folder=tmp_path / "run", what=what)
+    assert contents(tmp_path) == before
+
+
+def test_a_baseline_of_other_demonstrations_is_not_taken_over(finished: Path, tmp_path: Path) -> None:
+    """Copied from a run of the same spec; the run itself has still to be trained."""
+    path = finished / "demos.hdf5"
+    spec = with_overrides(spec_of(path), {"training.epochs": 1})
+    other = two_skills(seed=1)
+    replace(labelled(), demonstrations=tuple(replace(one, actions=new.actions)
+            for one, new in zip(labelled(), other, strict=True))).write(tmp_path / "demos.hdf5")  # fmt: skip
+    there = ddco_pyro.fit(spec, tmp_path / "demos.hdf5", out=tmp_path / "there")
+    flat = shutil.copytree(there.folder / "baselines", tmp_path / "here" / "baselines") / "flat"
+    for text in (flat / "spec.yaml",):
+        text.write_text(text.read_text().replace(str(tmp_path / "demos.hdf5"), str(path)))
+    shutil.copy(there.folder / "spec.yaml", tmp_path / "here")
+    here = tmp_path / "here" / "spec.yaml"
+    here.write_text(here.read_text().replace(str(tmp_path / "demos.hdf5"), str(path)))
+    with pytest.raises(BadInput, match=rf"^{flat}: is a run of other demonstrations \(actions changed\)"):
+        ddco_pyro.fit(spec, out=tmp_path / "here")
+
+
+def test_the_merger_of_another_pair_is_another_run(finished: Path, tmp_path: Path) -> None:
+    spec = with_overrides(spec_of(finished / "demos.hdf5"), {"hierarchy.levels.0.count": 3, "compare_with": []})
+    run = ddco_pyro.fit(with_overrides(spec, {"training.epochs": 1}))
+    merged = merge(run, Pair(0, (1, 2), None), out=tmp_path / "merged")
+    assert merge(run, Pair(0, (1, 2), None), out=tmp_path / "merged").metrics == merged.metrics
+    with pytest.raises(BadInput, match=r"holds options 1 and 2 of level 'option', merged"):
+        merge(run, Pair(0, (2, 3), None), out=tmp_path / "merged")
+
+
+def test_a_selection_of_a_file_that_has_changed_is_not_continued(tmp_path: Path) -> None:
+    """Its labels too, which no score depends on, but the fit of what is chosen does."""
+    data = data_at(tmp_path, labelled())
+    data["demonstrations"] |= {"labels": "phase"}
+    data["selection"] = {"folds": 2, "grid": {"training.epochs": [1, 2]}}
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(data))
+    command = ("select", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--jobs", "1")
+    assert call(*command).status == 0
+    edited(tmp_path / "demos.hdf5", CHANGES["a label"][0])
+    before = contents(tmp_path)
+    ended = call(*command, "--resume")
+    assert (ended.status, ended.err) == (
+        2, f"ddco-pyro: {REFUSED.format(folder=tmp_path / 'run', what='labels/phase changed')}\n",
+    )  # fmt: skip
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("written", [None, 1, 3])
+def test_a_run_of_another_version_is_to_be_fitted_again(finished: Path, tmp_path: Path, written: int | None) -> None:
+    said = f"this run was written by version {written or 1} of the run folder's format, and version 2 is read here"
+    for name in ("run", "interrupted"):
+        run = shutil.copytree(finished / name, tmp_path / name)
+        digest = json.loads((run / "demonstrations.json").read_text()) | {"format": written}
+        (run / "demonstrations.json").unlink()
+        if written is not None:
+            (run / "demonstrations.json").write_text(json.dumps(digest))
+        commands = [("fit", run / "spec.yaml", "--out", run, "--resume"), ("report", run)]
+        for command in commands if name == "run" else commands[:1]:
+            ended = call(*command)
+            assert (ended.status, ended.err) == (2, f"ddco-pyro: {run}: {said}: fit again\n")
+
+
+def test_a_damaged_digest_is_one_line(finished: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(finished / "run", tmp_path / "run")
+    for damaged in ("", "{}", '{"names": [1]}'):
+        (run / "demonstrations.json").write_text(damaged)
+        ended = call("fit", run / "spec.yaml", "--out", run, "--resume")
+        assert (ended.status, ended.err.count("\n")) == (2, 1)
+        assert ended.err.startswith(f"ddco-pyro: {run / 'demonstrations.json'}: is damaged: ")
+
+
+# --- the digest -------------------------------------------------------------------------------------------------------
+
+
+def test_the_digest_sees_every_number() -> None:
+    first, second = two_skills(3), two_skills(3)
+    assert difference(digest(first), digest(second)) == ""
+    second[2].observations["place"][1, 0] = np.nextafter(second[2].observations["place"][1, 0], 2)
+    assert difference(digest(first), digest(second)) == "obs/place changed"
+    backwards = Demonstrations(first.demonstrations[::-1])
+    assert difference(digest(first), digest(backwards)) == "their order differs"
+
+
+def test_pictures_are_read_once_and_again_where_their_file_has_changed(few_dots: Path, tmp_path: Path, monkeypatch):
+    """What is in the file decides, not when it was written: a copy is the same, an edit is not."""
+    read = []
+    monkeypatch.setattr(fitted_to, "blocks", lambda array: read.append(array) or [np.asarray(array)])
+
+    def pictures(path: Path, known: fitted_to.Digest | None) -> tuple[fitted_to.Digest, int]:
+        read.clear()
+        found = digest(Demonstrations.read(path), known)
+        return found, sum(not isinstance(array, np.ndarray) for array in read)
+
+    kept, number = pictures(few_dots, None)
+    assert number == len(kept.files) * 6 > 0
+    every = number
+    again, number = pictures(few_dots, kept)
+    assert (again, number) == (kept, 0)
+    path = Path(shutil.copyfile(few_dots, tmp_path / "copy.hdf5"))
+    copied, number = pictures(path, kept)
+    assert (difference(kept, copied), number) == ("", every)
+    edited(path, lambda file: file["data/demo_3/obs/camera"].__setitem__((0, 0, 0, 0), 9))
+    assert difference(copied, pictures(path, copied)[0]) == "obs/camera changed"

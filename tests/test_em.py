@@ -1,0 +1,278 @@
+"""Expectation-maximisation: closed forms, stationary points of the penalised likelihood, steps that never lower it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hierarchies import SHAPES, make_batch
+from planted import make_trainer
+from random_demonstrations import demonstrations
+from scipy import optimize, stats
+from sklearn.linear_model import LogisticRegression
+
+import ddco_pyro
+from ddco_pyro.data.controls import ControlPart
+from ddco_pyro.inference import log_likelihood
+from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import Inputs
+from ddco_pyro.spec import RidgeSpec, SpecError, parse_spec, with_overrides
+from ddco_pyro.training.checkpoint import Progress, Restart
+from ddco_pyro.training.em import Expectation, is_linear
+from ddco_pyro.training.loop import train
+from ddco_pyro.training.stages import effort
+
+EVERYTHING = ("levels.", "meta_policy.")
+LEARNED = {"learn": True, "floor": 0.01}
+CLIPPED = (ControlPart("arm", (0, 1), "clipped", (-0.8, -np.inf), (0.9, 1.0)),)
+MIXED = (ControlPart("arm", (0,), "clipped", (-0.8,), (0.9,)), ControlPart("jaw", (1,), "binary", (0.0,), (1.0,)))
+ACTIONS = (ControlPart("action", (0,), "categorical", values=(0.0, 1.0, 2.0)), ControlPart("b", (1,), "gaussian"))
+HURDLE = (ControlPart("stop", (0, 1), "hurdle", (-np.inf, -np.inf), (np.inf, np.inf), exact=(0.0, 0.0)),)
+
+
+def batch_for(parts, trajectories=12, steps=9):
+    """Random steps whose controls can be of these kinds, and are often on a bound or at a value."""
+    batch = make_batch(trajectories, steps)
+    actions, state = batch.actions.clone(), batch.inputs.vectors["state"]
+    for part in parts or ():
+        for place, dim in enumerate(part.dims):
+            drawn = actions[..., dim] + state[..., dim]
+            if part.kind == "clipped":
+                actions[..., dim] = drawn.clamp(part.low[place], part.high[place])
+            elif part.kind == "binary":
+                actions[..., dim] = (drawn > 0).float()
+            elif part.kind == "categorical":
+                actions[..., dim] = (drawn + 1).round().clamp(0, 2)
+            elif part.kind == "hurdle":
+                actions[..., dim] = torch.where(state[..., 2] > 0.3, 0.0, drawn)
+    return Batch(batch.inputs, actions, batch.lengths)
+
+
+def linear(counts, parts=None, emits=("options",), memoryless=(), **control):
+    """A random hierarchy of linear networks over three features, with these kinds of control."""
+    spec = {"network": "linear"}
+    levels = [
+        {"name": f"level-{number}", "count": count, "policy": {**spec, **({"emits": list(emits)} if number else {})},
+         "termination": "always" if number + 1 in memoryless else spec}
+        for number, count in enumerate(counts)
+    ]  # fmt: skip
+    whole = {"hierarchy": {"levels": levels, "meta_policy": {**spec, "emits": list(emits)}}}
+    if not counts:
+        whole = {"baseline": {"kind": "flat", "policy": spec}}
+    torch.manual_seed(0)
+    return Hierarchy(
+        parse_spec(
+            {"demonstrations": {"path": "unused"}, "observations": ["state"], "control": {"std": 0.7} | control} | whole
+        ),
+        SHAPES, 2, steps=9, parts=parts,
+    )  # fmt: skip
+
+
+def expectation(model, ridge, batch, trained=EVERYTHING, discovering=None):
+    def score(tables, piece, rows):
+        return log_likelihood(tables, piece.lengths).sum()
+
+    made = Expectation(model, trained, score, ridge, discovering)
+    values = []
+    for _ in range(400):
+        made.step(batch)
+        values.append(made.value)
+        if len(values) > 5 and values[-1] - values[-2] < 1e-11 * abs(values[-1]):
+            break
+    return made, values
+
+
+def penalised(model, batch, ridge):
+    """log p(ξ) and the log-prior of the ridges, by the formulas, differentiable in the model's parameters."""
+    value = log_likelihood(model.tabulate(batch), batch.lengths).sum()
+    for name, parameter in model.named_parameters():
+        if not name.endswith("weight"):
+            continue
+        if "termination" in name:
+            value = value - 0.5 * ridge.termination * parameter.square().sum()
+            continue
+        caller = model.get_submodule(name.split(".network.")[0])
+        logits, std = caller.sizes[0], caller.std
+        value = value - 0.5 * ridge.gate * parameter[..., :logits].square().sum()
+        at, place = logits, 0
+        for part in model.scaling.parts if std is not None else ():
+            if part.exact or not part.continuous:
+                last = at + (1 if part.exact else part.size)
+                value = value - 0.5 * ridge.gate * parameter[..., at:last].square().sum()
+                at = last
+            for _ in part.dims if part.continuous else ():
+                if place in std.of_state:
+                    value = value - 0.5 * ridge.gate * parameter[..., at].square().sum()
+                else:
+                    sigma = std().expand(parameter.shape[0], -1)[:, place]
+                    value = value - (0.5 * ridge.policy * parameter[..., at].square().sum(1) / sigma.square()).sum()
+                    if place in (*std.own, *std.shared):
+                        value = value - parameter.shape[1] * sigma.log().sum()
+                at, place = at + 1, place + 1
+        if std is not None and std.of_state:
+            value = value - 0.5 * ridge.gate * parameter[..., -len(std.of_state) :].square().sum()
+    return value
+
+
+CASES = {
+    "flat": ((), None, {}),
+    "options, sigma given": ((3,), None, {}),
+    "sigma of all options": ((3,), None, {"std": LEARNED}),
+    "sigma of each option": ((2,), None, {"std": {**LEARNED, "per_option": True}}),
+    "sigma of the state": ((2,), None, {"std": {**LEARNED, "per_state": True}}),
+    "clipped": ((3,), CLIPPED, {"std": {**LEARNED, "per_option": True}}),
+    "a switch beside": ((2,), MIXED, {"std": LEARNED}),
+    "discrete actions": ((2,), ACTIONS, {"std": LEARNED}),
+    "a hurdle": ((2,), HURDLE, {"std": {**LEARNED, "per_option": True}}),
+    "two levels": ((3, 2), CLIPPED, {"std": LEARNED}),
+    "hybrid, two levels": ((2, 2), None, {"std": LEARNED, "emits": ("options", "control")}),
+    "mixture": ((3,), None, {"std": {**LEARNED, "per_option": True}, "memoryless": (1,)}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_steps_never_lower_the_penalised_likelihood_and_end_where_its_gradient_is_zero(case):
+    """Checked by autograd on the networks in float64, and by the formula of the prior."""
+    counts, parts, others = CASES[case]
+    model, ridge = linear(counts, parts, **others).double(), RidgeSpec(policy=2.0, gate=1.5, termination=0.5)
+    batch = batch_for(parts)
+    assert is_linear(model)
+    made, values = expectation(model, ridge, batch)
+    assert np.diff(values).min() > -1e-9 * abs(values[-1])
+    assert values[-1] > values[0] + 1
+    inputs = Inputs({"state": batch.inputs.vectors["state"].double()}, {}, batch.inputs.time)
+    batch = Batch(inputs, batch.actions.double(), batch.lengths)
+    value = penalised(model, batch, ridge)
+    free = [(name, one) for name, one in model.named_parameters() if "raw" not in name or not _at_floor(model, name)]
+    gradients = torch.autograd.grad(value, [one for _, one in free])
+    for (name, _), gradient in zip(free, gradients, strict=True):
+        assert gradient.abs().max() < 2e-2, name
+    assert float(value.detach()) == pytest.approx(made.value, abs=0.1)  # of the weights before the last step
+
+
+def _at_floor(model, name):
+    caller = model.get_submodule(name.rsplit(".std.", 1)[0])
+    return bool((caller.std() < caller.std.floor + 2e-4).any())
+
+
+def test_only_what_is_trained_changes():
+    model, batch = linear((2,), std=LEARNED), batch_for(None)
+    before = {name: one.clone() for name, one in model.named_parameters()}
+    expectation(model, RidgeSpec(), batch, ("meta_policy.",))
+    changed = {name for name, one in model.named_parameters() if not torch.equal(one, before[name])}
+    assert changed == {"meta_policy.network.layers.0.weight", "meta_policy.network.layers.0.bias"}
+
+
+def rows_of(batch):
+    alive = batch.inputs.time < batch.lengths[:, None]
+    return batch.inputs.vectors["state"][alive].double().numpy(), batch.actions[alive].double().numpy()
+
+
+def test_a_flat_policy_is_least_squares():
+    """Without a ridge: numpy's least squares and the residuals' standard deviation."""
+    model, batch = linear((), std=LEARNED), batch_for(None)
+    expectation(model, RidgeSpec(policy=0, gate=0, termination=0), batch)
+    x, a = rows_of(batch)
+    with_one = np.hstack([x, np.ones((len(x), 1))])
+    solved, *_ = np.linalg.lstsq(with_one, a, rcond=None)
+    layer = model.meta_policy.network.layers[0]
+    np.testing.assert_allclose(layer.weight[0].detach(), solved[:-1], atol=1e-5)
+    np.testing.assert_allclose(layer.bias[0, 0].detach(), solved[-1], atol=1e-5)
+    np.testing.assert_allclose(model.meta_policy.std().detach(), (a - with_one @ solved).std(0), rtol=1e-5)
+
+
+def test_a_flat_clipped_policy_is_the_censored_regression_that_scipy_finds():
+    """The Tobit model's likelihood is maximised by BFGS from other weights."""
+    model, batch = linear((), CLIPPED, std=LEARNED), batch_for(CLIPPED)
+    expectation(model, RidgeSpec(policy=0, gate=0, termination=0), batch)
+    x, a = rows_of(batch)
+    with_one = np.hstack([x, np.ones((len(x), 1))])
+    layer = model.meta_policy.network.layers[0]
+    for dim in range(2):
+        low, high = CLIPPED[0].low[dim], CLIPPED[0].high[dim]
+
+        def loss(values, dim=dim, low=low, high=high):
+            mean, sigma = with_one @ values[:-1], np.exp(values[-1])
+            each = stats.norm.logpdf(a[:, dim], mean, sigma)
+            each = np.where(a[:, dim] <= np.float32(low), stats.norm.logcdf(low, mean, sigma), each)
+            return -np.where(a[:, dim] >= np.float32(high), stats.norm.logsf(high, mean, sigma), each).sum()
+
+        best = optimize.minimize(loss, np.zeros(5)).x
+        np.testing.assert_allclose(layer.weight[0, :, dim].detach(), best[:3], atol=2e-4)
+        np.testing.assert_allclose(model.meta_policy.std()[dim].detach(), np.exp(best[-1]), rtol=1e-3)
+
+
+def test_a_flat_switch_is_the_logistic_regression_of_scikit_learn():
+    parts = (ControlPart("jaw", (0,), "binary", (0.0,), (1.0,)), ControlPart("b", (1,), "gaussian"))
+    model, batch = linear((), parts), batch_for(parts)
+    expectation(model, RidgeSpec(gate=2.0), batch)
+    x, a = rows_of(batch)
+    truth = LogisticRegression(C=0.5, tol=1e-10, max_iter=1000).fit(x, a[:, 0])
+    layer = model.meta_policy.network.layers[0]
+    np.testing.assert_allclose(layer.weight[0, :, 0].detach(), truth.coef_[0], atol=1e-4)
+    np.testing.assert_allclose(layer.bias[0, 0, 0].detach(), truth.intercept_[0], atol=1e-4)
+
+
+def test_a_dead_option_keeps_finite_weights():
+    """No step belongs to the second option: its evidence forbids it."""
+    model, batch = linear((2,), std={**LEARNED, "per_option": True}), batch_for(None)
+
+    def score(tables, piece, rows):
+        first = torch.ones(piece.inputs.batch, dtype=torch.long)
+        return log_likelihood(tables.clamp(1, first), piece.lengths).sum()
+
+    made = Expectation(model, EVERYTHING, score, RidgeSpec())
+    for _ in range(20):
+        made.step(batch)
+    assert all(bool(torch.isfinite(one).all()) for one in model.parameters())
+
+
+def small_spec(**training):
+    network = {"network": "linear"}
+    return parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.2},
+            "observations": ["pose"],
+            "control": {"std": {**LEARNED, "per_option": True}},
+            "hierarchy": {
+                "levels": [{"count": 2, "policy": network, "termination": network}],
+                "meta_policy": network,
+            },
+            "compare_with": ["mixture", {"kind": "flat", "policy": {"network": "mlp", "hidden": [4]}}],
+            "training": {"optimizer": {"name": "em"}, "epochs": 60, **training},
+        }
+    )
+
+
+def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
+    fit = ddco_pyro.fit(small_spec(), demonstrations(12))
+    trained = {"ddco": fit.metrics["training"]} | {
+        name: one["training"] for name, one in fit.metrics["comparison"].items()
+    }
+    assert {name: one["by_em"] for name, one in trained.items()} == {"ddco": True, "mixture": True, "flat": False}
+    assert trained["ddco"]["spent"]["gradient_steps"] == trained["ddco"]["spent"]["epochs"]
+    assert "(EM)" in effort(trained["ddco"])
+
+
+def test_a_fit_by_em_that_is_interrupted_has_the_same_bits(tmp_path):
+    spec, demos = small_spec(), demonstrations(12)
+    whole, cut = (make_trainer(spec, demos, tmp_path / name) for name in ("whole", "cut"))
+    expected = train(whole.data, Restart(Progress(0)))
+    path = tmp_path / "restart.safetensors"
+    restart = Restart(Progress(0))
+    for _ in range(1000):
+        restart = train(cut.data, restart, seconds=0.0)
+        if restart.progress.done:
+            break
+        restart.write(path)
+        restart = Restart.read(path)
+    assert restart.progress.history == expected.progress.history
+    for name, value in expected.states["best"].items():
+        assert torch.equal(restart.states["best"][name], value), name
+
+
+def test_a_spec_that_em_would_not_follow_is_refused():
+    for key, value in (("training.average", 0.9), ("training.clip_gradient", 1.0), ("training.optimizer.warmup", 2)):
+        with pytest.raises(SpecError, match=f"{key}: em"):
+            with_overrides(small_spec(), {key: value})
