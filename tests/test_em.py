@@ -83,11 +83,11 @@ def expectation(model, ridge, batch, trained=EVERYTHING, discovering=None):
     return made, values
 
 
-def penalised(model, batch, ridge):
+def penalised(model, batch, ridge, discovering=None):
     """log p(ξ) and the log-prior of the ridges, by the formulas, differentiable in the model's parameters."""
-    value = log_likelihood(model.tabulate(batch), batch.lengths).sum()
+    value = log_likelihood(model.tabulate(batch, discovering), batch.lengths).sum()
     for name, parameter in model.named_parameters():
-        if not name.endswith("weight"):
+        if not name.endswith("weight") or (discovering and name.startswith("meta_policy")):
             continue
         if "termination" in name:
             value = value - 0.5 * ridge.termination * parameter.square().sum()
@@ -149,6 +149,21 @@ def test_steps_never_lower_the_penalised_likelihood_and_end_where_its_gradient_i
     for (name, _), gradient in zip(free, gradients, strict=True):
         assert gradient.abs().max() < 2e-2, name
     assert float(value.detach()) == pytest.approx(made.value, abs=0.1)  # of the weights before the last step
+
+
+@pytest.mark.parametrize("discovering", [1, 2])
+def test_levels_are_discovered_under_a_uniform_meta_policy(discovering):
+    """Every weight of the levels that are there ends where the gradient is zero, those that select among options too."""
+    model, ridge, batch = linear((2, 2), std=LEARNED).double(), RidgeSpec(), batch_for(None)
+    expectation(model, ridge, batch, ("levels.",), discovering)
+    inputs = Inputs({"state": batch.inputs.vectors["state"].double()}, {}, batch.inputs.time)
+    whole = Batch(inputs, batch.actions.double(), batch.lengths)
+    levels = tuple(f"levels.{level}." for level in range(discovering))
+    there = [(name, one) for name, one in model.named_parameters() if name.startswith(levels)]
+    assert len(there) == 5 * discovering - (discovering == 2)  # the second level has no σ
+    gradients = torch.autograd.grad(penalised(model, whole, ridge, discovering), [one for _, one in there])
+    for (name, _), gradient in zip(there, gradients, strict=True):
+        assert gradient.abs().max() < 2e-2, name
 
 
 def _at_floor(model, name):

@@ -39,7 +39,7 @@ ABOVE_FLOOR = 1e-4
 TOLERANCE = 1e-5
 """EM has converged where a step gains less, in nats per step of the demonstrations."""
 BIAS = 1e-6
-"""Ridge of biases: an option that is never active keeps its own."""
+"""Ridge of biases, and the least of weights: an option that is never active keeps its own."""
 
 Score = Callable[[Tables, Batch, Tensor], Tensor]
 """What is maximised of a piece of the demonstrations, nats: its tables, itself, and its rows."""
@@ -122,12 +122,12 @@ class Linear:
         assert isinstance(network, Mlp)  # is_linear
         (layer,) = network.layers
         assert isinstance(layer, StackedLinear)
-        self.layer, self.ridge, self.trained, self._reads = layer, ridge, trained, network.reads
-        self.weight = torch.cat([layer.weight.detach(), layer.bias.detach()], dim=1).double()
+        self.layer, self.ridge, self.trained, self.reads = layer, ridge, trained, tuple(network.reads)
+        self.weight = torch.cat([layer.weight.detach(), layer.bias.detach()], dim=1).double().cpu()
 
     def features(self, inputs: Inputs) -> Tensor:
         """x, [N, T, F]."""
-        vector = inputs.select(self._reads).vector.double()
+        vector = inputs.select(self.reads).vector.double()
         return torch.cat([vector, vector.new_ones(*vector.shape[:-1], 1)], dim=-1)
 
     def outputs(self, x: Tensor) -> Tensor:
@@ -196,14 +196,17 @@ class Expectation:
         discovering: int | None = None,
     ) -> None:
         self.model, self._score, self._discovering, self._ridge = model, score, discovering, ridge
-        self.networks: dict[str, Linear] = {}
-        self.stds: dict[str, Std] = {}
+        levels = {f"levels.{number}.policy": level.policy for number, level in enumerate(model.option_levels())}
+        self._callers = {**levels, "meta_policy": model.meta_policy}
+        self._networks: dict[str, Linear] = {}
         for name, network in model.networks().items():
             kind = ridge.termination if name.endswith("termination") else ridge.gate
-            self.networks[name] = Linear(network, kind, f"{name}.".startswith(trained))
-        for name, caller in self._callers():
-            if caller.std is not None:
-                self.stds[name] = Std(caller, f"{name}.".startswith(trained))
+            self._networks[name] = Linear(network, kind, f"{name}.".startswith(trained))
+        self._stds = {
+            name: Std(caller, self._networks[name].trained)
+            for name, caller in self._callers.items()
+            if caller.std is not None
+        }
         self._before: dict[str, Tensor] | None = None
         self.value, self.gain = -math.inf, math.inf
 
@@ -211,11 +214,6 @@ class Expectation:
     def converged(self) -> bool:
         """Whether the last step gained less than :data:`TOLERANCE`."""
         return self.gain < TOLERANCE
-
-    def _callers(self) -> Iterator[tuple[str, Caller]]:
-        for number, level in enumerate(self.model.option_levels()):
-            yield f"levels.{number}.policy", level.policy
-        yield "meta_policy", self.model.meta_policy
 
     def states(self) -> dict[str, Tensor]:
         """What a checkpoint keeps: the weights in float64, and those before the last step with their value."""
@@ -241,7 +239,8 @@ class Expectation:
         for _ in range(HALVINGS):
             if self._before is None or penalised >= self.value - 1e-9 * abs(self.value):
                 break
-            self._restore({name: 0.5 * (old + new) for (name, old), new in self._both()})
+            now = self._state()
+            self._restore({name: 0.5 * (old + now[name]) for name, old in self._before.items()})
             value, sums = self._expect(batch)
             penalised = value + self._penalty()
         else:
@@ -251,62 +250,47 @@ class Expectation:
             penalised = value + self._penalty()
         self.gain, self.value, self._before = (penalised - self.value) / batch.steps, penalised, self._state()
         self._maximise(sums)
-        for network in self.networks.values():
-            if network.trained:
-                network.store()
-        for std in self.stds.values():
-            if std.trained:
-                std.store()
+        for name in sums:
+            self._networks[name].store()
+            if name in self._stds:
+                self._stds[name].store()
         return value
 
     def _state(self) -> dict[str, Tensor]:
-        weights = {name: network.weight for name, network in self.networks.items()}
-        return weights | {f"{name}.std": std.value for name, std in self.stds.items()}
-
-    def _both(self) -> Iterator[tuple[tuple[str, Tensor], Tensor]]:
-        assert self._before is not None
-        now = self._state()
-        return ((item, now[item[0]]) for item in self._before.items())
+        weights = {name: network.weight for name, network in self._networks.items()}
+        return weights | {f"{name}.std": std.value for name, std in self._stds.items()}
 
     def _restore(self, state: Mapping[str, Tensor]) -> None:
-        for name, network in self.networks.items():
+        for name, network in self._networks.items():
             network.weight = state[name]
-        for name, std in self.stds.items():
+        for name, std in self._stds.items():
             std.value = state[f"{name}.std"]
 
     def _penalty(self) -> float:
         """The log-density of the prior that the ridges stand for, up to a constant, of what is trained."""
         total = 0.0
-        for name, network in self.networks.items():
+        for name, network in self._networks.items():
             if not network.trained:
                 continue
-            weight = network.weight[:, :-1]
-            squares = weight.square().sum(1)  # [K, n]
-            own = torch.full_like(squares, network.ridge)
-            if name in self.stds:
-                std = self.stds[name]
-                for columns, places in self._means(name):
-                    scale = std.value[:, list(places)]
-                    own[:, columns] = self._ridge.policy / scale.square()
-                    total -= weight.shape[1] * float(self._free_log(std, places)) * bool(self._ridge.policy)
-            total -= 0.5 * float((own * squares).sum())
+            weight = network.weight
+            each = _penalties(weight, network.ridge)
+            for part in _layout(self._callers[name], self.model) if name in self._stds else ():
+                std = self._stds[name]
+                if part.std and not set(part.std) & set(std.module.of_state):
+                    sigma = std.value[:, list(part.std)]
+                    each[:, part.means] = _penalties(weight[..., part.means], self._ridge.policy) / sigma.square()
+                    learned = [place for place in part.std if place in (*std.module.own, *std.module.shared)]
+                    total -= self._prior_count(weight) * float(std.value[:, learned].log().sum())
+            total -= 0.5 * float(each.sum())
         return total
 
-    @staticmethod
-    def _free_log(std: Std, places: Sequence[int]) -> Tensor:
-        learned = [place for place in places if place in (*std.module.own, *std.module.shared)]
-        return std.value[:, learned].log().sum()
-
-    def _means(self, name: str) -> Iterator[tuple[slice, tuple[int, ...]]]:
-        """The columns of means whose σ does not depend on the state, and the places of σ."""
-        caller = dict(self._callers())[name]
-        for group in _layout(caller, self.model):
-            if group.std and not set(group.std) & set(self.stds[name].module.of_state):
-                yield group.means, group.std
+    def _prior_count(self, weight: Tensor) -> int:
+        """How many numbers a mean's prior N(0, σ²/ρ) is of: the weights without the bias."""
+        return weight.shape[1] - 1 if self._ridge.policy else 0
 
     def _expect(self, batch: Batch) -> tuple[float, dict[str, Sums]]:
         """The E-step: the score, and the sums that the M-step solves for each network that is trained."""
-        total, sums = 0.0, {name: Sums() for name, network in self.networks.items() if network.trained}
+        total, sums = 0.0, {name: Sums() for name, network in self._networks.items() if network.trained}
         for rows, piece in batch.pieces(self.model.steps_at_once):
             total += self._expect_piece(rows, piece, sums)
         return total, sums
@@ -315,12 +299,14 @@ class Expectation:
         levels = self.model.option_levels()[: self._discovering]
         xs: dict[tuple[str, ...], Tensor] = {}
         said: dict[str, Tensor] = {}
-        for name, network in self.networks.items():
-            key = tuple(network._reads)
-            xs.setdefault(key, network.features(piece.inputs))
-            said[name] = network.outputs(xs[key]).requires_grad_()
-        stds = {name: std.value.clone().requires_grad_() for name, std in self.stds.items()}
-        callers = {name: caller(said[name], self.model.scaling, stds.get(name)) for name, caller in self._callers()}
+        for name, network in self._networks.items():
+            if network.reads not in xs:
+                xs[network.reads] = network.features(piece.inputs)
+            said[name] = network.outputs(xs[network.reads]).requires_grad_()
+        stds = {name: std.value.clone().requires_grad_() for name, std in self._stds.items()}
+        callers = {
+            name: caller(said[name], self.model.scaling, stds.get(name)) for name, caller in self._callers.items()
+        }
         named = [f"levels.{number}" for number in range(len(levels))]
         logits = [said[f"{name}.termination"].squeeze(-1) if f"{name}.termination" in said else None for name in named]
         top = callers["meta_policy"]
@@ -341,12 +327,11 @@ class Expectation:
             return None if table is None else of_table.get(id(table))
 
         every = [*(f"{name}.policy" for name in named), *([] if self._discovering else ["meta_policy"])]
-        selecting = [name for name in every if callers[name].options]
-        selection = dict(zip(selecting, tables.selection[-len(selecting) :] if selecting else (), strict=False))
+        selection = dict(zip((name for name in every if callers[name].options), tables.selection, strict=False))
         for place, name in enumerate(every):
             if name not in sums or of[name] is None:
                 continue
-            caller, groups = dict(self._callers())[name], []
+            caller, groups = self._callers[name], list[Information]()
             choices = posterior(selection.get(name))
             if caller.sizes[0] and choices is not None:
                 extra = choices.shape[-1] - caller.sizes[0]
@@ -355,11 +340,10 @@ class Expectation:
             acting = posterior(tables.control[place])
             if caller.std is not None and acting is not None:
                 emitted = _emitted(
-                    caller, self.model, said[name].detach(), self.stds[name].value, acting, piece.actions
+                    caller, self.model, said[name].detach(), self._stds[name].value, acting, piece.actions
                 )
                 groups.extend(emitted)
-            x = xs[tuple(self.networks[name]._reads)]
-            sums[name].add(x, of[name], groups, of_std.get(name))
+            sums[name].add(xs[self._networks[name].reads], of[name], groups, of_std.get(name))
         for place, prefix in enumerate(named):
             name = f"{prefix}.termination"
             if name in sums and of[name] is not None:
@@ -369,8 +353,7 @@ class Expectation:
                 slope = 1 - (within / TERMINATION_BOUND).square()
                 ending = within.sigmoid()
                 weight = table.sum(-1, keepdim=True).double() * ending * (1 - ending) * slope.square()
-                x = xs[tuple(self.networks[name]._reads)]
-                sums[name].add(x, of[name], [Information(slice(0, 1), weight)], None)
+                sums[name].add(xs[self._networks[name].reads], of[name], [Information(slice(0, 1), weight)], None)
         return float(value.detach())
 
     def _maximise(self, sums: dict[str, Sums]) -> None:
@@ -378,9 +361,9 @@ class Expectation:
         for name, own in sums.items():
             if isinstance(own.gradient, float):
                 continue  # nothing depends on it in this stage
-            network = self.networks[name]
+            network = self._networks[name]
             change = torch.zeros_like(network.weight)
-            std = self.stds.get(name)
+            std = self._stds.get(name)
             value = None if std is None else std.value
             for group, information, count in zip(own.groups, own.information, own.count, strict=True):
                 columns = group.columns
@@ -393,8 +376,7 @@ class Expectation:
                         information + torch.diag_embed(ridge), scale.square() * gradient - ridge.unsqueeze(-1) * weight
                     )
                     square = self._squares(std, own.std, group, information, count, gradient, weight, solved)
-                    learned = weight.shape[1] - 1 if self._ridge.policy else 0
-                    value = _merged(value, std.updated(square, count + learned, group.std), group.std)
+                    value = _merged(value, std.updated(square, count + self._prior_count(weight), group.std), group.std)
                 else:
                     solved = _damped(information, gradient, weight, network.ridge)
                 change[..., columns] = solved
@@ -406,15 +388,14 @@ class Expectation:
         self, std: Std, of_std: Tensor | float, group: Information, information: Tensor, count: Tensor,
         gradient: Tensor, weight: Tensor, change: Tensor,
     ) -> Tensor:  # fmt: skip
-        """Σ w E[(a - W'^T x)²] + ρ ‖W'‖² of each copy and dimension, [K, n], from the gradient in σ (Fisher's
+        """Σ w E[(a - W'^T x)²] + Σ_f ρ_f W'_f² of each copy and dimension, [K, n], from the gradient in σ (Fisher's
         identity).
         """
         assert isinstance(of_std, Tensor)
         sigma = std.value[:, list(group.std)]
         before = sigma.square() * (count.unsqueeze(-1) + sigma * of_std[:, list(group.std)])
         moved = (change * (information @ change)).sum(1) - 2 * sigma.square() * (change * gradient).sum(1)
-        new = weight + change
-        return before + moved + self._ridge.policy * new[:, :-1].square().sum(1)
+        return before + moved + _penalties(weight + change, self._ridge.policy)
 
 
 def _ridges(weight: Tensor, ridge: float) -> Tensor:
@@ -422,6 +403,11 @@ def _ridges(weight: Tensor, ridge: float) -> Tensor:
     each = torch.full(weight.shape[:2], max(ridge, BIAS), dtype=weight.dtype)
     each[:, -1] = BIAS
     return each
+
+
+def _penalties(weight: Tensor, ridge: float) -> Tensor:
+    """Σ_f ρ_f W_f² of each copy and output, [K, n]."""
+    return (_ridges(weight, ridge).unsqueeze(-1) * weight.square()).sum(1)
 
 
 def _damped(information: Tensor, gradient: Tensor, weight: Tensor, ridge: float) -> Tensor:
