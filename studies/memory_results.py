@@ -149,6 +149,7 @@ def _compared(named: Row, rows: Sequence[Row], pages: Sequence[Row]) -> Row:
     }
     mixture = values[MIXTURE]
     found = named | {"values": values, "seeds": sorted(mixture)}
+    found["apart"] = max(map(abs, paired(values[AGAIN], values[OPTIONS])), default=None)
     found["mean"] = {name: over_seeds([own[seed] for seed in mixture if seed in own]) for name, own in values.items()}
     found["difference"] = {
         f"{more} - {less}": over_seeds(paired(values[more], values[less])) for more, less in DIFFERENCES
@@ -176,6 +177,8 @@ def over_tasks(found: Sequence[Row]) -> list[Row]:
     for group in groups.values():
         named = {key: group[0][key] for key in KEY} | {"task": f"mean of {len(group)} tasks"}
         named["seeds"] = sorted({seed for one in group for seed in one["seeds"]})
+        named["fewest"] = min(len(one["seeds"]) for one in group)
+        named["apart"] = max((one["apart"] for one in group if one["apart"] is not None), default=None)
         whole.append(named | {part: _over(group, part) for part in ("mean", "difference")})
     return whole
 
@@ -219,8 +222,14 @@ def table(found: Sequence[Row]) -> list[str]:
         cells = [name, str(one["demonstrations"]), one["measure"] + acting]
         cells += [_mean(one, method) for method in (FLAT, EQUAL, MIXTURE, OPTIONS, AGAIN)]
         cells += [_difference(one, more, less) for more, less in DIFFERENCES]
-        lines.append(f"| {' | '.join([*cells, str(len(one['seeds']))])} |")
+        lines.append(f"| {' | '.join([*cells, _seeds(one)])} |")
     return lines
+
+
+def _seeds(one: Row) -> str:
+    """How many seeds: of a mean over tasks of which some have fewer, ``1 to 3``."""
+    most, fewest = len(one["seeds"]), one.get("fewest", len(one["seeds"]))
+    return str(most) if fewest == most else f"{fewest} to {most}"
 
 
 def _mean(one: Row, method: str) -> str:
@@ -318,18 +327,38 @@ def short(found: Sequence[Row]) -> str:
         seeds = len(one["seeds"])
         again = one["study"] == "arena" or len(one["difference"][f"{AGAIN} - {MIXTURE}"].get("by_seed", ())) == seeds
         name = NAMED[one["study"]] + (f", {one['task']}" if one["task"] != one["study"] else "")
-        cells = [name, str(one["demonstrations"]), measure.partition(",")[0], _difference(one, MIXTURE, FLAT)]
-        lines.append(f"| {' | '.join([*cells, _difference(one, AGAIN if again else OPTIONS, MIXTURE), str(seeds)])} |")
+        cells = [name, str(one["demonstrations"]), measure.partition(",")[0], _marked(one, MIXTURE, FLAT)]
+        lasting = _difference(one, AGAIN, MIXTURE) if again else _marked(one, OPTIONS, MIXTURE)
+        lines.append(f"| {' | '.join([*cells, lasting, _seeds(one)])} |")
     return "\n".join(lines)
 
 
-BEGIN, END = "<!-- begin: python studies/memory.py page -->\n", "\n<!-- end -->"
+SMALL = 0.1
+"""The part of a difference that a fit by another code may change before the difference is marked."""
+
+
+def _marked(one: Row, more: str, less: str) -> str:
+    """A difference one side of which another code has fitted.
+
+    The difference is marked, and not bold, where options of that code differ from those fitted again by more than a
+    small part of the difference, or where none was fitted again.
+    """
+    shown, mean = _difference(one, more, less), one["difference"][f"{more} - {less}"]["mean"]
+    if mean is None or (one["apart"] is not None and one["apart"] <= SMALL * abs(mean)):
+        return shown
+    return f"{shown.strip('*')} †"
+
+
+BEGIN, END = "<!-- begin: python studies/memory.py page -->", "<!-- end -->"
 
 
 def with_table(text: str, table: str) -> str:
-    """A text whose table between :data:`BEGIN` and :data:`END` is this one."""
-    before, _, rest = text.partition(BEGIN)
-    return f"{before}{BEGIN}{table}{END}{rest.partition(END)[2]}"
+    """A text whose table between :data:`BEGIN` and :data:`END` is this one.
+
+    :raises ValueError: the text has no such place.
+    """
+    first = text.index(BEGIN) + len(BEGIN)
+    return f"{text[:first]}\n{table}\n{text[text.index(END, first) :]}"
 
 
 # --- the figure -------------------------------------------------------------------------------------------------------

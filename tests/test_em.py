@@ -153,7 +153,7 @@ def test_steps_never_lower_the_penalised_likelihood_and_end_where_its_gradient_i
 
 @pytest.mark.parametrize("discovering", [1, 2])
 def test_levels_are_discovered_under_a_uniform_meta_policy(discovering):
-    """Every weight of the levels that are there ends where the gradient is zero, those that select among options too."""
+    """All weights of the levels end where the gradient is zero, those that select among options too."""
     model, ridge, batch = linear((2, 2), std=LEARNED).double(), RidgeSpec(), batch_for(None)
     expectation(model, ridge, batch, ("levels.",), discovering)
     inputs = Inputs({"state": batch.inputs.vectors["state"].double()}, {}, batch.inputs.time)
@@ -288,6 +288,9 @@ def test_a_fit_by_em_that_is_interrupted_has_the_same_bits(tmp_path):
 
 
 def test_a_spec_that_em_would_not_follow_is_refused():
+    seen = [{"key": "pose", "augment": {"versions": "others"}}]
+    with pytest.raises(SpecError, match=r"observations\.0\.augment\.versions: em sees"):
+        with_overrides(small_spec(), {"observations": seen})
     for key, value in (("training.average", 0.9), ("training.clip_gradient", 1.0), ("training.optimizer.warmup", 2)):
         with pytest.raises(SpecError, match=f"{key}: em"):
             with_overrides(small_spec(), {key: value})

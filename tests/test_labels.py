@@ -103,7 +103,7 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
 def test_its_gradient_is_that_of_finite_differences():
     material = make(labelled(), random_demonstrations())
     model = material.hierarchy(0)
-    assert model.step_bytes > 0  # counted while it is as it was built
+    assert model.step_bytes > 0  # counted on the model as built
     model = model.double()
     double = material.train.inputs.map(torch.Tensor.double, torch.arange(STEPS))
     material = replace(material, train=replace(material.train, inputs=double))

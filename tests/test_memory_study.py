@@ -130,4 +130,7 @@ def test_the_table_of_readme_is_that_of_the_page():
     readme = (ROOT / "README.md").read_text()
     assert with_table(readme, short(found)) == readme
     assert short(found).count("\n") > 5
-    assert with_table(readme, "other") != readme
+    other = with_table(readme, "other")
+    assert other == readme.replace(short(found), "other") != readme  # what stands around the table stays
+    with pytest.raises(ValueError, match="substring not found"):
+        with_table("no table", "other")

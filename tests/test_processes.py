@@ -81,7 +81,7 @@ def test_the_gradient_of_four_shards_is_that_of_one(demos, rows, dtype, close):
     for count in (1, 4):
         data = Trainer(make_spec(shards=count), Dimensions.of(demos), *demos.split(0.2, 0)).data
         model = data.hierarchy(0)
-        assert model.step_bytes > 0  # counted while it is as it was built
+        assert model.step_bytes > 0  # counted on the model as built
         batches = [
             replace(batch, inputs=batch.inputs.map(lambda array: array.to(dtype), batch.inputs.time))
             for batch in (data.train, data.tune)

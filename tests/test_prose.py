@@ -16,7 +16,14 @@ TURNS = (
     "of its own accord", "as it was", "as they were",
 )  # fmt: skip
 
-PLACES = {"ddco_pyro": "**/*.py", "ddco_pyro/drawing": "*.j2", "docs": "**/*.md", "specs": "*.yaml", ".": "README.md"}
+PLACES = {
+    "ddco_pyro": "**/*.py",
+    "ddco_pyro/drawing": "*.j2",
+    "ddco_pyro/data": "*.j2",
+    "docs": "**/*.md",
+    "specs": "*.yaml",
+    ".": "README.md",
+}
 FILES = [
     path
     for folder, pattern in PLACES.items()

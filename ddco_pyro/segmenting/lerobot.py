@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -28,11 +29,12 @@ def subtask_names(level: str, count: int) -> list[str]:
     return ["control", *(f"{level} {option}" for option in range(1, 1 + count))]
 
 
-class Form:
+class Form(ABC):
     """How a dataset holds subtasks: ``features`` are the entries of the new columns in ``meta/info.json``."""
 
     features: ClassVar[dict[str, Any]]
 
+    @abstractmethod
     def columns(self, rows: pyarrow.Table, options: np.ndarray, names: list[str]) -> dict[str, pyarrow.Array]:
         """The new columns of an episode.
 
@@ -40,7 +42,6 @@ class Form:
         :param options: the option of each row [T].
         :param names: the subtask of each option.
         """
-        raise NotImplementedError
 
     def tables(self, names: list[str]) -> dict[Path, pyarrow.Table]:
         """Further files of the dataset."""

@@ -104,10 +104,21 @@ class Task:
             registered, or a space has another type.
         """
         try:
-            from ddco_pyro.simulation.environments import task_of
+            from ddco_pyro.simulation.gymnasium_environment import GymnasiumEnvironment
         except ModuleNotFoundError as error:
             raise BadInput(f"{id}: needs {error.name}; install it with: pip install 'ddco-pyro[gymnasium]'") from error
-        return task_of(id, policies or {}, sources, options)
+        example = GymnasiumEnvironment(id, 0, options)
+        example.close()
+        return cls(
+            name=id.partition(":")[2] or id,
+            load=lambda seed: GymnasiumEnvironment(id, seed, options),
+            policies=policies or {},
+            outcome=GymnasiumEnvironment.outcome,
+            frame=GymnasiumEnvironment.frame,
+            sources=sources,
+            steps=example.steps,
+            measures={"success": "rate", "return": "mean"},
+        )
 
     def watched(self, seed: int, observed: Collection[str]) -> dm_env.Environment:
         """A fresh environment of ``load``, with the pictures of the cameras among ``observed`` as observations."""

@@ -139,6 +139,12 @@ class Spec(Model):
         for index, key in enumerate(keys):
             if key in keys[:index]:
                 yield f"observations.{index}.key", f"{key!r} is given twice; keep one"
+        for index, observation in enumerate(self.observations):
+            if self.training.optimizer.name == "em" and observation.augment and observation.augment.versions:
+                yield (
+                    f"observations.{index}.augment.versions",
+                    "em sees all demonstrations at once, as they are; leave it out",
+                )
         if not self.observed:
             yield "observations", f"{STEP} alone says nothing about the state; name an observation beside it"
         drawn = self.report.trajectory

@@ -7,6 +7,7 @@ with the same demonstrations and the same starts.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from functools import partial
 from pathlib import Path
 from typing import ClassVar
@@ -48,9 +49,9 @@ class Line(dm_env.Environment):
         return self.time == self.steps
 
     @property
+    @abstractmethod
     def arrived(self) -> bool:
         """Whether the episode is a success."""
-        raise NotImplementedError
 
     def begin(self) -> None:
         """Draw what differs between episodes."""
@@ -58,9 +59,9 @@ class Line(dm_env.Environment):
     def moved(self) -> None:
         """Change ``direction``, 1 or -1, and what else the last move changes."""
 
+    @abstractmethod
     def seen(self) -> list[float]:
         """What is observed where the intention is hidden."""
-        raise NotImplementedError
 
     def odds(self) -> float:
         """How often the supervisor's direction is 1 where it sees what is seen now."""
