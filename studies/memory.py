@@ -213,10 +213,11 @@ def cell_of(row: Row) -> Cell:
 
 
 def keep(out: Path, cell: Cell, measured: Iterable[Measured], made_by: Record) -> None:
-    """Add a cell's rows to the table, and what made them to the record beside it."""
+    """Add a cell's rows to the table, instead of those that another process has added, and what made them beside it."""
     path = out / "cells.csv"
     with only_one(out, wait=True):
-        rows = read(path) + [dict(zip(COLUMNS, (*astuple(cell), *one), strict=True)) for one in measured]
+        others = [row for row in read(path) if cell_of(row) != cell]
+        rows = others + [dict(zip(COLUMNS, (*astuple(cell), *one), strict=True)) for one in measured]
         written = io.StringIO()
         table = csv.DictWriter(written, COLUMNS, lineterminator="\n")
         table.writeheader()

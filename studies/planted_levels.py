@@ -39,6 +39,7 @@ from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.batch import encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables
+from ddco_pyro.spec import with_overrides
 from ddco_pyro.training.upper import Constants, converged, fitted
 
 COUNTS = (4, 4, 2)
@@ -73,7 +74,8 @@ def one_fit(way: str, seed: int, lasting: bool = True) -> Row:
         found = constants(truth, demos, held_out, choices, seed if kind == "search" else None)
     else:
         spec = make_spec(COUNTS, seed, CONTROL, **{**TRAINING, **WAYS[kind]})
-        spec = spec if lasting else spec.model_copy(update={"hierarchy": spec.hierarchy.without_memory()})
+        always = {f"hierarchy.levels.{number}.termination": "always" for number in range(len(COUNTS))}
+        spec = spec if lasting else with_overrides(spec, always)
         with tempfile.TemporaryDirectory() as folder:
             found = recovered(make_trainer(spec, demos, Path(folder)).run(), truth, held_out, choices)
     print(way, seed, found, flush=True)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ddco_pyro.data.controls import control_dimensions, notes
+from ddco_pyro.data.controls import control_dimensions, control_parts, notes
+from ddco_pyro.model.controls import ControlScaling
+from ddco_pyro.spec import ControlSpec
 
 STEPS = 200
 
@@ -82,6 +84,40 @@ def test_counts_of_many_steps_do_not_depend_on_blocks() -> None:
     assert whole == cut
     assert [each.at_inside for each in whole[:3]] == [4500, 4050, 900]
     assert (whole[3].inside, whole[3].at_inside) == (0.5, int((late[4096:] == 0.5).sum()))
+
+
+def rounded(dtype: type) -> np.ndarray:
+    """[200, 4]: a limit that is often reached, a switch, a rest and a constant, each missed by rounding now and then."""
+    random = np.random.default_rng(0)
+    found = random.uniform(-2.2, 2.2, (STEPS, 4))
+    found[::4, 0], found[1::4, 0] = -2.4, 2.4
+    found[:, 1] = np.where(np.arange(STEPS) % 2 == 0, 0.0, 0.7)
+    found[::3, 2] = 0.3
+    found[:, 3] = 0.1
+    found[::8] *= 1 + 2 * np.finfo(dtype).eps
+    return found.astype(dtype).astype(np.float64)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("cuts", [[], [1, 2, 3], list(range(1, STEPS))])
+def test_a_limit_that_is_missed_by_rounding_is_reached(cuts: list[int], dtype: type) -> None:
+    """Else most steps at the limit are a value inside the range, beside an extreme that a few steps have."""
+    demonstration = rounded(dtype)
+    found = control_dimensions(np.split(demonstration, cuts))
+    limit, switch, rest, still = found
+    assert len(np.unique(demonstration[::4, 0])) == 2  # rounding does show
+    assert (limit.at_minimum, limit.at_maximum, limit.inside) == (50, 50, None)
+    assert (len(switch.values), rest.at_inside, still.constant) == (2, 67, True)
+    parts = control_parts(ControlSpec(), found)
+    assert [(part.dims, part.kind) for part in parts] == [((0,), "clipped"), ((2,), "hurdle"), ((1,), "binary")]
+    scaling = ControlScaling(ControlSpec(), 4, {3: still.minimum}, parts)
+    scaled = scaling.scaled(demonstration)
+    at = [np.isin(np.arange(STEPS) % 4, phases) for phases in ([0], [1])]
+    low, high = (end.numpy()[0] for end in scaling.ends())
+    assert ((scaled[:, 0].astype(np.float32) <= low) == at[0]).all()
+    assert ((scaled[:, 0].astype(np.float32) >= high) == at[1]).all()
+    assert set(scaled[:, 1]) == {0.0, 1.0}
+    assert ((scaled[:, 2] == 0) == (np.arange(STEPS) % 3 == 0)).all()
 
 
 def test_a_short_file_does_not_sit_on_its_extremes() -> None:

@@ -23,8 +23,18 @@ FEWEST = 3
 TOGETHER = 0.9
 """Two dimensions rest together if this share of the steps in which either rests is shared."""
 
+ROUNDING = 4 * float(np.finfo(np.float32).eps)
+"""Two values are the same if they differ by at most this part of one of them."""
+
 MOST_DISTINCT = 64
 """Most distinct values of a dimension that are kept."""
+
+
+def same(values: np.ndarray, value: np.ndarray | float) -> np.ndarray:
+    """Which values are a finite ``value`` but for rounding; zero is zero alone."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        found: np.ndarray = np.isfinite(value) & (np.abs(values - value) <= ROUNDING * np.abs(value))
+    return found
 
 
 @dataclass(frozen=True)
@@ -33,7 +43,7 @@ class ControlDimension:
 
     :param number: index of the dimension, from 0.
     :param minimum: the smallest value, in the control's units; ``maximum`` likewise.
-    :param at_minimum: number of steps that equal the minimum; ``at_maximum`` likewise.
+    :param at_minimum: number of steps at the minimum, but for rounding (:data:`ROUNDING`); ``at_maximum`` likewise.
     :param steps: number of steps with finite values.
     :param distinct: the sorted values if there are at most :data:`MOST_DISTINCT`; else empty.
     :param inside: the commonest value strictly between the extremes; None without a common value.
@@ -67,7 +77,7 @@ class ControlDimension:
     @property
     def constant(self) -> bool:
         """Whether all steps have the same value."""
-        return self.minimum == self.maximum
+        return bool(same(np.array(self.minimum), self.maximum))
 
     @property
     def values(self) -> tuple[float, ...]:
@@ -138,7 +148,7 @@ class ControlStatistics:
         if not len(values):
             return
         low, high = np.where(finite, values, np.inf).min(0), np.where(finite, values, -np.inf).max(0)
-        new = [low, high, (values == low).sum(0), (values == high).sum(0), finite.sum(0)]
+        new = [low, high, same(values, low).sum(0), same(values, high).sum(0), finite.sum(0)]
         self._columns = _merged(self._columns, new) if self._columns else new
         before = self._distinct or [np.empty(0)] * values.shape[1]
         self._distinct = [
@@ -173,7 +183,7 @@ class ControlStatistics:
 def _merged(before: Sequence[np.ndarray], new: Sequence[np.ndarray]) -> list[np.ndarray]:
     low, high = np.minimum(before[0], new[0]), np.maximum(before[1], new[1])
     at_low, at_high = (
-        sum(np.where(part[end] == value, part[end + 2], 0) for part in (before, new))
+        sum(np.where(same(part[end], value), part[end + 2], 0) for part in (before, new))
         for end, value in ((0, low), (1, high))
     )
     return [low, high, np.asarray(at_low), np.asarray(at_high), before[4] + new[4]]
@@ -219,7 +229,7 @@ class _CommonValues:
             self._waiting = []
         places: dict[int, int] = {}
         for place, (dimension, value) in enumerate(self._values):  # the commonest come first
-            if low[dimension] < value < high[dimension]:
+            if not same(np.array([low[dimension], high[dimension]]), value).any():
                 places.setdefault(dimension, place)
         return {
             dimension: (
@@ -235,16 +245,21 @@ class _CommonValues:
         either = self._counts[first, first] + self._counts[second, second] - both
         return bool(both >= TOGETHER * either)
 
+    def _known(self, dimension: int, value: float) -> bool:
+        return any(own == dimension and same(np.array(known), value) for own, known in self._values)
+
     def _count(self, rows: np.ndarray) -> None:
         for dimension, column in enumerate(rows.T):
             values, times = np.unique(column[np.isfinite(column)], return_counts=True)
             often = np.argsort(-times, kind="stable")[:KEPT]
             often = often[times[often] >= max(FEWEST, ATOM * len(rows))]
             found = ((dimension, value + 0.0) for value in values[often].tolist())  # + 0.0: minus zero is zero
-            self._values += [each for each in found if each not in self._values]
+            for each in found:
+                if not self._known(*each):
+                    self._values.append(each)
         at = np.zeros((len(rows), len(self._values)), np.float32)
         for place, (dimension, value) in enumerate(self._values):
-            at[:, place] = rows[:, dimension] == value
+            at[:, place] = same(rows[:, dimension], value)
         counts = (at.T @ at).astype(np.float64)
         counts[: len(self._counts), : len(self._counts)] += self._counts
         order = np.argsort(-counts.diagonal(), kind="stable").tolist()

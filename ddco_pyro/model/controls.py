@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from ddco_pyro.data.controls import ControlPart, number
+from ddco_pyro.data.controls import ControlPart, number, same
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Emission, Gaussian, Hurdle, Product
 from ddco_pyro.spec import ControlSpec, LearnedStd
@@ -79,7 +79,7 @@ class ControlScaling(nn.Module):
     def fit(self, demonstrations: Demonstrations) -> None:
         """Where the spec says ``standardize``: take mean and spread of these demonstrations' controls."""
         if self.standardized.any():
-            rows = np.concatenate([demo.actions[:, self.varying.numpy()] for demo in demonstrations])
+            rows = np.concatenate([self._exactly(demo.actions) for demo in demonstrations])
             shift, spread = rows.mean(0), rows.std(0)
             for dims, part in zip(self.groups, self.parts, strict=True):
                 if part.exact:
@@ -92,13 +92,22 @@ class ControlScaling(nn.Module):
 
     def scaled(self, actions: np.ndarray) -> np.ndarray:
         """[T, A] in the control's own units to [T, A'] in scaled units; NaN for an unknown discrete action."""
-        scaled: np.ndarray = (actions[:, self.varying.numpy()] - self.shift.numpy()) / self.scale.numpy()
+        scaled: np.ndarray = (self._exactly(actions) - self.shift.numpy()) / self.scale.numpy()
         for dims, part in zip(self.groups, self.parts, strict=True):
             if part.values:
                 given, values = actions[:, part.dims[0]], np.array(part.values)
                 index = np.searchsorted(values, given).clip(max=len(values) - 1)
                 scaled[:, dims[0]] = np.where(values[index] == given, index, np.nan)
         return scaled
+
+    def _exactly(self, actions: np.ndarray) -> np.ndarray:
+        """The varying dimensions [T, A'], exactly at bounds and exact values that they miss by rounding."""
+        rows = np.array(actions[:, self.varying.numpy()], dtype=np.float64)
+        for dims, part in zip(self.groups, self.parts, strict=True):
+            for known in filter(None, (part.low, part.high, part.exact)):
+                own = rows[:, list(dims)]
+                rows[:, list(dims)] = np.where(same(own, np.array(known)), known, own)
+        return rows
 
     def impossible(self, demonstration: Demonstration) -> str:
         """The first control of probability 0 in a demonstration, in words; empty without one."""
