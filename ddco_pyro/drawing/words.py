@@ -40,9 +40,9 @@ def about(names: Iterable[str]) -> str:
 def stage(name: str) -> str:
     """A stage of training in words: ``vq-1`` is ``level 1 from clusters``."""
     kind, _, level = name.partition("-")
-    whole = {"meta-policy": "meta-policy alone", "joint": "all together"}
+    whole = {"meta-policy": "meta-policy alone", "joint": "all together", "mixture": "all together without memory"}
     whole |= {"segments": "levels above the lowest from segments", "upper": "levels above the lowest together"}
-    how = {"vq": "from clusters", "parts": "from equal parts", "level": "alone"}.get(kind)
+    how = {"vq": "from clusters", "parts": "from equal parts", "cuts": "from random cuts", "level": "alone"}.get(kind)
     return f"level {level} {how}" if how else whole.get(name, name)
 
 
@@ -297,7 +297,9 @@ def spent(training: Mapping[str, Any]) -> str:
 
 
 def restarts(training: Mapping[str, Any]) -> str:
-    """The best of several restarts, the ones stopped early or diverged, and the effort of all; else empty."""
+    """The best of several restarts, their starts, the ones stopped early or diverged, their effort and how their
+    segments agree with the best one's; empty for a single restart.
+    """
     told = training.get("restarts")
     if told is None or len(told["each"]) == 1:
         return ""
@@ -305,10 +307,16 @@ def restarts(training: Mapping[str, Any]) -> str:
     early = ", ".join(f"{number} after {epochs}" for number, epochs in stopped) or "none"
     ended = ", ".join(str(number) for number, each in enumerate(told["each"]) if each.get("diverged"))
     early += f"; diverged: {ended}" if ended else ""
+    starts = [each.get("initialize") for each in told["each"]]
+    every = f"0 to {len(starts) - 1}" + (f" from {starts[0]}" if starts[0] else "")
+    if len(set(starts)) > 1:
+        every = ", ".join(f"{number} from {start}" for number, start in enumerate(starts))
+    alike = ", ".join(f"{number(each['nmi'])} of {n}" for n, each in enumerate(told["each"]) if "nmi" in each)
     return (
-        f"restart {told['best']} was the best of {len(told['each'])} (0 to {len(told['each']) - 1}; stopped early, "
+        f"restart {told['best']} was the best of {len(starts)} ({every}; stopped early, "
         f"with their epochs of the last stage: {early}), which took {told['spent']['epochs']} epochs "
         f"({told['spent']['gradient_steps']} gradient steps) together"
+        + (f"; NMI of its segments of the training demonstrations with those of the others: {alike}" if alike else "")
     )
 
 

@@ -172,6 +172,10 @@ class Restart(Record):
     epochs: int
     stopped: int | None
     diverged: bool = False
+    initialize: Annotated[str | None, NOT_NULL] = None
+    """The kind of initialisation (``training.initialize``); left out for a policy without options."""
+    nmi: Annotated[Finite | None, NOT_NULL] = None
+    """NMI of its segments with the best restart's: of the training demonstrations, at the lowest level."""
 
 
 class Restarts(Record):

@@ -66,7 +66,7 @@ def train(
     with one_thread(), repeatable(device), Readers(spec.workers) as readers:
         data = data.read_by(readers).held(device)
         model = data.hierarchy(now.restart, states.get("model"))
-        stages = plan(data.spec, model.depth)
+        stages = plan(data.spec, model.depth, now.restart)
         try:
             while not now.done:
                 last = now.stage == len(stages) - 1
@@ -102,6 +102,8 @@ class StageTraining:
     def __init__(self, data: TrainingData, model: Hierarchy, stage: Stage, restart: Restart, ranks: Ranks) -> None:
         self.data, self.model, self.stage, self.restart, self.ranks = data, model, stage, restart, ranks
         self.spec, now = data.spec.training, restart.progress
+        if stage.memoryless:
+            model.begin_terminations()
         self.objective = Objective(data, now, stage, ranks, restart.states if now.epoch else None)
         self.parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
         self.optimizer = _optimizer(self.spec.optimizer, self.parameters)
