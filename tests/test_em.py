@@ -270,8 +270,9 @@ def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
     assert "(EM)" in effort(trained["ddco"])
 
 
-def test_a_fit_by_em_that_is_interrupted_has_the_same_bits(tmp_path):
-    spec, demos = small_spec(), demonstrations(12)
+@pytest.mark.parametrize("initialize", ["vq", "cuts", "mixture"])
+def test_a_fit_by_em_that_is_interrupted_has_the_same_bits(tmp_path, initialize):
+    spec, demos = small_spec(initialize=initialize), demonstrations(12)
     whole, cut = (make_trainer(spec, demos, tmp_path / name) for name in ("whole", "cut"))
     expected = train(whole.data, Restart(Progress(0)))
     path = tmp_path / "restart.safetensors"
