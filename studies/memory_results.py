@@ -149,7 +149,7 @@ def _compared(named: Row, rows: Sequence[Row], pages: Sequence[Row]) -> Row:
     }
     mixture = values[MIXTURE]
     found = named | {"values": values, "seeds": sorted(mixture)}
-    found["apart"] = max(map(abs, paired(values[AGAIN], values[OPTIONS])), default=None)
+    found["again"] = values[AGAIN].keys() >= mixture.keys()
     found["mean"] = {name: over_seeds([own[seed] for seed in mixture if seed in own]) for name, own in values.items()}
     found["difference"] = {
         f"{more} - {less}": over_seeds(paired(values[more], values[less])) for more, less in DIFFERENCES
@@ -177,8 +177,8 @@ def over_tasks(found: Sequence[Row]) -> list[Row]:
     for group in groups.values():
         named = {key: group[0][key] for key in KEY} | {"task": f"mean of {len(group)} tasks"}
         named["seeds"] = sorted({seed for one in group for seed in one["seeds"]})
+        named["again"] = all(one["again"] for one in group)
         named["fewest"] = min(len(one["seeds"]) for one in group)
-        named["apart"] = max((one["apart"] for one in group if one["apart"] is not None), default=None)
         whole.append(named | {part: _over(group, part) for part in ("mean", "difference")})
     return whole
 
@@ -290,8 +290,8 @@ def page(found: Sequence[Row], again: Sequence[Row], missing: Sequence[str], mad
         "",
         *reproduced(again),
         "",
-        "*Options* are the page's; *options again* are fitted by the code that fits the mixtures. A fit is sensitive "
-        "to last digits: on another machine the same seed gives another fit, to the same demonstrations.",
+        "*Options* are the page's; *options again* are fitted by the code and on the machine of the mixtures. A fit is "
+        "sensitive to last digits: on another machine the same seed gives another fit to the same demonstrations.",
     ]
     if tasks:
         lines += ["", "## Meta-World, by task", "", *table(tasks)]
@@ -311,9 +311,7 @@ SHORT = {
 
 
 def short(found: Sequence[Row]) -> str:
-    """The table of README: the two differences of each study, where options are fitted by the code of the mixtures, if
-    they are.
-    """
+    """The table of README: the two differences of each study, of options that were fitted again where all were."""
     main = [*(one for one in found if one["study"] not in ("arena", "planted")), *over_tasks(found)]
     lines = [
         "| | demonstrations | measure | several policies (mixture − flat) | lasting (options − mixture) | seeds |",
@@ -324,29 +322,11 @@ def short(found: Sequence[Row]) -> str:
         measure = one["measure"] + acting
         if one["measure"] != "nats" and (one["study"], measure) not in SHORT:
             continue
-        seeds = len(one["seeds"])
-        again = one["study"] == "arena" or len(one["difference"][f"{AGAIN} - {MIXTURE}"].get("by_seed", ())) == seeds
         name = NAMED[one["study"]] + (f", {one['task']}" if one["task"] != one["study"] else "")
-        cells = [name, str(one["demonstrations"]), measure.partition(",")[0], _marked(one, MIXTURE, FLAT)]
-        lasting = _difference(one, AGAIN, MIXTURE) if again else _marked(one, OPTIONS, MIXTURE)
+        cells = [name, str(one["demonstrations"]), measure.partition(",")[0], _difference(one, MIXTURE, FLAT)]
+        lasting = _difference(one, AGAIN if one["again"] else OPTIONS, MIXTURE)
         lines.append(f"| {' | '.join([*cells, lasting, _seeds(one)])} |")
     return "\n".join(lines)
-
-
-SMALL = 0.1
-"""The part of a difference that a fit by another code may change before the difference is marked."""
-
-
-def _marked(one: Row, more: str, less: str) -> str:
-    """A difference one side of which another code has fitted.
-
-    The difference is marked, and not bold, where options of that code differ from those fitted again by more than a
-    small part of the difference, or where none was fitted again.
-    """
-    shown, mean = _difference(one, more, less), one["difference"][f"{more} - {less}"]["mean"]
-    if mean is None or (one["apart"] is not None and one["apart"] <= SMALL * abs(mean)):
-        return shown
-    return f"{shown.strip('*')} †"
 
 
 BEGIN, END = "<!-- begin: python studies/memory.py page -->", "<!-- end -->"
