@@ -16,6 +16,7 @@ from provenance import ROOT
 from ddco_pyro.drawing.figures import FAINT, blank, save, style
 
 OPTIONS, MIXTURE, FLAT, EQUAL = "options", "mixture", "flat", "flat_equal"
+EM = "options by em"
 AGAIN = "options again"
 """Those that the code of the mixtures has fitted."""
 DIFFERENCES = ((MIXTURE, FLAT), (MIXTURE, EQUAL), (OPTIONS, MIXTURE), (AGAIN, MIXTURE))
