@@ -20,6 +20,7 @@ EM = "options by em"
 AGAIN = "options again"
 """Those that the code of the mixtures has fitted."""
 DIFFERENCES = ((MIXTURE, FLAT), (MIXTURE, EQUAL), (OPTIONS, MIXTURE), (AGAIN, MIXTURE))
+BY_EM = (EM, OPTIONS)
 RESULTS = ROOT / "docs" / "results"
 ROUNDING = 1e-6
 """Two codes that do the same differ by less."""
@@ -147,13 +148,14 @@ def _compared(named: Row, rows: Sequence[Row], pages: Sequence[Row]) -> Row:
         MIXTURE: _values(named, MIXTURE, rows),
         OPTIONS: _values(named, OPTIONS, pages),
         AGAIN: _values(named, OPTIONS, rows),
+        EM: _values(named, EM, rows),
     }
     mixture = values[MIXTURE]
     found = named | {"values": values, "seeds": sorted(mixture)}
     found["again"] = values[AGAIN].keys() >= mixture.keys()
     found["mean"] = {name: over_seeds([own[seed] for seed in mixture if seed in own]) for name, own in values.items()}
     found["difference"] = {
-        f"{more} - {less}": over_seeds(paired(values[more], values[less])) for more, less in DIFFERENCES
+        f"{more} - {less}": over_seeds(paired(values[more], values[less])) for more, less in (*DIFFERENCES, BY_EM)
     }
     return found
 
@@ -227,6 +229,16 @@ def table(found: Sequence[Row]) -> list[str]:
     return lines
 
 
+def table_by_em(found: Sequence[Row]) -> list[str]:
+    """Lines of Markdown: what another optimiser changes, where it was tried."""
+    lines = ["| study | demonstrations | measure | options by em − options |", "|---|---|---|---|"]
+    for one in found:
+        if one["mean"][EM]["mean"] is not None:
+            name = NAMED[one["study"]] + (f", {one['task']}" if one["task"] != one["study"] else "")
+            lines.append(f"| {name} | {one['demonstrations']} | {one['measure']} | {_difference(one, *BY_EM)} |")
+    return lines if len(lines) > 2 else []
+
+
 def _seeds(one: Row) -> str:
     """How many seeds: of a mean over tasks of which some have fewer, ``1 to 3``."""
     most, fewest = len(one["seeds"]), one.get("fewest", len(one["seeds"]))
@@ -294,6 +306,16 @@ def page(found: Sequence[Row], again: Sequence[Row], missing: Sequence[str], mad
         "*Options* are the page's; *options again* are fitted by the code and on the machine of the mixtures. A fit is "
         "sensitive to last digits: on another machine the same seed gives another fit to the same demonstrations.",
     ]
+    if by_em := table_by_em(main):
+        lines += [
+            "",
+            "## By expectation-maximisation",
+            "",
+            "The same specs with `training.optimizer: {name: em}` instead of Adam, paired by seed with the page's "
+            "options.",
+            "",
+            *by_em,
+        ]
     if tasks:
         lines += ["", "## Meta-World, by task", "", *table(tasks)]
     if missing:
