@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 CONFIDENCE = 0.95
 """Level of intervals; a difference is significant where its interval excludes 0."""
@@ -253,8 +252,15 @@ def _lasting(memory: Sequence[float]) -> str:
 def mean_interval(values: Sequence[float]) -> tuple[float, float]:
     """The 95 % t interval of the mean of a few values."""
     mean, count = float(np.mean(values)), len(values)
-    half = float(np.std(values, ddof=1) * stats.t.ppf((1 + CONFIDENCE) / 2, count - 1) / math.sqrt(count))
+    half = float(np.std(values, ddof=1) * _t_quantile(count - 1) / math.sqrt(count))
     return mean - half, mean + half
+
+
+def _t_quantile(freedom: int) -> float:
+    """Half the width of a :data:`CONFIDENCE` interval in standard errors, for so many degrees of freedom."""
+    from scipy.special import stdtrit  # most commands draw no interval
+
+    return float(stdtrit(freedom, (1 + CONFIDENCE) / 2))
 
 
 def spread(values: Sequence[float]) -> tuple[str, str, str]:
@@ -272,11 +278,7 @@ def with_error(difference: Mapping[str, Any] | None) -> str:
 def _direction(difference: Mapping[str, Any], held_out: int) -> int:
     """1 or -1 where the 95 % interval of a difference leaves out 0, else 0."""
     mean, error = difference["nats_per_step"], difference["standard_error"]
-    if (
-        error is None
-        or not math.isfinite(error)
-        or abs(mean) <= error * stats.t.ppf((1 + CONFIDENCE) / 2, held_out - 1)
-    ):
+    if error is None or not math.isfinite(error) or abs(mean) <= error * _t_quantile(held_out - 1):
         return 0
     return 1 if mean > 0 else -1
 
