@@ -277,7 +277,9 @@ def command(study: str, asked: Asked) -> str:
 
 def write_page(out: Path) -> str:
     """``memory.md``, ``.json`` and ``.png`` beside the folder of the table, and the table of README; the page."""
-    rows, pages = read(out / "cells.csv"), of_pages()
+    earlier = read(out / "far_end.csv")  # of a bin that the tree has no more
+    rows = read(out / "cells.csv") + [row for row in earlier if row["method"] == MIXTURE]
+    pages = of_pages() + [row for row in earlier if row["method"] != MIXTURE]
     found = comparisons(rows, pages)
     records = json.loads((out / "cells.json").read_text())["provenance"]
     made_by = sentence("python studies/memory.py page", records)

@@ -293,6 +293,8 @@ def page(found: Sequence[Row], again: Sequence[Row], missing: Sequence[str], mad
         "Starts: needle 60 with 20 demonstrations and 200 with 100, pushing 20 episodes of 2000 steps, Meta-World 20, "
         "bin picking 20 bins, where success is a bin that is cleared. Nats are per step, and NMI is with the labels; "
         "both are of held-out demonstrations. "
+        "*Bin picking, flat far end* shows loads over the pile (`memory/far_end.csv`): its mixtures are hierarchies of "
+        "commit 579683a with all logits of terminations at 40, beside the numbers of commit 9c3163b. "
         "Pushing's page has `marginal` alone of the three ways of choosing options; a flat policy acts in one way.",
         "",
         *table(main),
