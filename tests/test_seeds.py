@@ -171,6 +171,10 @@ def test_what_rollouts_are_worth_in_words():
     assert "DDCO − mixture +15 [13 to 17] points of success. In rollouts: options that last help." in (
         words.success_worth(found | {"seeds": seeds}, "DDCO")
     )
+    same = {"training_seeds": [0, 1, 2], "success": {}, "worth": {"memory": [0.02, 0.02, 0.02]}}
+    one_more = found["worth"] | {"memory": {"only_ours": 2, "only_theirs": 1, "trials": 50, "p_value": 1.0}}
+    text = words.success_worth({"worth": one_more, "seeds": same}, "DDCO")
+    assert text.endswith("In rollouts: inconclusive.")  # seeds gave the same fit; episodes have not
     assert words.success_worth({"methods": {}}, "DDCO") == ""
 
 

@@ -176,7 +176,7 @@ def worth(found: Mapping[str, Any], ours: str, held_out: int) -> str:
 
 def success_worth(rollouts: Mapping[str, Any], ours: str) -> str:
     """What several experts and options that last are worth in rollouts: in this fit, and over training seeds where it
-    was repeated; empty where there is no mixture.
+    was repeated; empty where there is no mixture. The verdict is by :func:`_wider`, with the error over episodes.
 
     :param rollouts: what ``metrics.json`` has under ``rollouts``.
     :param ours: what the hierarchy is called.
@@ -201,7 +201,10 @@ def success_worth(rollouts: Mapping[str, Any], ours: str) -> str:
         for part, values in seeds["worth"].items()
         if part in names
     ]
-    low, high = mean_interval(seeds["worth"]["memory"])
+    pair = found["memory"]
+    discordant, lead = pair["only_ours"] + pair["only_theirs"], pair["only_ours"] - pair["only_theirs"]
+    error = math.sqrt(discordant - lead**2 / pair["trials"]) / pair["trials"]
+    low, high = _wider(seeds["worth"]["memory"], error)
     decided = "options that last help" if low > 0 else "options that last harm" if high < 0 else "inconclusive"
     count = len(seeds["training_seeds"])
     return f"{text} Over {count} training seeds: {listed(parts)} points of success. In rollouts: {decided}."
@@ -242,15 +245,22 @@ def over_seeds(found: Mapping[str, Any], ours: str) -> str:
 def _lasting(memory: Sequence[float], errors: Sequence[float | None]) -> str:
     """Whether options that last are worth it: by the wider of two 95 % intervals, and :data:`SMALLEST`.
 
-    One is the t interval over training seeds. The other is two standard errors over held-out demonstrations, which
-    decide where seeds give nearly the same fit.
+    :param errors: standard errors over held-out demonstrations.
     """
-    low, high = mean_interval(memory)
-    mean, error = float(np.mean(memory)), 2 * float(np.mean([error or 0.0 for error in errors]))
-    if error > high - mean:
-        low, high = mean - error, mean + error
-        return f"Over held-out demonstrations it is {interval([low, high])}. {_verdict(low, high)}"
-    return _verdict(low, high)
+    low, high = _wider(memory, float(np.mean([error or 0.0 for error in errors])))
+    wider = high > mean_interval(memory)[1]
+    said = f"Over held-out demonstrations it is {interval([low, high])}. " if wider else ""
+    return said + _verdict(low, high)
+
+
+def _wider(values: Sequence[float], error: float) -> tuple[float, float]:
+    """The wider of two 95 % intervals of a mean: the t interval over training seeds, and two standard errors.
+
+    Seeds that give nearly the same fit have an interval without width, which is no evidence.
+    """
+    mean = float(np.mean(values))
+    half = max(mean_interval(values)[1] - mean, 2 * error)
+    return mean - half, mean + half
 
 
 def _verdict(low: float, high: float) -> str:
