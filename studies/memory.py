@@ -2,16 +2,17 @@
 
     python studies/memory.py needle [--counts 20 100] [--seeds 10] [--check 2]
     python studies/memory.py pushing [--counts 40 80] [--seeds 10] [--check 10]
-    python studies/memory.py arena [--counts 10 50] [--seeds 3] [--check 1] [--tasks pick-place-v3 ...]
+    python studies/memory.py arena [--counts 10 50] [--seeds 3] [--check 1] [--em 2]
+        [--tasks pick-place-v3 ...]
     python studies/memory.py bins [--counts 60] [--seeds 3] [--check 0]
     python studies/memory.py planted [--seeds 5] [--check 2] [--tasks segments joint]
     python studies/memory.py page
 
 A mixture is the hierarchy of that study's spec whose options end after every step (``termination: always``): the same
 demonstrations, training seeds, starts and gradient steps. ``--check`` fits options of so many seeds again, to see
-whether this code gives what the study's page has. Each cell is a few rows of ``cells.csv`` as soon as it is done, and
-is not done again. ``page`` pairs mixtures by seed with the numbers that those studies keep, and writes ``memory.md``
-and ``memory.png``.
+whether this code gives what the study's page has. ``--em`` fits them by expectation-maximisation. Each cell is a few
+rows of ``cells.csv`` as soon as it is done, and is not done again. ``page`` pairs mixtures by seed with the numbers of
+those studies, and writes ``memory.md`` and ``memory.png``.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from arena import TASKS
 from arena_results import nmi
 from cells import described, printed, some
 from ddco_tasks.pushing import environment as pushing_task
-from memory_results import MIXTURE, OPTIONS, checks, comparisons, draw, of_pages, page, short, with_table
+from memory_results import EM, MIXTURE, OPTIONS, checks, comparisons, draw, of_pages, page, short, with_table
 from provenance import ROOT, Record, record, sentence, text
 from threadpoolctl import threadpool_limits
 
@@ -49,7 +50,14 @@ from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.simulation.episodes import play
 from ddco_pyro.spec import load_spec, with_overrides
 
-MEMORYLESS = {"hierarchy.levels.0.termination": "always"}
+METHODS: dict[str, dict[str, Any]] = {
+    MIXTURE: {"hierarchy.levels.0.termination": "always"},
+    OPTIONS: {},
+    EM: {"training.optimizer": {"name": "em"}},
+}
+"""What each method changes in its study's spec."""
+ADAM = {"name": "adam", "lr": 3e-3}
+"""The optimiser of the arena's page, instead of the one that ``init`` writes."""
 ACTING = ("marginal", "sample", "most_likely")
 EPISODES = {"needle": {20: 60, 100: 200}, "arena": 20, "bins": 20, "pushing": pushing_cell.EPISODES}
 """Starts of each fit, as on the pages."""
@@ -83,13 +91,13 @@ COLUMNS = (*(field.name for field in fields(Cell)), *Measured._fields)
 
 
 def overridden(cell: Cell) -> dict[str, Any]:
-    """What a cell changes in its study's spec: nothing is trained beside, and a mixture has no memory."""
-    return {"compare_with": [], **(MEMORYLESS if cell.method == MIXTURE else {})}
+    """What a cell changes in its study's spec: nothing is trained beside."""
+    return {"compare_with": [], **METHODS[cell.method]}
 
 
 def words(cell: Cell) -> list[str]:
     """The same as words of a command."""
-    return [f"{key}={value}" for key, value in overridden(cell).items()]
+    return [f"{key}={json.dumps(value)}" for key, value in overridden(cell).items()]
 
 
 def needle(cell: Cell, runs: Path) -> list[Measured]:
@@ -128,7 +136,8 @@ def arena(cell: Cell, runs: Path) -> list[Measured]:
     settings = arena_cell.DEFAULTS
     source = arena_cell.recorded(cell.task, settings)
     own = arena_cell.ArenaCell(cell.task, cell.demonstrations, cell.seed)
-    fitted = arena_cell.fitted_cell(own, source, tuple(words(cell)), runs / "fits" / cell.name)
+    changes = (f"training.optimizer={json.dumps(ADAM)}", *words(cell))  # the later one counts
+    fitted = arena_cell.fitted_cell(own, source, changes, runs / "fits" / cell.name)
     played = arena_cell.sawyer(settings).play(cell.task, {cell.method: fitted}, source, EPISODES["arena"])
     successes = [episode["success"] for episode in played["episodes"][cell.method]]
     return [
@@ -166,18 +175,20 @@ class Asked(NamedTuple):
     """Cells of a study.
 
     :param check: options of so many seeds are fitted again.
+    :param em: options of so many seeds are fitted by expectation-maximisation.
     """
 
     counts: tuple[int, ...]
     seeds: int
     check: int
     tasks: tuple[str, ...]
+    em: int = 0
 
 
 WHOLE = {
     "needle": Asked((20, 100), 10, 2, ("needle",)),
     "pushing": Asked((40, 80), 10, 10, ("pushing",)),
-    "arena": Asked((10, 50), 3, 1, TASKS),
+    "arena": Asked((10, 50), 3, 1, TASKS, em=2),
     "bins": Asked((60,), 3, 0, ("bins",)),
     "planted": Asked((planted_levels.DEMONSTRATIONS,), 5, 2, ("segments", "joint")),
 }
@@ -186,12 +197,9 @@ WHOLE = {
 
 def cells_of(study: str, asked: Asked) -> list[Cell]:
     """All counts and tasks of a seed before another seed, mixtures before the options that check them."""
-    grid = itertools.product(range(asked.seeds), asked.counts, asked.tasks, (MIXTURE, OPTIONS))
-    return [
-        Cell(study, task, method, count, seed)
-        for seed, count, task, method in grid
-        if method == MIXTURE or seed < asked.check
-    ]
+    grid = itertools.product(range(asked.seeds), asked.counts, asked.tasks, METHODS)
+    seeds = {MIXTURE: asked.seeds, OPTIONS: asked.check, EM: asked.em}
+    return [Cell(study, task, method, count, seed) for seed, count, task, method in grid if seed < seeds[method]]
 
 
 Row = dict[str, Any]
@@ -252,7 +260,8 @@ def missing(done: set[Cell]) -> list[str]:
             cells = cells_of(study, whole._replace(counts=(count,)))
             left = [cell for cell in cells if cell not in done]
             if left:
-                kinds = ", ".join(f"{sum(one.method == kind for one in left)} of {kind}" for kind in (MIXTURE, OPTIONS))
+                asked_for = dict.fromkeys(one.method for one in cells)
+                kinds = ", ".join(f"{sum(one.method == kind for one in left)} of {kind}" for kind in asked_for)
                 lines.append(f"`{command(study, whole._replace(counts=(count,)))}`: {kinds}, of {len(cells)} cells")
     return lines
 
@@ -260,6 +269,7 @@ def missing(done: set[Cell]) -> list[str]:
 def command(study: str, asked: Asked) -> str:
     """What does these cells."""
     options = {"counts": asked.counts, "seeds": (asked.seeds,), "check": (asked.check,)}
+    options |= {"em": (asked.em,)} if asked.em else {}
     options |= {} if asked.tasks == WHOLE[study].tasks else {"tasks": asked.tasks}
     said = "".join(f" --{name} {' '.join(map(str, values))}" for name, values in options.items())
     return f"python studies/memory.py {study}{said}"
@@ -267,7 +277,9 @@ def command(study: str, asked: Asked) -> str:
 
 def write_page(out: Path) -> str:
     """``memory.md``, ``.json`` and ``.png`` beside the folder of the table, and the table of README; the page."""
-    rows, pages = read(out / "cells.csv"), of_pages()
+    earlier = read(out / "far_end.csv")  # of a bin that the tree has no more
+    rows = read(out / "cells.csv") + [row for row in earlier if row["method"] == MIXTURE]
+    pages = of_pages() + [row for row in earlier if row["method"] != MIXTURE]
     found = comparisons(rows, pages)
     records = json.loads((out / "cells.json").read_text())["provenance"]
     made_by = sentence("python studies/memory.py page", records)
@@ -284,7 +296,7 @@ def main() -> None:
     """Do the cells of a study, or write the page."""
     parser = described(__doc__)
     parser.add_argument("study", choices=[*STUDIES, "page"])
-    for name in ("counts", "seeds", "check"):
+    for name in ("counts", "seeds", "check", "em"):
         parser.add_argument(f"--{name}", type=int, nargs="+" if name == "counts" else None)
     parser.add_argument("--tasks", nargs="+")
     parser.add_argument("--runs", type=Path, default=Path("runs/memory"))

@@ -87,7 +87,7 @@ def test_counts_of_many_steps_do_not_depend_on_blocks() -> None:
 
 
 def rounded(dtype: type) -> np.ndarray:
-    """[200, 4]: a limit that is often reached, a switch, a rest and a constant, each missed by rounding now and then."""
+    """[200, 4]: a limit that is often reached, a switch, a rest and a constant, at times missed by rounding."""
     random = np.random.default_rng(0)
     found = random.uniform(-2.2, 2.2, (STEPS, 4))
     found[::4, 0], found[1::4, 0] = -2.4, 2.4

@@ -166,12 +166,12 @@ def test_what_dimensions_add_is_the_likelihood(fitted):
 
 
 def test_scaling_keeps_exactly_the_value_apart(fitted):
-    """The nearest numbers to the value are not the value, and what is scaled comes back exactly."""
+    """Numbers that differ by rounding are the value, others are not, and what is scaled comes back exactly."""
     scaling = fitted.hierarchy.scaling
-    rows = np.tile([0.0, STILL, 0.0, 1.0], (3, 1))
-    rows[1:, 1] = np.nextafter(STILL, -1), np.nextafter(STILL, 1)
+    rows = np.tile([0.0, STILL, 0.0, 1.0], (5, 1))
+    rows[1:, 1] = np.nextafter(STILL, -1), np.nextafter(STILL, 1), STILL * (1 - 1e-6), STILL * (1 + 1e-6)
     scaled = np.float32(scaling.scaled(rows))
-    assert ((scaled[:, 1] == 0) == [True, False, False]).all()
+    assert ((scaled[:, 1] == 0) == [True, True, True, False, False]).all()
     assert (scaled[:, [0, 2]] == 0).all()
     np.testing.assert_array_equal(scaling.unscaled(torch.from_numpy(scaled))[0], rows[0])
 

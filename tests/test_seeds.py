@@ -99,8 +99,21 @@ def test_the_intervals_are_those_of_scipy():
     ],
 )
 def test_the_verdict_is_over_training_seeds(memory, said):
-    text = words.over_seeds({"training_seeds": [0, 1, 2], "held_out": {}, "worth": {"memory": memory}}, "DDCO")
-    assert said in text
+    found = {"training_seeds": [0, 1, 2], "worth": {"memory": memory}, "standard_error": {"memory": [0.0, None, 0.0]}}
+    assert said in words.over_seeds(found, "DDCO")
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (0.016, "Over held-out demonstrations it is −0.01 to 0.05. It is inconclusive whether"),
+        (0.009, "Over held-out demonstrations it is 0.00 to 0.04. So options that last are worth it"),
+    ],
+)
+def test_where_seeds_give_the_same_fit_held_out_demonstrations_decide(error, said):
+    """EM reaches one optimum from any seed; an interval without width is no evidence."""
+    memory = {"worth": {"memory": [0.019, 0.0191, 0.0192]}, "standard_error": {"memory": [error] * 3}}
+    assert said in words.over_seeds({"training_seeds": [0, 1, 2]} | memory, "DDCO")
 
 
 def test_seeds_follow_the_specs_own(written):
@@ -112,7 +125,7 @@ def test_seeds_follow_the_specs_own(written):
 def test_a_run_without_a_mixture_has_no_parts():
     metrics = {"model": "ddco", "log_likelihood_per_step": {"train": 1.0, "valid": 0.5}, "comparison": {}}
     found = over_seeds([0, 1], [metrics, metrics])
-    assert found == {"training_seeds": [0, 1], "held_out": {"ddco": [0.5, 0.5]}, "worth": {}}
+    assert found == {"training_seeds": [0, 1], "held_out": {"ddco": [0.5, 0.5]}, "worth": {}, "standard_error": {}}
     assert words.over_seeds(found, "DDCO") == "Over 2 training seeds, with the same demonstrations held out."
 
 
@@ -158,6 +171,10 @@ def test_what_rollouts_are_worth_in_words():
     assert "DDCO − mixture +15 [13 to 17] points of success. In rollouts: options that last help." in (
         words.success_worth(found | {"seeds": seeds}, "DDCO")
     )
+    same = {"training_seeds": [0, 1, 2], "success": {}, "worth": {"memory": [0.02, 0.02, 0.02]}}
+    one_more = found["worth"] | {"memory": {"only_ours": 2, "only_theirs": 1, "trials": 50, "p_value": 1.0}}
+    text = words.success_worth({"worth": one_more, "seeds": same}, "DDCO")
+    assert text.endswith("In rollouts: inconclusive.")  # seeds gave the same fit; episodes have not
     assert words.success_worth({"methods": {}}, "DDCO") == ""
 
 

@@ -110,7 +110,6 @@ def _fit(
     import ddco_pyro
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.seeds import check_seeds, repeat
-    from ddco_pyro.report import write_report
 
     if jobs is None:
         jobs = -1 if processes == 1 else 1
@@ -124,6 +123,8 @@ def _fit(
         fitted = ddco_pyro.fit(loaded, None, folder, progress, jobs, processes, resume)
         if seeds is not None:
             fitted = repeat(fitted, seeds, progress, jobs)
+    from ddco_pyro.report import write_report  # imports matplotlib, after the fit
+
     console.log_likelihoods(fitted.metrics)
     console.seeds(fitted.metrics)
     _warn(fitted)

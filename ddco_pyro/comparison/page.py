@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from ddco_pyro.comparison import Comparison, Row
 from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.drawing import words
-from ddco_pyro.drawing.figures import Interval, Panel, Picture, interval_plot, save, style
-from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, note
+from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save, style
+from ddco_pyro.drawing.page import Block, Cell, Page, Picture, Section, Table, Text, note
 from ddco_pyro.evaluation.agreement import UNMATCHED
 from ddco_pyro.evaluation.worth import worth
 from ddco_pyro.report.likelihood import SHOWN

@@ -31,7 +31,7 @@ MOST_DISTINCT = 64
 
 
 def same(values: np.ndarray, value: np.ndarray | float) -> np.ndarray:
-    """Which values are a finite ``value`` but for rounding; zero is zero alone."""
+    """Which values equal a finite ``value`` within rounding. Only 0 equals 0."""
     with np.errstate(invalid="ignore", over="ignore"):
         found: np.ndarray = np.isfinite(value) & (np.abs(values - value) <= ROUNDING * np.abs(value))
     return found
@@ -43,7 +43,7 @@ class ControlDimension:
 
     :param number: index of the dimension, from 0.
     :param minimum: the smallest value, in the control's units; ``maximum`` likewise.
-    :param at_minimum: number of steps at the minimum, but for rounding (:data:`ROUNDING`); ``at_maximum`` likewise.
+    :param at_minimum: number of steps at the minimum within rounding (:data:`ROUNDING`); ``at_maximum`` likewise.
     :param steps: number of steps with finite values.
     :param distinct: the sorted values if there are at most :data:`MOST_DISTINCT`; else empty.
     :param inside: the commonest value strictly between the extremes; None without a common value.

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-import matplotlib
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
 from ddco_pyro.drawing.words import option_name
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 
 CONTROL = "#9a9a9a"
 
@@ -37,12 +38,14 @@ def option_colour(choice: int) -> str:
 
 def option_rgb(choice: int) -> tuple[int, int, int]:
     """The colour of a choice as red, green and blue, 0 to 255."""
-    red, green, blue = (round(255 * part) for part in matplotlib.colors.to_rgb(option_colour(choice)))
+    red, green, blue = bytes.fromhex(option_colour(choice)[1:])
     return red, green, blue
 
 
 def legend(choices: Iterable[int]) -> list[Patch]:
     """Legend handles that name the colours of choices."""
+    from matplotlib.patches import Patch
+
     return [Patch(color=option_colour(choice), label=option_name(choice)) for choice in choices]
 
 
@@ -58,6 +61,7 @@ def with_heat(picture: np.ndarray, values: np.ndarray) -> np.ndarray:
     Colours go from yellow to dark red on a scale of the picture's own; 0 has none.
     """
     import cv2  # one's own vectors need none of it
+    from matplotlib import colormaps
 
     grey = 255 - (1 - FADED) * (255 - picture.astype(float).mean(-1, keepdims=True))
     most = np.percentile(values, PERCENTILE) or values.max() or 1.0

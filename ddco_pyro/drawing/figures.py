@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ddco_pyro.data.files import whole_file
+from ddco_pyro.drawing.page import Picture
 
 WIDTH = 9.6
 """Inches. On a page of 960 pixels, text in a figure is as large as the page's own."""
@@ -50,15 +51,6 @@ STYLE: Any = {  # matplotlib types the keys as literals
     "legend.fontsize": 8,
     "figure.constrained_layout.use": True,
 }
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure on a page: PNG as a data URI, its alternative text and its caption."""
-
-    uri: str
-    alt: str
-    caption: str
 
 
 @contextmanager

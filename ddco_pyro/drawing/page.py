@@ -11,8 +11,6 @@ import jinja2
 import rich.table
 import rich.text
 
-from ddco_pyro.drawing.figures import Picture
-
 
 class Cell(str):
     """Text of a table's cell that HTML shows as a link, after a swatch of a colour, or as a mark."""
@@ -95,6 +93,15 @@ class Folded:
 
     summary: str
     blocks: Sequence[Block]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure on a page: PNG as a data URI, its alternative text and its caption."""
+
+    uri: str
+    alt: str
+    caption: str
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 CONFIDENCE = 0.95
 """Level of intervals; a difference is significant where its interval excludes 0."""
@@ -177,7 +176,7 @@ def worth(found: Mapping[str, Any], ours: str, held_out: int) -> str:
 
 def success_worth(rollouts: Mapping[str, Any], ours: str) -> str:
     """What several experts and options that last are worth in rollouts: in this fit, and over training seeds where it
-    was repeated; empty where there is no mixture.
+    was repeated; empty where there is no mixture. The verdict is by :func:`_wider`, with the error over episodes.
 
     :param rollouts: what ``metrics.json`` has under ``rollouts``.
     :param ours: what the hierarchy is called.
@@ -202,7 +201,10 @@ def success_worth(rollouts: Mapping[str, Any], ours: str) -> str:
         for part, values in seeds["worth"].items()
         if part in names
     ]
-    low, high = mean_interval(seeds["worth"]["memory"])
+    pair = found["memory"]
+    discordant, lead = pair["only_ours"] + pair["only_theirs"], pair["only_ours"] - pair["only_theirs"]
+    error = math.sqrt(discordant - lead**2 / pair["trials"]) / pair["trials"]
+    low, high = _wider(seeds["worth"]["memory"], error)
     decided = "options that last help" if low > 0 else "options that last harm" if high < 0 else "inconclusive"
     count = len(seeds["training_seeds"])
     return f"{text} Over {count} training seeds: {listed(parts)} points of success. In rollouts: {decided}."
@@ -235,12 +237,33 @@ def over_seeds(found: Mapping[str, Any], ours: str) -> str:
     count = len(found["training_seeds"])
     said = f": {listed(parts)} nats per step" if parts else ""
     text = f"Over {count} training seeds, with the same demonstrations held out{said}."
-    return f"{text} {_lasting(found['worth']['memory'])}" if "memory" in found["worth"] else text
+    if "memory" not in found["worth"]:
+        return text
+    return f"{text} {_lasting(found['worth']['memory'], found['standard_error']['memory'])}"
 
 
-def _lasting(memory: Sequence[float]) -> str:
-    """Whether options that last are worth it, by the 95 % t interval over training seeds and :data:`SMALLEST`."""
-    low, high = mean_interval(memory)
+def _lasting(memory: Sequence[float], errors: Sequence[float | None]) -> str:
+    """Whether options that last are worth it: by the wider of two 95 % intervals, and :data:`SMALLEST`.
+
+    :param errors: standard errors over held-out demonstrations.
+    """
+    low, high = _wider(memory, float(np.mean([error or 0.0 for error in errors])))
+    wider = high > mean_interval(memory)[1]
+    said = f"Over held-out demonstrations it is {interval([low, high])}. " if wider else ""
+    return said + _verdict(low, high)
+
+
+def _wider(values: Sequence[float], error: float) -> tuple[float, float]:
+    """The wider of two 95 % intervals of a mean: the t interval over training seeds, and two standard errors.
+
+    Seeds that give nearly the same fit have an interval without width, which is no evidence.
+    """
+    mean = float(np.mean(values))
+    half = max(mean_interval(values)[1] - mean, 2 * error)
+    return mean - half, mean + half
+
+
+def _verdict(low: float, high: float) -> str:
     if low > -SMALLEST and high < SMALLEST:
         return f"So options that last make no difference here: less than {SMALLEST} nats per step."
     if low > 0:
@@ -253,8 +276,15 @@ def _lasting(memory: Sequence[float]) -> str:
 def mean_interval(values: Sequence[float]) -> tuple[float, float]:
     """The 95 % t interval of the mean of a few values."""
     mean, count = float(np.mean(values)), len(values)
-    half = float(np.std(values, ddof=1) * stats.t.ppf((1 + CONFIDENCE) / 2, count - 1) / math.sqrt(count))
+    half = float(np.std(values, ddof=1) * _t_quantile(count - 1) / math.sqrt(count))
     return mean - half, mean + half
+
+
+def _t_quantile(freedom: int) -> float:
+    """Half the width of a :data:`CONFIDENCE` interval in standard errors, for so many degrees of freedom."""
+    from scipy.special import stdtrit  # most commands draw no interval
+
+    return float(stdtrit(freedom, (1 + CONFIDENCE) / 2))
 
 
 def spread(values: Sequence[float]) -> tuple[str, str, str]:
@@ -272,11 +302,7 @@ def with_error(difference: Mapping[str, Any] | None) -> str:
 def _direction(difference: Mapping[str, Any], held_out: int) -> int:
     """1 or -1 where the 95 % interval of a difference leaves out 0, else 0."""
     mean, error = difference["nats_per_step"], difference["standard_error"]
-    if (
-        error is None
-        or not math.isfinite(error)
-        or abs(mean) <= error * stats.t.ppf((1 + CONFIDENCE) / 2, held_out - 1)
-    ):
+    if error is None or not math.isfinite(error) or abs(mean) <= error * _t_quantile(held_out - 1):
         return 0
     return 1 if mean > 0 else -1
 

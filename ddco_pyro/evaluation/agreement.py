@@ -15,8 +15,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-from sklearn.metrics import adjusted_rand_score, normalized_mutual_info_score
 
 UNKNOWN = -1
 """The label of a step without ground truth."""
@@ -51,6 +49,8 @@ def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> d
     :param segments: options [T] of each demonstration, any integers.
     :param labels: the true ones [T].
     """
+    from sklearn.metrics import adjusted_rand_score, normalized_mutual_info_score
+
     pairs = _known(segments, labels)
     if not pairs:
         return None
@@ -118,6 +118,8 @@ def _counts(ours: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def _matching(counts: np.ndarray) -> np.ndarray:
     """The label of each option [options]; a distinct number above all labels for an unmatched option."""
+    from scipy.optimize import linear_sum_assignment
+
     match = LARGEST + np.arange(counts.shape[1])
     for label, option in zip(*linear_sum_assignment(counts, maximize=True), strict=True):
         if counts[label, option]:

@@ -231,6 +231,7 @@ class Seeds(Record):
     training_seeds: Annotated[list[int], Field(min_length=2)]
     held_out: dict[str, list[Finite]]
     worth: dict[str, list[Finite]]
+    standard_error: dict[str, list[Finite | None]]
 
 
 class Dimensions(Record):

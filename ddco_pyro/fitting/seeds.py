@@ -106,12 +106,16 @@ def over_seeds(seeds: Sequence[int], each: Sequence[Mapping[str, Any]]) -> dict[
     """``metrics["seeds"]``: the results of fits with these training seeds, from the metrics of each.
 
     :returns: the ``training_seeds``; by model its ``held_out`` log-likelihoods per step; and the parts of ``worth``
-        (:mod:`ddco_pyro.evaluation.worth`), nats per step: all in the order of the seeds.
+        (:mod:`ddco_pyro.evaluation.worth`), nats per step, each with its ``standard_error`` over held-out
+        demonstrations: all in the order of the seeds.
     """
     model = each[0]["model"]
     held_out = {model: [metrics["log_likelihood_per_step"]["valid"] for metrics in each]}
     for name in each[0]["comparison"]:
         held_out[name] = [metrics["comparison"][name]["log_likelihood_per_step"]["valid"] for metrics in each]
     parts = [part for part in PARTS if part in each[0].get("worth", {})]
-    worth = {part: [metrics["worth"][part]["nats_per_step"] for metrics in each] for part in parts}
-    return {"training_seeds": list(seeds), "held_out": held_out, "worth": worth}
+    worth, errors = (
+        {part: [metrics["worth"][part][key] for metrics in each] for part in parts}
+        for key in ("nats_per_step", "standard_error")
+    )
+    return {"training_seeds": list(seeds), "held_out": held_out, "worth": worth, "standard_error": errors}

@@ -52,7 +52,8 @@ class ControlScaling(nn.Module):
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
         self.register_buffer("varying", torch.tensor(varying, dtype=torch.int64))
         self.register_buffer("constant", torch.tensor([constant[d] for d in sorted(constant)], dtype=torch.float64))
-        self.register_buffer("order", torch.tensor([*varying, *sorted(constant)]).argsort(), persistent=False)
+        order = np.argsort([*varying, *sorted(constant)]).tolist()  # Tensor.argsort on "meta" imports sympy
+        self.register_buffer("order", torch.tensor(order), persistent=False)
         for name, end in (("low", -math.inf), ("high", math.inf)):
             values = torch.full((len(varying),), end, dtype=torch.float64)
             for dims, part in zip(self.groups, parts, strict=True):
@@ -219,12 +220,12 @@ class ControlStd(nn.Module):
         floors = [std.floor if isinstance(std, LearnedStd) else 0.0 for std in stds]
         self.register_buffer("fixed", torch.tensor(fixed), persistent=False)
         self.register_buffer("floor", torch.tensor(floors), persistent=False)
-        start = torch.tensor([math.log(math.expm1(max(INITIAL_STD - floor, 1e-3))) for floor in floors])
-        self.register_buffer("start", start, persistent=False)
+        start = [math.log(math.expm1(max(INITIAL_STD - floor, 1e-3))) for floor in floors]
+        self.register_buffer("start", torch.tensor(start), persistent=False)
         if self.shared:
-            self.raw = nn.Parameter(start[self.shared].clone())
+            self.raw = nn.Parameter(torch.tensor([start[place] for place in self.shared]))
         if self.own:
-            self.raw_own = nn.Parameter(start[self.own].repeat(copies, 1))
+            self.raw_own = nn.Parameter(torch.tensor([[start[place] for place in self.own]] * copies))
 
     def table(self) -> Tensor:
         """σ without the dimensions whose σ depends on the state: [C]; [K, C] with a σ of each option."""

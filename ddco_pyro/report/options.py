@@ -15,8 +15,8 @@ from matplotlib.ticker import MaxNLocator
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.colours import add_legend, option_colour
-from ddco_pyro.drawing.figures import FAINT, GRID, Picture, blank, hide_frame, save
-from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, Timeline, note
+from ddco_pyro.drawing.figures import FAINT, GRID, blank, hide_frame, save
+from ddco_pyro.drawing.page import Block, Cell, Picture, Section, Table, Text, Timeline, note
 from ddco_pyro.drawing.words import number, option_name, percent
 from ddco_pyro.evaluation.schema import option_labels
 from ddco_pyro.fitting.fit import Fit

@@ -12,7 +12,8 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.colours import add_legend, option_colour
-from ddco_pyro.drawing.figures import FAINT, INK, Picture, blank, save
+from ddco_pyro.drawing.figures import FAINT, INK, blank, save
+from ddco_pyro.drawing.page import Picture
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.report.activity import Activity, LevelActivity
 

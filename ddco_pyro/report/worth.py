@@ -11,10 +11,10 @@ from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Section, Table, note
 
 EXPLAINED = (
-    "A mixture has the hierarchy’s experts and the gate that chooses among them, and chooses anew at every step. Its "
-    "lead over one flat policy is the worth of several experts; the hierarchy’s lead over it is the worth of options "
-    "that last. This fit: ± one standard error over held-out demonstrations, p by McNemar’s exact test. Training "
-    "seeds: mean with its 95 % interval."
+    "A mixture has the hierarchy’s experts and the gate that chooses among them, and chooses anew at every step. "
+    "Its lead over one flat policy is the worth of several experts and of their parameters. The hierarchy’s lead "
+    "over it is the worth of options that last. This fit: ± one standard error over held-out demonstrations, p by "
+    "McNemar’s exact test. Training seeds: mean with its 95 % interval."
 )
 
 

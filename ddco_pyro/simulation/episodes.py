@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-from joblib import Parallel, delayed
-from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.simulation.task import Observation, Policy, Task, find_task
@@ -195,6 +193,8 @@ def run_episodes(
     :param task: the task's name for :func:`ddco_pyro.simulation.task.find_task`.
     :param observed: see :func:`run_episode`, also for ``keep``.
     """
+    from joblib import Parallel, delayed
+
     calls = (
         delayed(_run_named)(task, policy, seed, number < film, observed, keep) for number, seed in enumerate(seeds)
     )
@@ -225,8 +225,10 @@ def mean(values: np.ndarray) -> dict[str, Any]:
     centre = float(values.mean()) if trials else None
     if centre is None or trials < 2:
         return {"mean": centre, "std": None, "trials": trials, "interval": None}
+    from scipy.special import stdtrit
+
     spread = float(values.std(ddof=1))
-    half = float(spread / np.sqrt(trials) * stats.t.ppf((1 + CONFIDENCE) / 2, trials - 1))
+    half = float(spread / np.sqrt(trials) * stdtrit(trials - 1, (1 + CONFIDENCE) / 2))
     return {"mean": centre, "std": spread, "trials": trials, "interval": [centre - half, centre + half]}
 
 
@@ -234,7 +236,9 @@ def rate(successes: int, trials: int) -> dict[str, Any]:
     """A success rate and its Wilson 95 % interval."""
     if trials == 0:
         return {"successes": 0, "trials": 0, "rate": None, "interval": None}
-    interval = stats.binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
+    from scipy.stats import binomtest
+
+    interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
     return {
         "successes": successes,
         "trials": trials,
@@ -245,8 +249,10 @@ def rate(successes: int, trials: int) -> dict[str, Any]:
 
 def paired_difference(ours: Sequence[float], theirs: Sequence[float]) -> dict[str, Any]:
     """Successes from the same initial states: counts of those of one policy alone, and McNemar's exact p-value."""
+    from scipy.stats import binomtest
+
     only_ours = int(sum(a > b for a, b in zip(ours, theirs, strict=True)))
     only_theirs = int(sum(a < b for a, b in zip(ours, theirs, strict=True)))
     discordant = only_ours + only_theirs
-    p_value = float(stats.binomtest(only_ours, discordant).pvalue) if discordant else 1.0
+    p_value = float(binomtest(only_ours, discordant).pvalue) if discordant else 1.0
     return {"only_ours": only_ours, "only_theirs": only_theirs, "trials": len(ours), "p_value": p_value}

@@ -11,18 +11,20 @@ Where some options have labelled steps, their clusters start from the means of t
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from sklearn.cluster import KMeans
-from sklearn.linear_model import LogisticRegression
-from sklearn.metrics import euclidean_distances
 from torch import Tensor
 
 from ddco_pyro.data.memory import share
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import BYTES_AT_ONCE
 from ddco_pyro.model.networks.conv import POOLED
+
+if TYPE_CHECKING:
+    from sklearn.cluster import KMeans
+    from sklearn.linear_model import LogisticRegression
 
 ITERATIONS = 300
 """The most iterations of k-means or logistic regression."""
@@ -57,8 +59,12 @@ class Clusters:
         known = None if labels is None else labels[_alive(batch)].numpy()[chosen]
         self._namer: LogisticRegression | KMeans
         if known is not None and options > 1 and len(_labelled(known, options)) == options:
+            from sklearn.linear_model import LogisticRegression
+
             self._namer = LogisticRegression(max_iter=ITERATIONS).fit(rows[known > 0], known[known > 0] - 1)
         else:
+            from sklearn.cluster import KMeans
+
             start = "k-means++" if known is None else _Start(known)
             number = distinct(rows, options)
             self._namer = KMeans(number, init=start, n_init=10, max_iter=ITERATIONS, random_state=seed).fit(rows)
@@ -155,6 +161,8 @@ class _Start:
         self.labels = labels
 
     def __call__(self, rows: np.ndarray, clusters: int, random_state: np.random.RandomState) -> np.ndarray:
+        from sklearn.metrics import euclidean_distances
+
         labelled = _labelled(self.labels, clusters)
         means = {option: rows[self.labels == option].mean(0) for option in labelled}
         for option in set(range(1, clusters + 1)) - set(labelled):

@@ -106,10 +106,11 @@ class StageTraining:
             model.begin_terminations()
         self.objective = Objective(data, now, stage, ranks, restart.states if now.epoch else None)
         self.parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
-        self.optimizer = _optimizer(self.spec.optimizer, self.parameters)
-        self.em = None
+        self.em: Expectation | None = None
         if uses_em(self.spec.optimizer, model):
             self.em = Expectation(model, stage.trained, self._score, self.spec.optimizer.ridge, stage.discovering)
+        else:
+            self.optimizer = _optimizer(self.spec.optimizer, self.parameters)
         decay = self.spec.average
         self.mean = None if decay is None else AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(decay))
         if now.epoch > 0:
@@ -148,13 +149,12 @@ class StageTraining:
         """
         now, train = self.restart.progress, self.data.train
         place = now.restart, now.stage, now.epoch
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate(self.spec.optimizer, now.epoch, cap)
-        varied, total = train.varied(self.model.encoder.shifts, self.data.seed(*place)), 0.0
         if self.em is not None:
             total = self.em.step(train) / self.objective.likelihoods
         else:
-            total = self._gradient_steps(varied, place)
+            for group in self.optimizer.param_groups:
+                group["lr"] = learning_rate(self.spec.optimizer, now.epoch, cap)
+            total = self._gradient_steps(place)
         tune = self.objective.tune(self.kept)
         now.epoch += 1
         if tune > now.best:
@@ -167,14 +167,15 @@ class StageTraining:
         return ended
 
     def _score(self, tables: Tables, piece: Batch, rows: Tensor) -> Tensor:
-        return self.objective.value(self.objective.clamped(tables, rows), piece.lengths)
+        return self.objective.values(self.objective.clamped(tables, rows), piece.lengths).sum()
 
-    def _gradient_steps(self, varied: Batch, place: tuple[int, int, int]) -> float:
+    def _gradient_steps(self, place: tuple[int, int, int]) -> float:
         """A gradient step on each minibatch; the log-likelihood on the way, nats.
 
         :param place: the restart, stage and epoch, which seed what is random.
         """
         train, total = self.data.train, 0.0
+        varied = train.varied(self.model.encoder.shifts, self.data.seed(*place))
         with seeded(self.data.seed(*place), self.model.device):
             self.model.train()
             minibatches = torch.randperm(len(train)).split(self.spec.batch_size)
@@ -267,7 +268,7 @@ def backward(objective: Objective, model: Hierarchy, batch: Batch, rows: Tensor,
     batch, total = batch.select(rows), 0.0
     for part, piece in batch.pieces(model.steps_at_once):
         tables = objective.tables(model, piece, rows[part])  # networks → tables
-        value = objective.value(tables, piece.lengths)  # exact log-likelihood, all options summed out
+        value = objective.values(tables, piece.lengths).sum()  # exact log-likelihood, all options summed out
         if not bool(torch.isfinite(value.detach())):
             raise objective.diverged(tables, piece.lengths, rows[part])
         (-value / (steps or batch.steps)).backward()  # posteriors weight the networks' gradients

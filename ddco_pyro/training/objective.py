@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from statistics import median
 
 import torch
@@ -124,39 +125,41 @@ class Objective:
             tables = tables.clamp(level, choices[rows, : tables.steps])
         return tables
 
-    def value(self, tables: Tables, lengths: Tensor) -> Tensor:
-        """The objective of demonstrations, nats, a scalar.
+    def values(self, tables: Tables, lengths: Tensor) -> Tensor:
+        """The objective of each demonstration, nats, [N] in float64.
 
         :param lengths: steps of each demonstration, [N].
         """
         spec = self.data.spec
         likelihood = partial(log_likelihood, lengths=lengths, engine=spec.inference.engine)
         if self.constants is not None:
-            value = expected(tables, lengths, self.constants)
+            values = expected(tables, lengths, self.constants)
         elif self.stage.selecting:
             levels, meta_policy = tables.apart()
-            value = likelihood(levels).sum() + likelihood(meta_policy).sum()
+            values = likelihood(levels) + likelihood(meta_policy)
         else:
-            value = likelihood(tables).sum()
+            values = likelihood(tables)
         if spec.training.duration is None:
-            return value
+            return values
         prior = log_duration_prior(tables.termination, lengths, spec.training.duration)
-        return value + prior / self.data.train.steps
+        return values + prior / self.data.train.steps
 
     def tune(self, model: Hierarchy) -> float:
         """The objective per step of the tuning demonstrations: the mean, or the median over demonstrations."""
-        tune, by_median = self.data.tune, self.data.spec.training.tune_by == "median"
-        pieces = list(tune.pieces(1 if by_median else model.steps_at_once))  # one demonstration each
+        tune = self.data.tune
+        pieces = list(tune.pieces(model.steps_at_once))
         with torch.no_grad():
             if tune.picture_bytes:
                 read_ahead(model, tune, (piece for _, piece in self.ranks.own(pieces)))
-            values = list(self.ranks.each(partial(self._tuned, model, *piece) for piece in pieces))
-        if by_median:
-            return median(value / piece.steps for value, (_, piece) in zip(values, pieces, strict=True))
+            each = self.ranks.each(partial(self._tuned, model, *piece) for piece in pieces)
+            values = list(chain.from_iterable(each))
+        if self.data.spec.training.tune_by == "median":
+            return median(value / steps for value, steps in zip(values, tune.lengths.tolist(), strict=True))
         return sum(values) / tune.steps
 
-    def _tuned(self, model: Hierarchy, rows: Tensor, batch: Batch) -> float:
-        return float(self.value(self.tables(model, batch, rows, tuning=True), batch.lengths)) / self.likelihoods
+    def _tuned(self, model: Hierarchy, rows: Tensor, batch: Batch) -> list[float]:
+        values = self.values(self.tables(model, batch, rows, tuning=True), batch.lengths) / self.likelihoods
+        return values.tolist()
 
     def diverged(self, tables: Tables, lengths: Tensor, rows: Tensor) -> Diverged:
         """The error that names the training demonstrations whose log-likelihood is not finite."""
@@ -171,24 +174,24 @@ class Objective:
 
 
 def log_duration_prior(termination: Sequence[Tensor], lengths: Tensor, prior: DurationSpec) -> Tensor:
-    """Σ_d Σ_h Σ_n Σ_t w (log ψ_h(s_t) + (m_d - 1) log(1 - ψ_h(s_t))), nats, a scalar in float64.
+    """Σ_d Σ_h Σ_t w (log ψ_h(s_t) + (m_d - 1) log(1 - ψ_h(s_t))) of each trajectory, nats, [N] in float64.
 
-    ψ is that of option h of level d, w the prior's weight, m_d its mean. Divided by the number of steps this is the
-    mean over states of the log-density of Beta distributions of ψ with mean 1/m_d and w terminations, each as a
-    density of the logit of ψ and up to a constant. A level whose options end after every step has no such
-    distribution, and adds nothing.
+    ψ is that of option h of level d, w the prior's weight, m_d its mean. The sum over trajectories, divided by the
+    number of steps, is a mean over states. Its terms are log-densities of Beta distributions of ψ with mean 1/m_d and w
+    terminations. Each is a density of the logit of ψ, up to a constant. A level whose options end after every step has
+    no such distribution and adds nothing.
 
     :param termination: (log(1 - ψ), log ψ) of each level, lowest first, [N, T, k, 2].
     :param lengths: steps of each trajectory, [N].
     """
     means = prior.mean if isinstance(prior.mean, tuple) else (prior.mean,) * len(termination)
-    total = torch.zeros((), dtype=torch.float64)
+    total = lengths.new_zeros(len(lengths), dtype=torch.float64)
     for table, mean in zip(termination, means, strict=False):  # lower levels alone, where those are discovered
         if always_ends(table):
             continue
         alive = torch.arange(table.shape[1], device=lengths.device) < lengths[:, None]
         counts = prior.weight * torch.tensor([mean - 1.0, 1.0], dtype=torch.float64)
-        total = total + (table.double() * counts)[alive].sum()
+        total = total + torch.where(alive[..., None, None], table.double() * counts, 0.0).sum((1, 2, 3))
     return total
 
 

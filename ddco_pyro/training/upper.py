@@ -132,16 +132,17 @@ def improved(pieces: Sequence[Piece], constants: Constants) -> tuple[float, Cons
 
 
 def expected(tables: Tables, lengths: Tensor, constants: Constants) -> Tensor:
-    """The expected log-probability Σ_n E[log p(ζ_n)] that an M-step of the networks maximises, nats, a scalar, float64.
+    """The expected log-probability E[log p(ζ_n)] of each trajectory, nats, [N] in float64.
 
-    It is of selections, and of terminations above the lowest level, under the posterior of ζ_n given the constants.
+    An M-step of the networks maximises their sum. The log-probability is that of selections, and of terminations above
+    the lowest level. The expectation is over the posterior of ζ_n given the constants.
     """
     counts = fused.eliminate(constants.within(tables), lengths).tables
     pairs = [
         *zip(tables.selection, counts.selection, strict=True),
         *zip(tables.termination[1:], counts.termination[1:], strict=True),
     ]
-    total = torch.zeros((), dtype=torch.float64)
+    total = lengths.new_zeros(len(lengths), dtype=torch.float64)
     for table, count in pairs:
-        total = total + (table.double() * count)[count > 0].sum()
+        total = total + torch.where(count > 0, table.double() * count, 0.0).flatten(1).sum(1)
     return total
