@@ -10,9 +10,9 @@
 
 A mixture is the hierarchy of that study's spec whose options end after every step (``termination: always``): the same
 demonstrations, training seeds, starts and gradient steps. ``--check`` fits options of so many seeds again, to see
-whether this code gives what the study's page has. ``--em`` fits them by expectation-maximisation. Each cell is a few
-rows of ``cells.csv`` as soon as it is done, and is not done again. ``page`` pairs mixtures by seed with the numbers of
-those studies, and writes ``memory.md`` and ``memory.png``.
+whether this code gives what the study's page has. ``--em`` fits them by expectation-maximisation, with its
+ridges and without. Each cell is a few rows of ``cells.csv`` as soon as it is done, and is not done again. ``page``
+pairs mixtures by seed with the numbers of those studies, and writes ``memory.md`` and ``memory.png``.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from arena import TASKS
 from arena_results import nmi
 from cells import described, printed, some
 from ddco_tasks.pushing import environment as pushing_task
-from memory_results import EM, MIXTURE, OPTIONS, checks, comparisons, draw, of_pages, page, short, with_table
+from memory_results import EM, FREE, MIXTURE, OPTIONS, checks, comparisons, draw, of_pages, page, short, with_table
 from provenance import ROOT, Record, record, sentence, text
 from threadpoolctl import threadpool_limits
 
@@ -54,6 +54,7 @@ METHODS: dict[str, dict[str, Any]] = {
     MIXTURE: {"hierarchy.levels.0.termination": "always"},
     OPTIONS: {},
     EM: {"training.optimizer": {"name": "em"}},
+    FREE: {"training.optimizer": {"name": "em", "ridge": {"policy": 0.0, "gate": 0.0, "termination": 0.0}}},
 }
 """What each method changes in its study's spec."""
 ADAM = {"name": "adam", "lr": 3e-3}
@@ -175,7 +176,7 @@ class Asked(NamedTuple):
     """Cells of a study.
 
     :param check: options of so many seeds are fitted again.
-    :param em: options of so many seeds are fitted by expectation-maximisation.
+    :param em: options of so many seeds are fitted by expectation-maximisation, with ridges and without.
     """
 
     counts: tuple[int, ...]
@@ -198,7 +199,7 @@ WHOLE = {
 def cells_of(study: str, asked: Asked) -> list[Cell]:
     """All counts and tasks of a seed before another seed, mixtures before the options that check them."""
     grid = itertools.product(range(asked.seeds), asked.counts, asked.tasks, METHODS)
-    seeds = {MIXTURE: asked.seeds, OPTIONS: asked.check, EM: asked.em}
+    seeds = {MIXTURE: asked.seeds, OPTIONS: asked.check, EM: asked.em, FREE: asked.em}
     return [Cell(study, task, method, count, seed) for seed, count, task, method in grid if seed < seeds[method]]
 
 

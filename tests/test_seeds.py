@@ -60,9 +60,12 @@ def test_each_repetition_is_that_fit_with_another_training_seed(written):
 def test_the_command_says_how_much_they_differ(written):
     _, run, ended = written
     metrics = json.loads((run / "metrics.json").read_text())
-    assert words.over_seeds(metrics["seeds"], "DDCO") in ended.out
+    said = words.over_seeds(metrics["seeds"], "DDCO", len(metrics["valid"]))
+    assert said in ended.out
     assert "--seeds" not in ended.out  # nothing more is asked for
-    assert words.over_seeds(metrics["seeds"], "DDCO") in (run / "report.html").read_text().replace("&#39;", "'")
+    assert words.over_seeds(metrics["seeds"], "DDCO", len(metrics["valid"])) in (
+        run / "report.html"
+    ).read_text().replace("&#39;", "'")
 
 
 def test_what_is_done_is_not_done_again(written):
@@ -100,20 +103,23 @@ def test_the_intervals_are_those_of_scipy():
 )
 def test_the_verdict_is_over_training_seeds(memory, said):
     found = {"training_seeds": [0, 1, 2], "worth": {"memory": memory}, "standard_error": {"memory": [0.0, None, 0.0]}}
-    assert said in words.over_seeds(found, "DDCO")
+    assert said in words.over_seeds(found, "DDCO", 10)
 
 
 @pytest.mark.parametrize(
     ("error", "said"),
     [
-        (0.016, "Over held-out demonstrations it is −0.01 to 0.05. It is inconclusive whether"),
-        (0.009, "Over held-out demonstrations it is 0.00 to 0.04. So options that last are worth it"),
+        (0.016, "Over held-out demonstrations it is −0.02 to 0.06. It is inconclusive whether"),
+        (0.006, "Over held-out demonstrations it is 0.01 to 0.03. So options that last are worth it"),
     ],
 )
 def test_where_seeds_give_the_same_fit_held_out_demonstrations_decide(error, said):
     """EM reaches one optimum from any seed; an interval without width is no evidence."""
     memory = {"worth": {"memory": [0.019, 0.0191, 0.0192]}, "standard_error": {"memory": [error] * 3}}
-    assert said in words.over_seeds({"training_seeds": [0, 1, 2]} | memory, "DDCO")
+    text = words.over_seeds({"training_seeds": [0, 1, 2]} | memory, "DDCO", 10)
+    assert said in text
+    low, high = stats.t.interval(0.95, 9, 0.0191, error)  # ten held-out demonstrations
+    assert f"{low:.2f} to {high:.2f}".replace("-", "−") in text
 
 
 def test_seeds_follow_the_specs_own(written):
@@ -126,7 +132,7 @@ def test_a_run_without_a_mixture_has_no_parts():
     metrics = {"model": "ddco", "log_likelihood_per_step": {"train": 1.0, "valid": 0.5}, "comparison": {}}
     found = over_seeds([0, 1], [metrics, metrics])
     assert found == {"training_seeds": [0, 1], "held_out": {"ddco": [0.5, 0.5]}, "worth": {}, "standard_error": {}}
-    assert words.over_seeds(found, "DDCO") == "Over 2 training seeds, with the same demonstrations held out."
+    assert words.over_seeds(found, "DDCO", 10) == "Over 2 training seeds, with the same demonstrations held out."
 
 
 def test_rollouts_have_the_same_two_parts_and_the_same_seeds(tmp_path):

@@ -160,7 +160,9 @@ def test_from_pictures_to_a_policy_by_commands(source: Path, tmp_path: Path) -> 
     assert "; of moved pictures, 3 times: obs/camera_features_moved; " in ended.out
     assert call(*given, "--out", bare).status == 0
     assert call("init", out, "--out", spec).status == 0
-    written = yaml.safe_load(spec.read_text())["observations"]
+    whole = yaml.safe_load(spec.read_text())
+    assert whole["training"]["optimizer"]["name"] == "adam"  # em would see no versions
+    written = whole["observations"]
     own = next(one for one in written if one["key"] == "camera_features")
     assert own["augment"] == {"versions": "camera_features_moved"}
     assert "camera_features_moved" not in [one["key"] for one in written]

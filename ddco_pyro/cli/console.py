@@ -238,7 +238,7 @@ def seeds(metrics: Mapping[str, Any]) -> None:
     rows = [[words.method(name), *words.spread(values)] for name, values in found["held_out"].items()]
     title = f"held-out nats per step over training seeds {words.listed(map(str, found['training_seeds']))}"
     show(Table(["Method", "mean", "95 % interval", "range"], rows, title=title))
-    say(words.over_seeds(found, words.method(metrics["model"])))
+    say(words.over_seeds(found, words.method(metrics["model"]), len(metrics["valid"])))
 
 
 def merged(pair: Pair, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:

@@ -532,7 +532,8 @@ def _ends(
         return dim.minimum, dim.maximum
     if spec is not None and spec.bounds is not None:
         low, high = spec.bounds
-        if dim.minimum < low or dim.maximum > high:
+        ends = np.array([dim.minimum, dim.maximum])
+        if not (((ends >= low) & (ends <= high)) | same(ends, low) | same(ends, high)).all():
             raise SpecError(
                 f"{place}.bounds: control dimension {dim.number} goes from {number(dim.minimum)} to "
                 f"{number(dim.maximum)} in the demonstrations, beyond these bounds"

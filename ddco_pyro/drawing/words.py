@@ -128,7 +128,7 @@ def _explained(metrics: Mapping[str, Any]) -> str:
     if "worth" in metrics:
         said.append(worth(metrics["worth"], method(metrics["model"]), held_out))
     if "seeds" in metrics:
-        said.append(over_seeds(metrics["seeds"], method(metrics["model"])))
+        said.append(over_seeds(metrics["seeds"], method(metrics["model"]), held_out))
     return " ".join(said)
 
 
@@ -204,7 +204,7 @@ def success_worth(rollouts: Mapping[str, Any], ours: str) -> str:
     pair = found["memory"]
     discordant, lead = pair["only_ours"] + pair["only_theirs"], pair["only_ours"] - pair["only_theirs"]
     error = math.sqrt(discordant - lead**2 / pair["trials"]) / pair["trials"]
-    low, high = _wider(seeds["worth"]["memory"], error)
+    low, high = _wider(seeds["worth"]["memory"], error, pair["trials"])
     decided = "options that last help" if low > 0 else "options that last harm" if high < 0 else "inconclusive"
     count = len(seeds["training_seeds"])
     return f"{text} Over {count} training seeds: {listed(parts)} points of success. In rollouts: {decided}."
@@ -221,12 +221,13 @@ def of_episodes(pair: Mapping[str, Any] | None) -> str:
     return f"{_more(pair)} (p = {p_value(pair['p_value'])})".replace("= <", "<")
 
 
-def over_seeds(found: Mapping[str, Any], ours: str) -> str:
+def over_seeds(found: Mapping[str, Any], ours: str, held_out: int) -> str:
     """What the parts of the worth are over training seeds, each with a 95 % t interval, and the verdict, which is about
     options that last.
 
     :param found: what :func:`ddco_pyro.fitting.seeds.over_seeds` gives.
     :param ours: what the hierarchy is called.
+    :param held_out: number of held-out demonstrations.
     """
     names = {"memory": f"{ours} − mixture", "experts": "mixture − flat"}
     parts = [
@@ -239,27 +240,31 @@ def over_seeds(found: Mapping[str, Any], ours: str) -> str:
     text = f"Over {count} training seeds, with the same demonstrations held out{said}."
     if "memory" not in found["worth"]:
         return text
-    return f"{text} {_lasting(found['worth']['memory'], found['standard_error']['memory'])}"
+    return f"{text} {_lasting(found['worth']['memory'], found['standard_error']['memory'], held_out)}"
 
 
-def _lasting(memory: Sequence[float], errors: Sequence[float | None]) -> str:
-    """Whether options that last are worth it: by the wider of two 95 % intervals, and :data:`SMALLEST`.
+def _lasting(memory: Sequence[float], errors: Sequence[float | None], held_out: int) -> str:
+    """Whether options that last are worth it: by :func:`_wider` and :data:`SMALLEST`.
 
-    :param errors: standard errors over held-out demonstrations.
+    :param errors: standard errors over held-out demonstrations; None where there is one.
     """
-    low, high = _wider(memory, float(np.mean([error or 0.0 for error in errors])))
+    known = [error for error in errors if error is not None]
+    low, high = _wider(memory, float(np.mean(known)) if known else 0.0, held_out)
     wider = high > mean_interval(memory)[1]
     said = f"Over held-out demonstrations it is {interval([low, high])}. " if wider else ""
     return said + _verdict(low, high)
 
 
-def _wider(values: Sequence[float], error: float) -> tuple[float, float]:
-    """The wider of two 95 % intervals of a mean: the t interval over training seeds, and two standard errors.
+def _wider(values: Sequence[float], error: float, trials: int) -> tuple[float, float]:
+    """The wider of two 95 % t intervals of a mean: over training seeds, and over the trials of one fit.
 
     Seeds that give nearly the same fit have an interval without width, which is no evidence.
+
+    :param values: the value of each seed.
+    :param error: standard error over so many held-out demonstrations or episodes, 0 where it is not known.
     """
     mean = float(np.mean(values))
-    half = max(mean_interval(values)[1] - mean, 2 * error)
+    half = max(mean_interval(values)[1] - mean, error * _t_quantile(max(trials - 1, 1)))
     return mean - half, mean + half
 
 

@@ -38,7 +38,8 @@ class OptimizerSpec(Model):
     momentum: Share = 0.9
     """Momentum (``momentum`` only)."""
     weight_decay: float = Field(default=0.0, ge=0)
-    """L2 penalty; for ``adamw`` the decoupled weight decay: every weight shrinks by ``lr`` × this in a step."""
+    """L2 penalty; for ``adamw`` the decoupled weight decay: every weight shrinks by ``lr`` × this in a step.
+    Models that ``em`` trains have ridges instead."""
 
     @model_validator(mode="after")
     def _momentum_has_its_optimizer(self) -> OptimizerSpec:
