@@ -22,6 +22,9 @@ from ddco_pyro.spec.yaml import read_yaml
 MANY = 100
 """From so many demonstrations on a tenth is held out, of fewer a fifth."""
 
+FEW = 8
+"""Of fewer demonstrations none is held out from the fit: a part to tune by and a part to validate leave too few."""
+
 MOST_EPOCHS = 2000
 """Largest budget of epochs."""
 
@@ -100,6 +103,7 @@ def _filled(inspection: Inspection, path: str, observed: Sequence[Field], used: 
     vectors, images = ([field for field in used if field.image is image] for image in (False, True))
     recipe = VECTORS if vectors else PICTURES
     batch = _batch(np.array(lengths), recipe)
+    em = bool(vectors) and not images and not inspection.versions
     unusable_labels = [(field.key, why) for field in inspection.labels if (why := _unusable(inspection, field))]
     return environment.get_template("starting.yaml.j2").render(
         path=path,
@@ -117,6 +121,8 @@ def _filled(inspection: Inspection, path: str, observed: Sequence[Field], used: 
         left_out=[(field, why) for field in observed if (why := _left_out(inspection, field))],
         notes=[printable(note) for note in inspection.notes],
         batch=batch,
+        em=em,
+        few=em and len(lengths) < FEW and not {"train", "valid"} & set(masks),
         epochs=_epochs(np.array(lengths), batch, recipe),
     )
 

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import Failed
@@ -49,6 +50,10 @@ class Fitted(Protocol):
         """The numbers of a baseline, which is evaluated before its model."""
 
     @property
+    def without(self) -> Mapping[str, Hierarchy]:
+        """The model without each demonstration, by its name, which that demonstration is held out from; else empty."""
+
+    @property
     def baselines(self) -> Mapping[str, Any]:
         """The fitted baselines, by name."""
 
@@ -67,14 +72,52 @@ class _Part:
     segments: list[list[np.ndarray]]
 
     @classmethod
-    def of(cls, fit: Fitted, demos: Demonstrations) -> _Part:
+    def of(cls, fit: Fitted, demos: Demonstrations, held_out: bool = False) -> _Part:
         values, parts, paths = [], [], []
-        for piece in infer(fit.hierarchy, demos):
+        for piece in _inferred(fit, demos, held_out):
             values.append(_finite(fit, piece))
             parts.append(piece.decomposition)
-            paths.append(piece.path.choices)
+            paths.append(_named_alike(fit, piece, demos))
         segments = [[row[row >= 0].numpy() for h in level for row in h] for level in zip(*paths, strict=True)]
         return cls(np.concatenate(values), Decomposition.joined(parts), segments)
+
+
+def _inferred(fit: Fitted, demos: Demonstrations, held_out: bool) -> Iterator[Inferred]:
+    """The inference for demonstrations; with ``leave_one_out`` a held-out one is inferred by the model without it."""
+    if not (held_out and fit.without):
+        yield from infer(fit.hierarchy, demos)
+    else:
+        for demo in demos:
+            yield from infer(fit.without[demo.name], [demo])
+
+
+def _named_alike(fit: Fitted, piece: Inferred, demos: Demonstrations) -> tuple[Tensor, ...]:
+    """The most likely choices of each level, with the options of a model without a demonstration named as the fit's.
+
+    Options are matched so that both models agree on as many steps of the other demonstrations as possible.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    choices = piece.path.choices
+    if piece.hierarchy is fit.hierarchy:
+        return choices
+    others = demos.select(name for name in demos.names if name not in piece.names)
+    pairs = zip(*(_choices(model, others) for model in (piece.hierarchy, fit.hierarchy)), strict=True)
+    matched = []
+    for own, (theirs, ours) in zip(choices, pairs, strict=True):
+        names = np.arange(max(theirs.max(), ours.max(), own.max()) + 1)
+        together = np.zeros((len(names), len(names)))
+        np.add.at(together, (theirs, ours), 1)
+        names[1:] = 1 + linear_sum_assignment(together[1:, 1:], maximize=True)[1]  # 0 is the control
+        matched.append(torch.where(own < 0, own, torch.as_tensor(names)[own.clamp(min=0)]))
+    return tuple(matched)
+
+
+def _choices(model: Hierarchy, demos: Demonstrations) -> Iterator[np.ndarray]:
+    """The most likely choice at every step of demonstrations, [steps], for each level."""
+    paths = [piece.path.choices for piece in infer(model, demos)]
+    for level in zip(*paths, strict=True):
+        yield np.concatenate([part[part >= 0].numpy() for part in level])
 
 
 def _finite(fit: Fitted, piece: Inferred) -> np.ndarray:
@@ -102,11 +145,11 @@ def evaluate(fitted: Fitted, parts: dict[str, Demonstrations], demos: Demonstrat
 
     :raises NotFinite: a log-likelihood is NaN or infinite.
     """
-    ours = {name: _Part.of(fitted, part) for name, part in parts.items()}
+    ours = {name: _Part.of(fitted, part, name == "valid") for name, part in parts.items()}
     by_method = {fitted.name: {name: part.values for name, part in ours.items()}}
     for method, fit in fitted.baselines.items():
         by_method[method] = {
-            name: np.concatenate([_finite(fit, piece) for piece in infer(fit.hierarchy, part)])
+            name: np.concatenate([_finite(fit, piece) for piece in _inferred(fit, part, name == "valid")])
             for name, part in parts.items()
         }
     values = by_method[fitted.name]
@@ -151,7 +194,7 @@ def _worth(
     found = worth(fit.name, {name: values["valid"] for name, values in by_method.items()}, valid.lengths)
     if not found:
         return {}
-    pairs = zip(ours.segments, _Part.of(fit.baselines[MIXTURE], valid).segments, strict=True)
+    pairs = zip(ours.segments, _Part.of(fit.baselines[MIXTURE], valid, held_out=True).segments, strict=True)
     rows = [{"options": mean_run(own), MIXTURE: mean_run(mixture)} for own, mixture in pairs]
     return {"worth": found | {"steps_in_a_row": rows}}
 

@@ -32,6 +32,7 @@ from ddco_pyro.fitting.run import (
     RunError,
     claim,
     claimed,
+    has_model,
     is_finished,
     read_model,
     write_history,
@@ -68,6 +69,8 @@ class Fit:
     :param folder: the run folder; None where nothing was written.
     :param given: the demonstrations of the fit; None for those that the spec names.
     :param beside: the fitted baselines, by name; None for those in the run folder.
+    :param apart: models that were trained without a demonstration, by its name (``demonstrations.leave_one_out``); None
+        for those in the run folder.
     """
 
     spec: Spec
@@ -76,6 +79,7 @@ class Fit:
     folder: Path | None = None
     given: Demonstrations | None = field(default=None, repr=False)
     beside: Mapping[str, Fit] | None = field(default=None, repr=False)
+    apart: Mapping[str, Hierarchy] | None = field(default=None, repr=False)
 
     def __str__(self) -> str:
         return str(self.folder or "this fit")
@@ -116,6 +120,14 @@ class Fit:
         folders = [self.folder / "baselines" / name for name in named_baselines(self.spec)]
         allow_code = bool(user_code(self.spec))  # the spec names theirs too
         return {folder.name: load(folder, allow_code) for folder in folders if is_finished(folder)}
+
+    @cached_property
+    def without(self) -> Mapping[str, Hierarchy]:
+        """The model without each demonstration, by its name; empty without ``demonstrations.leave_one_out``."""
+        if self.apart is not None or self.folder is None or not self.spec.demonstrations.leave_one_out:
+            return self.apart or {}
+        places = _left_out(self.folder, self.demonstrations)
+        return {name: read_model(place, self.spec) for name, place in places.items()}
 
     @cached_property
     def held_out(self) -> dict[str, float]:
@@ -308,7 +320,9 @@ def _fit_model(
                 beside[baseline] = load(place, allow_code=True)
             else:
                 beside[baseline] = _fit_model(its, demos, place, on_event, jobs, ranks, Clock(), {}, baseline)
-    fitted = Fit(spec, hierarchy, {}, folder, demos, beside)
+    with clock("training"):
+        apart = _leave_one_out(spec, size, demos, folder, on_event, jobs, ranks)
+    fitted = Fit(spec, hierarchy, {}, folder, demos, beside, apart)
     with clock("evaluation"), repeatable(hierarchy.device):
         metrics = evaluate(fitted, split, demos)
     counts = {"train": len(trained.data.train), "tune": len(trained.data.tune), "valid": len(split.get("valid", ()))}
@@ -325,6 +339,39 @@ def _fit_model(
     if folder:
         write_metrics(folder, metrics)
     return replace(fitted, metrics=json.loads(json_text(metrics)))  # as they are read back
+
+
+def _leave_one_out(
+    spec: Spec,
+    size: Dimensions,
+    demos: Demonstrations,
+    folder: Path | None,
+    on_event: OnEvent,
+    jobs: int,
+    ranks: Ranks,
+) -> dict[str, Hierarchy]:
+    """The model trained without each demonstration, by its name, each kept in the run folder as soon as it is done."""
+    models: dict[str, Hierarchy] = {}
+    if not spec.demonstrations.leave_one_out:
+        return models
+    places = _left_out(folder, demos) if folder else {}
+    for name in demos.names:
+        place = places.get(name)
+        if place and has_model(place):
+            models[name] = read_model(place, spec)
+            continue
+        others = demos.select(other for other in demos.names if other != name)
+        checkpoints = place / "checkpoints" if place else None
+        event = f"{model_name(spec)} without {name}"
+        models[name] = train_model(spec, size, others, on_event, checkpoints, None, event, jobs, ranks).hierarchy
+        if place:
+            write_model(place, models[name])
+    return models
+
+
+def _left_out(folder: Path, demos: Demonstrations) -> dict[str, Path]:
+    """The folder of the model without each demonstration, by its name."""
+    return {name: folder / "left_out" / str(number) for number, name in enumerate(demos.names)}
 
 
 def load(folder: str | Path, allow_code: bool = False) -> Fit:

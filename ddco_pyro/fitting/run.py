@@ -75,6 +75,11 @@ def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
     write_text(folder / "metrics.json", json_text(metrics))
 
 
+def has_model(folder: Path) -> bool:
+    """Whether a trained model is in the folder."""
+    return (folder / "model.safetensors").exists()
+
+
 def write_model(folder: Path, hierarchy: Hierarchy) -> None:
     """Write ``model.safetensors``."""
     metadata = {

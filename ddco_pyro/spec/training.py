@@ -136,8 +136,9 @@ class TrainingSpec(Model):
     seed: Seed | None = None
     """Seed of initial weights, clusters, the order of demonstrations, and dropout; null: the spec's ``seed``. The split
     into training, tuning and held-out demonstrations does not depend on this seed."""
-    tune_fraction: Fraction = 0.1
-    """Fraction of the training demonstrations used for tuning: early stopping and the choice among restarts."""
+    tune_fraction: Share = 0.1
+    """Fraction of the training demonstrations used for tuning: early stopping and the choice among restarts; at least
+    one demonstration. With 0, ``em`` trains on all of them until it converges."""
     tune_by: Literal["mean", "median"] = "mean"
     """The tuning score: ``mean`` of the objective over steps, or ``median`` over demonstrations, which is robust to a
     single outlier."""

@@ -39,9 +39,11 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import Spec
 from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData
+from ddco_pyro.training.data import tuning_split
 from ddco_pyro.training.devices import described, device_of
+from ddco_pyro.training.em import uses_em
 from ddco_pyro.training.labels import Labels
-from ddco_pyro.training.loop import train, uses_em
+from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
 from ddco_pyro.training.processes import ALONE, Ranks, pool, results, useful_jobs
@@ -81,7 +83,7 @@ def train_model(
     """
     budget = spec.training
     with one_thread():
-        split = demos.split(budget.tune_fraction, spec.seed)
+        split = tuning_split(spec, dimensions, demos)
         trainer = Trainer(spec, dimensions, *split, checkpoints, on_event, jobs, ranks)
         if held_out is not None:
             refuse_unusable(held_out, trainer.hierarchy.encoder, trainer.hierarchy.scaling)
