@@ -266,3 +266,35 @@ def test_there_are_no_more_clusters_than_distinct_observations():
     batch = make_batch(PLACES[place], actions)
     assert adjusted_rand_score(place, alive(Clusters(batch, 5, seed=0).choices(batch))) == 1
     assert set(alive(Clusters(batch, 5, seed=0, controls=True).choices(batch))) == {1, 2, 3, 4, 5}
+
+
+def test_further_restarts_have_other_clusters_than_the_best_of_ten():
+    """Eight places in a ring and four clusters: k-means has many local optima, of which ten runs find the same one."""
+    random = np.random.default_rng(0)
+    angles = random.integers(0, 8, 240) * np.pi / 4
+    ring = np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1) + 0.02 * random.normal(size=(240, 3))
+    demos = Demonstrations(
+        tuple(
+            Demonstration(f"demo_{n}", {"state": rows}, 0.1 * random.normal(size=(40, 1)))
+            for n, rows in enumerate(np.split(ring, 6))
+        )
+    )
+    spec = parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": ["state"],
+            "hierarchy": {"levels": [{"count": 4}]},
+            "training": {"restarts": 6},
+        }
+    )
+    data = make_trainer(spec, demos, None).data
+
+    def clusters(restart):
+        objective = Objective(data, Progress(restart), plan(spec, 1)[0])
+        return objective.known[0][1].flatten()
+
+    found = {
+        tuple(sorted(Counter(zip(clusters(0).tolist(), clusters(number).tolist(), strict=True)).values()))
+        for number in range(1, 6)
+    }
+    assert len(found) > 1

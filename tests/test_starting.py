@@ -180,7 +180,8 @@ def test_a_control_that_never_changes_is_refused(path: Path) -> None:
 
 
 def test_masks_of_the_file_decide_what_is_held_out(path: Path, tmp_path: Path) -> None:
-    assert load_spec(write(tmp_path, starting_spec(inspect(path), path))).demonstrations.valid_fraction == 0.25
+    demonstrations(8).write(path)
+    assert load_spec(write(tmp_path, starting_spec(inspect(path), path))).demonstrations.valid_fraction == 0.2
     demonstrations(6, {"train": ("demo_0", "demo_3"), "valid": ("demo_1",), "better": ("demo_2",)}).write(path)
     text = starting_spec(inspect(path), path)
     assert "# held out: as mask/train and mask/valid in the file say" in text

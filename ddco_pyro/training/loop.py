@@ -136,7 +136,7 @@ class StageTraining:
         """Whether patience has run out, or EM gains nothing more."""
         patience = self.spec.patience if self._tuned else None
         out = patience is not None and self.restart.progress.stale >= patience
-        return out or (self.em is not None and self.em.converged)
+        return out or (self.em is not None and self.em.converged(roughly=not self.last))
 
     @property
     def _tuned(self) -> bool:
@@ -259,7 +259,7 @@ class StageTraining:
         now = self.restart.progress
         self.model.load_state_dict(self.restart.states["best"])
         end = StageEnd.of(self.stage.name, cap, now.tune, self.spec.patience)
-        if self.em is not None and self.em.converged:
+        if self.em is not None and self.em.converged(roughly=not self.last):
             end = replace(end, rising=0.0)  # at an optimum of the penalised likelihood
         now.ended.append(asdict(end))
 
