@@ -108,7 +108,7 @@ class TrainingSpec(Model):
     each restart. ``mixture``: first the memoryless mixture (ψ = 1) is trained from ``vq_controls``; then ψ starts at
     1/2, and all levels train together, whatever ``layerwise`` says. ``random``: random weights. A list has a kind for
     each of several restarts in turn, the first again after the last. The first restart has the best of ten runs of
-    k-means, each further one a run of its own."""
+    k-means, each further one a run from random steps."""
     layerwise: bool = True
     """Whether levels are discovered one after another, lowest first, rather than all at once."""
     upper_levels: Literal["clusters", "segments"] = "clusters"

@@ -40,7 +40,8 @@ class Clusters:
         observations and different controls are then in different clusters.
     :param labels: the options of labelled steps, 1 to m, and -1 for the others, [N, T].
     :param read: names of the observations that are clustered; all where it is empty.
-    :param runs: of k-means, of which the best is taken. Many give nearly the same clusters whatever the seed.
+    :param best: the best of ten runs of k-means, nearly the same ones whatever the seed; otherwise a single run from
+        steps drawn at random.
     """
 
     def __init__(
@@ -51,7 +52,7 @@ class Clusters:
         controls: bool = False,
         labels: Tensor | None = None,
         read: Sequence[str] = (),
-        runs: int = 10,
+        best: bool = True,
     ) -> None:
         self._controls, self._read = controls, read
         self._most = most_rows(next(self._blocks(batch)).shape[1])
@@ -67,9 +68,9 @@ class Clusters:
         else:
             from sklearn.cluster import KMeans
 
-            start = "k-means++" if known is None else _Start(known)
+            start = ("k-means++" if best else "random") if known is None else _Start(known)
             number = distinct(rows, options)
-            self._namer = KMeans(number, init=start, n_init=runs, max_iter=ITERATIONS, random_state=seed).fit(rows)
+            self._namer = KMeans(number, init=start, n_init=10 if best else 1, max_iter=ITERATIONS, random_state=seed).fit(rows)
 
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""

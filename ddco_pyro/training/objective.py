@@ -93,8 +93,8 @@ class Objective:
             start = RandomCuts(count, seed)
         else:
             labels, read = self.known[0].get(level), hierarchy.read_by(level)
-            runs = 10 if self.progress.restart == 0 else 1  # further restarts are to differ
-            start = Clusters(data.train, count, seed, kind != "vq", labels, read, runs)
+            best = self.progress.restart == 0  # further restarts are to differ
+            start = Clusters(data.train, count, seed, kind != "vq", labels, read, best)
         for known, batch in zip(self.known, (data.train, data.tune), strict=True):
             choices = start.choices(batch)
             labelled = known.get(level, choices)
