@@ -15,7 +15,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.pictures import Observed, Pictures, blocks
 from ddco_pyro.errors import BadInput
-from ddco_pyro.evaluation.schema import Record, read_record
+from ddco_pyro.metrics import Record, read_record
 
 NAME = "demonstrations.json"
 
@@ -23,7 +23,7 @@ TRAINED = ("checkpoints", "model.safetensors", "folds.json")
 """Files that a run or a selection has as soon as training begins."""
 
 
-FORMAT = 2
+FORMAT = 3
 """The version of the run folder's format."""
 
 

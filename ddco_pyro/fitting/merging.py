@@ -111,8 +111,8 @@ def chosen(run: Fit, level: str | None = None, options: tuple[int, int] | None =
 
 def _divergences(run: Fit, level: int) -> dict[tuple[int, int], float]:
     """The divergence of each pair of used options of a level."""
-    rows: list[dict[str, Any]] = run.metrics["divergences"][level]
-    return {(row["options"][0], row["options"][1]): row["divergence"] for row in rows if row["divergence"] is not None}
+    rows = run.metrics.divergences[level]
+    return {row.options: row.divergence for row in rows if row.divergence is not None}
 
 
 def merged_spec(spec: Spec, level: int) -> Spec:

@@ -15,11 +15,11 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking
 from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.errors import command
-from ddco_pyro.evaluation.schema import Unfinished, read_record
 from ddco_pyro.evaluation.worth import success_worth
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import RunError, write_metrics
+from ddco_pyro.fitting.run import RunError
+from ddco_pyro.metrics import Method, Rollouts, Unfinished, read_record
 from ddco_pyro.simulation.episodes import paired_difference, run_episode, run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task
@@ -47,7 +47,7 @@ def policies(fit: Fit) -> dict[str, Policy | str]:
 
 def roll_out(
     fit: Fit, episodes: int, film: int = 0, on_event: OnEvent = ignore, jobs: int = -1, resume: bool = False
-) -> dict[str, Any]:
+) -> Rollouts:
     """Roll out a fit, its baselines and the task's scripted policies from the same initial states.
 
     Writes ``rollouts.csv`` and ``videos/``, and adds ``rollouts`` to ``metrics.json``. After an interruption, finished
@@ -56,21 +56,17 @@ def roll_out(
     :param episodes: the number of initial states.
     :param film: the number of episodes of each method to film.
     :param resume: return the rollouts of the run where it has these very ones.
-    :returns: ``rollouts`` of ``metrics.json``.
+    :returns: ``rollouts`` of the fit's metrics.
     :raises RunError: there is no task, or the fit has no folder.
     :raises Damaged: the file of an interrupted rollout is damaged.
     """
     folder = fit.run_folder
     seeds = range(fit.spec.rollout.seed, fit.spec.rollout.seed + episodes)
     played = policies(fit)
-    held = fit.metrics.get("rollouts", {})
-    whole = (held.get("seed"), held.get("episodes"), set(held.get("methods", ()))) == (
-        seeds.start,
-        episodes,
-        {*played},
-    )
-    if resume and whole and all(_filmed(fit, name, seeds[:film]) for name in played):
-        return dict(held)
+    held = fit.metrics.rollouts
+    whole = held and (held.seed, held.episodes, {*held.methods}) == (seeds.start, episodes, {*played})
+    if held and whole and resume and all(_filmed(fit, name, seeds[:film]) for name in played):
+        return held
     rolled, total = _Unfinished(folder, seeds), len(played) * episodes
     for name, policy in played.items():
         if name in rolled.outcomes and _filmed(fit, name, seeds[:film]):
@@ -85,17 +81,22 @@ def roll_out(
                 write_film(_film(fit, name, episode.seed), episode)
             on_event(EpisodeEnded(name, total))
         rolled.keep(name, outcomes)
-    by_method = {name: rolled.outcomes[name] for name in played}
+    task, by_method = find_task(str(fit.spec.task)), {name: rolled.outcomes[name] for name in played}
     write_text(folder / "rollouts.csv", _table(by_method, seeds))
-    methods = _methods(find_task(str(fit.spec.task)), by_method, fit.name)
-    results = {"seed": seeds.start, "episodes": episodes, "methods": methods}
-    succeeded = {name: _successes(outcomes) for name, outcomes in by_method.items() if _judged(outcomes)}
-    if parts := success_worth(fit.name, succeeded):
-        results["worth"] = parts
-    fit.metrics["rollouts"] = results
-    write_metrics(folder, fit.metrics)
+    succeeded = {
+        name: [outcome[SUCCESS] for outcome in outcomes]
+        for name, outcomes in by_method.items()
+        if all(SUCCESS in outcome for outcome in outcomes)
+    }
+    fit.metrics.rollouts = Rollouts(
+        seed=seeds.start,
+        episodes=episodes,
+        methods={name: _method(task, name, outcomes, succeeded, fit.name) for name, outcomes in by_method.items()},
+        worth=success_worth(fit.name, succeeded),
+    )
+    fit.metrics.write(folder)
     rolled.end()
-    return results
+    return fit.metrics.rollouts
 
 
 def _film_looks(fit: Fit, name: str, policy: Policy | str, seed: int) -> None:
@@ -142,21 +143,14 @@ def _numbers(outcome: Mapping[str, float | None]) -> dict[str, float]:
     return {measure: math.nan if value is None else value for measure, value in outcome.items()}
 
 
-def _judged(outcomes: Sequence[Mapping[str, float]]) -> bool:
-    return all(SUCCESS in outcome for outcome in outcomes)
-
-
-def _successes(outcomes: Sequence[Mapping[str, float]]) -> list[float]:
-    return [outcome[SUCCESS] for outcome in outcomes]
-
-
-def _methods(task: Task, by_method: Outcomes, ours: str) -> dict[str, Any]:
-    methods: dict[str, Any] = {}
-    for name, outcomes in by_method.items():
-        methods[name] = {"measures": summarize(task, outcomes)}
-        if name != ours and _judged(outcomes):
-            methods[name]["against"] = paired_difference(_successes(by_method[ours]), _successes(outcomes))
-    return methods
+def _method(
+    task: Task, name: str, outcomes: list[dict[str, float]], succeeded: Mapping[str, list[float]], ours: str
+) -> Method:
+    """The measures of a method, and its successes against ours."""
+    found: dict[str, Any] = {"measures": summarize(task, outcomes)}
+    if name != ours and name in succeeded:
+        found["against"] = paired_difference(succeeded[ours], succeeded[name])
+    return Method.model_validate(found)
 
 
 def _table(by_method: Mapping[str, Sequence[Mapping[str, float]]], seeds: Sequence[int]) -> str:

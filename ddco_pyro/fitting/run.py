@@ -15,11 +15,11 @@ from typing import Any
 import torch
 
 from ddco_pyro.data.controls import ControlPart
-from ddco_pyro.data.files import Damaged, json_text, leftovers, only_one, write_text
+from ddco_pyro.data.files import Damaged, leftovers, only_one, write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.errors import BadInput
-from ddco_pyro.evaluation.schema import read_record, refit
 from ddco_pyro.events import EpochEnded, Event, OnEvent
+from ddco_pyro.metrics import read_record, refit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, dump_spec
 from ddco_pyro.training.checkpoint import copy_of
@@ -68,11 +68,6 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
 def is_finished(folder: Path) -> bool:
     """Whether a run is complete: ``metrics.json`` is written last. A damaged file that was removed is made again."""
     return all((folder / name).exists() for name in ("model.safetensors", "metrics.json"))
-
-
-def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
-    """Write ``metrics.json``."""
-    write_text(folder / "metrics.json", json_text(metrics))
 
 
 def write_model(folder: Path, hierarchy: Hierarchy) -> None:

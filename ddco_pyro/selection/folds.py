@@ -18,9 +18,9 @@ from sklearn.model_selection import KFold
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.evaluation.schema import Record, read_record
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.inference.threads import one_thread
+from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.training import processes
 from ddco_pyro.training.networks import Dimensions
