@@ -123,18 +123,11 @@ class Difference(Record):
     standard_error: Known
 
 
-class Allowed(Record):
-    """The budget of training; None for no limit."""
+class Effort(Record):
+    """What training took, or what it may take: None for no limit."""
 
     epochs: int | None
     gradient_steps: int | None
-
-
-class Spent(Record):
-    """The effort of training."""
-
-    epochs: int
-    gradient_steps: int
 
 
 class Stage(Record):
@@ -160,15 +153,15 @@ class Restarts(Record):
     """All restarts of a model, and the number of the best."""
 
     best: int
-    spent: Spent
+    spent: Effort
     each: Annotated[list[Restart], Field(min_length=1)]
 
 
 class Training(Record):
     """The effort of training out of its budget, and whether training converged."""
 
-    budget: Allowed
-    spent: Spent
+    budget: Effort
+    spent: Effort
     stages: Annotated[list[Stage], Field(min_length=1)]
     converged: bool
     restarts: Restarts
@@ -359,21 +352,6 @@ class Rollouts(Record):
         return {name: rate for name, rate in found.items() if isinstance(rate, Rate)}
 
 
-class Unfinished(Record):
-    """An interrupted rollout: the outcomes of finished methods by seed; null where a measure does not apply."""
-
-    models: str
-    seeds: list[int]
-    outcomes: dict[str, list[dict[str, float | None]]]
-
-    @model_validator(mode="after")
-    def _an_outcome_for_each_seed(self) -> Unfinished:
-        for method, outcomes in self.outcomes.items():
-            if len(outcomes) != len(self.seeds):
-                raise invalid(("outcomes", f"{method} has {len(outcomes)}, but there are {len(self.seeds)} seeds"))
-        return self
-
-
 class Counts(Record):
     """Numbers of demonstrations, and the success rate of their supervisor."""
 
@@ -497,9 +475,14 @@ class Metrics(Record, frozen=False):
         write_text(folder / "metrics.json", json_text(self.model_dump()))
 
     @property
+    def methods(self) -> dict[str, Metrics | Compared]:
+        """The model itself and its baselines, by name."""
+        return {self.model: self, **self.comparison}
+
+    @property
     def trainings(self) -> dict[str, Training]:
         """The training of the model and of each baseline, by name."""
-        return {self.model: self.training} | {name: other.training for name, other in self.comparison.items()}
+        return {name: method.training for name, method in self.methods.items()}
 
     @property
     def option_labels(self) -> dict[str, dict[int, int]]:

@@ -158,8 +158,7 @@ def _read_all(fit: Fit, metrics: Metrics) -> None:
     again = replace(fit, metrics=metrics)
     training.degeneracies(fit.spec, metrics), header(fit, metrics), training.particulars(again)
     agreement.section(again)
-    rows = likelihood.likelihoods(metrics, {name: one.metrics for name, one in fit.baselines.items()})
-    likelihood.table(rows)
+    likelihood.table(metrics)
     options.use_table(["option"], metrics.options, metrics.demonstrations.train)
     found = metrics.rollouts
     if found:

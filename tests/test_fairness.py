@@ -20,7 +20,7 @@ from ddco_pyro.drawing import words
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.metrics import Metrics
-from ddco_pyro.report import unconverged, write_report
+from ddco_pyro.report import write_report
 from ddco_pyro.selection import Workers, select
 from ddco_pyro.selection.choice import as_data, choose, markdown, table
 from ddco_pyro.spec import SpecError, dump_spec, with_overrides
@@ -198,7 +198,7 @@ def test_earlier_stages_are_named_where_the_last_one_has_converged(fitted):
     data["training"]["stages"][2] |= {"epochs": 0}
     data["training"]["stages"][3] |= {"converged": True}
     data["training"]["converged"] = True
-    ((text, _),) = unconverged(Metrics.model_validate(data))
+    ((text, _),) = words.unconverged(Metrics.model_validate(data))
     assert text.startswith(
         "Earlier stages of DDCO had not converged: the budget ended stage vq-1 after 2 epochs (tuning log-"
     )
@@ -210,7 +210,7 @@ def test_earlier_stages_are_named_where_the_last_one_has_converged(fitted):
 def test_the_report_says_so_too(fitted):
     run, _ = fitted
     shown = (run.folder / "report.html").read_text()
-    for text, advice in unconverged(run.metrics):
+    for text, advice in words.unconverged(run.metrics):
         assert text in shown
         assert advice in shown
     assert shown.count("<td>27, not converged</td>") == 4
@@ -220,7 +220,7 @@ def test_the_report_says_so_too(fitted):
 def test_where_nothing_rises_nothing_is_said(still, tmp_path):
     run, ended = still
     assert run.metrics.training.converged
-    assert unconverged(run.metrics) == []
+    assert words.unconverged(run.metrics) == []
     assert "converged" not in ended.out
     assert "converged" not in (run.folder / "report.html").read_text()
     assert "converged" not in write_markdown(compare([run.folder, run.folder / "baselines" / "flat"]), tmp_path)

@@ -183,7 +183,7 @@ def test_demonstrations_are_taken_as_they_are_needed(in_memory: ddco_pyro.Fit, m
 
 
 def test_evaluation_does_not_depend_on_the_pieces(in_memory: ddco_pyro.Fit, monkeypatch) -> None:
-    from ddco_pyro.evaluation.metrics import evaluate
+    from ddco_pyro.fitting.evaluation import evaluate
     from ddco_pyro.training.data import parts
 
     demos = two_skills()

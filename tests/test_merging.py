@@ -81,7 +81,7 @@ def test_the_pair_that_acts_most_alike_is_meant(planted):
     told = with_divergences(run, rows)
     assert chosen(told) == Pair(0, (2, 3), 0.3)
     assert chosen(told, "level-1", (3, 1)) == Pair(0, (1, 3), None)
-    with pytest.raises(MergeError, match=r"^the fit: no two options of level 'level-1' are used"):
+    with pytest.raises(MergeError, match=r"^this fit: no two options of level 'level-1' are used"):
         chosen(with_divergences(run, [row | {"divergence": None} for row in rows]))
 
 

@@ -35,6 +35,7 @@ from ddco_pyro.events import (
 
 if TYPE_CHECKING:
     from ddco_pyro.data.inspection import Field, Inspection
+    from ddco_pyro.fitting.fit import Fit
     from ddco_pyro.fitting.merging import Pair
     from ddco_pyro.metrics import Metrics
     from ddco_pyro.model.hierarchy import Hierarchy
@@ -219,10 +220,9 @@ ONE_FIT = (
 
 def log_likelihoods(metrics: Metrics) -> None:
     """Log-likelihood of the model and of its baselines, as in the report."""
-    from ddco_pyro.report import likelihood
+    from ddco_pyro.report.likelihood import table
 
-    rows = likelihood.likelihoods(metrics, {})
-    show(likelihood.table(rows, 3, "log-likelihood, nats per step (higher is better)"))
+    show(table(metrics, 3, "log-likelihood, nats per step (higher is better)"))
     if metrics.worth:
         said = words.worth(metrics.worth, words.method(metrics.model), len(metrics.valid))
         say(said if metrics.seeds else f"{said} {ONE_FIT}")
@@ -250,9 +250,11 @@ def merged(pair: Pair, before: Metrics, after: Metrics) -> None:
     say(f"Merged options {first} and {second}{apart}: held-out {values[0]} → {values[1]} nats/step.")
 
 
-def warnings(signs: Sequence[tuple[str, str]]) -> None:
-    """Warnings, each with the usual remedy."""
-    for what, advice in signs:
+def warnings(fit: Fit) -> None:
+    """Warnings of too short a training and of a degenerate solution, each with the usual remedy."""
+    from ddco_pyro.report.training import degeneracies
+
+    for what, advice in (*words.unconverged(fit.metrics), *degeneracies(fit.spec, fit.metrics)):
         say(f"warning: {what} {advice}")
 
 

@@ -60,9 +60,8 @@ def page(compared: Comparison, picture: Picture, folder: Path) -> Page:
     blocks = [note(listed), *demonstration_table(compared, links).folded(SHOWN, "demonstrations")]
     sections.append(Section("demonstrations", "Every held-out demonstration", blocks))
     if rollouts := rollout_table(compared):
-        rates = "Rates with Wilson 95 % intervals. p: McNemar’s exact test, two-sided, not corrected for the number of "
         title = "Success in rollouts from the same initial states"
-        sections.append(Section("rollouts", title, [rollouts, note(f"{rates}comparisons.")]))
+        sections.append(Section("rollouts", title, [rollouts, note(f"Rates: Wilson 95 % intervals. {words.P_VALUE}")]))
     return Page(f"Comparison of {len(compared.rows)} runs", [Text(verdict(compared), "verdict")], sections)
 
 
@@ -148,7 +147,7 @@ def _explanation(compared: Comparison) -> str:
     rising = any(not row.training.converged for row in compared.rows)
     return (
         f"Held-out log-likelihood of {len(compared.trajectories)} trajectories ({sum(compared.steps)} steps), in nats: "
-        "one nat more per step means that the control of a step is e = 2.7 times as probable. total: sum over "
+        f"{words.NAT}. total: sum over "
         "trajectories; se: its standard error. diff: the best's total minus this one's, trajectory by trajectory; dse: "
         "the standard error of that difference. Errors are over trajectories, for one fit of each run. The verdict has "
         f"the same numbers per step.{more if rising else ''}"

@@ -15,6 +15,10 @@ CONFIDENCE = 0.95
 SMALLEST = 0.01
 """The smallest useful difference in nats per step: each step's control is exp(0.01) times as probable, 1 % more."""
 
+NAT = "one nat more per step means that the control of a step is e = 2.7 times as probable"
+
+P_VALUE = "p: McNemar’s exact test, two-sided, not corrected for the number of comparisons."
+
 METHODS = {
     "ddco": "DDCO",
     "flat": "flat",

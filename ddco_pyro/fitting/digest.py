@@ -133,23 +133,7 @@ def record(folder: Path, demos: Demonstrations, known: Digest | None = None) -> 
     kept = recorded(folder)
     if kept is None:
         write_text(folder / NAME, digest(demos, known).model_dump_json(indent=1) + "\n")
-    else:
-        _compare(folder, kept, demos)
-
-
-def refuse_others(folder: Path, demos: Demonstrations) -> None:
-    """Refuse demonstrations other than those of a finished run.
-
-    :raises OtherDemonstrations: the folder is a run of other demonstrations.
-    :raises Damaged: ``demonstrations.json`` is damaged.
-    """
-    kept = recorded(folder)
-    assert kept is not None  # or it would not be finished
-    _compare(folder, kept, demos)
-
-
-def _compare(folder: Path, kept: Digest, demos: Demonstrations) -> None:
-    if different := difference(kept, digest(demos, kept)):
+    elif different := difference(kept, digest(demos, kept)):
         raise OtherDemonstrations(
             f"{folder}: is a run of other demonstrations ({different}); bring back those that it was fitted to, or "
             "choose another --out for these"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -22,9 +23,9 @@ from ddco_pyro.data.files import leftovers
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
 from ddco_pyro.evaluation.inferred import Inferred, infer
-from ddco_pyro.evaluation.metrics import evaluate, supervisor
 from ddco_pyro.events import OnEvent, ignore
-from ddco_pyro.fitting.digest import record, recorded, refuse_others
+from ddco_pyro.fitting.digest import record, recorded
+from ddco_pyro.fitting.evaluation import evaluate
 from ddco_pyro.fitting.run import (
     Clock,
     RunError,
@@ -103,7 +104,7 @@ class Fit:
             return self.given
         demos = read_demonstrations(self.spec)
         if self.folder is not None:
-            refuse_others(self.folder, demos)
+            record(self.folder, demos)
         return demos
 
     @cached_property
@@ -307,14 +308,15 @@ def _fit_model(
             else:
                 beside[baseline] = _fit_model(its, demos, place, on_event, jobs, ranks, Clock(), {}, baseline)
     fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=beside)
-    counts = {"train": len(trained.data.train), "tune": len(trained.data.tune), "valid": len(split.get("valid", ()))}
+    parts_of = {"train": trained.data.train, "tune": trained.data.tune, "valid": split.get("valid", ())}
+    known = {"supervisor": json.loads(str(demos.attributes.get("supervisor", "{}")))}  # a collected file has it
     with clock("evaluation"), repeatable(hierarchy.device):
         metrics = evaluate(
             fitted,
             split,
             demos,
             engine_check=trained.check._asdict(),
-            demonstrations=counts | {"supervisor": supervisor(demos)},
+            demonstrations={name: len(part) for name, part in parts_of.items()} | known,
             measure=measure(hierarchy.scaling.parts),
             control_dimensions=[dimension.as_data() for dimension in size.control],
             parameters=parameters(hierarchy),

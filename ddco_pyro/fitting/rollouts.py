@@ -9,7 +9,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, model_validator
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking
@@ -19,13 +21,14 @@ from ddco_pyro.evaluation.worth import success_worth
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import RunError
-from ddco_pyro.metrics import Method, Rollouts, Unfinished, read_record
+from ddco_pyro.metrics import Method, Record, Rollouts, read_record
 from ddco_pyro.simulation.episodes import paired_difference, run_episode, run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task
+from ddco_pyro.spec.base import invalid
 
-Outcomes = dict[str, list[dict[str, float]]]
-"""The outcomes of each method's episodes, in the order of their seeds."""
+OrNaN = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+"""A number; NaN, null in the file, for a measure that does not apply."""
 
 
 def policies(fit: Fit) -> dict[str, Policy | str]:
@@ -67,7 +70,8 @@ def roll_out(
     whole = held and (held.seed, held.episodes, {*held.methods}) == (seeds.start, episodes, {*played})
     if held and whole and resume and all(_filmed(fit, name, seeds[:film]) for name in played):
         return held
-    rolled, total = _Unfinished(folder, seeds), len(played) * episodes
+    unfinished, total = folder / "rollouts.unfinished.json", len(played) * episodes
+    rolled = _unfinished(unfinished, seeds)
     for name, policy in played.items():
         if name in rolled.outcomes and _filmed(fit, name, seeds[:film]):
             for _ in seeds:
@@ -80,7 +84,8 @@ def roll_out(
                 _film_looks(fit, name, policy, episode.seed)
                 write_film(_film(fit, name, episode.seed), episode)
             on_event(EpisodeEnded(name, total))
-        rolled.keep(name, outcomes)
+        rolled.outcomes[name] = outcomes
+        write_text(unfinished, json_text(rolled.model_dump()))
     task, by_method = find_task(str(fit.spec.task)), {name: rolled.outcomes[name] for name in played}
     write_text(folder / "rollouts.csv", _table(by_method, seeds))
     succeeded = {
@@ -95,7 +100,7 @@ def roll_out(
         worth=success_worth(fit.name, succeeded),
     )
     fit.metrics.write(folder)
-    rolled.end()
+    unfinished.unlink(missing_ok=True)
     return fit.metrics.rollouts
 
 
@@ -115,32 +120,29 @@ def _filmed(fit: Fit, name: str, seeds: Sequence[int]) -> bool:
     return all(_film(fit, name, seed).exists() for seed in seeds)
 
 
-class _Unfinished:
-    """The ``outcomes`` of finished methods, kept in a file until all methods are finished."""
+class _Unfinished(Record):
+    """The outcomes of finished methods, kept in a file until all methods are finished."""
 
-    def __init__(self, folder: Path, seeds: Sequence[int]) -> None:
-        self._path = folder / "rollouts.unfinished.json"
-        models = b"".join(path.read_bytes() for path in sorted(folder.rglob("model.safetensors")))
-        self._key = {"models": hashlib.sha256(models).hexdigest(), "seeds": list(seeds)}
-        self.outcomes: Outcomes = {}
-        if self._path.exists():
-            kept = read_record(self._path, Unfinished, f"remove it and roll out again: {command('rollout', folder)}")
-            if (kept.models, kept.seeds) == (self._key["models"], self._key["seeds"]):
-                self.outcomes = {name: [_numbers(one) for one in each] for name, each in kept.outcomes.items()}
+    models: str
+    seeds: list[int]
+    outcomes: dict[str, list[dict[str, OrNaN]]]
 
-    def keep(self, name: str, outcomes: list[dict[str, float]]) -> None:
-        """Add a finished method."""
-        self.outcomes[name] = outcomes
-        write_text(self._path, json_text(self._key | {"outcomes": self.outcomes}))
-
-    def end(self) -> None:
-        """Remove the file."""
-        self._path.unlink(missing_ok=True)
+    @model_validator(mode="after")
+    def _an_outcome_for_each_seed(self) -> _Unfinished:
+        for method, outcomes in self.outcomes.items():
+            if len(outcomes) != len(self.seeds):
+                raise invalid(("outcomes", f"{method} has {len(outcomes)}, but there are {len(self.seeds)} seeds"))
+        return self
 
 
-def _numbers(outcome: Mapping[str, float | None]) -> dict[str, float]:
-    """An outcome from JSON, with NaN for a measure that does not apply."""
-    return {measure: math.nan if value is None else value for measure, value in outcome.items()}
+def _unfinished(path: Path, seeds: Sequence[int]) -> _Unfinished:
+    """The outcomes in a file, if they are of these very networks and seeds; else none."""
+    models = b"".join(model.read_bytes() for model in sorted(path.parent.rglob("model.safetensors")))
+    fresh = _Unfinished(models=hashlib.sha256(models).hexdigest(), seeds=list(seeds), outcomes={})
+    if not path.exists():
+        return fresh
+    kept = read_record(path, _Unfinished, f"remove it and roll out again: {command('rollout', path.parent)}")
+    return kept if (kept.models, kept.seeds) == (fresh.models, fresh.seeds) else fresh
 
 
 def _method(

@@ -11,15 +11,12 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import style
 from ddco_pyro.drawing.page import Block, Facts, Page, Text, note
-from ddco_pyro.drawing.words import unconverged
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.metrics import Metrics, Rate
 from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, training, worth
 from ddco_pyro.report.activity import activity
 from ddco_pyro.report.training import degeneracies
 from ddco_pyro.segmenting.page import timelines
-
-__all__ = ["degeneracies", "unconverged", "write_report"]
 
 
 def write_report(fit: Fit, demos: Demonstrations) -> Path:
@@ -75,6 +72,6 @@ def header(fit: Fit, metrics: Metrics) -> list[Block]:
         blocks.append(Text(Markup("{} of a degenerate solution: see {}.").format(signs, link)))
     explained = (
         "Held out: used neither in training nor in tuning, which decides when to stop. A nat is the unit of "
-        "log-likelihood: one nat more per step means that the control of a step is e = 2.7 times as probable."
+        f"log-likelihood: {words.NAT}."
     )
     return [*blocks, note(explained), Facts(facts)]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -13,47 +12,20 @@ from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
 from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, note
 from ddco_pyro.drawing.words import about, effort, method, number, with_error
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.metrics import Difference, Metrics, PerStep, Training
+from ddco_pyro.metrics import Compared, Metrics
 from ddco_pyro.segmenting.page import anchor
 
 SHOWN = 20
 """Rows of the list of demonstrations that are not folded."""
 
 
-@dataclass(frozen=True)
-class Likelihood:
-    """Log-likelihood of one method.
-
-    :param values: nats per step.
-    :param difference: the model's held-out value minus the method's; None for the model.
-    :param each: the difference on each held-out demonstration.
-    """
-
-    name: str
-    values: PerStep
-    parameters: int
-    training: Training
-    difference: Difference | None = None
-    each: tuple[float, ...] = ()
-
-
-def likelihoods(metrics: Metrics, baselines: Mapping[str, Metrics]) -> list[Likelihood]:
-    """The model and its baselines, from their ``metrics.json``."""
-    rows = [Likelihood(metrics.model, metrics.log_likelihood_per_step, metrics.parameters, metrics.training)]
-    for name, other in metrics.comparison.items():
-        theirs = {row.name: row.log_likelihood for row in baselines[name].valid} if name in baselines else {}
-        each = ((row.log_likelihood - theirs[row.name]) / row.steps for row in metrics.valid if row.name in theirs)
-        about = other.log_likelihood_per_step, other.parameters, other.training, other.difference
-        rows.append(Likelihood(name, *about, tuple(each)))
-    return rows
-
-
 def section(fit: Fit) -> Section:
     """Log-likelihood of the model and its baselines."""
-    rows = likelihoods(fit.metrics, _of_baselines(fit))
-    alt = "; ".join(f"{method(row.name)}: {number(row.values.valid)} nats per step held out" for row in rows)
+    metrics = fit.metrics
+    valid = {method(name): number(one.log_likelihood_per_step.valid) for name, one in metrics.methods.items()}
+    alt = "; ".join(f"{name}: {value} nats per step held out" for name, value in valid.items())
     caption = "Log-likelihood of the model. Filled circle: held out; open circle: training."
-    if len(rows) > 1:
+    if metrics.comparison:
         caption = (
             "Left: log-likelihood of each method; filled circle: held out, open circle: training. Right: the model’s "
             "minus each baseline’s on the same held-out demonstrations; diamond: mean with one standard error, dots: "
@@ -64,47 +36,44 @@ def section(fit: Fit) -> Section:
         "log-probabilities. Another unit adds the same constant to every method. So differences in nats can be "
         "compared; percentages cannot."
     )
+    figure = draw(metrics, {name: one.held_out for name, one in fit.baselines.items()})
     blocks: list[Block] = [
-        Text(f"Nats per step; higher is better. {about(row.name for row in rows)}"),
-        table(rows),
-        save(draw(rows), fit.run_folder / "figures" / "likelihood.png", alt, caption),
+        Text(f"Nats per step; higher is better. {about(metrics.methods)}"),
+        table(metrics),
+        save(figure, fit.run_folder / "figures" / "likelihood.png", alt, caption),
         note(units),
     ]
     return Section("likelihood", "Held-out log-likelihood", blocks)
 
 
-def _of_baselines(fit: Fit) -> dict[str, Metrics]:
-    return {name: baseline.metrics for name, baseline in fit.baselines.items()}
-
-
-def table(compared: Sequence[Likelihood], digits: int = 2, title: str | None = None) -> Table:
+def table(metrics: Metrics, digits: int = 2, title: str | None = None) -> Table:
     """Log-likelihood of each method, the paired difference, parameters and gradient steps."""
-    rows = [
-        [
-            method(row.name),
-            number(row.values.valid, digits),
-            number(row.values.train, digits),
-            with_error(row.difference, digits, unknown=""),
-            str(row.parameters),
-            effort(row.training),
-        ]
-        for row in compared
-    ]
-    ours = f"{method(compared[0].name)} minus it, held out"
+    rows = []
+    for name, one in metrics.methods.items():
+        values, size = one.log_likelihood_per_step, str(one.parameters)
+        difference = with_error(one.difference, digits) if isinstance(one, Compared) else ""
+        each = number(values.valid, digits), number(values.train, digits), difference
+        rows.append([method(name), *each, size, effort(one.training)])
+    ours = f"{method(metrics.model)} minus it, held out"
     return Table(["Method", "Held out", "Training", ours, "Parameters", "Gradient steps"], rows, title=title)
 
 
-def draw(compared: Sequence[Likelihood]) -> Figure:
-    """Log-likelihood of each method and, where there are several, the paired differences."""
-    values = [
-        Interval(np.nan if row.values.valid is None else row.values.valid, hollow=row.values.train) for row in compared
-    ]
+def draw(metrics: Metrics, baselines: Mapping[str, Mapping[str, float]]) -> Figure:
+    """Log-likelihood of each method and, where there are several, the paired differences.
+
+    :param baselines: log p(ξ) of the held-out demonstrations by name, for each baseline.
+    """
+    per_step = [one.log_likelihood_per_step for one in metrics.methods.values()]
+    values = [Interval(np.nan if one.valid is None else one.valid, hollow=one.train) for one in per_step]
     panels = [Panel("Each method", "log-likelihood (nats per step)", values)]
-    if len(compared) > 1:
-        differences = [Interval.of(row.difference, row.each, marker="D") for row in compared]
-        title, axis = f"{method(compared[0].name)} minus each baseline", "nats per step above that method, held out"
+    if metrics.comparison:
+        differences: list[Interval | None] = [None]
+        for name, other in metrics.comparison.items():
+            each = [(one.log_likelihood - baselines[name][one.name]) / one.steps for one in metrics.valid]
+            differences.append(Interval.of(other.difference, each, marker="D"))
+        title, axis = f"{method(metrics.model)} minus each baseline", "nats per step above that method, held out"
         panels.append(Panel(title, axis, differences, line=0))
-    return interval_plot([method(row.name) for row in compared], panels)
+    return interval_plot(list(map(method, metrics.methods)), panels)
 
 
 def demonstrations(metrics: Metrics, anchors: Collection[str]) -> Section:
@@ -134,9 +103,8 @@ def demonstrations(metrics: Metrics, anchors: Collection[str]) -> Section:
 def dimensions(fit: Fit) -> Section:
     """The contribution of each control dimension, and of choosing options, to the log-likelihood of each method."""
     metrics = fit.metrics
-    parts = {
-        name: own.log_likelihood_by_dimension for name, own in {metrics.model: metrics, **_of_baselines(fit)}.items()
-    }
+    methods = {metrics.model: metrics} | {name: other.metrics for name, other in fit.baselines.items()}
+    parts = {name: own.log_likelihood_by_dimension for name, own in methods.items()}
     held_out = metrics.log_likelihood_by_dimension.valid is not None
     values = {name: found.valid or found.train for name, found in parts.items()}
     rows = []

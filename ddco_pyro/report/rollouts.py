@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from ddco_pyro.data.sources.video import frames
 from ddco_pyro.drawing.figures import WIDTH, Interval, Panel, blank, data_uri, hide_frame, interval_plot, save
 from ddco_pyro.drawing.page import Block, Film, Films, Section, Table, Text, note
-from ddco_pyro.drawing.words import interval, measure, method, number, p_value, rate
+from ddco_pyro.drawing.words import P_VALUE, interval, measure, method, number, p_value, rate
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.metrics import Mean, Measure, Method, read_successes
 
@@ -45,8 +45,7 @@ def success(fit: Fit) -> Section | None:
         caption = "Success rate of each method with its Wilson 95 % interval."
         blocks.append(save(figure, fit.run_folder / "figures" / "success.png", alt, caption))
     if paired := paired_table(methods, fit.metrics.model):
-        p = "p: McNemar’s exact test, two-sided, not corrected for the number of comparisons."
-        blocks += [Text("Paired comparison of success", "heading"), paired, note(p)]
+        blocks += [Text("Paired comparison of success", "heading"), paired, note(P_VALUE)]
     return Section("rollouts", "Success in the task", blocks)
 
 

@@ -18,7 +18,7 @@ from scipy import stats
 
 from ddco_pyro.drawing.figures import ACCENT, FAINT, INK, Interval, Panel, interval_plot, save, style
 from ddco_pyro.drawing.page import Page, Table, Text
-from ddco_pyro.drawing.words import number, with_error
+from ddco_pyro.drawing.words import NAT, number, with_error
 from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.metrics import Difference
 from ddco_pyro.selection.folds import Score
@@ -223,8 +223,8 @@ def markdown(choice: Choice, data: Mapping[str, Any]) -> str:
     """
     intro = (
         f"{data['folds']}-fold cross-validation over {data['demonstrations']} demonstrations, with the same folds for "
-        "every candidate. Log-likelihood in nats: one nat more per step means that the control of a step is e = 2.7 "
-        "times as probable. ± is one standard error over the folds; gradient steps are the mean of a fold."
+        f"every candidate. Log-likelihood in nats: {NAT}. ± is one standard error over the folds; gradient steps are "
+        "the mean of a fold."
     )
     lines = [data["rule"] + ".", *([data["stop_early"] + "."] if data["stop_early"] else [])]
     lines += [f"**Failed:** {one['name']}, fold {one['fold']}: {one['reason']}" for one in data["failed"]]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -34,38 +33,15 @@ from ddco_pyro.metrics import (
     Use,
     Worth,
 )
-from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
-from ddco_pyro.spec import Spec
 from ddco_pyro.training.labels import choices, used
+
+if TYPE_CHECKING:
+    from ddco_pyro.fitting.fit import Fit
 
 
 class NotFinite(Failed):
     """A log-likelihood is NaN or infinite."""
-
-
-class Fitted(Protocol):
-    """A fitted model: what evaluation reads of :class:`ddco_pyro.Fit`."""
-
-    @property
-    def name(self) -> str:
-        """The name of the model in tables."""
-
-    @property
-    def spec(self) -> Spec:
-        """The spec of the model."""
-
-    @property
-    def hierarchy(self) -> Hierarchy:
-        """The trained networks."""
-
-    @property
-    def metrics(self) -> Metrics:
-        """The numbers of a baseline, which is evaluated before its model."""
-
-    @property
-    def baselines(self) -> Mapping[str, Any]:
-        """The fitted baselines, by name."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +58,7 @@ class _Part:
     segments: list[list[np.ndarray]]
 
     @classmethod
-    def of(cls, fit: Fitted, demos: Demonstrations) -> _Part:
+    def of(cls, fit: Fit, demos: Demonstrations) -> _Part:
         values, parts, paths = [], [], []
         for piece in infer(fit.hierarchy, demos):
             values.append(_finite(fit, piece))
@@ -92,7 +68,7 @@ class _Part:
         return cls(np.concatenate(values), Decomposition.joined(parts), segments)
 
 
-def _finite(fit: Fitted, piece: Inferred) -> np.ndarray:
+def _finite(fit: Fit, piece: Inferred) -> np.ndarray:
     """log p(ξ) of each demonstration, nats, [N].
 
     :raises NotFinite: one is NaN or infinite.
@@ -106,7 +82,7 @@ def _finite(fit: Fitted, piece: Inferred) -> np.ndarray:
     return piece.log_likelihood
 
 
-def evaluate(fitted: Fitted, parts: dict[str, Demonstrations], demos: Demonstrations, **about: Any) -> Metrics:
+def evaluate(fitted: Fit, parts: dict[str, Demonstrations], demos: Demonstrations, **about: Any) -> Metrics:
     """The evaluation of a model.
 
     It has the log-likelihood in nats per step of each part of the data and of each demonstration, and the paired
@@ -159,7 +135,7 @@ def evaluate(fitted: Fitted, parts: dict[str, Demonstrations], demos: Demonstrat
     )
 
 
-def _worth(fit: Fitted, values: Mapping[str, np.ndarray], ours: _Part, valid: Demonstrations) -> Worth | None:
+def _worth(fit: Fit, values: Mapping[str, np.ndarray], ours: _Part, valid: Demonstrations) -> Worth | None:
     """The parts of the hierarchy's advantage on held-out demonstrations; None without a mixture."""
     found = worth(fit.name, values, valid.lengths)
     if found is None:
@@ -169,7 +145,7 @@ def _worth(fit: Fitted, values: Mapping[str, np.ndarray], ours: _Part, valid: De
     return found.model_copy(update={"steps_in_a_row": rows})
 
 
-def _options(fit: Fitted, demos: Demonstrations) -> tuple[list[list[Use]], list[list[Alike]]]:
+def _options(fit: Fit, demos: Demonstrations) -> tuple[list[list[Use]], list[list[Alike]]]:
     """The use and the divergences of options."""
     sums: list[Posterior] = []
 
@@ -203,7 +179,7 @@ def _worst_first(
     return sorted(rows, key=lambda row: row.log_likelihood_per_step[ours])
 
 
-def _by_dimension(fit: Fitted, each: Decomposition, demos: Demonstrations) -> Dimensions:
+def _by_dimension(fit: Fit, each: Decomposition, demos: Demonstrations) -> Dimensions:
     """The contributions of each control dimension, and of the choice of options, to the log-likelihood per step.
 
     Constant dimensions, which the model leaves out, have None.
@@ -232,12 +208,7 @@ def _agreement(names: Sequence[str], ours: dict[str, _Part], parts: dict[str, De
     return Agreement(labels=list(names), train=scores["train"], valid=scores.get("valid"), confusion=tables)
 
 
-def supervisor(demos: Demonstrations) -> dict[str, Any]:
-    """The supervisor's success rate from the file of demonstrations; empty where the file has none."""
-    return json.loads(str(demos.attributes.get("supervisor", "{}")))
-
-
-def _trained_labels(fit: Fitted, demos: Demonstrations) -> TrainedLabels | None:
+def _trained_labels(fit: Fit, demos: Demonstrations) -> TrainedLabels | None:
     """The labels that a fit used in training (``training.labels``).
 
     ``agreement`` is the fraction of the labelled steps whose most likely option, inferred without labels, is the
