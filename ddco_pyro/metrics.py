@@ -6,8 +6,9 @@ Log-likelihoods are in nats.
 from __future__ import annotations
 
 import csv
+import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -77,6 +78,15 @@ def read_table(path: Path, row: Callable[[dict[str, str]], T], remedy: str) -> l
             return [row(fields) for fields in csv.DictReader(file)]
     except (csv.Error, KeyError, TypeError, ValueError) as error:
         raise Damaged(path, f"{type(error).__name__}: {error}", remedy) from error
+
+
+def write_table(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write a CSV file with a line for each row, whole or not at all."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(columns), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
 
 
 def read_successes(folder: Path) -> dict[tuple[str, int], float]:

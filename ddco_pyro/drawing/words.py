@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from ddco_pyro.metrics import Against, Difference, Metrics, Rate, Rollouts, Seeds, Stage, Training, Worth
+from ddco_pyro.metrics import Against, Difference, Metrics, Rate, Rollouts, Seeds, Stage, SuccessWorth, Training, Worth
 
 CONFIDENCE = 0.95
 """Level of intervals; a difference is significant where its interval excludes 0."""
@@ -157,13 +158,8 @@ def worth(found: Worth, ours: str, held_out: int) -> str:
 
     :param ours: what the hierarchy is called.
     """
-    lasting = f"{with_error(found.memory)} from options that last ({ours} − mixture)"
-    if found.flat and found.total:
-        flat, total = method(found.flat), signed(found.total.nats_per_step)
-        experts = f"{with_error(found.experts)} come from several experts (mixture − {flat})"
-        parts = f"Of {total} nats per step over {flat}, {experts} and {lasting}."
-    else:
-        parts = f"Held-out nats per step: {lasting}."
+    total = signed(found.total.nats_per_step) if found.total else ""
+    parts = _divided(found, ours, f"{total} nats per step", "Held-out nats per step", with_error)
     decided = {
         1: "In this fit options that last explain held-out controls better; one fit of each model is no verdict.",
         0: "This fit does not show that options that last are worth anything.",
@@ -185,14 +181,9 @@ def success_worth(rollouts: Rollouts, ours: str) -> str:
     found = rollouts.worth
     if found is None:
         return ""
-    pair = found.memory
-    lasting = f"{of_episodes(pair)} from options that last ({ours} − mixture)"
-    if found.flat and found.total:
-        flat = method(found.flat)
-        experts = f"{of_episodes(found.experts)} come from several experts (mixture − {flat})"
-        text = f"Of {_more(found.total)} successes in {pair.trials} episodes over {flat}, {experts} and {lasting}."
-    else:
-        text = f"Successes in {pair.trials} episodes: {lasting}."
+    pair, total = found.memory, _more(found.total) if found.total else ""
+    successes = f"uccesses in {pair.trials} episodes"
+    text = _divided(found, ours, f"{total} s{successes}", f"S{successes}", of_episodes)
     if rollouts.seeds is None:
         return f"{text} One fit of each model is no verdict."
     seeds = rollouts.seeds
@@ -202,6 +193,16 @@ def success_worth(rollouts: Rollouts, ours: str) -> str:
     decided = "options that last help" if low > 0 else "options that last harm" if high < 0 else "inconclusive"
     parts = listed(_parts(seeds.worth, ours, 100, 0))
     return f"{text} Over {len(seeds.training_seeds)} training seeds: {parts} points of success. In rollouts: {decided}."
+
+
+def _divided(found: Worth | SuccessWorth, ours: str, total: str, memory_alone: str, said: Callable[[Any], str]) -> str:
+    """The parts of the advantage over a flat policy; the part of memory alone where there is none."""
+    lasting = f"{said(found.memory)} from options that last ({ours} − mixture)"
+    if found.flat is None:
+        return f"{memory_alone}: {lasting}."
+    flat = method(found.flat)
+    experts = f"{said(found.experts)} come from several experts (mixture − {flat})"
+    return f"Of {total} over {flat}, {experts} and {lasting}."
 
 
 def _parts(worth: Mapping[str, Sequence[float]], ours: str, scale: float = 1, digits: int = 2) -> list[str]:
@@ -275,7 +276,7 @@ def _verdict(low: float, high: float) -> str:
     return "It is inconclusive whether options that last are worth anything here."
 
 
-def mean_interval(values: Sequence[float]) -> tuple[float, float]:
+def mean_interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
     """The 95 % t interval of the mean of a few values."""
     mean, count = float(np.mean(values)), len(values)
     half = float(np.std(values, ddof=1) * _t_quantile(count - 1) / math.sqrt(count))

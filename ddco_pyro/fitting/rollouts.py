@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -21,7 +19,7 @@ from ddco_pyro.evaluation.worth import success_worth
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.run import RunError
-from ddco_pyro.metrics import Method, Record, Rollouts, read_record
+from ddco_pyro.metrics import Method, Record, Rollouts, read_record, write_table
 from ddco_pyro.simulation.episodes import paired_difference, run_episode, run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task
@@ -87,7 +85,12 @@ def roll_out(
         rolled.outcomes[name] = outcomes
         write_text(unfinished, json_text(rolled.model_dump()))
     task, by_method = find_task(str(fit.spec.task)), {name: rolled.outcomes[name] for name in played}
-    write_text(folder / "rollouts.csv", _table(by_method, seeds))
+    rows = [
+        {"method": name, "seed": seed, **outcome}
+        for name, outcomes in by_method.items()
+        for seed, outcome in zip(seeds, outcomes, strict=True)
+    ]
+    write_table(folder / "rollouts.csv", dict.fromkeys(column for row in rows for column in row), rows)
     succeeded = {
         name: [outcome[SUCCESS] for outcome in outcomes]
         for name, outcomes in by_method.items()
@@ -153,16 +156,3 @@ def _method(
     if name != ours and name in succeeded:
         found["against"] = paired_difference(succeeded[ours], succeeded[name])
     return Method.model_validate(found)
-
-
-def _table(by_method: Mapping[str, Sequence[Mapping[str, float]]], seeds: Sequence[int]) -> str:
-    """``rollouts.csv``: a row for each episode, a column for each measure."""
-    text = io.StringIO()
-    measures = dict.fromkeys(key for outcomes in by_method.values() for outcome in outcomes for key in outcome)
-    writer = csv.DictWriter(text, ["method", "seed", *measures], lineterminator="\n")
-    writer.writeheader()
-    for name, outcomes in by_method.items():
-        writer.writerows(
-            {"method": name, "seed": seed, **outcome} for seed, outcome in zip(seeds, outcomes, strict=True)
-        )
-    return text.getvalue()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import time
@@ -19,7 +17,7 @@ from ddco_pyro.data.files import Damaged, leftovers, only_one, write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import EpochEnded, Event, OnEvent
-from ddco_pyro.metrics import read_record, refit
+from ddco_pyro.metrics import read_record, refit, write_table
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, dump_spec
 from ddco_pyro.training.checkpoint import copy_of
@@ -109,11 +107,7 @@ def read_model(folder: Path, spec: Spec) -> Hierarchy:
 
 def write_history(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Write ``history.csv``: a row for each epoch of each restart."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, ["restart", "stage", "epoch", "train", "tune"], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(folder / "history.csv", text.getvalue())
+    write_table(folder / "history.csv", ("restart", "stage", "epoch", "train", "tune"), rows)
 
 
 class Clock:
