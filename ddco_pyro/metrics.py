@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import (
     BaseModel,
-    BeforeValidator,
     ConfigDict,
     Discriminator,
     Field,
@@ -37,11 +35,6 @@ def _empty(value: Any) -> bool:
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 AtLeastOne = Annotated[int, Field(ge=1)]
-Known = Annotated[
-    Finite | None, BeforeValidator(lambda value: None if isinstance(value, float) and math.isnan(value) else value)
-]
-"""A number; None, or NaN, where it is unknown."""
-
 LeftOut = Annotated[T, Field(exclude_if=_empty)]
 """A field that is left out of the file where it is empty."""
 
@@ -130,7 +123,7 @@ class Difference(Record):
     """A paired difference in nats per step, with its standard error; a single demonstration has none."""
 
     nats_per_step: Finite
-    standard_error: Known
+    standard_error: Finite | None
 
 
 class Effort(Record):
@@ -216,7 +209,7 @@ class Seeds(Record):
     training_seeds: Annotated[list[int], Field(min_length=2)]
     held_out: dict[str, list[Finite]]
     worth: dict[str, list[Finite]]
-    standard_error: dict[str, list[Known]]
+    standard_error: dict[str, list[Finite | None]]
 
 
 class Dimensions(Record):

@@ -295,7 +295,7 @@ def test_the_worth_of_a_hierarchy_has_two_parts():
             0.1,
             "In this fit options that last explain held-out controls worse than the same experts without memory.",
         ),
-        (0.5, math.nan, "This fit does not show that options that last are worth anything."),
+        (0.5, None, "This fit does not show that options that last are worth anything."),
     ],
 )
 def test_the_verdict_is_about_options_that_last(memory, error, said):

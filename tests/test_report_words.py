@@ -50,12 +50,6 @@ def test_a_column_is_of_one_kind_whatever_was_seen():
         (0.1, 0.05, 10, "with no clear difference from flat (+0.10 ± 0.05 nats per step)"),
         (0.1, 0.04, 100, "0.10 ± 0.04 nats per step better than flat"),
         (0.1, 0.04, 3, "with no clear difference from flat"),
-        (
-            0.1,
-            float("nan"),
-            1,
-            "0.10 nats per step better than flat (error unknown) (1 held-out demonstration, one fit",
-        ),
         (0.1, None, 1, "0.10 nats per step better than flat (error unknown) (1 held-out demonstration, one fit"),
     ],
 )

@@ -80,7 +80,7 @@ def fit(
 ) -> None:
     """Fit the spec's hierarchy and its baselines; write the run folder with its report.
 
-    An unfinished run of this very spec in --out is continued, with any number of processes.
+    An unfinished run of the same spec in --out is continued, with any number of processes.
 
     With --seeds the fit and its baselines are repeated, in --jobs processes, with other training seeds: other first
     weights, clusters and orders of the same demonstrations. RUN/seeds has a run for each.

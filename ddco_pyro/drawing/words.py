@@ -110,7 +110,7 @@ def _capital(text: str) -> str:
 
 
 def verdict(metrics: Metrics) -> str:
-    """How well the model explains held-out demonstrations, with the error, and the models that have not converged."""
+    """The verdict on a run: differences on held-out demonstrations, and the models that have not converged."""
     names = (method(name) for name, training in metrics.trainings.items() if not training.converged)
     return f"{_explained(metrics)}{rising(names)}"
 
@@ -154,7 +154,7 @@ def explains(name: str, differences: Mapping[str, Difference], held_out: int) ->
 
 
 def worth(found: Worth, ours: str, held_out: int) -> str:
-    """What several experts and options that last are worth in one fit of each model.
+    """The worth of several experts and of options that last, in one fit of each model.
 
     :param ours: what the hierarchy is called.
     """
@@ -173,8 +173,9 @@ def worth(found: Worth, ours: str, held_out: int) -> str:
 
 
 def success_worth(rollouts: Rollouts, ours: str) -> str:
-    """What several experts and options that last are worth in rollouts: in this fit, and over training seeds where it
-    was repeated; empty where there is no mixture. The verdict is by :func:`_wider`, with the error over episodes.
+    """The same worth in rollouts, in this fit and over its training seeds; empty without a mixture.
+
+    The verdict is by :func:`_wider`, with the error over episodes.
 
     :param ours: what the hierarchy is called.
     """
@@ -242,7 +243,7 @@ def over_seeds(found: Seeds, ours: str, held_out: int) -> str:
 
 
 def _lasting(memory: Sequence[float], errors: Sequence[float | None], held_out: int) -> str:
-    """Whether options that last are worth it: by :func:`_wider` and :data:`SMALLEST`.
+    """The verdict on options that last, by :func:`_wider` and :data:`SMALLEST`.
 
     :param errors: standard errors over held-out demonstrations; None where there is one.
     """

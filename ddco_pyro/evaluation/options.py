@@ -1,4 +1,4 @@
-"""How options are used and how differently they act, and the signs of a degenerate solution (SM 2.1) therein."""
+"""Use and divergence of options, and the signs of a degenerate solution (SM 2.1)."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ def paired(ours: np.ndarray, theirs: np.ndarray, lengths: np.ndarray) -> Differe
     mean = float(difference.sum() / lengths.sum())
     residual = difference - mean * lengths  # a ratio of sums: the error of its linearisation
     n = len(difference)
-    error = float(np.sqrt(residual.var(ddof=1) * n) / lengths.sum()) if n > 1 else float("nan")
+    error = float(np.sqrt(residual.var(ddof=1) * n) / lengths.sum()) if n > 1 else None
     return Difference(nats_per_step=mean, standard_error=error)
 
 

@@ -141,7 +141,7 @@ def record(folder: Path, demos: Demonstrations, known: Digest | None = None) -> 
 
 
 def difference(kept: Digest, now: Digest) -> str:
-    """What differs between two digests, in words; empty where they are equal."""
+    """The differences of two digests in words; empty where they are equal."""
     missing = [name for name in kept.names if name not in now.names]
     new = [name for name in now.names if name not in kept.names]
     if missing or new:

@@ -56,7 +56,7 @@ def roll_out(
 
     :param episodes: the number of initial states.
     :param film: the number of episodes of each method to film.
-    :param resume: return the rollouts of the run where it has these very ones.
+    :param resume: return the finished rollouts of the run where seeds and methods are the same.
     :returns: ``rollouts`` of the fit's metrics.
     :raises RunError: there is no task, or the fit has no folder.
     :raises Damaged: the file of an interrupted rollout is damaged.
@@ -139,7 +139,7 @@ class _Unfinished(Record):
 
 
 def _unfinished(path: Path, seeds: Sequence[int]) -> _Unfinished:
-    """The outcomes in a file, if they are of these very networks and seeds; else none."""
+    """The outcomes in a file where networks and seeds are the same; else none."""
     models = b"".join(model.read_bytes() for model in sorted(path.parent.rglob("model.safetensors")))
     fresh = _Unfinished(models=hashlib.sha256(models).hexdigest(), seeds=list(seeds), outcomes={})
     if not path.exists():

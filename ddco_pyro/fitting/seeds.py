@@ -70,10 +70,10 @@ def _again(spec: Spec, seed: int, folder: Path) -> None:
 
 
 def roll_out_repetitions(first: Fit, on_event: OnEvent = ignore, jobs: int = -1) -> None:
-    """Roll the repetitions of a rolled out fit out, from the same initial states.
+    """Roll out the repetitions of a fit from the initial states of its own rollouts.
 
-    Fills ``rollouts.seeds`` of the fit's ``metrics.json``: success rates by method and the parts of the worth, in the
-    order of the training seeds. Nothing happens where the fit was not repeated.
+    Adds ``rollouts.seeds`` to the fit's metrics: success rates by method, and the parts of the worth. A fit without
+    repetitions stays as it is.
     """
     rollouts, seeds = first.metrics.rollouts, first.metrics.seeds
     if seeds is None or rollouts is None:
@@ -96,7 +96,7 @@ def roll_out_repetitions(first: Fit, on_event: OnEvent = ignore, jobs: int = -1)
 
 
 PARTS = ("memory", "experts", "total")
-"""What a worth consists of."""
+"""The parts of a :class:`~ddco_pyro.metrics.Worth`."""
 
 
 def over_seeds(seeds: Sequence[int], each: Sequence[Metrics]) -> Seeds:

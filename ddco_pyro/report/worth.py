@@ -1,4 +1,4 @@
-"""The page's section on what the hierarchy is worth: several experts and options that last, apart."""
+"""The worth of the hierarchy in the report, in two parts: several experts, and options that last."""
 
 from __future__ import annotations
 

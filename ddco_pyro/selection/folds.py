@@ -28,7 +28,7 @@ from ddco_pyro.training.processes import ALL_CORES, BackendError
 from ddco_pyro.training.restarts import train_model
 
 CONNECT_SECONDS = 10
-"""How long a dask scheduler may take to answer."""
+"""Time for a dask scheduler to answer."""
 
 
 class FoldError(BadInput):
@@ -178,7 +178,7 @@ def kept_score(folder: Path, candidate: int, fold: int) -> Score | None:
 
 @dataclass(frozen=True)
 class Workers:
-    """Where folds are trained: in ``jobs`` processes here (-1: one for each core), or by a dask ``scheduler``.
+    """Processes that train folds: ``jobs`` of them here (-1: one for each core), or those of a dask ``scheduler``.
 
     :raises BackendError: ``jobs`` is not a number of processes.
     """
