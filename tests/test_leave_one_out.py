@@ -47,27 +47,25 @@ def run(tmp_path_factory):
 
 
 def test_every_demonstration_trains_and_is_held_out_from_a_fit_without_it(run):
-    demos = planted()
-    assert run.metrics["demonstrations"] == {"train": 5, "tune": 5, "valid": 5}
+    demos, counts = planted(), run.metrics.demonstrations
+    assert (counts.train, counts.tune, counts.valid) == (5, 5, 5)
     whole = with_overrides(run.spec, {"demonstrations.leave_one_out": False})
     for method, model in (("ddco", run), *run.baselines.items()):
         spec = with_overrides(model.spec, {"demonstrations.leave_one_out": False})
-        each = {row["name"]: row["log_likelihood"] for row in model.metrics["valid"]}
+        each = {row.name: row.log_likelihood for row in model.metrics.valid}
         for name in demos.names[:2]:
             masked = replace(demos, masks={"valid": (name,)})  # the same held out by a mask instead
             apart = ddco_pyro.fit(with_overrides(spec, {"compare_with": []}), masked)
             assert each[name] == pytest.approx(float(apart.log_likelihood(demos.select([name]))[0])), method
             assert each[name] < float(model.log_likelihood(demos.select([name]))[0])  # which the model was fitted to
-    everything = ddco_pyro.fit(
-        with_overrides(whole, {"demonstrations.valid_fraction": 0.0, "compare_with": []}), demos
-    )
+    everything = ddco_pyro.fit(with_overrides(whole, {"demonstrations.valid_fraction": 0.0, "compare_with": []}), demos)
     np.testing.assert_array_equal(run.log_likelihood(demos), everything.log_likelihood(demos))
 
 
 def test_options_of_the_fits_without_one_are_named_as_the_fits_own(run):
     """Else the NMI over all demonstrations would be of a mixture of names."""
-    assert run.metrics["agreement"]["train"][0]["nmi"] > 0.95
-    assert run.metrics["agreement"]["valid"][0]["nmi"] > 0.95
+    assert run.metrics.agreement.train[0].nmi > 0.95
+    assert run.metrics.agreement.valid[0].nmi > 0.95
 
 
 def test_a_run_has_the_models_without_one_and_goes_on_with_them(run, tmp_path):
@@ -80,7 +78,7 @@ def test_a_run_has_the_models_without_one_and_goes_on_with_them(run, tmp_path):
     assert len(before) == 15
     unchanged = ddco_pyro.fit(run.spec, out=run.folder).metrics
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    assert {**unchanged, "seconds": 0} == {**run.metrics, "seconds": 0}
+    assert unchanged.model_copy(update={"seconds": {}}) == run.metrics.model_copy(update={"seconds": {}})
 
 
 def test_what_masks_hold_out_cannot_be_trained_with():

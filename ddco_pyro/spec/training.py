@@ -6,7 +6,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import ConfigDict, Field, TypeAdapter, model_validator
 
-from ddco_pyro.spec.base import Count, Fraction, Items, Model, Positive, Seed, Share, Text, invalid, nested
+from ddco_pyro.spec.base import Count, Items, Model, Positive, Seed, Share, Text, invalid, nested
 
 
 class RidgeSpec(Model):

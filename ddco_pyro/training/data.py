@@ -68,9 +68,7 @@ def parts(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
     return {"train": train, "valid": valid}
 
 
-def tuning_split(
-    spec: Spec, dimensions: Dimensions, train: Demonstrations
-) -> tuple[Demonstrations, Demonstrations]:
+def tuning_split(spec: Spec, dimensions: Dimensions, train: Demonstrations) -> tuple[Demonstrations, Demonstrations]:
     """The training demonstrations of a model in those that it is fitted to, and those that it is tuned by.
 
     With ``training.tune_fraction: 0`` both are all of them where EM trains the model, which needs no early stopping.

@@ -70,7 +70,9 @@ class Clusters:
 
             start = ("k-means++" if best else "random") if known is None else _Start(known)
             number = distinct(rows, options)
-            self._namer = KMeans(number, init=start, n_init=10 if best else 1, max_iter=ITERATIONS, random_state=seed).fit(rows)
+            self._namer = KMeans(
+                number, init=start, n_init=10 if best else 1, max_iter=ITERATIONS, random_state=seed
+            ).fit(rows)
 
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""

@@ -214,10 +214,13 @@ class Trainer:
         best, updates = self.best, 1 if by_em else math.ceil(len(self.data.train) / self.spec.training.batch_size)
         ends = [StageEnd(**end) for end in self.restarts[best].progress.ended]
         each = [
-            {"epochs": len(restart.progress.history), "stopped": self.stopped.get(number)}
-            | ({} if restart.progress.diverged is None else {"diverged": True})
-            | ({"initialize": self.spec.training.start(number)} if self.hierarchy.depth else {})
-            | ({"nmi": self.agreement[number]} if number in self.agreement else {})
+            {
+                "epochs": len(restart.progress.history),
+                "stopped": self.stopped.get(number),
+                "diverged": restart.progress.diverged is not None,
+                "initialize": self.spec.training.start(number) if self.hierarchy.depth else None,
+                "nmi": self.agreement.get(number),
+            }
             for number, restart in enumerate(self.restarts)
         ]
 
