@@ -360,11 +360,16 @@ class Rollouts(Record):
 
 
 class Counts(Record):
-    """Numbers of demonstrations, and the success rate of their supervisor."""
+    """Numbers of demonstrations, and the success rate of their supervisor.
+
+    ``tune`` is 0 where the training demonstrations tune. Held-out demonstrations train the model, too, where
+    ``left_out`` says that each is held out from a fit without it.
+    """
 
     train: AtLeastOne
     tune: int
     valid: int
+    left_out: LeftOut[bool] = False
     supervisor: LeftOut[dict[str, Measure]] = {}
 
 

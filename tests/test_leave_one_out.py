@@ -9,6 +9,7 @@ import pytest
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.drawing import words
 from ddco_pyro.spec import parse_spec, with_overrides
 
 LINEAR = {"network": "linear"}
@@ -48,7 +49,7 @@ def run(tmp_path_factory):
 
 def test_every_demonstration_trains_and_is_held_out_from_a_fit_without_it(run):
     demos, counts = planted(), run.metrics.demonstrations
-    assert (counts.train, counts.tune, counts.valid) == (5, 5, 5)
+    assert (counts.train, counts.tune, counts.valid, counts.left_out) == (5, 0, 5, True)
     whole = with_overrides(run.spec, {"demonstrations.leave_one_out": False})
     for method, model in (("ddco", run), *run.baselines.items()):
         spec = with_overrides(model.spec, {"demonstrations.leave_one_out": False})
@@ -85,3 +86,15 @@ def test_what_masks_hold_out_cannot_be_trained_with():
     masked = replace(planted(), masks={"valid": ("demo_0",)})
     with pytest.raises(DemonstrationsError, match="leave_one_out: trains with every demonstration"):
         ddco_pyro.fit(spec_of(), masked)
+
+
+def test_runs_are_compared_by_what_the_fits_without_one_say(run):
+    compared = ddco_pyro.compare([run.folder, run.folder / "baselines" / "flat"])
+    each = {row.name: row.each for row in compared.rows}
+    assert each[str(run.folder)] == pytest.approx([row.log_likelihood for row in run.metrics.valid])
+
+    assert "each is held out from a fit without it" in words.verdict(run.metrics)
+    assert (
+        words.division(run.metrics.demonstrations)
+        == "5 for training, 0 for tuning, each held out from a fit without it"
+    )

@@ -405,10 +405,10 @@ def test_a_planted_hierarchy_is_recovered_from_the_best_of_several_cuts(tmp_path
     assert any(not torch.equal(segments[0][name], segments[1][name]) for name in segments[0])
     told = trainer.summary["restarts"]
     assert [each["initialize"] for each in told["each"]] == ["cuts"] * 6
-    assert ["nmi" in each for each in told["each"]] == [number != told["best"] for number in range(6)]
+    assert [each["nmi"] is not None for each in told["each"]] == [number != told["best"] for number in range(6)]
 
 
-@pytest.mark.parametrize("optimizer", [{"name": "em"}, {"lr": 0.03}], ids=["em", "adam"])
+@pytest.mark.parametrize("optimizer", [{"name": "em"}, {"name": "adam", "lr": 0.03}], ids=["em", "adam"])
 @pytest.mark.parametrize("counts", [(3,), (3, 2)])
 def test_a_hierarchy_begins_from_the_mixtures_fit_with_psi_one_half(tmp_path, counts, optimizer):
     """The stage before the last maximises the likelihood of the spec whose options always end."""
@@ -426,9 +426,9 @@ def test_a_hierarchy_begins_from_the_mixtures_fit_with_psi_one_half(tmp_path, co
             for batch in (data.train, data.tune)
         ]
     assert all(torch.allclose(level, torch.tensor(0.5)) for level in ends)
-    assert max(row["tune"] for row in restart.progress.history if row["stage"] == "mixture") == pytest.approx(
-        without[1], abs=1e-5
-    )
+    tuned = [row["tune"] for row in restart.progress.history if row["stage"] == "mixture"]
+    kept = tuned[-1] if optimizer["name"] == "em" else max(tuned)  # EM before the last stage keeps what converged
+    assert kept == pytest.approx(without[1], abs=1e-5)
     restart = train(data, restart)
     assert restart.progress.ended[-1]["stage"] == "joint"
     assert restart.progress.best > without[1]

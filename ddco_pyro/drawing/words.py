@@ -8,7 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.metrics import Against, Difference, Metrics, Rate, Rollouts, Seeds, Stage, SuccessWorth, Training, Worth
+from ddco_pyro.metrics import (
+    Against,
+    Counts,
+    Difference,
+    Metrics,
+    Rate,
+    Rollouts,
+    Seeds,
+    Stage,
+    SuccessWorth,
+    Training,
+    Worth,
+)
 
 CONFIDENCE = 0.95
 """Level of intervals; a difference is significant where its interval excludes 0."""
@@ -115,6 +127,12 @@ def verdict(metrics: Metrics) -> str:
     return f"{_explained(metrics)}{rising(names)}"
 
 
+def division(counts: Counts) -> str:
+    """The numbers of demonstrations that train, tune, and are held out."""
+    held_out = "each held out from a fit without it" if counts.left_out else f"{counts.valid} held out"
+    return f"{counts.train} for training, {counts.tune} for tuning, {held_out}"
+
+
 def rising(names: Iterable[str]) -> str:
     """A sentence, after a space, on models that have not converged; empty where there are none."""
     rising = list(names)
@@ -132,6 +150,8 @@ def _explained(metrics: Metrics) -> str:
         return f"{name} gives held-out demonstrations {value} nats per step; no baseline was trained to compare with."
     differences = {method(other): compared.difference for other, compared in metrics.comparison.items()}
     said = [explains(name, differences, held_out)]
+    if metrics.demonstrations.left_out:
+        said.append("Every demonstration trains the model; each is held out from a fit without it.")
     if metrics.worth:
         said.append(worth(metrics.worth, ours, held_out))
     if metrics.seeds:

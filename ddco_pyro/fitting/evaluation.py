@@ -62,21 +62,12 @@ class _Part:
     @classmethod
     def of(cls, fit: Fit, demos: Demonstrations, held_out: bool = False) -> _Part:
         values, parts, paths = [], [], []
-        for piece in _inferred(fit, demos, held_out):
+        for piece in fit.infer(demos, held_out):
             values.append(_finite(fit, piece))
             parts.append(piece.decomposition)
             paths.append(_named_alike(fit, piece, demos))
         segments = [[row[row >= 0].numpy() for h in level for row in h] for level in zip(*paths, strict=True)]
         return cls(np.concatenate(values), Decomposition.joined(parts), segments)
-
-
-def _inferred(fit: Fit, demos: Demonstrations, held_out: bool) -> Iterator[Inferred]:
-    """The inference for demonstrations; with ``leave_one_out`` a held-out one is inferred by the model without it."""
-    if not (held_out and fit.without):
-        yield from infer(fit.hierarchy, demos)
-    else:
-        for demo in demos:
-            yield from infer(fit.without[demo.name], [demo])
 
 
 def _named_alike(fit: Fit, piece: Inferred, demos: Demonstrations) -> tuple[Tensor, ...]:
@@ -137,7 +128,7 @@ def evaluate(fitted: Fit, parts: dict[str, Demonstrations], demos: Demonstration
     by_method = {fitted.name: {name: part.values for name, part in ours.items()}}
     for method, fit in fitted.baselines.items():
         by_method[method] = {
-            name: np.concatenate([_finite(fit, piece) for piece in _inferred(fit, part, name == "valid")])
+            name: np.concatenate([_finite(fit, piece) for piece in fit.infer(part, name == "valid")])
             for name, part in parts.items()
         }
     values, valid, depth = by_method[fitted.name], parts.get("valid"), fitted.hierarchy.depth

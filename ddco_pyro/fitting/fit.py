@@ -137,7 +137,7 @@ class Fit:
         """Whether a demonstration is among the held-out ones: the name and the log-likelihood are equal."""
         return bool(np.isclose(self.held_out.get(name, np.nan), log_likelihood, rtol=TOLERANCE, atol=TOLERANCE))
 
-    def infer(self, demos: Iterable[Demonstration]) -> Iterator[Inferred]:
+    def infer(self, demos: Iterable[Demonstration], held_out: bool = False) -> Iterator[Inferred]:
         """The model's outputs, posteriors and paths for demonstrations, in pieces that fit into memory, in order.
 
         >>> for piece in fit.infer(demos):
@@ -145,9 +145,14 @@ class Fit:
         (6,) torch.Size([6, 10, 3]) torch.Size([6, 10])
 
         :param demos: :class:`~ddco_pyro.Demonstrations`, or an iterable that reads one after the other.
+        :param held_out: with ``demonstrations.leave_one_out``, each by the model that was trained without it.
         :raises DemonstrationsError: there are none, or a number is too large for networks.
         """
-        return infer(self.hierarchy, demos)
+        if not (held_out and self.without):
+            yield from infer(self.hierarchy, demos)
+        else:
+            for demo in demos:
+                yield from infer(self.without[demo.name], [demo])
 
     def log_likelihood(self, demos: Iterable[Demonstration]) -> np.ndarray:
         """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units.
@@ -322,7 +327,8 @@ def _fit_model(
     with clock("training"):
         apart = _leave_one_out(spec, size, demos, folder, on_event, jobs, ranks)
     fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=beside, apart=apart)
-    parts_of = {"train": trained.data.train, "tune": trained.data.tune, "valid": split.get("valid", ())}
+    train, valid = len(trained.data.train), len(split.get("valid", ()))
+    counts = {"train": train, "tune": len(split["train"]) - train, "valid": valid, "left_out": bool(apart)}
     known = {"supervisor": json.loads(str(demos.attributes.get("supervisor", "{}")))}  # a collected file has it
     with clock("evaluation"), repeatable(hierarchy.device):
         metrics = evaluate(
@@ -330,7 +336,7 @@ def _fit_model(
             split,
             demos,
             engine_check=trained.check._asdict(),
-            demonstrations={name: len(part) for name, part in parts_of.items()} | known,
+            demonstrations=counts | known,
             measure=measure(hierarchy.scaling.parts),
             control_dimensions=[dimension.as_data() for dimension in size.control],
             parameters=parameters(hierarchy),
