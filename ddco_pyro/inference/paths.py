@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.inference.arguments import refuse_impossible
-from ddco_pyro.inference.fused import joint_evidence, side_by_side
+from ddco_pyro.inference.fused import choice_factors
 from ddco_pyro.inference.kernel import Array, Rows, Structure, jit, match_torch_threads, parallel, trajectory
+from ddco_pyro.model.links import Alive
 from ddco_pyro.model.tables import Tables
 
 
@@ -86,19 +87,20 @@ def segment(tables: Tables, lengths: Tensor) -> tuple[Tensor, ...]:
 def _trace(tables: Tables, lengths: Tensor, best: bool, uniforms: np.ndarray) -> Path:
     if not tables.depth:
         return Path((), ())
-    structure = Structure.of(tuple(table.shape[-1] for table in tables.selection))
+    structure, alive = Structure.of(tables.sizes), Alive.of(lengths, tables.steps)
     joint, terminated = np.full((2, *uniforms.shape[:2], tables.steps), -1, dtype=np.int64)
     possible = np.ones(len(lengths), dtype=np.bool_)
-    logs = (*(side_by_side(group) for group in (tables.selection, tables.termination, tables.control)),)
-    rows = Rows(*(table.numpy() for table in (*logs, joint_evidence(tables))))
+    *levels, meta_policy = tables.control
+    groups = tables.selection, tables.termination, (meta_policy, *levels)
+    logs = (np.concatenate([alive.take(table).double().numpy() for table in group], axis=1) for group in groups)
+    rows, starts = Rows(*logs, choice_factors(tables, alive)), (lengths.cumsum(0) - lengths).numpy()
     match_torch_threads()
-    _trace_all(rows, lengths.numpy(), best, uniforms, joint, terminated, possible, structure)
+    _trace_all(rows, starts, lengths.numpy(), best, uniforms, joint, terminated, possible, structure)
     refuse_impossible(torch.from_numpy(possible))
-    alive = joint >= 0
-    levels = range(tables.depth)
+    within = joint >= 0
     return Path(
-        tuple(torch.from_numpy(np.where(alive, digit, -1)) for digit in structure.digits(joint)),
-        tuple(torch.from_numpy(np.where(alive, terminated > level, -1)) for level in levels),
+        tuple(torch.from_numpy(np.where(within, digit, -1)) for digit in structure.digits(joint)),
+        tuple(torch.from_numpy(np.where(within, terminated > level, -1)) for level in range(tables.depth)),
     )
 
 
@@ -226,8 +228,8 @@ def _back(
 
 @parallel
 def _trace_all(
-    rows: Rows, lengths: Array, best: bool, uniforms: Array, joint: Array, terminated: Array, possible: Array,
-    of: Structure,
+    rows: Rows, starts: Array, lengths: Array, best: bool, uniforms: Array, joint: Array, terminated: Array,
+    possible: Array, of: Structure,
 ) -> None:  # fmt: skip
     """Fill the ``joint`` choices [M, N, T] of M paths, and how many levels ``terminated`` before each.
 
@@ -237,11 +239,11 @@ def _trace_all(
     :param best: the most likely path instead of a draw from the posterior.
     :param uniforms: numbers uniform in [0, 1), [M, N, 1 + T, 2·D].
     """
-    sizes, starts, ends, callers, actors, choices = of  # a parallel loop takes no tuple within a tuple
+    sizes, firsts, ends, callers, actors, choices = of  # a parallel loop takes no tuple within a tuple
     for n in numba.prange(len(lengths)):
-        structure = Structure(sizes, starts, ends, callers, actors, choices)
-        own = trajectory(rows, n, lengths[n])
-        messages, spread = np.empty((1 + lengths[n], starts[-1])), np.empty((lengths[n], starts[-1]))
+        structure = Structure(sizes, firsts, ends, callers, actors, choices)
+        own = trajectory(rows, starts[n], lengths[n])
+        messages, spread = np.empty((1 + lengths[n], firsts[-1])), np.empty((lengths[n], firsts[-1]))
         _forward(own, best, messages, spread, structure)
         for m in range(len(joint)):
             possible[n] = _back(

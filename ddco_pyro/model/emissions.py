@@ -14,13 +14,15 @@ from functools import reduce
 from operator import add
 from typing import Any, Protocol, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 from torch.nn.functional import logsigmoid, one_hot, pad
 from torch.special import ndtr
 
-from ddco_pyro.model.links import weighted_squares
+from ddco_pyro.model.elementary import Array, jit, log_normal_cdf
+from ddco_pyro.model.links import Alive, Gradients, Link, Posterior, flat, like
 from ddco_pyro.model.tables import NEVER
 
 LOG_2PI = math.log(2 * math.pi)
@@ -101,6 +103,42 @@ class Emission(ABC):
         }
         return replace(self, **changed)  # type: ignore[type-var]
 
+    def tensors(self) -> tuple[Tensor, ...]:
+        """The floating-point tensors, those of other emissions included."""
+        found: list[Tensor] = []
+
+        def collect(tensor: Tensor) -> Tensor:
+            found.extend([tensor] if tensor.is_floating_point() else [])
+            return tensor
+
+        self.map(collect)
+        return tuple(found)
+
+    def add(self, actions: Tensor, alive: Alive, rows: Array, first: int) -> Any:
+        """Add log π(a | s) to K columns of ``rows`` [M, n], from ``first`` on; what :meth:`gradients` needs of it.
+
+        A kind without a compiled pass is differentiated by torch.
+        """
+        leaves: list[Tensor] = []
+
+        def leaf(tensor: Tensor) -> Tensor:
+            if not tensor.is_floating_point():
+                return tensor
+            leaves.append(tensor.detach().requires_grad_())
+            return leaves[-1]
+
+        with torch.enable_grad():
+            value = self.map(leaf).log_density(actions)
+        rows[:, first : first + value.shape[-1]] += alive.take(value).numpy()
+        return value, leaves
+
+    def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
+        """The gradient of each of the :meth:`tensors`, given how likely each caller acts, in the same columns."""
+        value, leaves = kept
+        own = torch.from_numpy(posterior.found)[:, first : first + value.shape[-1]]
+        upstream = alive.put(own * torch.from_numpy(posterior.weight).unsqueeze(-1), value.shape, value.dtype)
+        return torch.autograd.grad(value, leaves, upstream, retain_graph=True, allow_unused=True)
+
     def _fields(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
 
@@ -127,7 +165,35 @@ class Gaussian(Emission):
         """log N(a; μ, σ²), [..., K]."""
         constant = self.std.log().sum(-1) + 0.5 * LOG_2PI * self.std.shape[-1] + self.log_scale.sum(-1)
         weight = (-0.5 / self.std.square()).to(self.mean.dtype)
-        return weighted_squares(self.mean, weight, actions) - constant.to(self.mean.dtype)
+        error = actions.to(self.mean.dtype).unsqueeze(-2) - self.mean
+        return (error.square() * weight).sum(-1) - constant.to(self.mean.dtype)
+
+    def add(self, actions: Tensor, alive: Alive, rows: Array, first: int) -> Any:
+        """The density in a compiled pass where σ does not depend on the state; kept is φ / Φ of each mass."""
+        if self.std.dim() > 2:
+            return super().add(actions, alive, rows, first)
+        std = self._std()
+        constant = std.log() + 0.5 * LOG_2PI + self.log_scale.double()
+        given = alive.rows, flat(self.mean, 2), std.numpy(), *self._bounds(), flat(actions, 1)
+        return _add_normal(*given, constant.numpy(), rows, first)
+
+    def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
+        """The gradients of μ, σ and the units, and those of bounds."""
+        if self.std.dim() > 2:
+            return super().gradients(actions, alive, posterior, first, kept)
+        mean, sums = like(self.mean, alive), torch.zeros(4, *self.shape[-2:], dtype=torch.float64)
+        given = alive.rows, flat(self.mean, 2), self._std().numpy(), *self._bounds(), flat(actions, 1)
+        _normal_gradient(*given, posterior.found, posterior.weight, first, kept, flat(mean, 2), sums.numpy())
+        fixed = list(self._fields().values())[1:]
+        return mean, *(own.sum_to_size(of.shape).to(of.dtype) for own, of in zip(sums, fixed, strict=False))
+
+    def _std(self) -> Tensor:
+        return self.std.detach().double().expand(self.shape[-2:]).contiguous()
+
+    def _bounds(self) -> tuple[Array, Array]:
+        """The lower and the upper bound of each dimension, [A]."""
+        none = np.full(self.shape[-1], np.inf)
+        return -none, none
 
     @property
     def mode(self) -> Tensor:
@@ -179,6 +245,9 @@ class Clipped(Gaussian):
         """The sum over dimensions, float64 [..., K]."""
         return self.by_dimension(actions).sum(-1)
 
+    def _bounds(self) -> tuple[Array, Array]:
+        return self.low.double().numpy(), self.high.double().numpy()
+
     @property
     def mode(self) -> Tensor:
         """μ within the bounds: the control without noise."""
@@ -187,6 +256,75 @@ class Clipped(Gaussian):
     def draw(self, noise: Tensor) -> Tensor:
         """μ + σ·z within the bounds."""
         return super().draw(noise).clamp(self.low, self.high)
+
+
+@jit
+def _add_normal(
+    alive: Array, mean: Array, std: Array, low: Array, high: Array, actions: Array, constant: Array,
+    rows: Array, first: int,
+) -> Array:  # fmt: skip
+    """Add log-densities within the bounds and log-masses on them; φ / Φ of each mass, in order."""
+    callers, size = std.shape
+    masses = 0
+    for row in alive:
+        for d in range(size):
+            masses += not low[d] < actions[row, d] < high[d]
+    beyond, slope = np.empty(masses * callers), np.empty(masses * callers)
+    i = 0
+    for m in range(len(alive)):
+        row = alive[m]
+        for d in range(size):
+            a = np.float64(actions[row, d])
+            if low[d] < a < high[d]:
+                for j in range(callers):
+                    z = (a - mean[row, j, d]) / std[j, d]
+                    rows[m, first + j] -= 0.5 * z * z + constant[j, d]
+            else:
+                below = a <= low[d]
+                for j in range(callers):
+                    beyond[i + j] = (low[d] - mean[row, j, d] if below else mean[row, j, d] - high[d]) / std[j, d]
+                i += callers
+    log_normal_cdf(beyond, slope)
+    i = 0
+    for m in range(len(alive) if masses else 0):
+        for d in range(size):
+            if not low[d] < actions[alive[m], d] < high[d]:
+                for j in range(callers):
+                    rows[m, first + j] += beyond[i + j]
+                i += callers
+    return slope
+
+
+@jit
+def _normal_gradient(
+    alive: Array, mean: Array, std: Array, low: Array, high: Array, actions: Array, posterior: Array, weight: Array,
+    first: int, slope: Array, of_mean: Array, sums: Array,
+) -> None:  # fmt: skip
+    """The gradient of μ; those of σ, the units' logarithms and both bounds are added to ``sums`` [4, K, A]."""
+    of_std, of_scale, of_low, of_high = sums
+    callers, size = std.shape
+    i = 0
+    for m in range(len(alive)):
+        row = alive[m]
+        for d in range(size):
+            a = np.float64(actions[row, d])
+            if low[d] < a < high[d]:
+                for j in range(callers):
+                    own, z = weight[m] * posterior[m, first + j], (a - mean[row, j, d]) / std[j, d]
+                    share = own / std[j, d]
+                    of_mean[row, j, d] = share * z
+                    of_std[j, d] += share * (z * z - 1.0)
+                    of_scale[j, d] -= own
+            else:
+                below = a <= low[d]
+                for j in range(callers):
+                    share = weight[m] * posterior[m, first + j] * slope[i + j] / std[j, d]
+                    of_mean[row, j, d] = -share if below else share
+                    of_low[j, d] += share if below else 0.0
+                    of_high[j, d] -= 0.0 if below else share
+                    z = (low[d] - mean[row, j, d] if below else mean[row, j, d] - high[d]) / std[j, d]
+                    of_std[j, d] -= share * z
+                i += callers
 
 
 @dataclass(frozen=True)
@@ -358,6 +496,21 @@ class Product(Emission):
         """log π(a | s), [..., K]."""
         return reduce(add, (emission.log_density(actions[..., dims]) for dims, emission in self.groups))
 
+    def tensors(self) -> tuple[Tensor, ...]:
+        """Those of the groups."""
+        return tuple(tensor for _, emission in self.groups for tensor in emission.tensors())
+
+    def add(self, actions: Tensor, alive: Alive, rows: Array, first: int) -> Any:
+        """The groups' one after the other."""
+        return [emission.add(actions[..., dims], alive, rows, first) for dims, emission in self.groups]
+
+    def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
+        """Those of the groups."""
+        found: list[Tensor | None] = []
+        for (dims, emission), own in zip(self.groups, kept, strict=True):
+            found.extend(emission.gradients(actions[..., dims], alive, posterior, first, own))
+        return tuple(found)
+
     @property
     def mode(self) -> Tensor:
         """The most likely control of each group."""
@@ -395,6 +548,27 @@ class Product(Emission):
         """The groups' values [..., K, A_g] in the order of the dimensions."""
         order = torch.tensor([dimension for dimensions, _ in self.groups for dimension in dimensions]).argsort()
         return torch.cat(list(values), dim=-1)[..., order]
+
+
+class Density(Link):
+    """log π(a | s) of K callers, for controls [N, T, A] without a gradient."""
+
+    def __init__(self, emission: Emission, actions: Tensor) -> None:
+        self.emission, self.actions = emission, actions
+        self.inputs, self.shape = emission.tensors(), emission.shape[:-1]
+
+    def formula(self) -> Tensor:
+        """[N, T, K]."""
+        return self.emission.log_density(self.actions)
+
+    def fill(self, alive: Alive, rows: Array, first: int) -> Any:
+        """The log-density; kept is what its parts keep."""
+        rows[:, first : first + self.columns] = 0.0
+        return self.emission.add(self.actions, alive, rows, first)
+
+    def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
+        """Those of the emission."""
+        return self.emission.gradients(self.actions, alive, posterior, first, kept)
 
 
 TAIL = -30.0
