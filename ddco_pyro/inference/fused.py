@@ -11,7 +11,7 @@ Probabilities come from the links of the networks' outputs, which also turn the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import chain
+from itertools import accumulate, chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,7 +46,7 @@ def _parts(tables: Tables) -> list[Part]:
 
 
 def _side_by_side(links: Sequence[Link], group: int) -> list[Part]:
-    firsts = np.cumsum([0, *(link.columns for link in links)]).tolist()
+    firsts = accumulate((link.columns for link in links), initial=0)
     return [Part(link, group, first) for link, first in zip(links, firsts, strict=False)]
 
 
@@ -77,7 +77,7 @@ class Elimination(NamedTuple):
 
     def _table(self, part: Part) -> Tensor:
         own = torch.from_numpy(self.posteriors[part.group])[:, part.columns]
-        return self.alive.put(own, part.link.shape, torch.float64)
+        return self.alive.put(own, part.link.shape)
 
 
 class Eliminate(torch.autograd.Function):
@@ -106,7 +106,7 @@ class Eliminate(torch.autograd.Function):
         found: Elimination = ctx.found
         inputs, needed = ctx.saved_tensors, ctx.needs_input_grad[3:]
         with torch.no_grad():
-            weight = upstream.detach().double().repeat_interleave(ctx.lengths)
+            weight = np.repeat(upstream.detach().numpy(), ctx.lengths.numpy())
             gradients = _gradients(found, weight, needed)
             if ctx.evidence:
                 gradients += _evidence_gradients(ctx.tables, found, weight)
@@ -116,29 +116,30 @@ class Eliminate(torch.autograd.Function):
         return None, None, None, *(one if wanted else None for one, wanted in zip(gradients, needed, strict=True))
 
 
-def _gradients(found: Elimination, weight: Tensor, needed: Sequence[bool]) -> list[Tensor | None]:
+def _gradients(found: Elimination, weight: Array, needed: Sequence[bool]) -> list[Tensor | None]:
     """The gradients of the links' inputs, where a link has one that is ``needed``, then those of the probes."""
     gradients: list[Tensor | None] = []
     for part, kept in zip(found.parts, found.kept, strict=True):
         wanted = any(needed[len(gradients) : len(gradients) + len(part.link.inputs)])
-        posterior = Posterior(found.rows[part.group], found.posteriors[part.group], weight.numpy())
+        posterior = Posterior(found.rows[part.group], found.posteriors[part.group], weight)
         none = (None,) * len(part.link.inputs)
         gradients += part.link.gradients(found.alive, posterior, part.first, kept) if wanted else none
     for part in found.parts:
-        own, probe = torch.from_numpy(found.posteriors[part.group])[:, part.columns], part.link.probe
-        weighted = None if probe is None else own * weight.unsqueeze(-1)
-        gradients.append(None if weighted is None else found.alive.put(weighted, part.link.shape, probe.dtype))
+        if part.link.probe is None:
+            gradients.append(None)
+        else:
+            weighted = found.posteriors[part.group][:, part.columns] * weight[:, None]
+            gradients.append(found.alive.put(torch.from_numpy(weighted), part.link.shape))
     return gradients
 
 
-def _evidence_gradients(tables: Tables, found: Elimination, weight: Tensor) -> list[Tensor | None]:
+def _evidence_gradients(tables: Tables, found: Elimination, weight: Array) -> list[Tensor | None]:
     """The marginals of the levels with evidence; None where they were not asked for."""
-    marginals = torch.from_numpy(found.posteriors.choice)
-    if not marginals.shape[1]:
+    if not found.posteriors.choice.shape[1]:
         return [None] * tables.depth
-    weighted = (marginals * weight.unsqueeze(-1)).split(tables.sizes, dim=-1)
+    weighted = torch.from_numpy(found.posteriors.choice * weight[:, None]).split(tables.sizes, dim=-1)
     return [
-        None if own is None else found.alive.put(part, own.shape, own.dtype)
+        None if own is None else found.alive.put(part.to(own.dtype), own.shape)
         for part, own in zip(weighted, tables.evidence, strict=True)
     ]
 
@@ -206,7 +207,7 @@ def eliminate(
 def choice_factors(tables: Tables, alive: Alive) -> Array:
     """The evidence of every joint choice, [M, S]; [M, 0] without evidence."""
     joint = tables.joint_evidence()
-    return np.empty((len(alive.rows), 0)) if joint is None else alive.take(joint).contiguous().numpy()
+    return np.empty((len(alive.rows), 0)) if joint is None else alive.take(joint.flatten(2))
 
 
 def _repeat_in_log_space(

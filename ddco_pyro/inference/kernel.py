@@ -119,8 +119,11 @@ class Rows(NamedTuple):
 def match_torch_threads() -> None:
     """Let compiled loops run on ``torch.get_num_threads()`` threads."""
     threads = torch.get_num_threads()
-    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
-    torch.set_num_threads(threads)  # numba's first call sets OpenMP's number for the whole process
+    own = min(threads, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    if numba.get_num_threads() != own:
+        numba.set_num_threads(own)
+    if torch.get_num_threads() != threads:  # numba's first call sets OpenMP's number for the whole process
+        torch.set_num_threads(threads)
 
 
 @jit
@@ -428,13 +431,14 @@ def scale_densities(rows: Array, starts: Array, lengths: Array, shift: Array) ->
     A step without a finite largest is not scaled.
     """
     for n in range(len(lengths)):
-        shift[n] = 0.0
-        for m in range(starts[n], starts[n] + lengths[n]):
-            top = rows[m, 0]
-            for j in range(1, rows.shape[1]):
-                top = max(top, rows[m, j])
+        own, total = rows[starts[n] : starts[n] + lengths[n]], 0.0
+        for t in range(len(own)):
+            top = own[t, 0]
+            for j in range(1, own.shape[1]):
+                top = max(top, own[t, j])
             if np.isfinite(top):
-                shift[n] += top
-                for j in range(rows.shape[1]):
-                    rows[m, j] -= top
+                total += top
+                for j in range(own.shape[1]):
+                    own[t, j] -= top
+        shift[n] = total
     exponentials(rows.reshape(-1))

@@ -16,9 +16,12 @@ from torch import Tensor
 
 from ddco_pyro.inference.arguments import refuse_impossible
 from ddco_pyro.inference.fused import choice_factors
-from ddco_pyro.inference.kernel import Array, Rows, Structure, jit, match_torch_threads, parallel, trajectory
+from ddco_pyro.inference.kernel import Array, Rows, Structure, match_torch_threads, parallel, trajectory
 from ddco_pyro.model.links import Alive
 from ddco_pyro.model.tables import Tables
+
+
+jit = numba.njit(cache=True, error_model="numpy")
 
 
 class Path(NamedTuple):
@@ -92,7 +95,7 @@ def _trace(tables: Tables, lengths: Tensor, best: bool, uniforms: np.ndarray) ->
     possible = np.ones(len(lengths), dtype=np.bool_)
     *levels, meta_policy = tables.control
     groups = tables.selection, tables.termination, (meta_policy, *levels)
-    logs = (np.concatenate([alive.take(table).double().numpy() for table in group], axis=1) for group in groups)
+    logs = (np.concatenate([alive.take(table.flatten(2)) for table in group], axis=1, dtype=np.float64) for group in groups)
     rows, starts = Rows(*logs, choice_factors(tables, alive)), (lengths.cumsum(0) - lengths).numpy()
     match_torch_threads()
     _trace_all(rows, starts, lengths.numpy(), best, uniforms, joint, terminated, possible, structure)
@@ -149,15 +152,27 @@ def _forward(rows: Rows, best: bool, messages: Array, spread: Array, of: Structu
     messages[0, of.starts[depth]] = 0.0  # at t = 0 everything is selected
     for t in range(len(spread)):
         for d in range(depth if t > 0 else 0):
-            messages[t, of.starts[d + 1] : of.starts[d + 2]] = -np.inf
-            for below in range(of.starts[d], of.starts[d + 1]):
-                above = _above(d, below, of)
-                messages[t, above] = _plus(messages[t, above], _ended(t, d, below, rows, messages, of), best)
+            c, below = of.sizes[d], of.starts[d]
+            for above in range(of.starts[d + 1], of.starts[d + 2]):
+                total = messages[t, below]  # choice 0 lasts one step
+                for j in range(1, c):
+                    ended = messages[t, below + j] + rows.termination[t, of.ends[d] + 2 * j - 1]
+                    total = _plus(total, ended, best)
+                messages[t, above] = total
+                below += c
         spread[t, of.starts[depth]] = messages[t, of.starts[depth]]
         for d in range(depth - 1, -1, -1):
-            for below in range(of.starts[d], of.starts[d + 1]):
-                kept = _kept(t, d, below, rows, messages, of)
-                spread[t, below] = _plus(kept, _selected(t, d, below, rows, spread, of), best)
+            c, below = of.sizes[d], of.starts[d]
+            for above in range(of.starts[d + 1], of.starts[d + 2]):
+                mass, first = spread[t, above], of.callers[above]
+                spread[t, below] = mass if first < 0 else mass + rows.selection[t, first]
+                for j in range(1, c):
+                    if first < 0:
+                        spread[t, below + j] = -np.inf
+                    else:
+                        kept = messages[t, below + j] + rows.termination[t, of.ends[d] + 2 * j - 2]
+                        spread[t, below + j] = _plus(kept, mass + rows.selection[t, first + j], best)
+                below += c
         for s in range(len(of.actors)):
             actor = of.actors[s]
             messages[t + 1, s] = spread[t, s] + rows.control[t, actor] if actor >= 0 else -np.inf

@@ -44,9 +44,9 @@ def exponentials(x: Array) -> None:
     bits = np.empty(BLOCK, np.int64)
     scale, fraction = bits.view(np.float64), np.empty(BLOCK)
     for first in range(0, len(x), BLOCK):
-        count = min(BLOCK, len(x) - first)
-        for i in range(count):
-            v = x[first + i]
+        own = x[first : first + BLOCK]
+        for i in range(len(own)):
+            v = own[i]
             within = min(max(v, SMALLEST), 709.0)
             k = np.floor(within * LOG2_E + 0.5)
             r = v - k * LN2_HIGH - k * LN2_LOW
@@ -64,8 +64,8 @@ def exponentials(x: Array) -> None:
             q = q * r + 1.0
             fraction[i] = 0.0 if v < SMALLEST else q * r + 1.0
             bits[i] = np.int64(np.int32(k) + np.int32(EXPONENT_BIAS)) << 52
-        for i in range(count):
-            x[first + i] = fraction[i] * scale[i]
+        for i in range(len(own)):
+            own[i] = fraction[i] * scale[i]
 
 
 @jit
@@ -73,14 +73,13 @@ def logarithms(x: Array) -> None:
     """log(x) in place of positive normal x [M]: error below 5e-16, relative or absolute; NaN for NaN."""
     bits, exponent = np.empty(BLOCK, np.int64), np.empty(BLOCK)
     mantissa = bits.view(np.float64)
-    seen = x.view(np.int64)
     for first in range(0, len(x), BLOCK):
-        count = min(BLOCK, len(x) - first)
-        for i in range(count):
-            own = seen[first + i]
-            exponent[i] = np.float64(np.int32(own >> 52) - np.int32(EXPONENT_BIAS))
-            bits[i] = (own & MANTISSA) | ONE
-        for i in range(count):
+        own = x[first : first + BLOCK]
+        seen = own.view(np.int64)
+        for i in range(len(own)):
+            exponent[i] = np.float64(np.int32(seen[i] >> 52) - np.int32(EXPONENT_BIAS))
+            bits[i] = (seen[i] & MANTISSA) | ONE
+        for i in range(len(own)):
             high = mantissa[i] > 1.4142135623730951
             m = 0.5 * mantissa[i] if high else mantissa[i]
             k = exponent[i] + 1.0 if high else exponent[i]
@@ -96,8 +95,8 @@ def logarithms(x: Array) -> None:
             q = q * z + 1.0 / 7.0
             q = q * z + 1.0 / 5.0
             q = q * z + 1.0 / 3.0
-            own_log = k * LN2_HIGH + (2.0 * s + (2.0 * s * z * q + k * LN2_LOW))
-            x[first + i] = own_log if x[first + i] == x[first + i] else np.nan
+            value = k * LN2_HIGH + (2.0 * s + (2.0 * s * z * q + k * LN2_LOW))
+            own[i] = value if own[i] == own[i] else np.nan
 
 
 @jit
@@ -106,31 +105,28 @@ def log_normal_cdf(x: Array, slope: Array) -> None:
 
     log Φ has an error of at most 2e-15, relative or absolute; the derivative has a relative one of at most 2e-15.
     """
-    square, ratio, t = np.empty(len(x)), np.empty(len(x)), np.empty(BLOCK)
+    block_of_t, block_of_ratio, block_of_square = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
     for first in range(0, len(x), BLOCK):
-        count = min(BLOCK, len(x) - first)
-        q = ratio[first : first + count]
-        for i in range(count):
-            z = abs(x[first + i]) * SQRT_HALF
+        own, density = x[first : first + BLOCK], slope[first : first + BLOCK]
+        t, ratio, square = block_of_t[: len(own)], block_of_ratio[: len(own)], block_of_square[: len(own)]
+        for i in range(len(own)):
+            z = abs(own[i]) * SQRT_HALF
             t[i] = (z - CENTRE) / (z + CENTRE)
-            q[i] = 0.0
+            ratio[i] = 0.0
+            square[i] = density[i] = -0.5 * own[i] * own[i]
         for coefficient in SCALED_ERFC:
-            for i in range(count):
-                q[i] = q[i] * t[i] + coefficient
-        for i in range(count):
-            z = abs(x[first + i]) * SQRT_HALF
-            q[i] /= 1.0 + 2.0 * z
-    for i in range(len(x)):
-        square[i] = slope[i] = -0.5 * x[i] * x[i]
-    exponentials(slope)
-    for i in range(len(x)):
-        low = x[i] <= 0.0
-        below = 0.5 * ratio[i]  # Φ(x) / exp(-x²/2) of a negative x
-        whole = 1.0 - slope[i] * below  # Φ(x) of a positive x
-        density = 0.5 * SQRT_2_OVER_PI * slope[i]
-        slope[i] = SQRT_2_OVER_PI / ratio[i] if low else density / whole
-        square[i] = square[i] if low else 0.0
-        x[i] = below if low else whole
-    logarithms(x)
-    for i in range(len(x)):
-        x[i] += square[i]
+            for i in range(len(own)):
+                ratio[i] = ratio[i] * t[i] + coefficient
+        exponentials(density)
+        for i in range(len(own)):
+            low = own[i] <= 0.0
+            scaled = ratio[i] / (1.0 + 2.0 * SQRT_HALF * abs(own[i]))  # exp(z²) erfc(z)
+            below = 0.5 * scaled  # Φ(x) / exp(-x²/2) of a negative x
+            whole = 1.0 - density[i] * below  # Φ(x) of a positive x
+            part = below if low else whole
+            density[i] = 0.5 * SQRT_2_OVER_PI * (1.0 if low else density[i]) / part
+            square[i] = square[i] if low else 0.0
+            own[i] = part
+        logarithms(own)
+        for i in range(len(own)):
+            own[i] += square[i]

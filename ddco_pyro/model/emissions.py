@@ -22,7 +22,7 @@ from torch.nn.functional import logsigmoid, one_hot, pad
 from torch.special import ndtr
 
 from ddco_pyro.model.elementary import Array, jit, log_normal_cdf
-from ddco_pyro.model.links import Alive, Gradients, Link, Posterior, flat, like
+from ddco_pyro.model.links import Alive, Gradients, Link, Posterior
 from ddco_pyro.model.tables import NEVER
 
 LOG_2PI = math.log(2 * math.pi)
@@ -106,12 +106,9 @@ class Emission(ABC):
     def tensors(self) -> tuple[Tensor, ...]:
         """The floating-point tensors, those of other emissions included."""
         found: list[Tensor] = []
-
-        def collect(tensor: Tensor) -> Tensor:
-            found.extend([tensor] if tensor.is_floating_point() else [])
-            return tensor
-
-        self.map(collect)
+        for value in self._fields().values():
+            own = (value,) if isinstance(value, Tensor) else value.tensors()
+            found.extend(tensor for tensor in own if tensor.is_floating_point())
         return tuple(found)
 
     def add(self, actions: Tensor, alive: Alive, rows: Array, first: int) -> Any:
@@ -129,14 +126,15 @@ class Emission(ABC):
 
         with torch.enable_grad():
             value = self.map(leaf).log_density(actions)
-        rows[:, first : first + value.shape[-1]] += alive.take(value).numpy()
+        rows[:, first : first + value.shape[-1]] += alive.take(value)
         return value, leaves
 
     def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
         """The gradient of each of the :meth:`tensors`, given how likely each caller acts, in the same columns."""
         value, leaves = kept
         own = torch.from_numpy(posterior.found)[:, first : first + value.shape[-1]]
-        upstream = alive.put(own * torch.from_numpy(posterior.weight).unsqueeze(-1), value.shape, value.dtype)
+        weighted = own * torch.from_numpy(posterior.weight).unsqueeze(-1)
+        upstream = alive.put(weighted, value.shape).to(value.dtype)
         return torch.autograd.grad(value, leaves, upstream, retain_graph=True, allow_unused=True)
 
     def _fields(self) -> dict[str, Any]:
@@ -172,27 +170,28 @@ class Gaussian(Emission):
         """The density in a compiled pass where σ does not depend on the state; kept is φ / Φ of each mass."""
         if self.std.dim() > 2:
             return super().add(actions, alive, rows, first)
-        std = self._std()
-        constant = std.log() + 0.5 * LOG_2PI + self.log_scale.double()
-        given = alive.rows, flat(self.mean, 2), std.numpy(), *self._bounds(), flat(actions, 1)
-        return _add_normal(*given, constant.numpy(), rows, first)
+        std = self.std.detach().numpy().astype(np.float64)
+        constant = np.log(std) + (0.5 * LOG_2PI + self.log_scale.detach().numpy())
+        inverse, constant = (np.array(np.broadcast_to(own, self.mean.shape[-2:])) for own in (1 / std, constant))
+        given = alive.take(self.mean), inverse, *self._bounds(), alive.take(actions)
+        return *given, _add_normal(*given, constant, rows, first)
 
     def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
         """The gradients of μ, σ and the units, and those of bounds."""
         if self.std.dim() > 2:
             return super().gradients(actions, alive, posterior, first, kept)
-        mean, sums = like(self.mean, alive), torch.zeros(4, *self.shape[-2:], dtype=torch.float64)
-        given = alive.rows, flat(self.mean, 2), self._std().numpy(), *self._bounds(), flat(actions, 1)
-        _normal_gradient(*given, posterior.found, posterior.weight, first, kept, flat(mean, 2), sums.numpy())
-        fixed = list(self._fields().values())[1:]
-        return mean, *(own.sum_to_size(of.shape).to(of.dtype) for own, of in zip(sums, fixed, strict=False))
-
-    def _std(self) -> Tensor:
-        return self.std.detach().double().expand(self.shape[-2:]).contiguous()
+        mean, sums = alive.empty(self.mean), np.zeros((4, *self.mean.shape[-2:]))
+        *given, slope = kept
+        _normal_gradient(*given, posterior.found, posterior.weight, first, slope, mean.numpy(), sums)
+        fixed = zip(self.tensors()[1:], sums, strict=False)
+        others = (
+            torch.from_numpy(own).sum_to_size(of.shape).to(of.dtype) if of.requires_grad else None for of, own in fixed
+        )
+        return alive.put(mean, self.mean.shape), *others
 
     def _bounds(self) -> tuple[Array, Array]:
-        """The lower and the upper bound of each dimension, [A]."""
-        none = np.full(self.shape[-1], np.inf)
+        """The lower and the upper bound of each dimension, float64 [A]."""
+        none = np.full(self.mean.shape[-1], np.inf)
         return -none, none
 
     @property
@@ -246,7 +245,7 @@ class Clipped(Gaussian):
         return self.by_dimension(actions).sum(-1)
 
     def _bounds(self) -> tuple[Array, Array]:
-        return self.low.double().numpy(), self.high.double().numpy()
+        return self.low.detach().double().numpy(), self.high.detach().double().numpy()
 
     @property
     def mode(self) -> Tensor:
@@ -258,73 +257,112 @@ class Clipped(Gaussian):
         return super().draw(noise).clamp(self.low, self.high)
 
 
+SIDE_BY_SIDE = 128
+"""Steps whose densities are computed side by side in vector instructions."""
+
+
 @jit
 def _add_normal(
-    alive: Array, mean: Array, std: Array, low: Array, high: Array, actions: Array, constant: Array,
-    rows: Array, first: int,
-) -> Array:  # fmt: skip
-    """Add log-densities within the bounds and log-masses on them; φ / Φ of each mass, in order."""
-    callers, size = std.shape
-    masses = 0
-    for row in alive:
+    mean: Array, inverse: Array, low: Array, high: Array, actions: Array, constant: Array, rows: Array, first: int
+) -> Array:
+    """Add log-densities within the bounds and log-masses on them; φ / Φ of each mass, in order.
+
+    :param mean: [M, K, A].
+    :param inverse: 1/σ, [K, A].
+    """
+    steps, callers, size = mean.shape
+    whole, masses = rows[:, first : first + callers], 0
+    control, free, total = np.empty(SIDE_BY_SIDE), np.empty(SIDE_BY_SIDE), np.empty((callers, SIDE_BY_SIDE))
+    for begin in range(0, steps, SIDE_BY_SIDE):
+        own, act = mean[begin : begin + SIDE_BY_SIDE], actions[begin : begin + SIDE_BY_SIDE]
+        total[:] = 0.0
         for d in range(size):
-            masses += not low[d] < actions[row, d] < high[d]
-    beyond, slope = np.empty(masses * callers), np.empty(masses * callers)
+            for i in range(len(act)):
+                control[i] = act[i, d]
+                free[i] = low[d] < act[i, d] < high[d]
+            for j in range(callers):
+                for i in range(len(act)):
+                    z = (control[i] - own[i, j, d]) * inverse[j, d]
+                    total[j, i] += free[i] * (0.5 * z * z + constant[j, d])
+            for i in range(len(act)):
+                masses += free[i] == 0.0
+        out = whole[begin : begin + SIDE_BY_SIDE]
+        for i in range(len(act)):
+            for j in range(callers):
+                out[i, j] -= total[j, i]
+    beyond, slope, i = np.empty((masses, callers)), np.empty((masses, callers)), 0
+    for m in range(steps if masses else 0):
+        for d in range(size):
+            a = np.float64(actions[m, d])
+            if not low[d] < a < high[d]:
+                for j in range(callers):
+                    beyond[i, j] = _beyond(a, np.float64(mean[m, j, d]), low[d], high[d]) * inverse[j, d]
+                i += 1
+    log_normal_cdf(beyond.reshape(-1), slope.reshape(-1))
     i = 0
-    for m in range(len(alive)):
-        row = alive[m]
+    for m in range(steps if masses else 0):
         for d in range(size):
-            a = np.float64(actions[row, d])
-            if low[d] < a < high[d]:
+            if not low[d] < actions[m, d] < high[d]:
                 for j in range(callers):
-                    z = (a - mean[row, j, d]) / std[j, d]
-                    rows[m, first + j] -= 0.5 * z * z + constant[j, d]
-            else:
-                below = a <= low[d]
-                for j in range(callers):
-                    beyond[i + j] = (low[d] - mean[row, j, d] if below else mean[row, j, d] - high[d]) / std[j, d]
-                i += callers
-    log_normal_cdf(beyond, slope)
-    i = 0
-    for m in range(len(alive) if masses else 0):
-        for d in range(size):
-            if not low[d] < actions[alive[m], d] < high[d]:
-                for j in range(callers):
-                    rows[m, first + j] += beyond[i + j]
-                i += callers
+                    whole[m, j] += beyond[i, j]
+                i += 1
     return slope
 
 
 @jit
+def _beyond(action: float, mean: float, low: float, high: float) -> float:
+    """x·σ of the mass Φ(x) that lies on or beyond the bound that a control is on."""
+    return low - mean if action <= low else mean - high
+
+
+@jit
 def _normal_gradient(
-    alive: Array, mean: Array, std: Array, low: Array, high: Array, actions: Array, posterior: Array, weight: Array,
+    mean: Array, inverse: Array, low: Array, high: Array, actions: Array, posterior: Array, weight: Array,
     first: int, slope: Array, of_mean: Array, sums: Array,
 ) -> None:  # fmt: skip
     """The gradient of μ; those of σ, the units' logarithms and both bounds are added to ``sums`` [4, K, A]."""
-    of_std, of_scale, of_low, of_high = sums
-    callers, size = std.shape
-    i = 0
-    for m in range(len(alive)):
-        row = alive[m]
+    of_std, of_scale, of_low, of_high = sums[0], sums[1], sums[2], sums[3]
+    steps, callers, size = mean.shape
+    acts, i = posterior[:, first : first + callers], 0
+    control, free, acting = np.empty(SIDE_BY_SIDE), np.empty(SIDE_BY_SIDE), np.empty((callers, SIDE_BY_SIDE))
+    squares, counts = np.zeros((2, size, callers, SIDE_BY_SIDE))
+    for begin in range(0, steps, SIDE_BY_SIDE):
+        own, act = mean[begin : begin + SIDE_BY_SIDE], actions[begin : begin + SIDE_BY_SIDE]
+        out, likely = of_mean[begin : begin + SIDE_BY_SIDE], acts[begin : begin + SIDE_BY_SIDE]
+        step = weight[begin : begin + SIDE_BY_SIDE]
+        for i in range(len(act)):
+            for j in range(callers):
+                acting[j, i] = step[i] * likely[i, j]
         for d in range(size):
-            a = np.float64(actions[row, d])
-            if low[d] < a < high[d]:
+            for i in range(len(act)):
+                control[i] = act[i, d]
+                free[i] = low[d] < act[i, d] < high[d]
+            for j in range(callers):
+                square, count = squares[d, j], counts[d, j]
+                for i in range(len(act)):
+                    z, share = (control[i] - own[i, j, d]) * inverse[j, d], free[i] * acting[j, i]
+                    out[i, j, d] = share * z * inverse[j, d]
+                    square[i] += share * z * z
+                    count[i] += share
+    i = 0
+    for m in range(steps if len(slope) else 0):
+        for d in range(size):
+            a = np.float64(actions[m, d])
+            if not low[d] < a < high[d]:
                 for j in range(callers):
-                    own, z = weight[m] * posterior[m, first + j], (a - mean[row, j, d]) / std[j, d]
-                    share = own / std[j, d]
-                    of_mean[row, j, d] = share * z
-                    of_std[j, d] += share * (z * z - 1.0)
-                    of_scale[j, d] -= own
-            else:
-                below = a <= low[d]
-                for j in range(callers):
-                    share = weight[m] * posterior[m, first + j] * slope[i + j] / std[j, d]
-                    of_mean[row, j, d] = -share if below else share
-                    of_low[j, d] += share if below else 0.0
-                    of_high[j, d] -= 0.0 if below else share
-                    z = (low[d] - mean[row, j, d] if below else mean[row, j, d] - high[d]) / std[j, d]
-                    of_std[j, d] -= share * z
-                i += callers
+                    share = weight[m] * acts[m, j] * slope[i, j]
+                    of_mean[m, j, d] = (-share if a <= low[d] else share) * inverse[j, d]
+                    of_low[j, d] += share if a <= low[d] else 0.0
+                    of_high[j, d] -= 0.0 if a <= low[d] else share
+                    of_std[j, d] -= share * _beyond(a, np.float64(mean[m, j, d]), low[d], high[d]) * inverse[j, d]
+                i += 1
+    for j in range(callers):
+        for d in range(size):
+            count = counts[d, j].sum()
+            of_scale[j, d] -= count
+            of_std[j, d] = (of_std[j, d] + squares[d, j].sum() - count) * inverse[j, d]
+            of_low[j, d] *= inverse[j, d]
+            of_high[j, d] *= inverse[j, d]
 
 
 @dataclass(frozen=True)

@@ -57,20 +57,26 @@ class Alive(NamedTuple):
     @classmethod
     def of(cls, lengths: Tensor, steps: int) -> Alive:
         """The steps of trajectories with these lengths [N] in a batch padded to ``steps``."""
-        alive = torch.arange(steps) < lengths.unsqueeze(-1)
-        return cls(alive.flatten().nonzero().squeeze(-1).numpy(), alive.numel())
+        alive = np.arange(steps) < lengths.numpy()[:, None]
+        return cls(np.flatnonzero(alive), alive.size)
 
-    def take(self, table: Tensor) -> Tensor:
-        """The rows of a table [N, T, ...], flat: [M, n]."""
-        rows = table.detach().reshape(self.number, -1)
-        return rows if len(self.rows) == self.number else rows[torch.from_numpy(self.rows)]
+    def take(self, table: Tensor) -> Array:
+        """The rows of a table [N, T, ...], contiguous: [M, ...]."""
+        rows = table.detach().reshape(self.number, *table.shape[2:])
+        if len(self.rows) < self.number:
+            rows = rows[torch.from_numpy(self.rows)]
+        return np.ascontiguousarray(rows.numpy())
 
-    def put(self, rows: Tensor, shape: torch.Size, dtype: torch.dtype) -> Tensor:
-        """The table of rows [M, n]; 0 past the trajectories."""
+    def empty(self, table: Tensor) -> Tensor:
+        """Room for the rows of a table [N, T, ...], [M, ...]."""
+        return torch.empty(len(self.rows), *table.shape[2:], dtype=table.dtype)
+
+    def put(self, rows: Tensor, shape: torch.Size) -> Tensor:
+        """The table of rows [M, ...]; 0 past the trajectories."""
         if len(self.rows) == self.number:
-            return rows.to(dtype).reshape(shape)
-        table = rows.new_zeros(self.number, rows.shape[1], dtype=dtype)
-        table[torch.from_numpy(self.rows)] = rows.to(dtype)
+            return rows.reshape(shape)
+        table = rows.new_zeros(self.number, *rows.shape[1:])
+        table[torch.from_numpy(self.rows)] = rows
         return table.reshape(shape)
 
 
@@ -142,7 +148,7 @@ class LogTable(Link):
     def fill(self, alive: Alive, rows: Array, first: int) -> None:
         """Copy the table, or its exponentials."""
         own = torch.from_numpy(rows)[:, first : first + self.columns]
-        own.copy_(alive.take(self.inputs[0]))
+        own.copy_(torch.from_numpy(alive.take(self.inputs[0])).flatten(1))
         if not self.log:
             own.exp_()
 
@@ -150,7 +156,7 @@ class LogTable(Link):
         """The posterior itself."""
         own = torch.from_numpy(posterior.found)[:, first : first + self.columns]
         weighted = own * torch.from_numpy(posterior.weight).unsqueeze(-1)
-        return (alive.put(weighted, self.shape, self.inputs[0].dtype),)
+        return (alive.put(weighted.to(self.inputs[0].dtype), self.shape),)
 
 
 class Selection(Link):
@@ -166,56 +172,65 @@ class Selection(Link):
 
     def fill(self, alive: Alive, rows: Array, first: int) -> None:
         """η."""
-        _softmax(flat(self.inputs[0], 2), alive.rows, rows, first, self.control)
+        _softmax(alive.take(self.inputs[0]), rows, first, self.control)
 
     def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
         """Posterior minus η times the posterior of its caller."""
-        gradient = like(self.inputs[0], alive)
-        _softmax_gradient(alive.rows, *posterior, first, self.control, flat(gradient, 2))
-        return (gradient,)
+        logits = self.inputs[0]
+        gradient = alive.empty(logits)
+        _softmax_gradient(*posterior, first, self.control, gradient.numpy())
+        return (alive.put(gradient, logits.shape),)
 
 
 @jit
-def _softmax(logits: Array, alive: Array, rows: Array, first: int, control: int) -> None:
-    _, callers, choices = logits.shape
-    block = max(1, BLOCK // (callers * choices))
-    shares = np.empty(block * callers * choices)
-    for begin in range(0, len(alive), block):
-        end, i = min(begin + block, len(alive)), 0
-        for m in range(begin, end):
-            for c in range(callers):
-                top = logits[alive[m], c, 0]
-                for j in range(1, choices):
-                    top = max(top, logits[alive[m], c, j])
+def _softmax(logits: Array, rows: Array, first: int, control: int) -> None:
+    """Blocks of steps lie side by side in memory, so that all but the copies vectorises."""
+    steps, callers, choices = logits.shape
+    block = max(8, BLOCK // choices)
+    shares, top, total = np.empty((choices, block)), np.empty(block), np.empty(block)
+    for c in range(callers):
+        column = first + c * (control + choices)
+        for begin in range(0, steps, block):
+            own = logits[begin : begin + block, c]
+            out = rows[begin : begin + block, column : column + control + choices]
+            for i in range(len(own)):
                 for j in range(choices):
-                    shares[i + j] = np.float64(logits[alive[m], c, j]) - top
-                i += choices
-        exponentials(shares[:i])
-        i = 0
-        for m in range(begin, end):
-            for c in range(callers):
-                total, column = 0.0, first + c * (control + choices)
+                    shares[j, i] = own[i, j]
+            for i in range(len(own)):
+                top[i] = shares[0, i]
+                total[i] = 0.0
+            for j in range(1, choices):
+                for i in range(len(own)):
+                    top[i] = shares[j, i] if shares[j, i] > top[i] else top[i]
+            for j in range(choices):
+                for i in range(len(own)):
+                    shares[j, i] -= top[i]
+                exponentials(shares[j, : len(own)])
+                for i in range(len(own)):
+                    total[i] += shares[j, i]
+            for i in range(len(own)):
+                total[i] = 1.0 / total[i]
+            out[:, :control] = 0.0
+            chosen = out[:, control:]
+            for i in range(len(own)):
                 for j in range(choices):
-                    total += shares[i + j]
-                for j in range(control):
-                    rows[m, column + j] = 0.0
-                for j in range(choices):
-                    rows[m, column + control + j] = shares[i + j] / total
-                i += choices
+                    chosen[i, j] = shares[j, i] * total[i]
 
 
 @jit
 def _softmax_gradient(
-    alive: Array, rows: Array, posterior: Array, weight: Array, first: int, control: int, gradient: Array
+    rows: Array, posterior: Array, weight: Array, first: int, control: int, gradient: Array
 ) -> None:
-    _, callers, choices = gradient.shape
-    for m in range(len(alive)):
-        for c in range(callers):
-            total, column = 0.0, first + c * (control + choices) + control
+    steps, callers, choices = gradient.shape
+    for c in range(callers):
+        column = first + c * (control + choices) + control
+        p, q = rows[:, column : column + choices], posterior[:, column : column + choices]
+        for m in range(steps):
+            total = 0.0
             for j in range(choices):
-                total += posterior[m, column + j]
+                total += q[m, j]
             for j in range(choices):
-                gradient[alive[m], c, j] = weight[m] * (posterior[m, column + j] - rows[m, column + j] * total)
+                gradient[m, c, j] = weight[m] * (q[m, j] - p[m, j] * total)
 
 
 class Termination(Link):
@@ -230,66 +245,54 @@ class Termination(Link):
 
     def fill(self, alive: Alive, rows: Array, first: int) -> Array:
         """1 - ψ and ψ; kept is tanh of the logits over their bound."""
-        logits = flat(self.inputs[0], 1)
-        tanh = np.empty((len(alive.rows), logits.shape[1]))
-        _terminate(logits, alive.rows, rows, first, tanh)
+        logits = alive.take(self.inputs[0])
+        tanh = np.empty(logits.shape)
+        _terminate(logits.reshape(-1), tanh.reshape(-1), rows, first, logits.shape[1])
         return tanh
 
     def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Array) -> Gradients:
         """(q_1 (1 - ψ) - q_0 ψ) times the slope of the bound, for posteriors q."""
-        gradient = like(self.inputs[0], alive)
-        _terminate_gradient(alive.rows, *posterior, first, kept, flat(gradient, 1))
-        return (gradient,)
+        logits = self.inputs[0]
+        gradient = alive.empty(logits)
+        _terminate_gradient(*posterior, first, kept, gradient.numpy())
+        return (alive.put(gradient, logits.shape),)
 
 
 @jit
-def _terminate(logits: Array, alive: Array, rows: Array, first: int, tanh: Array) -> None:
-    options = logits.shape[1]
-    block = max(1, BLOCK // options)
-    flat_tanh, x = tanh.reshape(-1), np.empty(block * options)
-    for begin in range(0, len(alive), block):
-        end, i = min(begin + block, len(alive)), 0
-        for m in range(begin, end):
-            for j in range(options):
-                v = np.float64(logits[alive[m], j]) * (2.0 / TERMINATION_BOUND)
-                x[i] = min(v, 700.0)  # NaN is not less
-                x[i] = v if v != v else x[i]
-                i += 1
-        exponentials(x[:i])
-        offset = begin * options
-        for i in range((end - begin) * options):
-            flat_tanh[offset + i] = 1.0 - 2.0 / (1.0 + x[i])
-            x[i] = -TERMINATION_BOUND * flat_tanh[offset + i]
-        exponentials(x[: (end - begin) * options])
+def _terminate(logits: Array, tanh: Array, rows: Array, first: int, options: int) -> None:
+    block = max(BLOCK // options, 1) * options
+    x, ending = np.empty(block), np.empty(block)
+    for begin in range(0, len(logits), block):
+        own, bound = logits[begin : begin + block], tanh[begin : begin + block]
+        for i in range(len(own)):
+            v = np.float64(own[i]) * (2.0 / TERMINATION_BOUND)
+            x[i] = 700.0 if v > 700.0 else v  # NaN stays
+        exponentials(x[: len(own)])
+        for i in range(len(own)):
+            bound[i] = 1.0 - 2.0 / (1.0 + x[i])
+            x[i] = -TERMINATION_BOUND * bound[i]
+        exponentials(x[: len(own)])
+        for i in range(len(own)):
+            ending[i] = 1.0 / (1.0 + x[i])
+            x[i] *= ending[i]
+        out = rows[begin // options : (begin + block) // options, first : first + 2 * options]
         i = 0
-        for m in range(begin, end):
+        for m in range(len(out)):
             for j in range(options):
-                ending = 1.0 / (1.0 + x[i])
-                rows[m, first + 2 * j] = x[i] * ending
-                rows[m, first + 2 * j + 1] = ending
+                out[m, 2 * j], out[m, 2 * j + 1] = x[i], ending[i]
                 i += 1
 
 
 @jit
 def _terminate_gradient(
-    alive: Array, rows: Array, posterior: Array, weight: Array, first: int, tanh: Array, gradient: Array
+    rows: Array, posterior: Array, weight: Array, first: int, tanh: Array, gradient: Array
 ) -> None:
-    for m in range(len(alive)):
-        for j in range(gradient.shape[1]):
-            column = first + 2 * j
-            change = posterior[m, column + 1] * rows[m, column] - posterior[m, column] * rows[m, column + 1]
-            gradient[alive[m], j] = weight[m] * change * (1.0 - tanh[m, j] * tanh[m, j])
-
-
-def flat(table: Tensor, columns: int) -> Array:
-    """A table as an array, its dimensions before the last ``columns`` as one; a copy where it is not contiguous."""
-    array = np.ascontiguousarray(table.detach().numpy())
-    return array.reshape(-1, *array.shape[array.ndim - columns :])
-
-
-def like(table: Tensor, alive: Alive) -> Tensor:
-    """A contiguous tensor for a table's gradient, 0 past the trajectories."""
-    return (torch.empty if len(alive.rows) == alive.number else torch.zeros)(table.shape, dtype=table.dtype)
+    steps, options = gradient.shape
+    p, q = rows[:, first : first + 2 * options], posterior[:, first : first + 2 * options]
+    for m in range(steps):
+        for j in range(options):
+            change = q[m, 2 * j + 1] * p[m, 2 * j] - q[m, 2 * j] * p[m, 2 * j + 1]
+            gradient[m, j] = weight[m] * change * (1.0 - tanh[m, j] * tanh[m, j])
 
 
 class LinkedTables(Tables):
