@@ -168,9 +168,7 @@ def log_likelihood(tables: Tables, lengths: Tensor) -> Tensor:
     return value
 
 
-def eliminate(
-    tables: Tables, lengths: Tensor, marginals: bool = False, parts: list[Part] | None = None
-) -> Elimination:
+def eliminate(tables: Tables, lengths: Tensor, marginals: bool = False, parts: list[Part] | None = None) -> Elimination:
     """Log-likelihoods and posteriors of tables on the CPU with at least one option level.
 
     :param marginals: whether the posteriors have those of the choices.
@@ -192,7 +190,8 @@ def eliminate(
     kernel.scale_densities(rows[2], starts, lengths.numpy(), shift.numpy())
     found = [np.empty_like(own) for own in rows]
     choices = np.empty((steps, sum(tables.sizes) if marginals and not one_level else 0))
-    given, posteriors = Rows(*rows, np.exp(choice)), Rows(*found, choices)
+    given = Rows(rows[0], rows[1], rows[2], np.exp(choice))
+    posteriors = Rows(found[0], found[1], found[2], choices)
     kernel.match_torch_threads()
     run = kernel.one_level if one_level else kernel.any_levels
     run(given, starts, lengths.numpy(), value.numpy(), exact, posteriors, structure)

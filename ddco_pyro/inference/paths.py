@@ -20,7 +20,6 @@ from ddco_pyro.inference.kernel import Array, Rows, Structure, match_torch_threa
 from ddco_pyro.model.links import Alive
 from ddco_pyro.model.tables import Tables
 
-
 jit = numba.njit(cache=True, error_model="numpy")
 
 
@@ -95,8 +94,11 @@ def _trace(tables: Tables, lengths: Tensor, best: bool, uniforms: np.ndarray) ->
     possible = np.ones(len(lengths), dtype=np.bool_)
     *levels, meta_policy = tables.control
     groups = tables.selection, tables.termination, (meta_policy, *levels)
-    logs = (np.concatenate([alive.take(table.flatten(2)) for table in group], axis=1, dtype=np.float64) for group in groups)
-    rows, starts = Rows(*logs, choice_factors(tables, alive)), (lengths.cumsum(0) - lengths).numpy()
+    selection, termination, control = (
+        np.concatenate([alive.take(table.flatten(2)) for table in group], axis=1, dtype=np.float64) for group in groups
+    )
+    rows = Rows(selection, termination, control, choice_factors(tables, alive))
+    starts = (lengths.cumsum(0) - lengths).numpy()
     match_torch_threads()
     _trace_all(rows, starts, lengths.numpy(), best, uniforms, joint, terminated, possible, structure)
     refuse_impossible(torch.from_numpy(possible))

@@ -174,14 +174,14 @@ class Gaussian(Emission):
         constant = np.log(std) + (0.5 * LOG_2PI + self.log_scale.detach().numpy())
         inverse, constant = (np.array(np.broadcast_to(own, self.mean.shape[-2:])) for own in (1 / std, constant))
         given = alive.take(self.mean), inverse, *self._bounds(), alive.take(actions)
-        return *given, _add_normal(*given, constant, rows, first)
+        return given, _add_normal(*given, constant, rows, first)
 
     def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
         """The gradients of μ, σ and the units, and those of bounds."""
         if self.std.dim() > 2:
             return super().gradients(actions, alive, posterior, first, kept)
         mean, sums = alive.empty(self.mean), np.zeros((4, *self.mean.shape[-2:]))
-        *given, slope = kept
+        given, slope = kept
         _normal_gradient(*given, posterior.found, posterior.weight, first, slope, mean.numpy(), sums)
         fixed = zip(self.tensors()[1:], sums, strict=False)
         others = (

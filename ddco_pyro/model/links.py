@@ -1,9 +1,9 @@
 """Links from networks' outputs to log-probabilities, each by a formula in torch and in compiled passes.
 
-The formula defines a link: the tables of evaluation, the Pyro program and log space come from it. The fused engine takes
-a link's compiled passes instead. They give probabilities for the elimination, and turn its posteriors into the gradient
-of the outputs, without a table of logarithms between. All compiled arrays have one row for each step of a batch that
-is within its trajectory, trajectory after trajectory: M rows.
+The formula defines a link: evaluation, the Pyro program and log space use it. The fused engine uses the compiled
+passes. They give the probabilities for the elimination, and turn its posteriors into gradients of the outputs, so that
+training builds no table of logarithms. Compiled arrays have M rows: the steps within their trajectories, one trajectory
+after the other.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cached_property
-from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -218,9 +217,7 @@ def _softmax(logits: Array, rows: Array, first: int, control: int) -> None:
 
 
 @jit
-def _softmax_gradient(
-    rows: Array, posterior: Array, weight: Array, first: int, control: int, gradient: Array
-) -> None:
+def _softmax_gradient(rows: Array, posterior: Array, weight: Array, first: int, control: int, gradient: Array) -> None:
     steps, callers, choices = gradient.shape
     for c in range(callers):
         column = first + c * (control + choices) + control
@@ -284,9 +281,7 @@ def _terminate(logits: Array, tanh: Array, rows: Array, first: int, options: int
 
 
 @jit
-def _terminate_gradient(
-    rows: Array, posterior: Array, weight: Array, first: int, tanh: Array, gradient: Array
-) -> None:
+def _terminate_gradient(rows: Array, posterior: Array, weight: Array, first: int, tanh: Array, gradient: Array) -> None:
     steps, options = gradient.shape
     p, q = rows[:, first : first + 2 * options], posterior[:, first : first + 2 * options]
     for m in range(steps):
@@ -327,9 +322,14 @@ class LinkedTables(Tables):
 
     def probe(self) -> Tables:
         """Give each link a probe; the probes. Their gradients are the posteriors of the tables."""
-        for link in chain(*self.links.values()):
-            link.probe = torch.zeros((), dtype=torch.float64).expand(link.shape).requires_grad_()
-        return Tables(*(tuple(link.probe for link in links) for links in self.links.values()))  # type: ignore[misc]
+
+        def probes(group: Group) -> tuple[Tensor, ...]:
+            each = [torch.zeros((), dtype=torch.float64).expand(link.shape) for link in self.links[group]]
+            for link, probe in zip(self.links[group], each, strict=True):
+                link.probe = probe.requires_grad_()
+            return tuple(each)
+
+        return Tables(probes("selection"), probes("termination"), probes("control"))
 
     def _tables(self, group: Group) -> tuple[Tensor, ...]:
         return tuple(link.table for link in self.links[group])
