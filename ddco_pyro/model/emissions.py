@@ -134,7 +134,7 @@ class Emission(ABC):
         value, leaves = kept
         own = torch.from_numpy(posterior.found)[:, first : first + value.shape[-1]]
         weighted = own * torch.from_numpy(posterior.weight).unsqueeze(-1)
-        upstream = alive.put(weighted, value.shape).to(value.dtype)
+        upstream = alive.put(weighted.to(value.dtype), value.shape)
         return torch.autograd.grad(value, leaves, upstream, retain_graph=True, allow_unused=True)
 
     def _fields(self) -> dict[str, Any]:
@@ -173,7 +173,8 @@ class Gaussian(Emission):
         std = self.std.detach().numpy().astype(np.float64)
         constant = np.log(std) + (0.5 * LOG_2PI + self.log_scale.detach().numpy())
         inverse, constant = (np.array(np.broadcast_to(own, self.mean.shape[-2:])) for own in (1 / std, constant))
-        given = alive.take(self.mean), inverse, *self._bounds(), alive.take(actions)
+        low, high = self._bounds()
+        given = alive.take(self.mean), inverse, low, high, alive.take(actions)
         return given, _add_normal(*given, constant, rows, first)
 
     def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
@@ -181,8 +182,9 @@ class Gaussian(Emission):
         if self.std.dim() > 2:
             return super().gradients(actions, alive, posterior, first, kept)
         mean, sums = alive.empty(self.mean), np.zeros((4, *self.mean.shape[-2:]))
-        given, slope = kept
-        _normal_gradient(*given, posterior.found, posterior.weight, first, slope, mean.numpy(), sums)
+        (means, inverse, low, high, acts), slope = kept
+        found, weight = posterior.found, posterior.weight
+        _normal_gradient(means, inverse, low, high, acts, found, weight, first, slope, mean.numpy(), sums)
         fixed = zip(self.tensors()[1:], sums, strict=False)
         others = (
             torch.from_numpy(own).sum_to_size(of.shape).to(of.dtype) if of.requires_grad else None for of, own in fixed
