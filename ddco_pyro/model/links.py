@@ -314,11 +314,11 @@ class LinkedTables(Tables):
 
     def with_evidence(self, evidence: tuple[Tensor | None, ...]) -> LinkedTables:
         """The same links with this evidence."""
-        return LinkedTables(**self.links, evidence=evidence)
+        return LinkedTables(self.parts("selection"), self.parts("termination"), self.parts("control"), evidence)
 
-    def parts(self, group: Group) -> tuple[Link, ...]:
-        """The links of a group."""
-        return self.links[group]
+    def parts(self, group: Group) -> tuple[Any, ...]:
+        """The links of a group; its tables once they are computed, as their reader may have changed them."""
+        return self.__dict__.get(group, self.links[group])  # type: ignore[no-any-return]
 
     def probe(self) -> Tables:
         """Give each link a probe; the probes. Their gradients are the posteriors of the tables."""
