@@ -291,7 +291,7 @@ def command(study: str, asked: Asked) -> str:
 
 
 def write_page(out: Path) -> str:
-    """``memory.md``, ``.json`` and ``.png`` beside the folder of the table, and the table and the figure of README; the page."""
+    """``memory.md``, ``.json`` and ``.png`` beside the folder of the table, README's table and its figure; the page."""
     earlier = read(out / "far_end.csv")  # of a bin that the tree has no more
     rows = read(out / "cells.csv") + [row for row in earlier if row["method"] == MIXTURE]
     pages = of_pages() + [row for row in earlier if row["method"] != MIXTURE]

@@ -346,8 +346,8 @@ def shortest(found: Sequence[Row]) -> list[Row]:
             (one for one in rows if (one["study"], one["measure"]) == named), key=lambda one: one["demonstrations"]
         )
         lasting = one["difference"][f"{AGAIN if one['again'] else OPTIONS} - {MIXTURE}"]
-        several = one["difference"][f"{MIXTURE} - {FLAT}"]
-        chosen.append(one | {"acting": "", "difference": {f"{MIXTURE} - {FLAT}": several, f"{OPTIONS} - {MIXTURE}": lasting}})
+        both = {f"{MIXTURE} - {FLAT}": one["difference"][f"{MIXTURE} - {FLAT}"], f"{OPTIONS} - {MIXTURE}": lasting}
+        chosen.append(one | {"acting": "", "difference": both})
     return chosen
 
 
@@ -406,8 +406,9 @@ def draw(rows: Sequence[Row], path: Path, columns: int = 2) -> None:
             _panel(axes, name, group)
         for axes in panels[len(groups) :]:
             axes.set_axis_off()
-        named = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-        figure.legend(named.values(), named, loc="outside upper left", ncols=2)
+        named = [one for axes in panels for one in zip(*axes.get_legend_handles_labels(), strict=True)]
+        handles = {label: handle for handle, label in named}
+        figure.legend(handles.values(), handles, loc="outside upper left", ncols=2)
         save(figure, path, "What several policies are worth, and what it is worth that they last", "")
 
 

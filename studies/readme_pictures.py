@@ -92,7 +92,8 @@ def film(run: Path) -> None:
 
 def pages(run: Path, segments: Path) -> None:
     """Cut the pictures from a report and from a page of segments."""
-    small = {name: screen(page, STYLES[name]) for name, page in (("report", run / "report.html"), ("segments", segments))}
+    sources = {"report": run / "report.html", "segments": segments}
+    small = {name: screen(page, STYLES[name]) for name, page in sources.items()}
     whole = Image.open(run / "figures" / "trajectories.png").convert("RGB")
     small["space"] = trimmed(whole.crop((0, 60, whole.width // 2, whole.height - 60)))
     for name, picture in small.items():
