@@ -39,7 +39,21 @@ from arena import TASKS
 from arena_results import nmi
 from cells import described, printed, some
 from ddco_tasks.pushing import environment as pushing_task
-from memory_results import EM, FREE, MIXTURE, OPTIONS, checks, comparisons, draw, of_pages, page, short, with_table
+from memory_results import (
+    EM,
+    FREE,
+    MIXTURE,
+    OPTIONS,
+    checks,
+    comparisons,
+    draw,
+    everything,
+    of_pages,
+    page,
+    short,
+    shortest,
+    with_table,
+)
 from provenance import ROOT, Record, record, sentence, text
 from threadpoolctl import threadpool_limits
 
@@ -277,7 +291,7 @@ def command(study: str, asked: Asked) -> str:
 
 
 def write_page(out: Path) -> str:
-    """``memory.md``, ``.json`` and ``.png`` beside the folder of the table, and the table of README; the page."""
+    """``memory.md``, ``.json`` and ``.png`` beside the folder of the table, README's table and its figure; the page."""
     earlier = read(out / "far_end.csv")  # of a bin that the tree has no more
     rows = read(out / "cells.csv") + [row for row in earlier if row["method"] == MIXTURE]
     pages = of_pages() + [row for row in earlier if row["method"] != MIXTURE]
@@ -287,7 +301,8 @@ def write_page(out: Path) -> str:
     shown = page(found, checks(rows, pages), missing({cell_of(row) for row in rows}), made_by)
     write_text(out.with_suffix(".json"), text(found, records))
     write_text(out.with_suffix(".md"), shown)
-    draw(found, out.with_suffix(".png"))
+    draw(everything(found), out.with_suffix(".png"))
+    draw(shortest(found), ROOT / "docs" / "images" / "worth.png", columns=1)
     readme = ROOT / "README.md"
     write_text(readme, with_table(readme.read_text(encoding="utf-8"), short(found)))
     return shown
