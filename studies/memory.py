@@ -67,12 +67,12 @@ from ddco_pyro.spec import load_spec, with_overrides
 METHODS: dict[str, dict[str, Any]] = {
     MIXTURE: {"hierarchy.levels.0.termination": "always"},
     OPTIONS: {},
-    EM: {"training.optimizer": {"name": "em"}},
-    FREE: {"training.optimizer": {"name": "em", "ridge": {"policy": 0.0, "gate": 0.0, "termination": 0.0}}},
+    EM: {},
+    FREE: {"training.optimizer.ridge": {"policy": 0.0, "gate": 0.0, "termination": 0.0}},
 }
 """What each method changes in its study's spec."""
 ADAM = {"name": "adam", "lr": 3e-3}
-"""The optimiser of the arena's page, instead of the one that ``init`` writes."""
+"""The optimiser of the arena's page, instead of the one that ``init`` writes, which is expectation-maximisation."""
 ACTING = ("marginal", "sample", "most_likely")
 EPISODES = {"needle": {20: 60, 100: 200}, "arena": 20, "bins": 20, "pushing": pushing_cell.EPISODES}
 """Starts of each fit, as on the pages."""
@@ -151,7 +151,8 @@ def arena(cell: Cell, runs: Path) -> list[Measured]:
     settings = arena_cell.DEFAULTS
     source = arena_cell.recorded(cell.task, settings)
     own = arena_cell.ArenaCell(cell.task, cell.demonstrations, cell.seed)
-    changes = (f"training.optimizer={json.dumps(ADAM)}", *words(cell))  # the later one counts
+    by_em = cell.method in (EM, FREE)
+    changes = (*(() if by_em else (f"training.optimizer={json.dumps(ADAM)}",)), *words(cell))
     fitted = arena_cell.fitted_cell(own, source, changes, runs / "fits" / cell.name)
     played = arena_cell.sawyer(settings).play(cell.task, {cell.method: fitted}, source, EPISODES["arena"])
     successes = [episode["success"] for episode in played["episodes"][cell.method]]
