@@ -5,6 +5,7 @@ No test depends on how busy the machine is, and every run draws the same example
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ import toy_task
 import yaml
 from dots import followed
 from hypothesis import settings
+from matplotlib.figure import Figure
 
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
@@ -38,6 +40,31 @@ def cache(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cache")
     os.environ["DDCO_PYRO_CACHE"] = str(folder)
     return folder
+
+
+SAVEFIG = Figure.savefig
+
+
+@pytest.fixture(scope="session", autouse=True)
+def undrawn():
+    """Every figure is saved as the same small picture: rendering takes most of the time of a report."""
+    content = io.BytesIO()
+    SAVEFIG(Figure(figsize=(0.1, 0.1)), content, format="png")
+
+    def savefig(figure, file, **options):
+        file.write(content.getvalue()) if hasattr(file, "write") else Path(file).write_bytes(content.getvalue())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", savefig)
+        yield
+
+
+@pytest.fixture(scope="module")
+def drawn(undrawn):
+    """Figures are rendered, in the modules that ask for it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", SAVEFIG)
+        yield
 
 
 class Watched:

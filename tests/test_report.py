@@ -20,6 +20,8 @@ from ddco_pyro.simulation.film import write_film
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.training.data import demonstrations, parts
 
+pytestmark = pytest.mark.usefixtures("drawn")
+
 LINEAR = {"network": "linear"}
 
 
