@@ -20,7 +20,7 @@ from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Gaussian, Hu
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import complete
 
-DRAWS = 2000
+DRAWS = 800
 
 
 def said(counts, emits=("options", "control")):

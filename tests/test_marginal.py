@@ -72,8 +72,8 @@ def test_svi_reaches_the_posterior_mode():
     hierarchy, batch = make_hierarchy((2,), network="linear"), make_batch(trajectories=6, steps=8)
     model = bayesian(hierarchy, batch, True)
     guide = AutoDelta(model)
-    svi = SVI(model, guide, pyro.optim.Adam({"lr": 0.02}), Trace_ELBO())
-    for _ in range(1500):
+    svi = SVI(model, guide, pyro.optim.Adam({"lr": 0.03}), Trace_ELBO())
+    for _ in range(800):
         svi.step()
     found = {
         name: guide()[name.replace(".", "_")].detach().requires_grad_() for name, _ in hierarchy.named_parameters()
