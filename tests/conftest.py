@@ -29,6 +29,7 @@ INSTALLED = HERE / "fixtures" / "installed"
 sys.path.append(str(INSTALLED))
 os.environ["PYTHONPATH"] = f"{SUPPORT}:{INSTALLED}"  # of the processes that tests start
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that run episodes
+os.environ["LOKY_MAX_CPU_COUNT"] = "1"  # "all cores" is one: the workers of pytest-xdist have the others
 torch.set_num_threads(1)
 settings.register_profile("deterministic", deadline=None, derandomize=True)
 settings.load_profile("deterministic")

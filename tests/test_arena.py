@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-import stat
 
 import apart
 import arena_cell
 import arena_playing
 import arena_recording
-import arena_venv
 import cells
 import h5py
 import numpy as np
@@ -20,7 +18,7 @@ from arena_playing import controls, exported, play
 from arena_results import draw, mean_success, page, summarize
 from arena_segments import MEASURES
 
-from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.errors import BadInput
 from ddco_pyro.exporting import write_numpy
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -89,38 +87,6 @@ def test_an_exported_controller_plays_as_its_fit_does(fitted, runner, goal, succ
         np.testing.assert_allclose(controls(runner, observed, seed), expected, atol=1e-5)
         rows = {"state": np.stack([one["state"] for one in observed])}
         np.testing.assert_allclose(controls(runner, observed, 0), apart.acted(fitted, rows), atol=1e-5)
-
-
-# --- the environment --------------------------------------------------------------------------------------------------
-
-
-def python_that(tmp_path, pip):
-    """A stand-in for Python, whose environments have a Python that does this instead of installing."""
-    path = tmp_path / "python"
-    inner = f"#!/bin/sh\\necho installed >> {tmp_path}/log\\n{pip}\\n"
-    path.write_text(f"#!/bin/sh\nmkdir -p $4/bin\nprintf '{inner}' > $4/bin/python\nchmod +x $4/bin/python\n")
-    path.chmod(path.stat().st_mode | stat.S_IXUSR)
-    return str(path)
-
-
-def test_an_environment_is_made_once_and_again_for_other_pins(tmp_path):
-    pins, folder, python = tmp_path / "pins.txt", tmp_path / "venv", python_that(tmp_path, "exit 0")
-    for content, times in (("a==1\n", 1), ("a==1\n", 1), ("a==2\n", 2)):
-        pins.write_text(content)
-        assert arena_venv.made(folder, pins, python) == folder / "bin" / "python"
-        assert (tmp_path / "log").read_text().count("installed") == times
-
-
-def test_an_environment_that_cannot_be_made_is_one_line(tmp_path):
-    pins, folder = tmp_path / "pins.txt", tmp_path / "venv"
-    pins.write_text("a==1\n")
-    failing = python_that(tmp_path, "echo looking >&2; echo ERROR: no a==1 >&2; exit 1")
-    for python, why in ((failing, "ERROR: no a==1"), ("/no/such/python", "No such file or directory")):
-        with pytest.raises(Failed, match=why) as refused:
-            arena_venv.made(folder, pins, python)
-        assert "\n" not in str(refused.value)
-        assert f"{folder}: an environment with pins.txt cannot be made" in str(refused.value)
-        assert not (folder / arena_venv.MADE).exists()
 
 
 # --- recording --------------------------------------------------------------------------------------------------------

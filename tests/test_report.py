@@ -133,22 +133,6 @@ def test_the_page_is_one_self_contained_file(labelled, deep):
         assert not re.search(r"https?://", rest)
 
 
-def test_figures_are_also_files(labelled, deep):
-    names = {path.name for path in (labelled[0].folder / "figures").iterdir()}
-    assert names == {
-        f"{one}.png" for one in ("likelihood", "learning", "posterior", "segments", "trajectories", "timing")
-    }
-    assert (deep[0].folder / "figures" / "film.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_sections_are_there_where_they_apply(labelled, deep):
-    some = ["likelihood", "demonstrations", "dimensions", "learning", "options", "agreement", "warnings"]
-    assert ids(labelled[1]) == [*some, "particulars", "segments"]
-    before, after = ["likelihood", "demonstrations", "dimensions", "rollouts", "learning"], ["options", "warnings"]
-    assert ids(deep[1]) == [*before, *after, "films", "particulars", "segments"]
-    assert "trajectories" not in {path.stem for path in (deep[0].folder / "figures").iterdir()}
-
-
 def test_a_baseline_has_no_options(labelled):
     found, _, demos = labelled
     before = found.baselines["flat"].metrics
@@ -248,21 +232,6 @@ def test_a_long_list_is_folded_and_long_timelines_are_cut(labelled, monkeypatch)
     assert "ddco-pyro segment RUN FILE --html PAGE" in folded
 
 
-def test_words_of_the_method_are_explained_where_they_stand(labelled, deep):
-    shown = " ".join(text(labelled[1]).split())
-    for explained in (
-        "DDCO: the hierarchy of options; flat: one policy without options.",
-        "“From clusters” trains",
-        "“Alone” trains",
-        "vq-1, level-1, meta-policy, joint, policy",
-        "probability that an active option ends at a step (its termination condition, ψ in the paper)",
-        "Posterior probability of each option at each step",
-        "A nat is the unit of log-likelihood",
-    ):
-        assert explained in shown
-    assert "per-timestep: a policy for each time step." in " ".join(text(deep[1]).split())
-
-
 def test_success_is_shown_with_trials_intervals_and_the_paired_comparison(deep):
     shown = " ".join(text(deep[1]).split())
     assert "DDCO 3 of 4 (30 to 95 %) 3.33 ± 1.53 [−0.46 to 7.13], n = 3" in shown
@@ -276,13 +245,6 @@ def test_warnings_are_in_words_with_their_numbers(labelled, deep):
     assert 'href="#warnings"' in deep[1]
     if "No sign of a degenerate solution" in labelled[1]:
         assert 'href="#warnings"' not in labelled[1]
-
-
-def test_films_begin_with_the_model(deep):
-    shown = text(deep[1])
-    places = [shown.index(one) for one in ("DDCO, seed 1000: success", "DDCO, seed 1001: failure", "flat, seed 1000")]
-    assert places == sorted(places)
-    assert deep[1].count('src="data:video/mp4') == 3
 
 
 def test_films_past_the_limit_are_links(deep, monkeypatch):
