@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import os
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -60,11 +61,24 @@ def undrawn():
         yield
 
 
+@contextmanager
+def rendering():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", SAVEFIG)
+        yield
+
+
 @pytest.fixture(scope="module")
 def drawn(undrawn):
     """Figures are rendered, in the modules that ask for it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", SAVEFIG)
+    with rendering():
+        yield
+
+
+@pytest.fixture
+def drawn_here(undrawn):
+    """Figures are rendered, in the tests that ask for it."""
+    with rendering():
         yield
 
 

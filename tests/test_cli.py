@@ -420,8 +420,15 @@ finally:
 HEAVY = ("h5py", "matplotlib", "pandas", "pyro", "scipy.stats", "sklearn", "sympy", "torch", "torch._dynamo")
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["fit", "--help"], ["check", "--schema"], ["check", "nowhere.yaml"]])
-@pytest.mark.parametrize("module", ["ddco_pyro.cli", "ddco_pyro.cli.app"])
+@pytest.mark.parametrize(
+    ("module", "arguments"),
+    [
+        ("ddco_pyro.cli.app", ["--help"]),
+        ("ddco_pyro.cli", ["fit", "--help"]),
+        ("ddco_pyro.cli", ["check", "--schema"]),
+        ("ddco_pyro.cli", ["check", "nowhere.yaml"]),
+    ],
+)
 def test_help_and_refusals_load_nothing_heavy(module, arguments):
     """Loading torch, pyro and scikit-learn takes seconds."""
     program = LIGHT.format(module=module, arguments=["ddco-pyro", *arguments], heavy=HEAVY)

@@ -9,7 +9,6 @@ import toy_task
 from moving_demonstrations import made, reaches, recorded
 
 from ddco_pyro.drawing import words
-from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.fitting.fit import fit, load
 from ddco_pyro.fitting.run import write_metrics
 from ddco_pyro.report import rollouts as rolling
@@ -143,34 +142,6 @@ def test_a_baseline_has_no_options(labelled):
     assert "<strong>Flat has not converged: " in page
     assert "sign of a degenerate solution" not in page
     assert 'href="#segments' not in page
-
-
-def test_numbers_are_those_of_the_metrics(labelled):
-    found, page, _ = labelled
-    metrics, shown = found.metrics, " ".join(text(page).split())
-    for one in (metrics["log_likelihood_per_step"], metrics["comparison"]["flat"]["log_likelihood_per_step"]):
-        assert f" {words.number(one['valid'])} " in shown
-        assert f" {words.number(one['train'])} " in shown
-    difference = metrics["comparison"]["flat"]["difference"]
-    mean, error = words.signed(difference["nats_per_step"]), words.number(difference["standard_error"])
-    assert f"{mean} ± {error}" in shown
-    for use in metrics["options"][0][1:]:
-        assert f" {words.percent(use['share'], 1)} " in shown
-        assert f" {words.number(use['duration'], 1)} " in shown
-    for part in ("train", "valid"):
-        (scores,) = metrics["agreement"][part]
-        alone = [words.number(scores[name]) for name in UNMATCHED]
-        whole, each = (
-            [words.number(scores[way][name]) for name in MATCHED]
-            for way in ("matched_globally", "matched_per_demonstration")
-        )
-        assert " ".join([*alone, "one for all", *whole, "each its own", *each]) in shown
-    (table,) = metrics["agreement"]["confusion"]
-    for label, steps in zip(table["labels"], table["steps"], strict=True):
-        shares = [words.percent(count / sum(steps)) for count in steps if count]
-        assert " ".join([str(label), str(sum(steps)), *shares]) in shown
-    assert f"{metrics['engine_check']['value']:.1e}" in shown
-    assert metrics["versions"]["torch"] in shown
 
 
 def rows_of(page):
