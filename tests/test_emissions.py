@@ -379,7 +379,7 @@ def test_divergences_are_those_of_torch(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("depth", [1, 2, 3])
+@pytest.mark.parametrize("depth", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
 def test_every_kind_at_every_depth_has_one_likelihood(kind, depth):
     """Brute force, Pyro's enumeration of the program and the compiled pass."""
     steps, actions = 3 if depth < 3 else 2, actions_of(kind)

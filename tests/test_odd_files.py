@@ -82,7 +82,13 @@ def warm(toy_run, tmp_path_factory) -> Path:
     return toy_run.folder
 
 
-@pytest.mark.parametrize("name", ROWS)
+ELSEWHERE = ("atoms", "kinds", "layouts", "places")
+"""Tables whose rows have tests of their own, beside the reader that they are about."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name.startswith(ELSEWHERE) else name for name in ROWS]
+)
 def test_an_odd_file(name: str, tmp_path: Path, warm: Path) -> None:
     row: Row = ROWS[name]
     folder, out = tmp_path / "odd", tmp_path / "out"
