@@ -10,7 +10,7 @@ from moving_demonstrations import made, reaches, recorded
 
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.fit import fit, load
-from ddco_pyro.fitting.run import write_metrics
+from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import rollouts as rolling
 from ddco_pyro.report import write_report
 from ddco_pyro.report.activity import activity
@@ -67,7 +67,9 @@ def deep(tmp_path_factory):
         training={"epochs": 12, "restarts": 2},
         compare_with=[{"kind": "flat", "policy": LINEAR}, {"kind": "per_timestep"}],
     )
-    write_metrics(found.folder, found.metrics | {"rollouts": rollouts(), "options": unused(found.metrics["options"])})
+    data = found.metrics.model_dump() | {"rollouts": rollouts()}
+    data["options"][0][2]["share"] = 0.001
+    Metrics.model_validate(data).write(found.folder)
     frames = np.random.default_rng(0).integers(0, 255, (5, 48, 64, 3), dtype=np.uint8)
     (found.folder / "videos").mkdir()
     for name in ("flat-1000", "ddco-1000", "ddco-1001"):
@@ -91,11 +93,6 @@ def rollouts():
         "ddco": {"measures": outcomes(OURS)},
     }
     return {"seed": 1000, "episodes": 4, "methods": methods}
-
-
-def unused(options):
-    options[0][2]["share"] = 0.001
-    return options
 
 
 class Resources(HTMLParser):

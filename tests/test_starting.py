@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from command_line import call
 from gripper import planted
-from random_demonstrations import demonstrations
+from random_demonstrations import demonstration, demonstrations
 from scipy import stats
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import PICTURES, VECTORS, Recipe, _batch, _epochs, starting_spec
-from ddco_pyro.spec import load_spec
+from ddco_pyro.spec import Spec, load_spec
 
 
 @pytest.fixture
@@ -64,12 +64,12 @@ def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Pa
     assert looked == f"next: ddco-pyro init '{path}' --out 'my demos: 1'.yaml"
     fit = ddco_pyro.load(tmp_path / "run")
     assert fit.spec == load_spec(spec)
-    held_out = Demonstrations.read(path, labels=["skill"]).select([one["name"] for one in fit.metrics["valid"]])
+    held_out = Demonstrations.read(path, labels=["skill"]).select([one.name for one in fit.metrics.valid])
     side = [np.where(demo.labels["skill"] == 5, 1, -1)[:, None] * demo.observations["place"] for demo in held_out]
     truth = stats.norm.logpdf(np.concatenate([demo.actions for demo in held_out]), np.concatenate(side), NOISE).mean()
-    assert fit.metrics["log_likelihood_per_step"]["valid"] > truth - 0.1
+    assert fit.metrics.log_likelihood_per_step.valid > truth - 0.1
     assert list(fit.baselines) == ["flat", "flat_equal"]
-    assert "agreement" in fit.metrics  # with the labels in the file
+    assert fit.metrics.agreement  # with the labels in the file
 
 
 @pytest.mark.slow
@@ -80,9 +80,9 @@ def test_what_it_writes_lets_every_method_converge(tmp_path: Path) -> None:
     ended = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run")
     assert ended.status == 0, ended.err
     metrics = ddco_pyro.load(tmp_path / "run").metrics
-    trainings = [metrics["training"], *(one["training"] for one in metrics["comparison"].values())]
-    assert [one["converged"] for one in trainings] == [True, True, True]
-    assert len({json.dumps(one["budget"]) for one in trainings}) == 1
+    trainings = metrics.trainings.values()
+    assert [one.converged for one in trainings] == [True, True, True]
+    assert len({one.budget for one in trainings}) == 1
 
 
 @pytest.mark.parametrize(
@@ -106,8 +106,8 @@ def test_three_demonstrations_are_enough(tmp_path: Path) -> None:
     assert call("init", tmp_path / "demos.hdf5", "--out", tmp_path / "spec.yaml").status == 0
     ended = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--set", "training.epochs=1")
     assert ended.status == 0, ended.err
-    numbers = ddco_pyro.load(tmp_path / "run").metrics["demonstrations"]
-    assert [numbers[part] for part in ("train", "tune", "valid")] == [1, 1, 1]
+    numbers = ddco_pyro.load(tmp_path / "run").metrics.demonstrations
+    assert [getattr(numbers, part) for part in ("train", "tune", "valid")] == [1, 1, 1]
 
 
 def test_it_says_what_it_leaves_out(path: Path, tmp_path: Path) -> None:
@@ -143,8 +143,8 @@ def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path) ->
         "fit", written, "--out", tmp_path / "run", "--set", "training.epochs=1", "--set", "compare_with=[]"
     )  # fmt: skip
     assert ended.status == 0, ended.err
-    numbers = ddco_pyro.load(tmp_path / "run").metrics["demonstrations"]
-    assert sum(numbers[part] for part in ("train", "tune", "valid")) == 8
+    numbers = ddco_pyro.load(tmp_path / "run").metrics.demonstrations
+    assert numbers.train + numbers.tune + numbers.valid == 8
     assert call("report", tmp_path / "run").status == 0
     ended = call("segment", tmp_path / "run", path, "--csv", tmp_path / "segments.csv")
     assert ended.status == 0, ended.err
@@ -182,7 +182,8 @@ def test_a_control_that_never_changes_is_refused(path: Path) -> None:
 
 
 def test_masks_of_the_file_decide_what_is_held_out(path: Path, tmp_path: Path) -> None:
-    assert load_spec(write(tmp_path, starting_spec(inspect(path), path))).demonstrations.valid_fraction == 0.25
+    demonstrations(8).write(path)
+    assert load_spec(write(tmp_path, starting_spec(inspect(path), path))).demonstrations.valid_fraction == 0.2
     demonstrations(6, {"train": ("demo_0", "demo_3"), "valid": ("demo_1",), "better": ("demo_2",)}).write(path)
     text = starting_spec(inspect(path), path)
     assert "# held out: as mask/train and mask/valid in the file say" in text
@@ -244,3 +245,16 @@ def test_a_file_that_is_there_is_not_replaced_unasked(path: Path, tmp_path: Path
     assert ended.err == f"ddco-pyro: {spec}: exists; choose another --out, or replace it with --force\n"
     assert call("init", path, "--out", spec, "--force").status == 0
     assert spec.read_text() != "mine"
+
+
+def test_few_demonstrations_all_train_and_few_steps_have_stronger_ridges(path: Path, tmp_path: Path) -> None:
+    def spec(*steps: int) -> Spec:
+        records = tuple(demonstration(f"demo_{n}", length, n) for n, length in enumerate(steps))
+        vectors = (replace(one, observations={"pose": one.observations["pose"]}) for one in records)
+        Demonstrations(tuple(vectors)).write(path)
+        return load_spec(write(tmp_path, starting_spec(inspect(path), path)))
+
+    few, short, long = spec(*[200] * 7), spec(*[20] * 8), spec(*[200] * 8)
+    assert [one.demonstrations.leave_one_out for one in (few, short, long)] == [True, False, False]
+    assert [one.training.tune_fraction for one in (few, short, long)] == [0, 0.1, 0.1]
+    assert [one.training.optimizer.ridge.policy for one in (few, short, long)] == [10, 10, 1]

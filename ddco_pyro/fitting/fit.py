@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import numpy as np
 import torch
@@ -19,26 +19,26 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor
 from ddco_pyro.data.controls import measure
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.files import json_text, leftovers
+from ddco_pyro.data.files import leftovers
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
 from ddco_pyro.evaluation.inferred import Inferred, infer
-from ddco_pyro.evaluation.metrics import evaluate, supervisor
-from ddco_pyro.evaluation.schema import read_metrics
 from ddco_pyro.events import OnEvent, ignore
-from ddco_pyro.fitting.digest import record, recorded, refuse_others
+from ddco_pyro.fitting.digest import record, recorded
+from ddco_pyro.fitting.evaluation import evaluate
 from ddco_pyro.fitting.run import (
     Clock,
     RunError,
     claim,
     claimed,
+    has_model,
     is_finished,
     read_model,
     write_history,
-    write_metrics,
     write_model,
 )
 from ddco_pyro.inference import Posterior
+from ddco_pyro.metrics import Metrics
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, user_code, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
@@ -61,21 +61,24 @@ TOLERANCE = 1e-4
 class Fit:
     """A fitted model.
 
-    >>> fit.spec.hierarchy.levels[0].count, sorted(fit.baselines), fit.metrics["demonstrations"]["valid"]
+    >>> fit.spec.hierarchy.levels[0].count, sorted(fit.baselines), fit.metrics.demonstrations.valid
     (2, ['flat'], 1)
 
-    :param metrics: the contents of ``metrics.json``.
+    :param metrics: the contents of ``metrics.json``; None of a model that was not evaluated.
     :param folder: the run folder; None where nothing was written.
     :param given: the demonstrations of the fit; None for those that the spec names.
     :param beside: the fitted baselines, by name; None for those in the run folder.
+    :param apart: models that were trained without a demonstration, by its name (``demonstrations.leave_one_out``); None
+        for those in the run folder.
     """
 
     spec: Spec
     hierarchy: Hierarchy
-    metrics: dict[str, Any] = field(default_factory=dict, repr=False)
+    metrics: Metrics = field(default=cast(Metrics, None), repr=False)
     folder: Path | None = None
     given: Demonstrations | None = field(default=None, repr=False)
     beside: Mapping[str, Fit] | None = field(default=None, repr=False)
+    apart: Mapping[str, Hierarchy] | None = field(default=None, repr=False)
 
     def __str__(self) -> str:
         return str(self.folder or "this fit")
@@ -105,7 +108,7 @@ class Fit:
             return self.given
         demos = read_demonstrations(self.spec)
         if self.folder is not None:
-            refuse_others(self.folder, demos)
+            record(self.folder, demos)
         return demos
 
     @cached_property
@@ -118,15 +121,23 @@ class Fit:
         return {folder.name: load(folder, allow_code) for folder in folders if is_finished(folder)}
 
     @cached_property
+    def without(self) -> Mapping[str, Hierarchy]:
+        """The model without each demonstration, by its name; empty without ``demonstrations.leave_one_out``."""
+        if self.apart is not None or self.folder is None or not self.spec.demonstrations.leave_one_out:
+            return self.apart or {}
+        places = _left_out(self.folder, self.demonstrations)
+        return {name: read_model(place, self.spec) for name, place in places.items()}
+
+    @cached_property
     def held_out(self) -> dict[str, float]:
         """log p(ξ) of each held-out demonstration by name, computed when it was fitted, nats."""
-        return {row["name"]: row["log_likelihood"] for row in self.metrics["valid"]}
+        return {row.name: row.log_likelihood for row in self.metrics.valid}
 
     def was_held_out(self, name: str, log_likelihood: float) -> bool:
         """Whether a demonstration is among the held-out ones: the name and the log-likelihood are equal."""
         return bool(np.isclose(self.held_out.get(name, np.nan), log_likelihood, rtol=TOLERANCE, atol=TOLERANCE))
 
-    def infer(self, demos: Iterable[Demonstration]) -> Iterator[Inferred]:
+    def infer(self, demos: Iterable[Demonstration], held_out: bool = False) -> Iterator[Inferred]:
         """The model's outputs, posteriors and paths for demonstrations, in pieces that fit into memory, in order.
 
         >>> for piece in fit.infer(demos):
@@ -134,9 +145,14 @@ class Fit:
         (6,) torch.Size([6, 10, 3]) torch.Size([6, 10])
 
         :param demos: :class:`~ddco_pyro.Demonstrations`, or an iterable that reads one after the other.
+        :param held_out: with ``demonstrations.leave_one_out``, each by the model that was trained without it.
         :raises DemonstrationsError: there are none, or a number is too large for networks.
         """
-        return infer(self.hierarchy, demos)
+        if not (held_out and self.without):
+            yield from infer(self.hierarchy, demos)
+        else:
+            for demo in demos:
+                yield from infer(self.without[demo.name], [demo])
 
     def log_likelihood(self, demos: Iterable[Demonstration]) -> np.ndarray:
         """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units.
@@ -202,8 +218,8 @@ def fit(
     ...     return ddco_pyro.Demonstration(f"demo_{n}", {"place": place}, place * np.repeat([[-2.0], [2.0]], 5, 0))
     >>> demos = ddco_pyro.Demonstrations(tuple(demonstration(n) for n in range(6)))
     >>> fit = ddco_pyro.fit("mine.yaml", demos)
-    >>> fit.metrics["demonstrations"]
-    {'train': 4, 'tune': 1, 'valid': 1}
+    >>> fit.metrics.demonstrations
+    Counts(train=4, tune=1, valid=1, supervisor={})
     >>> ddco_pyro.fit("mine.yaml", demos, out="runs/mine").folder.as_posix()
     'runs/mine'
 
@@ -308,23 +324,63 @@ def _fit_model(
                 beside[baseline] = load(place, allow_code=True)
             else:
                 beside[baseline] = _fit_model(its, demos, place, on_event, jobs, ranks, Clock(), {}, baseline)
-    fitted = Fit(spec, hierarchy, {}, folder, demos, beside)
+    with clock("training"):
+        apart = _leave_one_out(spec, size, demos, folder, on_event, jobs, ranks)
+    fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=beside, apart=apart)
+    train, valid = len(trained.data.train), len(split.get("valid", ()))
+    counts = {"train": train, "tune": len(split["train"]) - train, "valid": valid, "left_out": bool(apart)}
+    known = {"supervisor": json.loads(str(demos.attributes.get("supervisor", "{}")))}  # a collected file has it
     with clock("evaluation"), repeatable(hierarchy.device):
-        metrics = evaluate(fitted, split, demos)
-    counts = {"train": len(trained.data.train), "tune": len(trained.data.tune), "valid": len(split.get("valid", ()))}
-    metrics |= {
-        "engine_check": trained.check._asdict(),
-        "demonstrations": counts | supervisor(demos),
-        "measure": measure(hierarchy.scaling.parts),
-        "control_dimensions": [dimension.as_data() for dimension in size.control],
-        "parameters": parameters(hierarchy),
-        "training": trained.summary,
-        "seconds": clock.end(),
-        "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
-    }
+        metrics = evaluate(
+            fitted,
+            split,
+            demos,
+            engine_check=trained.check._asdict(),
+            demonstrations=counts | known,
+            measure=measure(hierarchy.scaling.parts),
+            control_dimensions=[dimension.as_data() for dimension in size.control],
+            parameters=parameters(hierarchy),
+            training=trained.summary,
+            seconds={},
+            versions={package: importlib.metadata.version(package) for package in PACKAGES},
+        )
+    metrics.seconds = clock.end()
     if folder:
-        write_metrics(folder, metrics)
-    return replace(fitted, metrics=json.loads(json_text(metrics)))  # as they are read back
+        metrics.write(folder)
+    return replace(fitted, metrics=metrics)
+
+
+def _leave_one_out(
+    spec: Spec,
+    size: Dimensions,
+    demos: Demonstrations,
+    folder: Path | None,
+    on_event: OnEvent,
+    jobs: int,
+    ranks: Ranks,
+) -> dict[str, Hierarchy]:
+    """The model trained without each demonstration, by its name, each kept in the run folder as soon as it is done."""
+    models: dict[str, Hierarchy] = {}
+    if not spec.demonstrations.leave_one_out:
+        return models
+    places = _left_out(folder, demos) if folder else {}
+    for name in demos.names:
+        place = places.get(name)
+        if place and has_model(place):
+            models[name] = read_model(place, spec)
+            continue
+        others = demos.select(other for other in demos.names if other != name)
+        checkpoints = place / "checkpoints" if place else None
+        event = f"{model_name(spec)} without {name}"
+        models[name] = train_model(spec, size, others, on_event, checkpoints, None, event, jobs, ranks).hierarchy
+        if place:
+            write_model(place, models[name])
+    return models
+
+
+def _left_out(folder: Path, demos: Demonstrations) -> dict[str, Path]:
+    """The folder of the model without each demonstration, by its name."""
+    return {name: folder / "left_out" / str(number) for number, name in enumerate(demos.names)}
 
 
 def load(folder: str | Path, allow_code: bool = False) -> Fit:
@@ -352,4 +408,4 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
     recorded(folder)  # or the format is another
     hierarchy = read_model(folder, spec)
     counts = [level.count for level in spec.hierarchy.levels] if spec.hierarchy else []
-    return Fit(spec, hierarchy, read_metrics(folder, counts), folder)
+    return Fit(spec, hierarchy, Metrics.read(folder, counts), folder)

@@ -76,7 +76,7 @@ class Outputs:
     def termination(self) -> tuple[Tensor, ...]:
         """(log(1 - ψ), log ψ) of each level, [N, T, k, 2]."""
         levels = zip(self.callers, self.termination_logits, strict=False)  # the meta-policy has none
-        return tuple(_always(level.shape) if logit is None else log_termination(logit) for level, logit in levels)
+        return tuple(always(level.shape) if logit is None else log_termination(logit) for level, logit in levels)
 
     def tables(self, actions: Tensor | None = None) -> Tables:
         """The tables for controls [N, T, A] in scaled units; without them, of selections and terminations alone."""
@@ -108,6 +108,6 @@ class Outputs:
         return Outputs(tuple(callers), tuple(changed(logit) for logit in self.termination_logits))
 
 
-def _always(shape: torch.Size) -> Tensor:
+def always(shape: torch.Size) -> Tensor:
     """The termination table of options that end after every step, [N, T, k, 2]."""
     return torch.tensor([NEVER, 0.0]).expand(*shape, 2)

@@ -28,7 +28,7 @@ from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.perceptrons import Mlp, StackedLinear
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import Tables
-from ddco_pyro.spec import RidgeSpec
+from ddco_pyro.spec import OptimizerSpec, RidgeSpec
 
 LARGEST = 3.0
 """The most that a weight of a logit changes in a step: Fisher scoring overshoots where a logistic curve is flat."""
@@ -38,6 +38,8 @@ ABOVE_FLOOR = 1e-4
 """A learned σ stays so far above its floor."""
 TOLERANCE = 1e-5
 """EM has converged where a step gains less, in nats per step of the demonstrations."""
+ROUGHLY = 1e-3
+"""The same in a stage whose end is a start alone."""
 BIAS = 1e-6
 """Ridge of biases, and the least of weights: an option that is never active keeps its own."""
 
@@ -51,6 +53,11 @@ def is_linear(model: Hierarchy) -> bool:
         isinstance(network, Mlp) and network.trunk_size is None and len(network.layers) == 1
         for network in model.networks().values()
     )
+
+
+def uses_em(spec: OptimizerSpec, model: Hierarchy) -> bool:
+    """Whether a model is trained by EM: where the spec asks for it, and every network is linear."""
+    return spec.name == "em" and is_linear(model)
 
 
 @dataclass(frozen=True)
@@ -210,10 +217,9 @@ class Expectation:
         self._before: dict[str, Tensor] | None = None
         self.value, self.gain = -math.inf, math.inf
 
-    @property
-    def converged(self) -> bool:
-        """Whether the last step gained less than :data:`TOLERANCE`."""
-        return self.gain < TOLERANCE
+    def converged(self, roughly: bool = False) -> bool:
+        """Whether the last step gained less than :data:`TOLERANCE`, or roughly: less than :data:`ROUGHLY`."""
+        return self.gain < (ROUGHLY if roughly else TOLERANCE)
 
     def states(self) -> dict[str, Tensor]:
         """What a checkpoint keeps: the weights in float64, and those before the last step with their value."""
