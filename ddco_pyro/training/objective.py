@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import chain
 from statistics import median
@@ -17,7 +16,6 @@ from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.outputs import always
 from ddco_pyro.model.tables import Tables, always_ends
 from ddco_pyro.spec import DurationSpec
 from ddco_pyro.training.checkpoint import Progress, State, TrainingData
@@ -121,7 +119,7 @@ class Objective:
     def clamped(self, tables: Tables, rows: Tensor, tuning: bool = False) -> Tables:
         """The tables with the choices that are known clamped, and ψ = 1 in a stage that is memoryless."""
         if self.stage.memoryless:
-            tables = replace(tables, termination=tuple(always(table.shape[:-1]) for table in tables.termination))
+            tables = tables.memoryless()
         for level, choices in self.known[tuning].items():
             tables = tables.clamp(level, choices[rows, : tables.steps])
         return tables
