@@ -54,7 +54,7 @@ OTHER = {
 }
 """Those that are computed by another algorithm, or in another order, where they are not on the host."""
 
-QUICK = ("mlp", "lstm", "a trunk of branches")
+QUICK = ("mlp", "a trunk of branches")
 ALL = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in (*SAME, *OTHER)]
 
 
