@@ -36,8 +36,8 @@ def write_page(path: Path, segmented: Segmented, run: str, file: str, agreements
     sections = [_level(name, segmented, agreements.get(name)) for name in segmented.counts]
     drawn = note(
         f"Time runs to the right on one scale; the full width is {longest}. Colours are options; a white line is a new "
-        "choice. Grey rows are labels in the file. Rest the pointer on a segment for its steps and its probability. "
-        "Nats per step: the log-likelihood of the demonstration's controls under the model; higher is better, and one "
+        "choice. Grey rows are labels in the file and baselines. Rest the pointer on a segment for its steps and its "
+        "probability. Nats per step: the log-likelihood of the demonstration's controls under the model; higher is better, and one "
         "nat more means that each step's control is e = 2.7 times as probable."
     )
     sections.append(Section("segments", "Every demonstration", [drawn, *timelines(segmented)]))
@@ -96,11 +96,11 @@ def timelines(segmented: Segmented, most_segments: float = math.inf) -> list[Tim
 
 
 def _rows(demo: Segments, segmented: Segmented, longest: int) -> Iterator[tuple[str, list[Strip]]]:
-    """The levels, the highest first, and the labels of a demonstration."""
+    """The levels, the highest first, the baselines and the labels of a demonstration."""
     for name, level in reversed(demo.levels.items()):
         labels = segmented.option_labels.get(name, {})
         yield name, [_option(level, run, labels, segmented.frequency, longest) for run in level.runs()]
-    for name, values in demo.labels.items():
+    for name, values in {**demo.labels, **demo.baselines}.items():
         if name not in demo.levels and not name.endswith("_boundary"):
             yield name, list(_labels(name, values, longest))
 
