@@ -37,8 +37,8 @@ def write_page(path: Path, segmented: Segmented, run: str, file: str, agreements
     drawn = note(
         f"Time runs to the right on one scale; the full width is {longest}. Colours are options; a white line is a new "
         "choice. Grey rows are labels in the file and baselines. Rest the pointer on a segment for its steps and its "
-        "probability. Nats per step: the log-likelihood of the demonstration's controls under the model; higher is better, and one "
-        "nat more means that each step's control is e = 2.7 times as probable."
+        "probability. Nats per step: the log-likelihood of the demonstration's controls under the model; higher is "
+        "better, and one nat more means that each step's control is e = 2.7 times as probable."
     )
     sections.append(Section("segments", "Every demonstration", [drawn, *timelines(segmented)]))
     page = Page(file, [Text(intro)] if held_out else [], sections, subtitle=f"segmented by {run}")
