@@ -8,7 +8,6 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 from urllib.parse import quote
 
-import matplotlib
 import numpy as np
 
 from ddco_pyro.data.files import write_text
@@ -123,7 +122,9 @@ def _labels(name: str, values: np.ndarray, longest: int) -> Iterator[Strip]:
 
 
 def _strip(start: int, end: int, longest: int, colour: str, text: str, title: str) -> Strip:
+    from matplotlib.colors import to_rgb  # most commands draw no page
+
     shown = text if end - start > ROOM * longest else ""
-    red, green, blue = matplotlib.colors.to_rgb(colour)
+    red, green, blue = to_rgb(colour)
     ink = "#000" if 0.299 * red + 0.587 * green + 0.114 * blue > 0.55 else "#fff"  # the one that can be read
     return Strip(f"{100 * start / longest:.3f}", f"{100 * (end - start) / longest:.3f}", colour, ink, shown, title)
