@@ -293,11 +293,10 @@ def learning_rate(spec: OptimizerSpec, epoch: int, cap: int | None) -> float:
 
 
 def _optimizer(spec: OptimizerSpec, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
+    common = {"params": parameters, "lr": spec.lr, "weight_decay": spec.weight_decay}
     if spec.name == "momentum":
-        kind, settings = torch.optim.SGD, {"momentum": spec.momentum}
-    else:
-        kind, settings = (torch.optim.AdamW if spec.name == "adamw" else torch.optim.Adam), {"fused": True}
-    return _uncompiled(kind)(parameters, lr=spec.lr, weight_decay=spec.weight_decay, **settings)
+        return _uncompiled(torch.optim.SGD)(**common, momentum=spec.momentum)
+    return _uncompiled(torch.optim.AdamW if spec.name == "adamw" else torch.optim.Adam)(**common, fused=True)
 
 
 def _uncompiled(kind: type[torch.optim.Optimizer]) -> Callable[..., torch.optim.Optimizer]:
