@@ -71,7 +71,7 @@ Image(figures / "posterior.png")
 # ## How are they used?
 
 # %%
-use = tables.option_use(["option"], needle.metrics["options"], len(demos))
+use = tables.option_use(["option"], needle.metrics.options, len(demos))
 Markdown("\n".join(["|".join(use.head), "|".join("-" * len(use.head)), *("|".join(row) for row in use.rows)]))
 
 # %% [markdown]

@@ -86,9 +86,9 @@ Markdown(words.verdict(mine.metrics))
 Image(mine.folder / "figures" / "segments.png")
 
 # %%
-agreement = mine.metrics["agreement"]
+agreement = mine.metrics.agreement
 print("normalised mutual information with the expert's phases:",
-      *(f"{part} {agreement[part][0]['nmi']:.2f}" for part in ("train", "valid")))  # fmt: skip
+      f"train {agreement.train[0].nmi:.2f} valid {agreement.valid[0].nmi:.2f}")  # fmt: skip
 
 # %% [markdown]
 # As a policy that acts, one observation at a time:

@@ -66,15 +66,15 @@ class ArenaCell(Cell):
         methods = {OURS: fitted} | fitted.baselines
         played = world.play(self.task, methods, source, int(own["episodes"]))
         ended = time.perf_counter()
-        metrics = fitted.metrics
+        metrics = fitted.metrics.model_dump()
         return {
             "demonstrations_sha256": hashlib.sha256(source.read_bytes()).hexdigest(),
             "expert": expert(source),
             "methods": {
                 name: {
-                    "log_likelihood_per_step": one.metrics["log_likelihood_per_step"],
-                    "parameters": one.metrics["parameters"],
-                    "converged": one.metrics["training"]["converged"],
+                    "log_likelihood_per_step": one.metrics.log_likelihood_per_step.model_dump(),
+                    "parameters": one.metrics.parameters,
+                    "converged": one.metrics.training.converged,
                     "success": [episode["success"] for episode in played["episodes"][name]],
                     "steps": [episode["steps"] for episode in played["episodes"][name]],
                     "bridge_difference": played["differences"][name],

@@ -20,7 +20,6 @@ from cells import Cell, Settings
 
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement
-from ddco_pyro.evaluation.schema import option_labels
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.training.data import parts
 
@@ -55,8 +54,8 @@ class LabelsCell(Cell):
         fitted = fitted_cell(ArenaCell(self.task, TRAINED, self.seed), source, tuple(changes), folder)
         return {
             "phases": len(kinds),
-            "log_likelihood_per_step": fitted.metrics["log_likelihood_per_step"],
-            "converged": fitted.metrics["training"]["converged"],
+            "log_likelihood_per_step": fitted.metrics.log_likelihood_per_step.model_dump(),
+            "converged": fitted.metrics.training.converged,
             "measures": measured(fitted, kinds),
         }
 
@@ -76,7 +75,7 @@ def measured(fitted: Fit, kinds: list[int]) -> dict[str, float]:
     valid = parts(fitted.spec, fitted.demonstrations)["valid"]
     truth = [demo.labels[LABELS] for demo in valid]
     segments = [own[own >= 0] for own in fitted.segment(valid)[0]]
-    names = next(iter(option_labels(fitted.metrics).values()), dict(enumerate(kinds, start=1)))
+    names = next(iter(fitted.metrics.option_labels.values()), dict(enumerate(kinds, start=1)))
     right = [names.get(option) == phase for own, phases in zip(segments, truth, strict=True)
              for option, phase in zip(own.tolist(), phases.tolist(), strict=True)]  # fmt: skip
     return flat(agreement(segments, truth)) | {"named": float(np.mean(right))}

@@ -10,6 +10,7 @@ from scipy import stats
 
 from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.metrics import Scores as Measures
 from ddco_pyro.segmenting.baselines import BASELINES, segment
 from ddco_pyro.training.data import parts
 
@@ -30,10 +31,10 @@ def scored(fitted: Fit, labels: str) -> dict[str, Scores]:
     return {name: flat(agreement(own, truth)) for name, own in segments.items()}
 
 
-def flat(measures: dict[str, Any] | None) -> Scores:
+def flat(measures: Measures | None) -> Scores:
     """Each measure as a number, options matched globally where they are."""
     assert measures is not None  # every step of the arena has a phase
-    both = measures | measures["matched_globally"]
+    both = dict(measures) | dict(measures.matched_globally)
     return {name: float(both[name]) for name in MEASURES}
 
 

@@ -70,9 +70,9 @@ class BabyAICell(Cell):
             "bot": expert(source) | {"steps": list(map(len, demos))},
             "methods": {
                 name: {
-                    "log_likelihood_per_step": one.metrics["log_likelihood_per_step"],
-                    "parameters": one.metrics["parameters"],
-                    "converged": one.metrics["training"]["converged"],
+                    "log_likelihood_per_step": one.metrics.log_likelihood_per_step.model_dump(),
+                    "parameters": one.metrics.parameters,
+                    "converged": one.metrics.training.converged,
                     "bridge_difference": played["differences"][name],
                 }
                 for name, one in methods.items()
@@ -81,10 +81,10 @@ class BabyAICell(Cell):
                 name: {key: [one[key] for one in episodes] for key in ("success", "steps")}
                 for name, episodes in played["episodes"].items()
             },
-            "agreement": {name: one.metrics["agreement"] for name, one in fits.items()},
+            "agreement": {name: one.metrics.model_dump()["agreement"] for name, one in fits.items()},
             "crossed": {name: crossed(one.segment(valid), valid) for name, one in fits.items()},
             "references": references(demos, valid, self.seed),
-            "options": {name: one.metrics["options"] for name, one in fits.items()},
+            "options": {name: one.metrics.model_dump()["options"] for name, one in fits.items()},
             "seconds": {"fit": trained - begun, "play": ended - trained, "all": ended - begun},
         }
 
@@ -142,10 +142,16 @@ def fitted(
     return fit(load_spec(path, list(overrides)), demos, out=folder / name)
 
 
+def scores(segments: list[np.ndarray], truth: list[np.ndarray]) -> dict[str, Any] | None:
+    """The measures of agreement as plain data."""
+    found = agreement(segments, truth)
+    return found and found.model_dump()
+
+
 def crossed(levels: Iterable[np.ndarray], demos: Demonstrations) -> list[dict[str, Any]]:
     """Agreement of each level's options, padded with -1, with each of the labels."""
     return [
-        {label: agreement([row[row >= 0] for row in rows], [demo.labels[label] for demo in demos]) for label in LABELS}
+        {label: scores([row[row >= 0] for row in rows], [demo.labels[label] for demo in demos]) for label in LABELS}
         for rows in levels
     ]
 
@@ -156,9 +162,9 @@ def references(demos: Demonstrations, valid: Demonstrations, seed: int) -> dict[
     found: dict[str, dict[str, Any]] = {name: {} for name in ("constant", *REFERENCES)}
     for label, count in zip(LABELS, COUNTS, strict=True):
         truth = [demo.labels[label] for demo in valid]
-        found["constant"][label] = agreement([np.zeros_like(one) for one in truth], truth)
+        found["constant"][label] = scores([np.zeros_like(one) for one in truth], truth)
         for name in REFERENCES:
-            found[name][label] = agreement(baselines.segment(name, train, valid, count, seed), truth)
+            found[name][label] = scores(baselines.segment(name, train, valid, count, seed), truth)
     return found
 
 

@@ -79,7 +79,7 @@ def evaluated(
 
 def _methods(called: str, fitted: Fit) -> dict[str, Any]:
     """The bins of each method by name, with its held-out likelihood where it was fitted."""
-    models = {fitted.name: fitted.metrics} | fitted.metrics.get("comparison", {})
+    models = {fitted.name: fitted.metrics} | fitted.metrics.comparison
     found: dict[str, Any] = {}
     with (fitted.run_folder / "rollouts.csv").open(encoding="utf-8", newline="") as table:
         for row in csv.DictReader(table):
@@ -87,7 +87,7 @@ def _methods(called: str, fitted: Fit) -> dict[str, Any]:
             own = found.setdefault(called if name == fitted.name else name, {"bins": []})
             own["bins"].append({key: float(value) for key, value in row.items()})
             if name in models:
-                own["log_likelihood_per_step"] = models[name]["log_likelihood_per_step"]
+                own["log_likelihood_per_step"] = models[name].log_likelihood_per_step.model_dump()
     return found
 
 

@@ -38,7 +38,7 @@ def run(spec: str, own_changes: list[str], variant: tuple[str, str, str], seed: 
         f"seed={seed}", "compare_with=[]", *own_changes,
     ]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
-        metrics = fit(load_spec(spec, changes), out=Path(folder) / "run").metrics
+        metrics = fit(load_spec(spec, changes), out=Path(folder) / "run").metrics.model_dump()
     return {
         "kind": kind,
         "network": network,

@@ -86,9 +86,9 @@ def summarize(found: list[dict[str, Any]], names: list[str]) -> dict[str, Any]:
             (ours, steps), (ddco, _) = (_totals(found, model, count) for model in (name, "ddco"))
             mean = paired(ours, np.zeros(len(ours)), steps)
             summary[name][count] = {
-                "log_likelihood_per_step": mean["nats_per_step"],
-                "standard_error": mean["standard_error"],
-                "minus_ddco": paired(ours, ddco, steps),
+                "log_likelihood_per_step": mean.nats_per_step,
+                "standard_error": mean.standard_error,
+                "minus_ddco": paired(ours, ddco, steps).model_dump(),
                 "folds": (ours / steps).tolist(),
             }
     return summary

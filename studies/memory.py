@@ -107,8 +107,8 @@ def needle(cell: Cell, runs: Path) -> list[Measured]:
     spec = needle_success.spec_of("ddco", cell.seed, cell.demonstrations, changes)
     fitted = fit(spec, out=runs / "fits" / cell.name)
     rolled = roll_out(fitted, EPISODES["needle"].get(cell.demonstrations, 60), jobs=1)
-    success = rolled["methods"][fitted.name]["measures"]["success"]["rate"]
-    nats = fitted.metrics["log_likelihood_per_step"]["valid"]
+    success = rolled.success_rates[fitted.name].rate
+    nats = fitted.metrics.log_likelihood_per_step.valid
     return [Measured("", "nats", nats), Measured(spec.rollout.options, "success", success)]
 
 
@@ -142,8 +142,8 @@ def arena(cell: Cell, runs: Path) -> list[Measured]:
     played = arena_cell.sawyer(settings).play(cell.task, {cell.method: fitted}, source, EPISODES["arena"])
     successes = [episode["success"] for episode in played["episodes"][cell.method]]
     return [
-        Measured("", "nats", fitted.metrics["log_likelihood_per_step"]["valid"]),
-        Measured("", "NMI", nmi(fitted.metrics["agreement"])),
+        Measured("", "nats", fitted.metrics.log_likelihood_per_step.valid),
+        Measured("", "NMI", nmi(fitted.metrics.model_dump()["agreement"])),
         Measured(fitted.spec.rollout.options, "success", sum(successes) / len(successes)),
     ]
 

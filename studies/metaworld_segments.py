@@ -29,7 +29,7 @@ def run(initialize: str, seed: int, overrides: list[str]) -> dict[str, Any]:
     changes = [*overrides, f"training.initialize={initialize}", f"seed={seed}", "compare_with=[]"]
     spec = load_spec("specs/metaworld_pick_place.yaml", changes)
     with tempfile.TemporaryDirectory() as folder:
-        metrics = fit(spec, out=Path(folder) / "run").metrics
+        metrics = fit(spec, out=Path(folder) / "run").metrics.model_dump()
     return {
         "initialize": initialize,
         "seed": seed,

@@ -67,9 +67,9 @@ def run(method: str, seed: int, draw: int, arguments: argparse.Namespace, made_b
         with one_thread():
             fitted = fit(spec, disturbed(demonstrations(spec), draw), out=arguments.runs / made_by["code"][:12] / name)
             rolled = roll_out(fitted, arguments.episodes, jobs=1)
-        success = rolled["methods"][fitted.name]["measures"]["success"]
-        valid = fitted.metrics["log_likelihood_per_step"]["valid"]
-        return {"successes": success["successes"], "trials": success["trials"], "log_likelihood_valid": valid}
+        success = rolled.success_rates[fitted.name]
+        valid = fitted.metrics.log_likelihood_per_step.valid
+        return {"successes": success.successes, "trials": success.trials, "log_likelihood_valid": valid}
 
     return kept(arguments.runs / "cells" / f"{name}.json", named, made_by, results)["results"]
 

@@ -76,8 +76,8 @@ def run_seed(seed: int, count: int, arguments: argparse.Namespace, made_by: Reco
         spec = spec_of(name, seed, count, (*scripted, *(arguments.set if name.startswith(OURS) else ())))
         with one_thread():
             fitted = fit(spec, out=folder / name)
-            rolled = roll_out(fitted, arguments.episodes, jobs=1)
-        for part, values in _numbers(fitted, rolled).items():
+            roll_out(fitted, arguments.episodes, jobs=1)
+        for part, values in _numbers(fitted).items():
             found[part] = found.get(part, {}) | {f"{method}{suffix}": value for method, value in values.items()}
     write_text(path, text(settings | found, [*records, made_by]))
 
@@ -106,14 +106,14 @@ def kept_at(out: Path, seed: int, count: int, clocked: bool = False) -> Path:
     return out / f"{'clock' if clocked else 'count'}-{count:03d}-seed-{seed}.json"
 
 
-def _numbers(fitted: Fit, rolled: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def _numbers(fitted: Fit) -> dict[str, dict[str, Any]]:
     """By part what there is of every method."""
-    metrics = fitted.metrics
-    models = {fitted.name: metrics} | metrics.get("comparison", {})
+    metrics = fitted.metrics.model_dump()
+    models = {fitted.name: metrics} | metrics["comparison"]
     return {
         "log_likelihood_per_step": {name: model["log_likelihood_per_step"] for name, model in models.items()},
         "training": {name: model["training"] for name, model in models.items()},
-        "methods": rolled["methods"],
+        "methods": metrics["rollouts"]["methods"],
         "options": {fitted.name: metrics.get("options")},
         "engine_check": {fitted.name: metrics["engine_check"]},
     }

@@ -55,7 +55,7 @@ def phases(fit: Fit, demos: Demonstrations) -> dict[str, Any]:
     found = agreement(segments, labels)
     assert found is not None
     steps = {name: np.bincount(_of(segments, labels, number))[1:].tolist() for number, name in enumerate(PHASES)}
-    return {"nmi": found["nmi"], "steps": steps}
+    return {"nmi": found.nmi, "steps": steps}
 
 
 def _of(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray], label: int) -> np.ndarray:

@@ -146,7 +146,7 @@ def run_cell(
             execution: successes(fitted, spec, execution, episodes)
             for execution in (EXECUTIONS if spec.hierarchy else EXECUTIONS[:1])
         }
-    found = settings | {"valid": fitted.metrics["log_likelihood_per_step"]["valid"], "success": success}
+    found = settings | {"valid": fitted.metrics.log_likelihood_per_step.valid, "success": success}
     write_text(kept, text(found, [made_by]))
     return found
 

@@ -105,7 +105,7 @@ def measure(fit: Fit, demos: Demonstrations, divided: dict[str, Demonstrations])
     assert selection is not None  # the meta-policy emits options
     steps = torch.arange(selection.shape[1]) < torch.tensor(demos.lengths)[:, None]
     control, *options = [one.share for one in option_use(posterior)[0]]
-    apart = [one["divergence"] for one in divergences([(outputs, posterior)])[0]]
+    apart = [one.divergence for one in divergences([(outputs, posterior)])[0]]
     segments = fit.segment(demos)[0]
     return {
         **{part: float(fit.log_likelihood(own).sum() / sum(own.lengths)) for part, own in divided.items()},

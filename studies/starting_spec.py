@@ -28,7 +28,7 @@ def valid(spec: Path, seed: int) -> float:
     """Held-out nats per step of one fit."""
     with tempfile.TemporaryDirectory() as folder:
         metrics = fit(load_spec(spec, [f"seed={seed}", "compare_with=[]"]), out=Path(folder) / "run").metrics
-    return float(metrics["log_likelihood_per_step"]["valid"])
+    return metrics.log_likelihood_per_step.valid
 
 
 def main() -> None:

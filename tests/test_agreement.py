@@ -14,9 +14,19 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 from sklearn.metrics import adjusted_rand_score, jaccard_score, normalized_mutual_info_score
 
-from ddco_pyro.evaluation.agreement import MATCHED, UNKNOWN, UNMATCHED, agreement, confusion
+from ddco_pyro.evaluation import agreement as measures
+from ddco_pyro.evaluation.agreement import MATCHED, UNKNOWN, UNMATCHED
 
 WAYS = ("matched_globally", "matched_per_demonstration")
+
+
+def agreement(segments, labels):
+    found = measures.agreement(segments, labels)
+    return found and found.model_dump()
+
+
+def confusion(segments, labels):
+    return measures.confusion(segments, labels).model_dump()
 
 
 def array(text):

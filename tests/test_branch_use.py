@@ -52,9 +52,9 @@ def fitted(request, tmp_path_factory):
 
 
 def test_what_decides_the_control_is_told_from_what_does_not(fitted):
-    use, *_ = fitted.metrics["branches"]
-    assert (use["level"], use["branches"]) == (0, ["seen", "noise"])
-    for seen, noise in use["loss"]:
+    use, *_ = fitted.metrics.branches
+    assert (use.level, use.branches) == (0, ["seen", "noise"])
+    for seen, noise in use.loss:
         assert seen > 1.0
         assert abs(noise) < 0.3 * seen
 
@@ -71,7 +71,7 @@ def test_activations_are_the_mean_sizes_of_what_the_branches_give(fitted):
         with torch.no_grad():
             units = branch(piece.batch.inputs, branch.initial_state(4))[0].double().abs().mean(-1)
         expected = (u * units).sum((0, 1)) / u.sum((0, 1))
-        np.testing.assert_allclose([row[column] for row in use["activation"]], expected, rtol=1e-6)
+        np.testing.assert_allclose([row[column] for row in use.activation], expected, rtol=1e-6)
 
 
 def test_the_networks_are_as_they_were_afterwards(fitted):
@@ -89,4 +89,4 @@ def test_the_report_shows_them(fitted):
 
 def test_without_branches_nothing_is_said():
     fit = ddco_pyro.fit(spec_of({}, epochs=4), demonstrations())
-    assert "branches" not in fit.metrics
+    assert fit.metrics.branches == []

@@ -126,9 +126,9 @@ def test_fit_writes_a_run_and_its_report(run):
     assert list(loaded.baselines) == ["flat"]
     assert (folder / "report.html").stat().st_size > 1000
     assert ended.out.splitlines()[-1] == f"report: {folder / 'report.html'}"
-    for name, row in {"ddco": loaded.metrics, **loaded.metrics["comparison"]}.items():
-        values = row["log_likelihood_per_step"]
-        valid, train = (words.number(values[part], 3) for part in ("valid", "train"))
+    for name, row in {"ddco": loaded.metrics, **loaded.metrics.comparison}.items():
+        values = row.log_likelihood_per_step
+        valid, train = (words.number(getattr(values, part), 3) for part in ("valid", "train"))
         assert re.search(rf"^ *{words.method(name)} +│ +{valid} +│ +{train}", ended.out, re.MULTILINE)
 
 
@@ -136,10 +136,10 @@ def test_rollout_and_report(run):
     folder, _ = run
     ended = call("rollout", folder, "--episodes", 2, "--video", "--jobs", 1)
     assert ended.status == 0
-    methods = ddco_pyro.load(folder).metrics["rollouts"]["methods"]
+    methods = ddco_pyro.load(folder).metrics.rollouts.methods
     assert list(methods) == ["open_loop", "supervisor", "flat", "ddco"]
     for name, one in methods.items():
-        successes = one["measures"]["success"]["successes"]
+        successes = one.measures["success"].successes
         assert re.search(rf"^ *{words.method(name)} +│ +{successes} of 2 \(", ended.out, re.MULTILINE)
     assert len(list((folder / "videos").glob("*.mp4"))) == 8
     again = call("rollout", folder, "--episodes", 2, "--video", "--jobs", 1, "--resume")

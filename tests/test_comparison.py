@@ -14,6 +14,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 from command_line import call
+from made_metrics import made_metrics
 from scipy import stats
 from sklearn.metrics import normalized_mutual_info_score
 
@@ -96,15 +97,16 @@ def test_rows_are_what_az_compare_would_say(found, folders, held_out):
 def test_the_verdict_is_that_of_the_report_in_its_words(toy_run, found, folders):
     """The best run against each other one, with the difference and the error that the report gives."""
     pair = compare([toy_run.folder, toy_run.folder / "baselines" / "flat"])
-    difference = toy_run.metrics["comparison"]["flat"]["difference"]
+    difference = toy_run.metrics.comparison["flat"].difference
     ours, theirs = (str(folder) for folder in folders[:2])
-    if difference["nats_per_step"] < 0:  # the best run is the subject
+    if difference.nats_per_step < 0:  # the best run is the subject
         ours, theirs = theirs, ours
-    said = words.verdict(toy_run.metrics | {"comparison": {"flat": {"difference": difference | {
-        "nats_per_step": abs(difference["nats_per_step"])}}}})  # fmt: skip
+    ahead = difference.model_copy(update={"nats_per_step": abs(difference.nats_per_step)})
+    against = toy_run.metrics.comparison["flat"].model_copy(update={"difference": ahead})
+    said = words.verdict(toy_run.metrics.model_copy(update={"comparison": {"flat": against}}))
     first, named = "of each model).", said.replace("flat", theirs, 1).replace("DDCO explains", f"{ours} explains")
     assert page.verdict(pair).partition(first)[0] == named.partition(first)[0]
-    rising = [row.name for row in pair.rows if not row.training["converged"]]
+    rising = [row.name for row in pair.rows if not row.training.converged]
     assert page.verdict(pair).partition(first)[2] == words.rising(rising)
     assert page.verdict(found).startswith(f"{found.rows[0].name} explains held-out demonstrations ")
     assert all(row.name in page.verdict(found) for row in found.rows)
@@ -129,7 +131,9 @@ def test_the_verdict_says_whether_a_difference_is_outside_its_error(each, said):
 
 
 def row(name, rank, each, model="ddco"):
-    return Row(rank, name, model, 3, sum(each), 0.1, 0.0, 0.0, sum(each) / len(each), tuple(each), None)
+    return Row(
+        rank, name, model, 3, sum(each), 0.1, 0.0, 0.0, sum(each) / len(each), tuple(each), made_metrics().training
+    )
 
 
 def test_demonstrations_are_listed_worst_first_by_the_best_hierarchy(toy_run, found, folders, held_out):
@@ -252,8 +256,8 @@ def test_agreement_is_that_of_each_run_on_what_was_held_out(found, folders, held
         assert (row["level"], row["labels"]) == (fitted.spec.hierarchy.levels[0].name, "phase")
         assert row["nmi"] == pytest.approx(normalized_mutual_info_score(phases, options))
         assert row["accuracy"] == pytest.approx(best_match(phases, options))
-        (scores,) = fitted.metrics["agreement"]["valid"]
-        assert [row[f"boundary_f1_{n}"] for n in (1, 3, 5)] == [scores[f"boundary_f1_{n}"] for n in (1, 3, 5)]
+        (scores,) = fitted.metrics.agreement.valid
+        assert [row[f"boundary_f1_{n}"] for n in (1, 3, 5)] == [getattr(scores, f"boundary_f1_{n}") for n in (1, 3, 5)]
 
 
 def segments(fitted, demos):
@@ -382,7 +386,7 @@ def test_a_single_trajectory_has_no_error(other, tmp_path):
     ]
     found = compare([one.folder for one in runs])
     assert len(found.trajectories) == 1
-    assert np.isnan(found.rows[1].dse)
+    assert found.rows[1].dse is None
     assert "–" in page.run_table(found).rows[1]
     data = json.loads((write(found, tmp_path / "x").parent / "compare.json").read_text())
     assert data["rows"][1]["dse"] is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from made_metrics import compared, made_metrics
 
 from ddco_pyro.cli import console
 from ddco_pyro.drawing.page import Table
@@ -72,9 +73,7 @@ def test_markup_in_names_is_text(clock, capsys):
 
 def test_log_likelihoods(capsys):
     values = {"train": 1.0, "valid": 0.5}
-    other = {"log_likelihood_per_step": values, "difference": {"nats_per_step": -0.25, "standard_error": 0.125}}
-    metrics = {"model": "ddco", "log_likelihood_per_step": values, "comparison": {"flat": other}}
-    console.log_likelihoods(metrics | {"valid": [], "parameters": 7})
+    console.log_likelihoods(made_metrics(log_likelihood_per_step=values, comparison={"flat": compared(-0.25, 0.125)}))
     _, head, _, ours, theirs = capsys.readouterr().out.splitlines()
     assert [cell.strip() for cell in head.split("┃")[1:3]] == ["Held out", "Training"]
     assert [cell.strip() for cell in ours.split("│")[:3]] == ["DDCO", "0.500", "1.000"]
@@ -89,7 +88,7 @@ def test_successes(capsys):
         "ddco": {"measures": {"success": rate, "error": mean}},
         "flat": {"measures": {"success": rate, "error": nothing}},
     }
-    console.successes({"episodes": 4, "methods": methods}, "ddco")
+    console.successes(made_metrics(rollouts={"seed": 0, "episodes": 4, "methods": methods}))
     printed = capsys.readouterr().out
     assert "4 episodes each" in printed
     ddco, flat = printed.splitlines()[-2:]

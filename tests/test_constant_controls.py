@@ -92,23 +92,23 @@ def reduced(folder: Path) -> Fit:
 def test_they_are_no_part_of_the_likelihood(whole: Fit, reduced: Fit) -> None:
     for ours, theirs in ((whole, reduced), (whole.baselines["flat"], reduced.baselines["flat"])):
         for part in ("log_likelihood_per_step", "valid", "parameters"):
-            assert ours.metrics[part] == theirs.metrics[part]
-    assert whole.metrics["divergences"] == reduced.metrics["divergences"]
-    assert whole.metrics["comparison"]["flat"]["difference"] == reduced.metrics["comparison"]["flat"]["difference"]
+            assert getattr(ours.metrics, part) == getattr(theirs.metrics, part)
+    assert whole.metrics.divergences == reduced.metrics.divergences
+    assert whole.metrics.comparison["flat"].difference == reduced.metrics.comparison["flat"].difference
     assert whole.hierarchy.scaling.varying.tolist() == FREE
 
 
 def test_each_dimension_has_its_part_of_it(whole: Fit, reduced: Fit) -> None:
     for ours, theirs in ((whole, reduced), (whole.baselines["flat"], reduced.baselines["flat"])):
         for part in ("train", "valid"):
-            found = ours.metrics["log_likelihood_by_dimension"][part]
-            assert [found["by_dimension"][d] for d in STILL] == [None, None]
-            own = [found["by_dimension"][d] for d in FREE]
-            assert own == theirs.metrics["log_likelihood_by_dimension"][part]["by_dimension"]
-            total = sum(own) + found["options"]
-            assert total == pytest.approx(ours.metrics["log_likelihood_per_step"][part], rel=1e-6)
-    assert whole.metrics["log_likelihood_by_dimension"]["train"]["options"] < 0
-    assert whole.baselines["flat"].metrics["log_likelihood_by_dimension"]["train"]["options"] == 0
+            found = getattr(ours.metrics.log_likelihood_by_dimension, part)
+            assert [found.by_dimension[d] for d in STILL] == [None, None]
+            own = [found.by_dimension[d] for d in FREE]
+            assert own == getattr(theirs.metrics.log_likelihood_by_dimension, part).by_dimension
+            total = sum(own) + found.options
+            assert total == pytest.approx(getattr(ours.metrics.log_likelihood_per_step, part), rel=1e-6)
+    assert whole.metrics.log_likelihood_by_dimension.train.options < 0
+    assert whole.baselines["flat"].metrics.log_likelihood_by_dimension.train.options == 0
 
 
 def test_what_they_are_comes_back_from_the_run(whole: Fit) -> None:
@@ -188,7 +188,7 @@ def test_what_changes_in_held_out_demonstrations_alone_stays_in(folder: Path, tm
     with_controls(demos, {"demo_7": changed}).write(path)
     found = fit(spec_for(path, compare_with=[]), out=tmp_path / "run")
     assert found.hierarchy.scaling.varying.tolist() == [0, 2, 3]
-    held_out = found.metrics["log_likelihood_by_dimension"]["valid"]["by_dimension"]
+    held_out = found.metrics.log_likelihood_by_dimension.valid.by_dimension
     assert np.isfinite(held_out[3])
     assert call("segment", tmp_path / "run", path, "--csv", tmp_path / "a.csv").status == 0
 

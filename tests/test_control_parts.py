@@ -200,7 +200,7 @@ def test_what_was_decided_comes_back_from_the_run(fitted):
     again = ddco_pyro.load(fitted.folder)
     assert again.hierarchy.scaling.parts == fitted.hierarchy.scaling.parts
     np.testing.assert_allclose(again.log_likelihood(demonstrations()), fitted.log_likelihood(demonstrations()))
-    assert again.metrics["measure"] == {
+    assert again.metrics.measure == {
         "0": ["gaussian"], "1": ["clipped", -2.0, 2.0], "2": ["binary", 0.1, 0.7], "3": ["clipped", None, 1.0],
     }  # fmt: skip
 
@@ -243,7 +243,7 @@ def test_discrete_actions_from_file_to_controller(tmp_path: Path, rows):
         controller.reset()
         expected = np.eye(3)[action] if rows else [float(action)]
         np.testing.assert_array_equal(controller.act({"state": np.eye(3)[action]}), expected)
-    assert fit.metrics["log_likelihood_per_step"]["valid"] > -0.3
+    assert fit.metrics.log_likelihood_per_step.valid > -0.3
     assert all(d < TOLERANCE for d, _ in export(fit, tmp_path / "out", onnx=True).values())
 
 

@@ -24,9 +24,9 @@ from ddco_pyro.cli import console
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.drawing import words
-from ddco_pyro.evaluation.schema import read_metrics, read_successes
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.fitting.rollouts import roll_out
+from ddco_pyro.metrics import Metrics, read_successes
 from ddco_pyro.report import agreement, header, likelihood, options, rollouts, training
 from ddco_pyro.training.data import demonstrations
 
@@ -147,25 +147,23 @@ def changed(data: Any, place: tuple[Any, ...], value: Any) -> Any:
     return copy
 
 
-def read_all(fit: Fit, metrics: dict[str, Any]) -> None:
+def read_all(fit: Fit, metrics: Metrics) -> None:
     """Everything that is read from ``metrics.json``, short of drawing it."""
     with contextlib.redirect_stdout(io.StringIO()):
         _read_all(fit, metrics)
 
 
-def _read_all(fit: Fit, metrics: dict[str, Any]) -> None:
+def _read_all(fit: Fit, metrics: Metrics) -> None:
     words.verdict(metrics), words.success(metrics)
     again = replace(fit, metrics=metrics)
     training.degeneracies(fit.spec, metrics), header(fit, metrics), training.particulars(again)
     agreement.section(again)
-    rows = likelihood.likelihoods(metrics, {name: one.metrics for name, one in fit.baselines.items()})
-    likelihood.table(rows)
-    counts = metrics["demonstrations"]
-    options.use_table(["option"], metrics["options"], sum(counts[part] for part in ("train", "tune", "valid")))
-    found = metrics.get("rollouts")
+    likelihood.table(metrics)
+    options.use_table(["option"], metrics.options, metrics.demonstrations.train)
+    found = metrics.rollouts
     if found:
-        rollouts.measures_table(found["methods"]), rollouts.paired_table(found["methods"], metrics["model"])
-        console.successes(found, "ddco")
+        rollouts.measures_table(found.methods), rollouts.paired_table(found.methods, metrics.model)
+        console.successes(metrics)
     console.log_likelihoods(metrics)
 
 
@@ -180,7 +178,7 @@ def test_whatever_is_damaged_is_refused_or_makes_no_difference_to_readers(run: P
         for value in (REMOVED, None, "text", 1.5, -1, [], {}, [[]], True)[number % every :: every]:
             path.write_text(json.dumps(changed(data, place, value)))
             try:
-                metrics = read_metrics(run, [2])
+                metrics = Metrics.read(run, [2])
             except Damaged:
                 counts["refused"] += 1
             else:

@@ -129,8 +129,8 @@ def test_a_fit_with_networks_elsewhere(demos: Demonstrations, network: str, monk
         np.testing.assert_allclose(moved[name], values, err_msg=name, **close)
     expected = here.controller().act({key: values[0] for key, values in demos[0].observations.items()})
     np.testing.assert_allclose(acted, expected, **close)
-    assert there.metrics["training"]["device"] == THERE.type
-    each = [fit.metrics["log_likelihood_per_step"]["valid"] for fit in (there, here)]
+    assert there.metrics.training.device == THERE.type
+    each = [fit.metrics.log_likelihood_per_step.valid for fit in (there, here)]
     assert each[0] == pytest.approx(each[1], rel=0 if network in SAME else 1e-3)
 
 
@@ -195,7 +195,7 @@ def test_networks_in_bfloat16(demos: Demonstrations, network: str) -> None:
     }
     first = [fit.hierarchy.eval()(fit.hierarchy.encoder.inputs([demos[0].observations])) for fit in (exact, reduced)]
     assert {tensor.dtype for said in first for tensor in said.tensors()} == {torch.float32}
-    values = [fit.metrics["log_likelihood_per_step"]["train"] for fit in (exact, reduced)]
+    values = [fit.metrics.log_likelihood_per_step.train for fit in (exact, reduced)]
     assert values[0] != values[1]
     assert values[0] == pytest.approx(values[1], abs=0.02)
 
@@ -266,7 +266,7 @@ def test_what_is_trained_elsewhere_is_finished_anywhere(demos: Demonstrations, t
     here = ddco_pyro.fit(spec, demos, tmp_path)
     for name, values in weights(there).items():
         np.testing.assert_array_equal(weights(here)[name], values)
-    assert here.metrics["training"]["device"] == THERE.type
+    assert here.metrics.training.device == THERE.type
 
 
 def test_restarts_that_were_stopped_elsewhere_keep_nothing_from_being_finished(demos, tmp_path, monkeypatch) -> None:
@@ -275,14 +275,14 @@ def test_restarts_that_were_stopped_elsewhere_keep_nothing_from_being_finished(d
     on(monkeypatch, THERE)
     with Device():
         there = ddco_pyro.fit(spec, demos, tmp_path)
-    assert sum(one["stopped"] is not None for one in there.metrics["training"]["restarts"]["each"]) == 2
+    assert sum(one.stopped is not None for one in there.metrics.training.restarts.each) == 2
     (tmp_path / "metrics.json").unlink()
     kept = {path.name: path.read_bytes() for path in (tmp_path / "checkpoints").iterdir()}
     on(monkeypatch, torch.device("cpu"))
     here = ddco_pyro.fit(spec, demos, tmp_path)
     for name, values in weights(there).items():
         np.testing.assert_array_equal(weights(here)[name], values)
-    assert here.metrics["training"] == there.metrics["training"]
+    assert here.metrics.training == there.metrics.training
     assert {path.name: path.read_bytes() for path in (tmp_path / "checkpoints").iterdir()} == kept
 
 

@@ -1,15 +1,16 @@
 import pytest
 import torch
 
-from ddco_pyro.evaluation.options import Finding, as_rows, diagnose, option_use
+from ddco_pyro.evaluation.options import Finding, diagnose, option_use
 from ddco_pyro.inference import Posterior
+from ddco_pyro.metrics import Alike, Use
 
 
 def level(*shares, durations=None):
     """Options that are selected ten times in each of two demonstrations."""
     durations = durations or [5.0] * len(shares)
     return [
-        {"choice": choice, "share": share, "selected": 20.0, "demonstrations": 2.0, "duration": duration}
+        Use(choice=choice, share=share, selected=20.0, demonstrations=2.0, duration=duration)
         for choice, (share, duration) in enumerate(zip(shares, durations, strict=True))
     ]
 
@@ -25,7 +26,7 @@ def use(*demonstrations):
             active[row, start : start + length, option] = 1
             selected[row, start, option] = 1
             start += length
-    return as_rows(option_use(Posterior((active,), (selected,), (active,))))
+    return option_use(Posterior((active,), (selected,), (active,)))
 
 
 def test_a_balanced_solution_has_no_signs():
@@ -83,7 +84,7 @@ def test_an_unused_option_is_not_also_said_to_be_short():
 
 
 def pair(first, second, divergence):
-    return {"options": [first, second], "divergence": divergence}
+    return Alike(options=(first, second), divergence=divergence)
 
 
 @pytest.mark.parametrize(("divergence", "redundant"), [(0.0999, True), (0.1, False)])

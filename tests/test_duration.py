@@ -141,6 +141,6 @@ def test_what_is_reported_is_the_likelihood_alone(demos):
     with torch.no_grad():
         values = log_likelihood(fit.hierarchy.tabulate(batch), batch.lengths).numpy()
     for part in ("train", "valid"):
-        names = [row["name"] for row in fit.metrics["demonstrations_by_likelihood"] if row["part"] == part]
+        names = [row.name for row in fit.metrics.demonstrations_by_likelihood if row.part == part]
         expected = sum(values[demos.names.index(name)] for name in names) / (20 * len(names))
-        assert fit.metrics["log_likelihood_per_step"][part] == pytest.approx(expected, rel=1e-4)
+        assert getattr(fit.metrics.log_likelihood_per_step, part) == pytest.approx(expected, rel=1e-4)

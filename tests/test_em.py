@@ -13,6 +13,7 @@ from sklearn.linear_model import LogisticRegression
 
 import ddco_pyro
 from ddco_pyro.data.controls import ControlPart
+from ddco_pyro.drawing import words
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -21,7 +22,6 @@ from ddco_pyro.spec import RidgeSpec, SpecError, parse_spec, with_overrides
 from ddco_pyro.training.checkpoint import Progress, Restart
 from ddco_pyro.training.em import Expectation, is_linear
 from ddco_pyro.training.loop import train
-from ddco_pyro.training.stages import effort
 
 EVERYTHING = ("levels.", "meta_policy.")
 LEARNED = {"learn": True, "floor": 0.01}
@@ -262,12 +262,10 @@ def small_spec(**training):
 
 def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
     fit = ddco_pyro.fit(small_spec(), demonstrations(12))
-    trained = {"ddco": fit.metrics["training"]} | {
-        name: one["training"] for name, one in fit.metrics["comparison"].items()
-    }
-    assert {name: one["by_em"] for name, one in trained.items()} == {"ddco": True, "mixture": True, "flat": False}
-    assert trained["ddco"]["spent"]["gradient_steps"] == trained["ddco"]["spent"]["epochs"]
-    assert "(EM)" in effort(trained["ddco"])
+    trained = fit.metrics.trainings
+    assert {name: one.by_em for name, one in trained.items()} == {"ddco": True, "mixture": True, "flat": False}
+    assert trained["ddco"].spent.gradient_steps == trained["ddco"].spent.epochs
+    assert "(EM)" in words.effort(trained["ddco"])
 
 
 def test_a_fit_by_em_that_is_interrupted_has_the_same_bits(tmp_path):

@@ -31,7 +31,7 @@ def rolled(toy_run, tmp_path_factory):
     """A copy of the run, rolled out and filmed; what was returned, and what was told on the way."""
     told = []
     run = ddco_pyro.load(shutil.copytree(toy_run.folder, tmp_path_factory.mktemp("rolled") / "run"))
-    before = run.metrics
+    before = json.loads((run.folder / "metrics.json").read_text())
     results = roll_out(run, EPISODES, film=2, on_event=told.append, jobs=1)
     return run, results, told, before
 
@@ -70,22 +70,22 @@ def test_progress_is_told_for_every_episode(rolled):
 def test_metrics_can_be_computed_again_from_the_table(rolled, rows):
     run, results, _, before = rolled
     metrics = json.loads((run.folder / "metrics.json").read_text())
-    assert metrics == before | {"rollouts": results}
-    assert (results["seed"], results["episodes"], list(results["methods"])) == (FIRST, EPISODES, METHODS)
+    assert metrics == before | {"rollouts": results.model_dump(mode="json")}
+    assert (results.seed, results.episodes, list(results.methods)) == (FIRST, EPISODES, METHODS)
     ours = values(rows, "ddco", "success")
-    for method, found in results["methods"].items():
+    for method, found in results.methods.items():
         successes, errors = values(rows, method, "success"), values(rows, method, "error")
         applies = [error for error in errors if not math.isnan(error)]
-        success, error = found["measures"]["success"], found["measures"]["error"]
-        assert (success["successes"], success["trials"]) == (sum(successes), EPISODES)
-        assert error["trials"] == len(applies)
-        assert not applies or error["mean"] == pytest.approx(np.mean(applies))
+        success, error = found.measures["success"], found.measures["error"]
+        assert (success.successes, success.trials) == (sum(successes), EPISODES)
+        assert error.trials == len(applies)
+        assert not applies or error.mean == pytest.approx(np.mean(applies))
         if method == "ddco":
-            assert "against" not in found
+            assert found.against is None
             continue
         wins = sum(a > b for a, b in zip(ours, successes, strict=True))
         losses = sum(a < b for a, b in zip(ours, successes, strict=True))
-        assert (found["against"]["only_ours"], found["against"]["only_theirs"]) == (wins, losses)
+        assert (found.against.only_ours, found.against.only_theirs) == (wins, losses)
 
 
 def test_the_first_episodes_of_each_method_are_filmed(rolled):
@@ -100,7 +100,7 @@ def test_rolling_out_again_gives_the_same(rolled, toy_run, tmp_path):
     again = ddco_pyro.load(shutil.copytree(toy_run.folder, tmp_path / "again"))
     roll_out(again, EPISODES, film=0, jobs=2)
     assert (again.folder / "rollouts.csv").read_bytes() == (run.folder / "rollouts.csv").read_bytes()
-    assert again.metrics["rollouts"] == results
+    assert again.metrics.rollouts == results
     assert not (again.folder / "videos").exists()
 
 
@@ -164,7 +164,7 @@ def test_others_are(copied, change, episodes, film, resume):
     results = roll_out(copied, episodes, film, told.append, jobs=1, resume=resume)
     methods = METHODS[1:] if change == "method" else METHODS
     assert Counter(event.method for event in told) == dict.fromkeys(methods, episodes)
-    assert (list(results["methods"]), results["episodes"]) == (methods, episodes)
+    assert (list(results.methods), results.episodes) == (methods, episodes)
 
 
 def interrupted(run, after, **options):
@@ -188,7 +188,7 @@ def fresh(toy_run, tmp_path):
 def test_what_was_interrupted_goes_on_with_the_next_method(rolled, fresh, monkeypatch):
     run, results, *_ = rolled
     interrupted(fresh, after=2 * EPISODES + 3)
-    assert "rollouts" not in fresh.metrics
+    assert fresh.metrics.rollouts is None
     begun, told = [], []
 
     def counted(task, policy, *rest):

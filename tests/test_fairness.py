@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import re
 import shutil
@@ -20,7 +19,8 @@ from ddco_pyro.comparison.page import write
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.report import unconverged, write_report
+from ddco_pyro.metrics import Metrics
+from ddco_pyro.report import write_report
 from ddco_pyro.selection import Workers, select
 from ddco_pyro.selection.choice import as_data, choose, markdown, table
 from ddco_pyro.spec import SpecError, dump_spec, with_overrides
@@ -67,10 +67,7 @@ def test_a_baseline_beside_trains_as_it_would_alone(toy_spec, tmp_path):
     beside = fit(with_overrides(toy_spec, shared | {"compare_with": [OWN]}), out=tmp_path / "beside").baselines["flat"]
     alone = {"hierarchy": None, "baseline": {**OWN, "optimizer": None}, "compare_with": []}
     spec = with_overrides(toy_spec, shared | alone | {"training.optimizer.lr": 0.03})
-    assert (
-        beside.metrics["log_likelihood_per_step"]
-        == fit(spec, out=tmp_path / "alone").metrics["log_likelihood_per_step"]
-    )
+    assert beside.metrics.log_likelihood_per_step == fit(spec, out=tmp_path / "alone").metrics.log_likelihood_per_step
     assert beside.spec.training == spec.training
 
 
@@ -118,8 +115,8 @@ def test_flat_equal_has_as_many_parameters_as_the_hierarchy(fitted):
     ours = policies + options * perceptron((), outputs=1) + perceptron((count,), outputs=options)
     width = min(range(1, 1000), key=lambda h: abs(perceptron((h,)) - ours))
     equal = run.baselines["flat_equal"]
-    assert run.metrics["parameters"] == ours
-    assert equal.metrics["parameters"] == run.metrics["comparison"]["flat_equal"]["parameters"] == perceptron((width,))
+    assert run.metrics.parameters == ours
+    assert equal.metrics.parameters == run.metrics.comparison["flat_equal"].parameters == perceptron((width,))
     assert abs(perceptron((width,)) - ours) <= 4  # a unit has 8
     assert equal.spec.baseline.policy.hidden == (width,)
     assert equal.spec.baseline.kind == equal.name == "flat_equal"
@@ -129,10 +126,10 @@ def test_check_shows_the_width_and_the_sizes(spec, fitted):
     run, _ = fitted
     printed = call("check", spec, "--set", "compare_with=[flat, flat_equal]").out  # the toy task does not say its steps
     shown = [[cell.strip() for cell in line.split("│")] for line in printed.splitlines() if "│" in line]
-    sizes = {name: str(one.metrics["parameters"]) for name, one in run.baselines.items()}
+    sizes = {name: str(one.metrics.parameters) for name, one in run.baselines.items()}
     width = run.baselines["flat_equal"].spec.baseline.policy.hidden[0]
     assert shown[-3:] == [
-        ["all networks", str(run.metrics["parameters"])],
+        ["all networks", str(run.metrics.parameters)],
         ["compare_with.0: flat, hidden: [64]", sizes["flat"]],
         [f"compare_with.1: flat_equal, hidden: [{width}]", sizes["flat_equal"]],
     ]
@@ -146,13 +143,13 @@ def test_flat_equal_is_a_run_of_its_own(fitted, tmp_path):
     assert "flat of equal size" in write_report(alone, demos).read_text().lower()
     again = call("fit", alone.folder / "spec.yaml", "--out", tmp_path / "again")
     assert again.status == 0, again.err
-    assert ddco_pyro.load(tmp_path / "again").metrics["parameters"] == alone.metrics["parameters"]
+    assert ddco_pyro.load(tmp_path / "again").metrics.parameters == alone.metrics.parameters
     assert (tmp_path / "again" / "spec.yaml").read_text() == dump_spec(alone.spec)
 
 
 def test_flat_equal_is_rolled_out_and_compared(fitted, tmp_path):
     copied = ddco_pyro.load(shutil.copytree(fitted[0].folder, tmp_path / "run"))
-    assert set(roll_out(copied, 2, jobs=1)["methods"]) >= {"ddco", *BASELINES}
+    assert set(roll_out(copied, 2, jobs=1).methods) >= {"ddco", *BASELINES}
     found = compare([copied.folder, *(copied.folder / "baselines" / name for name in BASELINES)])
     assert {row.model for row in found.rows} == {"ddco", *BASELINES}
     assert len(found.rollouts) == 3
@@ -164,9 +161,9 @@ def test_flat_equal_is_rolled_out_and_compared(fitted, tmp_path):
 def test_every_method_has_the_same_budget(fitted):
     """Eight training demonstrations in minibatches of three: three gradient steps in an epoch."""
     metrics = fitted[0].metrics
-    for row in (metrics, *metrics["comparison"].values()):
-        assert row["training"]["budget"] == row["training"]["spent"] == {"epochs": 9, "gradient_steps": 27}
-    assert [stage["cap"] for stage in metrics["training"]["stages"]] == [2, 2, 2, 3]
+    for training in metrics.trainings.values():
+        assert dict(training.budget) == dict(training.spent) == {"epochs": 9, "gradient_steps": 27}
+    assert [stage.cap for stage in metrics.training.stages] == [2, 2, 2, 3]
 
 
 def test_candidates_of_a_selection_have_the_same_budget(tmp_path):
@@ -184,24 +181,24 @@ def test_candidates_of_a_selection_have_the_same_budget(tmp_path):
 def test_stages_that_needed_more_are_named_on_the_console(fitted):
     run, ended = fitted
     said = " ".join(ended.out.split())
-    for name, row in {"ddco": run.metrics, **run.metrics["comparison"]}.items():
-        assert not row["training"]["converged"]
+    for name, training in run.metrics.trainings.items():
+        assert not training.converged
         assert re.search(rf" {words.method(name)} │[^┃]*│ 27, not converged ", said)
-        for stage in row["training"]["stages"]:
-            rise = f"{stage['rising']:.2f} nats per step over the last {stage['epochs']})"
-            assert f"stage {stage['stage']} after {stage['epochs']} epochs (tuning log-likelihood up by {rise}" in said
+        for stage in training.stages:
+            rise = f"{stage.rising:.2f} nats per step over the last {stage.epochs})"
+            assert f"stage {stage.stage} after {stage.epochs} epochs (tuning log-likelihood up by {rise}" in said
     assert said.count("warning: ") >= 4
     assert "warning: DDCO has not converged: the budget ended stage vq-1 after 2 epochs" in said
     assert "warning: Flat of equal size has not converged: the budget ended stage policy after 9 epochs" in said
 
 
 def test_earlier_stages_are_named_where_the_last_one_has_converged(fitted):
-    metrics = copy.deepcopy(fitted[0].metrics) | {"comparison": {}}
-    metrics["training"]["stages"][1] |= {"converged": True}
-    metrics["training"]["stages"][2] |= {"epochs": 0}
-    metrics["training"]["stages"][3] |= {"converged": True}
-    metrics["training"]["converged"] = True
-    ((text, _),) = unconverged(metrics)
+    data = fitted[0].metrics.model_dump() | {"comparison": {}}
+    data["training"]["stages"][1] |= {"converged": True}
+    data["training"]["stages"][2] |= {"epochs": 0}
+    data["training"]["stages"][3] |= {"converged": True}
+    data["training"]["converged"] = True
+    ((text, _),) = words.unconverged(Metrics.model_validate(data))
     assert text.startswith(
         "Earlier stages of DDCO had not converged: the budget ended stage vq-1 after 2 epochs (tuning log-"
     )
@@ -213,7 +210,7 @@ def test_earlier_stages_are_named_where_the_last_one_has_converged(fitted):
 def test_the_report_says_so_too(fitted):
     run, _ = fitted
     shown = (run.folder / "report.html").read_text()
-    for text, advice in unconverged(run.metrics):
+    for text, advice in words.unconverged(run.metrics):
         assert text in shown
         assert advice in shown
     assert shown.count("<td>27, not converged</td>") == 4
@@ -222,8 +219,8 @@ def test_the_report_says_so_too(fitted):
 
 def test_where_nothing_rises_nothing_is_said(still, tmp_path):
     run, ended = still
-    assert run.metrics["training"]["converged"]
-    assert unconverged(run.metrics) == []
+    assert run.metrics.training.converged
+    assert words.unconverged(run.metrics) == []
     assert "converged" not in ended.out
     assert "converged" not in (run.folder / "report.html").read_text()
     assert "converged" not in write_markdown(compare([run.folder, run.folder / "baselines" / "flat"]), tmp_path)

@@ -45,9 +45,9 @@ def test_without_skill_options_gain_nothing(at_once):
     demos, gained = no_ops(30, at_once=at_once), {}
     for kind in ("gaussian", "auto"):
         spec = with_overrides(spec_of(epochs=100, kind=kind), {"compare_with": ["flat"]})
-        gained[kind] = ddco_pyro.fit(spec, demos).metrics["comparison"]["flat"]["difference"]
-    assert gained["gaussian"]["nats_per_step"] > 1
-    assert abs(gained["auto"]["nats_per_step"]) < 3 * gained["auto"]["standard_error"] < 0.075
+        gained[kind] = ddco_pyro.fit(spec, demos).metrics.comparison["flat"].difference
+    assert gained["gaussian"].nats_per_step > 1
+    assert abs(gained["auto"].nats_per_step) < 3 * gained["auto"].standard_error < 0.075
 
 
 # --- what is decided --------------------------------------------------------------------------------------------------
@@ -150,19 +150,19 @@ def test_what_was_decided_comes_back_from_the_run(fitted):
     again = ddco_pyro.load(fitted.folder)
     assert again.hierarchy.scaling.parts == fitted.hierarchy.scaling.parts
     np.testing.assert_array_equal(again.log_likelihood(mixed()), fitted.log_likelihood(mixed()))
-    assert again.metrics["measure"] == {
+    assert again.metrics.measure == {
         "0": ["hurdle", -1.0, 1.0, 0.0, [0]],
         "1": ["hurdle", None, None, STILL, [1, 2]],
         "2": ["hurdle", None, None, 0.0, [1, 2]],
         "3": ["binary", 0.0, 1.0],
     }
-    assert again.metrics["engine_check"]["value"] < 1e-6
+    assert again.metrics.engine_check.value < 1e-6
 
 
 def test_what_dimensions_add_is_the_likelihood(fitted):
-    each = fitted.metrics["log_likelihood_by_dimension"]["valid"]
-    total = fitted.metrics["log_likelihood_per_step"]["valid"]
-    assert sum(each["by_dimension"]) + each["options"] == pytest.approx(total, rel=1e-6)
+    each = fitted.metrics.log_likelihood_by_dimension.valid
+    total = fitted.metrics.log_likelihood_per_step.valid
+    assert sum(each.by_dimension) + each.options == pytest.approx(total, rel=1e-6)
 
 
 def test_scaling_keeps_exactly_the_value_apart(fitted):

@@ -44,14 +44,14 @@ def test_each_level_is_measured_with_its_own_labels(tmp_path, monkeypatch, label
     monkeypatch.chdir(tmp_path)
     demonstrations().write(tmp_path / "demos.hdf5")
     fit = ddco_pyro.fit(spec(labels), out=tmp_path / "run")
-    metrics = fit.metrics["agreement"]
-    assert metrics["labels"] == names
-    valid = demonstrations().select([row["name"] for row in fit.metrics["valid"]])
-    measured = zip(fit.segment(valid), names, metrics["valid"], metrics["confusion"], strict=True)
+    metrics = fit.metrics.agreement
+    assert metrics.labels == names
+    valid = demonstrations().select([row.name for row in fit.metrics.valid])
+    measured = zip(fit.segment(valid), names, metrics.valid, metrics.confusion, strict=True)
     for level, name, found, table in measured:
         truth = [demo.labels[name] for demo in valid]
         assert found == agreement(list(level), truth)
-        assert np.sum(table["steps"]) == sum((one >= 0).sum() for one in truth)
+        assert np.sum(table.steps) == sum((one >= 0).sum() for one in truth)
     page = write_report(ddco_pyro.load(tmp_path / "run"), fit.demonstrations).read_text()
     for level, name in zip(("low", "high"), names, strict=True):
         assert f"Where each label’s steps lie: level “{level}”, label “{name}”" in page

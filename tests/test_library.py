@@ -54,7 +54,7 @@ def in_memory(commanded: Path) -> ddco_pyro.Fit:
 
 
 def numbers(fit: ddco_pyro.Fit) -> dict[str, object]:
-    return {key: value for key, value in fit.metrics.items() if key != "seconds"}
+    return fit.metrics.model_dump(exclude={"seconds"})
 
 
 def test_the_fit_in_memory_is_the_commands(in_memory: ddco_pyro.Fit, commanded: Path) -> None:
@@ -108,7 +108,7 @@ def test_masks_of_demonstrations_from_memory_say_which_are_held_out(in_memory: d
     given = replace(two_skills(), demonstrations=tuple(reversed(two_skills())), masks={"valid": names[2:5]})
     kept = ddco_pyro.fit(in_memory.spec, given, out=tmp_path / "run")
     for fit in (kept, ddco_pyro.fit(in_memory.spec, given)):
-        assert tuple(one["name"] for one in fit.metrics["valid"]) == names[2:5]
+        assert tuple(one.name for one in fit.metrics.valid) == names[2:5]
     assert Demonstrations.read(tmp_path / "run" / "demonstrations.hdf5", ["place"]).masks == {"valid": names[2:5]}
 
 
@@ -137,7 +137,7 @@ def test_several_baselines_of_a_kind(commanded: Path, tmp_path: Path) -> None:
     fit = ddco_pyro.fit(parse_spec(data), out=tmp_path / "run")
     loaded = ddco_pyro.load(tmp_path / "run")
     for one in (fit, loaded):
-        assert list(one.metrics["comparison"]) == list(one.baselines) == ["flat", "flat_2"]
+        assert list(one.metrics.comparison) == list(one.baselines) == ["flat", "flat_2"]
         networks = [beside.spec.baseline.policy.network for beside in one.baselines.values()]
         assert networks == ["linear", "mlp"]
     outcomes = {"ddco": (1, 1), "flat": (0, 1), "flat_2": (0, 0)}
@@ -224,15 +224,17 @@ def test_demonstrations_are_taken_as_they_are_needed(in_memory: ddco_pyro.Fit, m
 
 
 def test_evaluation_does_not_depend_on_the_pieces(in_memory: ddco_pyro.Fit, monkeypatch) -> None:
-    from ddco_pyro.evaluation.metrics import evaluate
+    from ddco_pyro.fitting.evaluation import evaluate
     from ddco_pyro.training.data import parts
 
     demos = two_skills()
     monkeypatch.setattr("ddco_pyro.model.hierarchy.STEPS_AT_ONCE", 1)
-    again = evaluate(in_memory, parts(in_memory.spec, demos), demos)
+    about = ("engine_check", "demonstrations", "measure", "control_dimensions", "parameters", "training", "seconds")
+    known = {name: getattr(in_memory.metrics, name) for name in (*about, "versions")}
+    again = evaluate(in_memory, parts(in_memory.spec, demos), demos, **known).model_dump()
     for key in ("options", "divergences", "valid", "log_likelihood_by_dimension"):
         assert len(str(again[key])) > 10
-        compare(again[key], in_memory.metrics[key])
+        compare(again[key], in_memory.metrics.model_dump()[key])
 
 
 def compare(ours: object, theirs: object) -> None:

@@ -85,9 +85,9 @@ def fitted(name, observed):
 
 def worth(fit):
     """What options that last are worth, held-out nats per step: mean, and the ends of its 95 % t interval."""
-    found, held_out = fit.metrics["worth"]["memory"], fit.metrics["demonstrations"]["valid"]
-    half = found["standard_error"] * stats.t.ppf(0.975, held_out - 1)
-    return found["nats_per_step"], found["nats_per_step"] - half, found["nats_per_step"] + half
+    found, held_out = fit.metrics.worth.memory, fit.metrics.demonstrations.valid
+    half = found.standard_error * stats.t.ppf(0.975, held_out - 1)
+    return found.nats_per_step, found.nats_per_step - half, found.nats_per_step + half
 
 
 def successes(outcomes):

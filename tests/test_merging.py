@@ -18,6 +18,7 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.merging import LABELS, MergeError, Pair, chosen, merge, merged_labels, merged_spec
+from ddco_pyro.metrics import Metrics
 from ddco_pyro.spec import with_overrides
 from ddco_pyro.training.data import parts
 
@@ -51,7 +52,7 @@ def test_the_halves_of_a_planted_option_are_found_and_made_one(planted):
     assert merged.spec.hierarchy.levels[0].count == 2
     found, true = table(merged, truth)
     assert normalized_mutual_info_score(true, found) > 0.95
-    before, after = (one.metrics["log_likelihood_per_step"]["valid"] for one in (run, merged))
+    before, after = (one.metrics.log_likelihood_per_step.valid for one in (run, merged))
     assert after > before - 0.05
 
 
@@ -69,17 +70,19 @@ def test_what_training_begins_from(planted, monkeypatch, options, labels):
     assert labelled.labels[LABELS].tolist() == labels
 
 
+def with_divergences(run, rows):
+    return replace(run, metrics=Metrics.model_validate(run.metrics.model_dump() | {"divergences": [rows]}))
+
+
 def test_the_pair_that_acts_most_alike_is_meant(planted):
     run, _ = planted
     rows = [{"options": [1, 2], "divergence": 0.4}, {"options": [1, 3], "divergence": None},
             {"options": [2, 3], "divergence": 0.3}]  # fmt: skip
-    told = replace(run, metrics=run.metrics | {"divergences": [rows]})
+    told = with_divergences(run, rows)
     assert chosen(told) == Pair(0, (2, 3), 0.3)
     assert chosen(told, "level-1", (3, 1)) == Pair(0, (1, 3), None)
-    for row in rows:
-        row["divergence"] = None
-    with pytest.raises(MergeError, match=r"^the fit: no two options of level 'level-1' are used"):
-        chosen(told)
+    with pytest.raises(MergeError, match=r"^this fit: no two options of level 'level-1' are used"):
+        chosen(with_divergences(run, [row | {"divergence": None} for row in rows]))
 
 
 @pytest.mark.parametrize(
@@ -135,7 +138,7 @@ def test_the_command_writes_a_run_and_goes_on_where_it_was(toy_run, tmp_path):
     arguments = ("merge", toy_run.folder, "--out", tmp_path / "merged", "--jobs", 1)
     ended = call(*arguments)
     assert ended.status == 0, ended.err
-    values = [run.metrics["log_likelihood_per_step"]["valid"] for run in (toy_run, ddco_pyro.load(tmp_path / "merged"))]
+    values = [run.metrics.log_likelihood_per_step.valid for run in (toy_run, ddco_pyro.load(tmp_path / "merged"))]
     said = " ".join(ended.out.split())
     before, after = map(words.number, values)
     assert re.search(rf"Merged options 1 and 2 \([\d.]+ nats/step apart\): held-out {before} → {after} nats/step", said)

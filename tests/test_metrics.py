@@ -12,6 +12,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import json_text
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.rollouts import policies
+from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.training.data import parts
@@ -57,14 +58,14 @@ def test_a_baseline_of_the_models_own_kind_has_numbers_of_its_own(tmp_path):
     valid = parts(spec, demos)["valid"]
     steps = sum(valid.lengths)
     ours = run.log_likelihood(valid)
-    assert list(run.metrics["comparison"]) == list(run.baselines) == ["flat_2", "flat_3"]
-    assert run.metrics["log_likelihood_per_step"]["valid"] == pytest.approx(ours.sum() / steps)
+    assert list(run.metrics.comparison) == list(run.baselines) == ["flat_2", "flat_3"]
+    assert run.metrics.log_likelihood_per_step.valid == pytest.approx(ours.sum() / steps)
     for name, beside in run.baselines.items():
-        theirs, said = beside.log_likelihood(valid), run.metrics["comparison"][name]
+        theirs, said = beside.log_likelihood(valid), run.metrics.comparison[name]
         assert abs(ours.sum() - theirs.sum()) / steps > 0.1  # or this could not tell one from the other
-        assert said["log_likelihood_per_step"]["valid"] == pytest.approx(theirs.sum() / steps)
-        assert said["difference"]["nats_per_step"] == pytest.approx((ours.sum() - theirs.sum()) / steps)
-    listed = {row["name"]: row["log_likelihood_per_step"] for row in run.metrics["demonstrations_by_likelihood"]}
+        assert said.log_likelihood_per_step.valid == pytest.approx(theirs.sum() / steps)
+        assert said.difference.nats_per_step == pytest.approx((ours.sum() - theirs.sum()) / steps)
+    listed = {row.name: row.log_likelihood_per_step for row in run.metrics.demonstrations_by_likelihood}
     for name, value, length in zip(valid.names, ours, valid.lengths, strict=True):
         assert listed[name]["flat"] == pytest.approx(value / length)
     assert list(ddco_pyro.load(tmp_path / "run").baselines) == ["flat_2", "flat_3"]
@@ -80,8 +81,9 @@ def test_a_single_held_out_demonstration_has_no_error_and_every_file_is_json(tmp
     spec = make_spec(0.1, hierarchy={"levels": [{"count": 2}]}, compare_with=["flat"])
     run = ddco_pyro.fit(spec, demonstrations(6), out=tmp_path / "run")
     again = ddco_pyro.load(tmp_path / "run")
-    for metrics in (run.metrics, again.metrics, strictly((tmp_path / "run" / "metrics.json").read_text())):
-        assert metrics["comparison"]["flat"]["difference"]["standard_error"] is None
+    read = strictly((tmp_path / "run" / "metrics.json").read_text())
+    for metrics in (run.metrics, again.metrics, Metrics.model_validate(read)):
+        assert metrics.comparison["flat"].difference.standard_error is None
     assert "(error unknown) (1 held-out demonstration" in words.verdict(run.metrics)
     page = write_report(run, run.demonstrations).read_text()
     assert "± –" in page

@@ -21,6 +21,7 @@ from ddco_pyro.drawing import words
 from ddco_pyro.evaluation.worth import mean_run, worth
 from ddco_pyro.inference import log_likelihood, posterior
 from ddco_pyro.inference.engines import compare_engines
+from ddco_pyro.metrics import Worth
 from ddco_pyro.model.batch import encode
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import always_ends
@@ -254,14 +255,14 @@ def run(tmp_path_factory):
 
 def test_a_fit_trains_it_beside_with_the_same_budget(run):
     mixture = run.baselines["mixture"]
-    assert run.metrics["comparison"]["mixture"]["training"]["budget"] == run.metrics["training"]["budget"]
-    stages = [[stage["stage"] for stage in fit.metrics["training"]["stages"]] for fit in (run, mixture)]
+    assert run.metrics.comparison["mixture"].training.budget == run.metrics.training.budget
+    stages = [[stage.stage for stage in fit.metrics.training.stages] for fit in (run, mixture)]
     assert stages[0] == stages[1]
-    assert mixture.metrics["engine_check"]["value"] < 1e-6
+    assert mixture.metrics.engine_check.value < 1e-6
     assert mixture.spec.training.labels == run.spec.training.labels
     again = ddco_pyro.load(run.folder / "baselines" / "mixture")
     np.testing.assert_array_equal(again.log_likelihood(run.demonstrations), mixture.log_likelihood(run.demonstrations))
-    lasting = parameters(build_hierarchy(run.spec, Dimensions.of(run.demonstrations))) - mixture.metrics["parameters"]
+    lasting = parameters(build_hierarchy(run.spec, Dimensions.of(run.demonstrations))) - mixture.metrics.parameters
     assert lasting == sum(p.numel() for p in run.hierarchy.levels[0].termination.parameters())
 
 
@@ -272,12 +273,12 @@ def test_the_worth_of_a_hierarchy_has_two_parts():
     """Hand-made likelihoods of two demonstrations with 2 and 3 steps: the parts add up, in nats per step."""
     values = {"ddco": np.array([6.0, 9.0]), "mixture": np.array([4.0, 8.0]), "flat": np.array([-1.0, -2.0])}
     found = worth("ddco", values, (2, 3))
-    means = {part: found[part]["nats_per_step"] for part in ("memory", "experts", "total")}
+    means = {part: getattr(found, part).nats_per_step for part in ("memory", "experts", "total")}
     assert means == pytest.approx({"memory": 3 / 5, "experts": 15 / 5, "total": 18 / 5})
-    assert found["flat"] == "flat"
-    assert worth("ddco", values | {"mixture": values["flat"]}, (2, 3))["experts"]["nats_per_step"] == 0
-    assert worth("mixture", values, (2, 3)) == worth("ddco", {"flat": values["flat"]}, (2, 3)) == {}
-    assert worth("ddco", {name: values[name] for name in ("ddco", "mixture")}, (2, 3)).keys() == {"memory"}
+    assert found.flat == "flat"
+    assert worth("ddco", values | {"mixture": values["flat"]}, (2, 3)).experts.nats_per_step == 0
+    assert worth("mixture", values, (2, 3)) is worth("ddco", {"flat": values["flat"]}, (2, 3)) is None
+    assert worth("ddco", {name: values[name] for name in ("ddco", "mixture")}, (2, 3)).total is None
 
 
 @pytest.mark.parametrize(
@@ -294,19 +295,20 @@ def test_the_worth_of_a_hierarchy_has_two_parts():
             0.1,
             "In this fit options that last explain held-out controls worse than the same experts without memory.",
         ),
-        (0.5, math.nan, "This fit does not show that options that last are worth anything."),
+        (0.5, None, "This fit does not show that options that last are worth anything."),
     ],
 )
 def test_the_verdict_is_about_options_that_last(memory, error, said):
     parts = {"memory": memory, "experts": 2.0, "total": 2.0 + memory}
     found = {name: {"nats_per_step": value, "standard_error": error} for name, value in parts.items()}
-    text = words.worth(found | {"flat": "flat", "steps_in_a_row": [{"options": 9.0, "mixture": 3.0}]}, "DDCO", 10)
+    long, rows = ([{"options": options, "mixture": mixture}] for options, mixture in ((9.0, 3.0), (3.0, 4.0)))
+    text = words.worth(Worth(**found, flat="flat", steps_in_a_row=long), "DDCO", 10)
     total, plus = words.signed(2.0 + memory), f"{words.signed(memory)} ± {words.number(error)}"
     assert text == (
         f"Of {total} nats per step over flat, +2.00 ± {words.number(error)} come from several experts (mixture − flat) "
         f"and {plus} from options that last (DDCO − mixture). {said}"
     )
-    short = words.worth(found | {"steps_in_a_row": [{"options": 3.0, "mixture": 4.0}]}, "DDCO", 10)
+    short = words.worth(Worth(**found, steps_in_a_row=rows), "DDCO", 10)
     assert short.endswith("Options stay active no longer (3.0 steps) than the mixture keeps to one expert (4.0).")
 
 
@@ -316,12 +318,12 @@ def test_how_long_a_choice_is_kept():
 
 def test_a_run_says_what_lasting_is_worth(run):
     """By the likelihoods of what it held out, computed anew."""
-    held_out = run.demonstrations.select(row["name"] for row in run.metrics["valid"])
+    held_out = run.demonstrations.select(row.name for row in run.metrics.valid)
     ours, mixture = (fit.log_likelihood(held_out).sum() for fit in (run, run.baselines["mixture"]))
-    found = run.metrics["worth"]
-    assert found["memory"]["nats_per_step"] == pytest.approx((ours - mixture) / sum(held_out.lengths))
+    found = run.metrics.worth
+    assert found.memory.nats_per_step == pytest.approx((ours - mixture) / sum(held_out.lengths))
     (path,) = run.segment(held_out)
-    assert found["steps_in_a_row"][0]["options"] == pytest.approx(mean_run([row[row >= 0] for row in path]))
+    assert found.steps_in_a_row[0].options == pytest.approx(mean_run([row[row >= 0] for row in path]))
     assert words.worth(found, "DDCO", len(held_out)) in words.verdict(run.metrics)
 
 

@@ -151,8 +151,9 @@ def test_what_several_files_keep_of_a_seed_is_joined_by_method(seeds):
 def test_some_fits_are_done_again_beside_what_is_kept_of_the_others(tmp_path, monkeypatch):
     """The file then has the records of both codes; with other settings nothing that was kept is taken over."""
     monkeypatch.setattr(needle_success, "fit", lambda spec, out: out.name)
-    monkeypatch.setattr(needle_success, "roll_out", lambda fitted, episodes, jobs: episodes)
-    monkeypatch.setattr(needle_success, "_numbers", lambda fitted, rolled: {"methods": {fitted: rolled}})
+    rolled = {}
+    monkeypatch.setattr(needle_success, "roll_out", lambda fitted, episodes, jobs: rolled.update({fitted: episodes}))
+    monkeypatch.setattr(needle_success, "_numbers", lambda fitted: {"methods": {fitted: rolled[fitted]}})
     parser = needle_success.described(None, seeds=1, episodes=60)
 
     def kept(code, *words):
@@ -162,9 +163,9 @@ def test_some_fits_are_done_again_beside_what_is_kept_of_the_others(tmp_path, mo
         return content["results"]["methods"], [one["code"][0] for one in content["provenance"]]
 
     assert kept("a") == ({"ddco": 60, "flat": 60, "per_timestep": 60}, ["a"])
-    monkeypatch.setattr(needle_success, "_numbers", lambda fitted, rolled: {"methods": {fitted: -rolled}})
+    monkeypatch.setattr(needle_success, "_numbers", lambda fitted: {"methods": {fitted: -rolled[fitted]}})
     assert kept("b", "--fits", "ddco") == ({"ddco": -60, "flat": 60, "per_timestep": 60}, ["a", "b"])
     assert kept("c", "--fits", "ddco", "--episodes", "7") == ({"ddco": -7}, ["c"])
-    monkeypatch.setattr(needle_success, "_numbers", lambda fitted, rolled: {"methods": {fitted: rolled}})
+    monkeypatch.setattr(needle_success, "_numbers", lambda fitted: {"methods": {fitted: rolled[fitted]}})
     assert kept("c", "--episodes", "7") == ({"ddco": 7, "flat": 7, "per_timestep": 7}, ["c"])
     assert kept("d", "--episodes", "7", "--fits", "flat_clock") == ({"ddco": 7, "flat": 7, "per_timestep": 7}, ["c"])

@@ -11,7 +11,7 @@ import torch
 from command_line import call
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.evaluation.metrics import NotFinite, evaluate
+from ddco_pyro.fitting.evaluation import NotFinite, evaluate
 from ddco_pyro.fitting.fit import Fit, fit
 from ddco_pyro.model.networks import Inputs, InputShape
 from ddco_pyro.spec import parse_spec

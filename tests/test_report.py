@@ -11,7 +11,7 @@ from moving_demonstrations import made, reaches, recorded
 from ddco_pyro.drawing import words
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.fitting.fit import fit, load
-from ddco_pyro.fitting.run import write_metrics
+from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import rollouts as rolling
 from ddco_pyro.report import write_report
 from ddco_pyro.report.activity import activity
@@ -66,7 +66,9 @@ def deep(tmp_path_factory):
         training={"epochs": 12, "restarts": 2},
         compare_with=[{"kind": "flat", "policy": LINEAR}, {"kind": "per_timestep"}],
     )
-    write_metrics(found.folder, found.metrics | {"rollouts": rollouts(), "options": unused(found.metrics["options"])})
+    data = found.metrics.model_dump() | {"rollouts": rollouts()}
+    data["options"][0][2]["share"] = 0.001
+    Metrics.model_validate(data).write(found.folder)
     frames = np.random.default_rng(0).integers(0, 255, (5, 48, 64, 3), dtype=np.uint8)
     (found.folder / "videos").mkdir()
     for name in ("flat-1000", "ddco-1000", "ddco-1001"):
@@ -90,11 +92,6 @@ def rollouts():
         "ddco": {"measures": outcomes(OURS)},
     }
     return {"seed": 1000, "episodes": 4, "methods": methods}
-
-
-def unused(options):
-    options[0][2]["share"] = 0.001
-    return options
 
 
 class Resources(HTMLParser):
@@ -162,29 +159,29 @@ def test_a_baseline_has_no_options(labelled):
 def test_numbers_are_those_of_the_metrics(labelled):
     found, page, _ = labelled
     metrics, shown = found.metrics, " ".join(text(page).split())
-    for one in (metrics["log_likelihood_per_step"], metrics["comparison"]["flat"]["log_likelihood_per_step"]):
-        assert f" {words.number(one['valid'])} " in shown
-        assert f" {words.number(one['train'])} " in shown
-    difference = metrics["comparison"]["flat"]["difference"]
-    mean, error = words.signed(difference["nats_per_step"]), words.number(difference["standard_error"])
+    for one in (metrics.log_likelihood_per_step, metrics.comparison["flat"].log_likelihood_per_step):
+        assert f" {words.number(one.valid)} " in shown
+        assert f" {words.number(one.train)} " in shown
+    difference = metrics.comparison["flat"].difference
+    mean, error = words.signed(difference.nats_per_step), words.number(difference.standard_error)
     assert f"{mean} ± {error}" in shown
-    for use in metrics["options"][0][1:]:
-        assert f" {words.percent(use['share'], 1)} " in shown
-        assert f" {words.number(use['duration'], 1)} " in shown
+    for use in metrics.options[0][1:]:
+        assert f" {words.percent(use.share, 1)} " in shown
+        assert f" {words.number(use.duration, 1)} " in shown
     for part in ("train", "valid"):
-        (scores,) = metrics["agreement"][part]
-        alone = [words.number(scores[name]) for name in UNMATCHED]
+        (scores,) = getattr(metrics.agreement, part)
+        alone = [words.number(getattr(scores, name)) for name in UNMATCHED]
         whole, each = (
-            [words.number(scores[way][name]) for name in MATCHED]
+            [words.number(getattr(getattr(scores, way), name)) for name in MATCHED]
             for way in ("matched_globally", "matched_per_demonstration")
         )
         assert " ".join([*alone, "one for all", *whole, "each its own", *each]) in shown
-    (table,) = metrics["agreement"]["confusion"]
-    for label, steps in zip(table["labels"], table["steps"], strict=True):
+    (table,) = metrics.agreement.confusion
+    for label, steps in zip(table.labels, table.steps, strict=True):
         shares = [words.percent(count / sum(steps)) for count in steps if count]
         assert " ".join([str(label), str(sum(steps)), *shares]) in shown
-    assert f"{metrics['engine_check']['value']:.1e}" in shown
-    assert metrics["versions"]["torch"] in shown
+    assert f"{metrics.engine_check.value:.1e}" in shown
+    assert metrics.versions["torch"] in shown
 
 
 def rows_of(page):

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from made_metrics import compared, made_metrics
 from moving_demonstrations import made, reaches, recorded
 
 from ddco_pyro.report.activity import Activity, LevelActivity, bins
-from ddco_pyro.report.likelihood import Likelihood, draw
+from ddco_pyro.report.likelihood import draw
 from ddco_pyro.report.options import row_order, shares, terminations
 from ddco_pyro.report.trajectories import movement, position_key, view
 
@@ -101,9 +102,10 @@ def test_movement_by_hand():
 
 def test_a_model_alone_is_compared_with_nothing():
     """Each method has a place on the left; there is a panel of differences where there are some."""
-    alone, other = Likelihood("ddco", 1.5, 1.0), Likelihood("flat", 0.5, 0.0, (1.0, 0.1), (0.9, 1.1))
-    for rows, panels in ([alone], 1), ([alone, other], 2):
-        axes = draw(rows).axes
+    beside = made_metrics(2, comparison={"flat": compared(1.0, 0.1)})
+    for metrics, panels in (made_metrics(2), 1), (beside, 2):
+        axes = draw(metrics, {"flat": {"demo_0": 0.0, "demo_1": 0.5}}).axes
         assert len(axes) == panels
         shown = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes[0].lines]
-        np.testing.assert_allclose(shown, [(row.valid, place) for place, row in enumerate(rows)])
+        values = [one.log_likelihood_per_step.valid for one in metrics.methods.values()]
+        np.testing.assert_allclose(shown, [(value, place) for place, value in enumerate(values)])

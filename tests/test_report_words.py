@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import toy_task
+from made_metrics import compared, made_metrics
 
 from ddco_pyro.drawing import words
+from ddco_pyro.metrics import Method
 from ddco_pyro.report.rollouts import measures_table
 from ddco_pyro.simulation.episodes import summarize
 
@@ -32,21 +34,12 @@ def test_a_column_is_of_one_kind_whatever_was_seen():
         "flat": [{"topples": 0.0, "inserted": np.nan, "accuracy_mm": np.nan}] * 2,
         "ddco": [{"topples": 3.0, "inserted": 1.0, "accuracy_mm": 1.0}] * 2,
     }
-    found = measures_table({name: {"measures": summarize(task, outcomes)} for name, outcomes in seen.items()})
+    found = measures_table({name: Method(measures=summarize(task, outcomes)) for name, outcomes in seen.items()})
     assert found.head == ["Method", "Topples", "Inserted", "Accuracy (mm)"]
     assert found.rows == [
         ["flat", "0.00 ± 0.00 [0.00 to 0.00], n = 2", "0 of 0", "– (n = 0)"],
         ["DDCO", "3.00 ± 0.00 [3.00 to 3.00], n = 2", "2 of 2 (34 to 100 %)", "1.00 ± 0.00 [1.00 to 1.00], n = 2"],
     ]
-
-
-def comparison(mean, error, held_out=10):
-    return {
-        "model": "ddco",
-        "valid": [{}] * held_out,
-        "log_likelihood_per_step": {"train": 2.0, "valid": 1.0},
-        "comparison": {"flat": {"difference": {"nats_per_step": mean, "standard_error": error}}},
-    }
 
 
 @pytest.mark.parametrize(
@@ -57,17 +50,11 @@ def comparison(mean, error, held_out=10):
         (0.1, 0.05, 10, "with no clear difference from flat (+0.10 ± 0.05 nats per step)"),
         (0.1, 0.04, 100, "0.10 ± 0.04 nats per step better than flat"),
         (0.1, 0.04, 3, "with no clear difference from flat"),
-        (
-            0.1,
-            float("nan"),
-            1,
-            "0.10 nats per step better than flat (error unknown) (1 held-out demonstration, one fit",
-        ),
         (0.1, None, 1, "0.10 nats per step better than flat (error unknown) (1 held-out demonstration, one fit"),
     ],
 )
 def test_the_verdict_is_honest(mean, error, held_out, said):
-    assert said in words.verdict(comparison(mean, error, held_out))
+    assert said in words.verdict(made_metrics(held_out, comparison={"flat": compared(mean, error)}))
 
 
 def test_numbers_in_words():

@@ -113,10 +113,10 @@ def test_the_compiled_engine_leaves_the_number_of_threads_alone():
 
 def test_versions_and_seconds_are_kept(toy_run):
     metrics = toy_run.metrics
-    assert set(metrics["seconds"]) == {"demonstrations", "training", "baselines", "evaluation"}
-    assert metrics["versions"]["ddco-pyro"] == "0.1.0"
-    assert metrics["engine_check"]["value"] < 1e-9
-    assert metrics["engine_check"]["gradient"] < 1e-9
+    assert set(metrics.seconds) == {"demonstrations", "training", "baselines", "evaluation"}
+    assert metrics.versions["ddco-pyro"] == "0.1.0"
+    assert metrics.engine_check.value < 1e-9
+    assert metrics.engine_check.gradient < 1e-9
 
 
 # --- the numbers again ------------------------------------------------------------------------------------------------
@@ -134,49 +134,49 @@ def test_log_likelihoods_can_be_computed_again(toy_run, parts):
     metrics, loaded = toy_run.metrics, ddco_pyro.load(toy_run.folder)
     for name, part in parts.items():
         value = loaded.log_likelihood(part).sum() / sum(part.lengths)
-        assert metrics["log_likelihood_per_step"][name] == pytest.approx(value, rel=1e-12)
-    assert metrics["valid"] == [
+        assert getattr(metrics.log_likelihood_per_step, name) == pytest.approx(value, rel=1e-12)
+    assert [dict(one) for one in metrics.valid] == [
         {"name": demo.name, "steps": len(demo), "log_likelihood": pytest.approx(value)}
         for demo, value in zip(parts["valid"], loaded.log_likelihood(parts["valid"]), strict=True)
     ]
 
 
 def test_every_demonstration_is_listed_worst_first(toy_run, demos, parts):
-    listed = toy_run.metrics["demonstrations_by_likelihood"]
+    listed = toy_run.metrics.demonstrations_by_likelihood
     methods = {"ddco": toy_run, **toy_run.baselines}
     steps = dict(zip(demos.names, demos.lengths, strict=True))
     values = {
         name: dict(zip(demos.names, fitted.log_likelihood(demos) / demos.lengths, strict=True))
         for name, fitted in methods.items()
     }
-    assert [one["name"] for one in listed] == sorted(demos.names, key=values["ddco"].__getitem__)
+    assert [one.name for one in listed] == sorted(demos.names, key=values["ddco"].__getitem__)
     for one in listed:
-        assert one["part"] == ("valid" if one["name"] in parts["valid"].names else "train")
-        assert one["steps"] == steps[one["name"]]
-        assert one["log_likelihood_per_step"] == pytest.approx({m: values[m][one["name"]] for m in methods})
-    flat = toy_run.baselines["flat"].metrics["demonstrations_by_likelihood"]
-    assert [one["name"] for one in flat] == sorted(demos.names, key=values["flat"].__getitem__)
+        assert one.part == ("valid" if one.name in parts["valid"].names else "train")
+        assert one.steps == steps[one.name]
+        assert one.log_likelihood_per_step == pytest.approx({m: values[m][one.name] for m in methods})
+    flat = toy_run.baselines["flat"].metrics.demonstrations_by_likelihood
+    assert [one.name for one in flat] == sorted(demos.names, key=values["flat"].__getitem__)
 
 
 def test_comparisons_can_be_computed_again(toy_run, parts):
     loaded, valid = ddco_pyro.load(toy_run.folder), parts["valid"]
     steps = sum(valid.lengths)
-    assert list(loaded.metrics["comparison"]) == list(loaded.baselines) == ["flat", "per_timestep"]
+    assert list(loaded.metrics.comparison) == list(loaded.baselines) == ["flat", "per_timestep"]
     for name, baseline in loaded.baselines.items():
         assert (baseline.name, loaded.name) == (name, "ddco")
         difference = (loaded.log_likelihood(valid) - baseline.log_likelihood(valid)).sum() / steps
-        found = loaded.metrics["comparison"][name]
-        assert found["difference"]["nats_per_step"] == pytest.approx(difference)
-        assert found["log_likelihood_per_step"]["valid"] == pytest.approx(baseline.log_likelihood(valid).sum() / steps)
+        found = loaded.metrics.comparison[name]
+        assert found.difference.nats_per_step == pytest.approx(difference)
+        assert found.log_likelihood_per_step.valid == pytest.approx(baseline.log_likelihood(valid).sum() / steps)
 
 
 def test_baselines_are_trained_on_the_same_split(toy_run):
     metrics = toy_run.metrics
-    assert metrics["demonstrations"] | {"supervisor": ...} == {"train": 8, "tune": 1, "valid": 3, "supervisor": ...}
+    assert dict(metrics.demonstrations) | {"supervisor": ...} == {"train": 8, "tune": 1, "valid": 3, "supervisor": ...}
     for baseline in toy_run.baselines.values():
         for key in ("name", "steps"):
-            assert [one[key] for one in baseline.metrics["valid"]] == [one[key] for one in metrics["valid"]]
-        assert baseline.metrics["demonstrations"] == metrics["demonstrations"]
+            assert [getattr(one, key) for one in baseline.metrics.valid] == [getattr(one, key) for one in metrics.valid]
+        assert baseline.metrics.demonstrations == metrics.demonstrations
         for name in ("mean", "std"):
             ours, theirs = (getattr(one.hierarchy.encoder, name) for one in (toy_run, baseline))
             np.testing.assert_array_equal(ours, theirs)
@@ -195,18 +195,18 @@ def test_agreement_with_the_labels_can_be_computed_again(toy_run, parts):
         (segments,) = toy_run.segment(part)
         found = np.concatenate([row[: len(demo)] for row, demo in zip(segments, part, strict=True)])
         truth = np.concatenate([demo.labels["phase"] for demo in part])
-        (scores,) = toy_run.metrics["agreement"][name]
-        assert scores["nmi"] == pytest.approx(normalized_mutual_info_score(truth, found))
+        (scores,) = getattr(toy_run.metrics.agreement, name)
+        assert scores.nmi == pytest.approx(normalized_mutual_info_score(truth, found))
         values, counts = np.unique(found, return_counts=True)
-        (table,) = toy_run.metrics["agreement"]["confusion"]  # of the part that comes last, which is held out
-        assert name == "train" or np.sum(table["steps"], 0).tolist() == counts.tolist()
-        assert name == "train" or table["options"] == values.tolist()
-    assert toy_run.metrics["agreement"]["labels"] == ["phase"]
+        (table,) = toy_run.metrics.agreement.confusion  # of the part that comes last, which is held out
+        assert name == "train" or np.sum(table.steps, 0).tolist() == counts.tolist()
+        assert name == "train" or table.options == values.tolist()
+    assert toy_run.metrics.agreement.labels == ["phase"]
 
 
 def test_the_use_of_options_can_be_computed_again(toy_run, demos):
     u = toy_run.posterior(demos).u[0].sum((0, 1))
-    assert [one["share"] for one in toy_run.metrics["options"][0]] == pytest.approx((u / u.sum()).tolist())
+    assert [one.share for one in toy_run.metrics.options[0]] == pytest.approx((u / u.sum()).tolist())
 
 
 @pytest.fixture(scope="module")
@@ -240,12 +240,12 @@ def test_planted_skills_are_found(planted, tmp_path, toy_spec):
     }
     spec = with_overrides(toy_spec, given | {"compare_with": [], "training.epochs": 240} | LINEAR)
     found = fit(spec, out=tmp_path / "run")
-    (scores,) = found.metrics["agreement"]["valid"]
-    assert (scores["nmi"], scores["boundary_f1_1"]) == (pytest.approx(1), 1)
-    assert scores["matched_globally"] == dict.fromkeys(scores["matched_globally"], 1)
-    (table,) = found.metrics["agreement"]["confusion"]
-    assert (table["labels"], sorted(table["matched"])) == ([2, 5], [2, 5])
-    assert "supervisor" not in found.metrics["demonstrations"]
+    (scores,) = found.metrics.agreement.valid
+    assert (scores.nmi, scores.boundary_f1_1) == (pytest.approx(1), 1)
+    assert {value for _, value in scores.matched_globally} == {1}
+    (table,) = found.metrics.agreement.confusion
+    assert (table.labels, sorted(table.matched)) == ([2, 5], [2, 5])
+    assert found.metrics.demonstrations.supervisor == {}
 
 
 # --- going on ---------------------------------------------------------------------------------------------------------
@@ -287,7 +287,7 @@ def test_seconds_are_those_of_all_processes(toy_spec, tmp_path, monkeypatch):
     for each in told[:2]:
         with pytest.raises(KeyboardInterrupt):
             fit(spec, out=tmp_path / "run", on_event=each)
-    seconds = fit(spec, out=tmp_path / "run", on_event=told[2]).metrics["seconds"]
+    seconds = fit(spec, out=tmp_path / "run", on_event=told[2]).metrics.seconds
     assert (seconds["demonstrations"], seconds["evaluation"]) == (0, 0)
     assert seconds["training"] + seconds["baselines"] == now[0] == sum(100 * each.epochs for each in told)
     assert seconds["training"] == sum(100 * each.own for each in told)
@@ -313,7 +313,7 @@ def test_a_finished_run_is_left_as_it_is(copied, toy_spec):
     metrics = copied / "metrics.json"
     metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"note": "kept"}))
     before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in copied.rglob("*") if path.is_file()}
-    assert fit(toy_spec, out=copied, on_event=Interrupting(1)).metrics["note"] == "kept"
+    assert fit(toy_spec, out=copied, on_event=Interrupting(1)).metrics.model_extra == {"note": "kept"}
     assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in before} == before
 
 

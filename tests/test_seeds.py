@@ -11,12 +11,14 @@ import pytest
 import toy_task
 import yaml
 from command_line import call
+from made_metrics import made_metrics
 from random_demonstrations import demonstrations
 from scipy import stats
 
 import ddco_pyro
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.seeds import over_seeds, training_seeds
+from ddco_pyro.metrics import Rollouts, Seeds
 from ddco_pyro.spec import load_spec, with_overrides
 
 SPEC = {
@@ -44,28 +46,27 @@ def test_each_repetition_is_that_fit_with_another_training_seed(written):
     alone = ddco_pyro.fit(with_overrides(load_spec(spec), {"training.seed": 2}))
     again = ddco_pyro.load(run / "seeds" / "2")
     for name in ("flat", "mixture"):
-        assert (
-            again.baselines[name].metrics["log_likelihood_per_step"]
-            == (alone.baselines[name].metrics["log_likelihood_per_step"])
+        assert again.baselines[name].metrics.log_likelihood_per_step == (
+            alone.baselines[name].metrics.log_likelihood_per_step
         )
-    held_out = [[row["name"] for row in ddco_pyro.load(path).metrics["valid"]] for path in (run, run / "seeds" / "1")]
+    held_out = [[row.name for row in ddco_pyro.load(path).metrics.valid] for path in (run, run / "seeds" / "1")]
     assert held_out[0] == held_out[1]
-    found = ddco_pyro.load(run).metrics["seeds"]
-    assert found["training_seeds"] == [0, 1, 2]
-    assert found["held_out"]["ddco"][2] == alone.metrics["log_likelihood_per_step"]["valid"]
-    assert len(set(found["held_out"]["ddco"])) == 3
-    assert found["worth"]["memory"][2] == pytest.approx(alone.metrics["worth"]["memory"]["nats_per_step"])
+    found = ddco_pyro.load(run).metrics.seeds
+    assert found.training_seeds == [0, 1, 2]
+    assert found.held_out["ddco"][2] == alone.metrics.log_likelihood_per_step.valid
+    assert len(set(found.held_out["ddco"])) == 3
+    assert found.worth["memory"][2] == pytest.approx(alone.metrics.worth.memory.nats_per_step)
 
 
 def test_the_command_says_how_much_they_differ(written):
     _, run, ended = written
-    metrics = json.loads((run / "metrics.json").read_text())
-    said = words.over_seeds(metrics["seeds"], "DDCO", len(metrics["valid"]))
+    metrics = ddco_pyro.load(run).metrics
+    said = words.over_seeds(metrics.seeds, "DDCO", len(metrics.valid))
     assert said in ended.out
     assert "--seeds" not in ended.out  # nothing more is asked for
-    assert words.over_seeds(metrics["seeds"], "DDCO", len(metrics["valid"])) in (
-        run / "report.html"
-    ).read_text().replace("&#39;", "'")
+    assert words.over_seeds(metrics.seeds, "DDCO", len(metrics.valid)) in (run / "report.html").read_text().replace(
+        "&#39;", "'"
+    )
 
 
 def test_what_is_done_is_not_done_again(written):
@@ -91,6 +92,11 @@ def test_the_intervals_are_those_of_scipy():
     assert words.spread(values) == ("2.05", f"{low:.2f} to {high:.2f}", "1.50 to 2.50")
 
 
+def over_three(memory, errors):
+    seeds = {"training_seeds": [0, 1, 2], "held_out": {}}
+    return Seeds.model_validate(seeds | {"worth": {"memory": memory}, "standard_error": {"memory": errors}})
+
+
 @pytest.mark.parametrize(
     ("memory", "said"),
     [
@@ -102,8 +108,7 @@ def test_the_intervals_are_those_of_scipy():
     ],
 )
 def test_the_verdict_is_over_training_seeds(memory, said):
-    found = {"training_seeds": [0, 1, 2], "worth": {"memory": memory}, "standard_error": {"memory": [0.0, None, 0.0]}}
-    assert said in words.over_seeds(found, "DDCO", 10)
+    assert said in words.over_seeds(over_three(memory, [0.0, None, 0.0]), "DDCO", 10)
 
 
 @pytest.mark.parametrize(
@@ -115,8 +120,7 @@ def test_the_verdict_is_over_training_seeds(memory, said):
 )
 def test_where_seeds_give_the_same_fit_held_out_demonstrations_decide(error, said):
     """EM reaches one optimum from any seed; an interval without width is no evidence."""
-    memory = {"worth": {"memory": [0.019, 0.0191, 0.0192]}, "standard_error": {"memory": [error] * 3}}
-    text = words.over_seeds({"training_seeds": [0, 1, 2]} | memory, "DDCO", 10)
+    text = words.over_seeds(over_three([0.019, 0.0191, 0.0192], [error] * 3), "DDCO", 10)
     assert said in text
     low, high = stats.t.interval(0.95, 9, 0.0191, error)  # ten held-out demonstrations
     assert f"{low:.2f} to {high:.2f}".replace("-", "−") in text
@@ -129,9 +133,13 @@ def test_seeds_follow_the_specs_own(written):
 
 
 def test_a_run_without_a_mixture_has_no_parts():
-    metrics = {"model": "ddco", "log_likelihood_per_step": {"train": 1.0, "valid": 0.5}, "comparison": {}}
-    found = over_seeds([0, 1], [metrics, metrics])
-    assert found == {"training_seeds": [0, 1], "held_out": {"ddco": [0.5, 0.5]}, "worth": {}, "standard_error": {}}
+    found = over_seeds([0, 1], [made_metrics(), made_metrics()])
+    assert dict(found) == {
+        "training_seeds": [0, 1],
+        "held_out": {"ddco": [1.0, 1.0]},
+        "worth": {},
+        "standard_error": {},
+    }
     assert words.over_seeds(found, "DDCO", 10) == "Over 2 training seeds, with the same demonstrations held out."
 
 
@@ -157,7 +165,7 @@ def test_rollouts_have_the_same_two_parts_and_the_same_seeds(tmp_path):
     assert found["seeds"]["worth"]["experts"] == pytest.approx(experts)
     own = found["worth"]
     assert (own["memory"]["only_ours"] - own["memory"]["only_theirs"]) / 6 == pytest.approx(memory[0])
-    assert words.success_worth(found, "DDCO") in ended.out
+    assert words.success_worth(Rollouts.model_validate(found), "DDCO") in ended.out
     page = (run / "report.html").read_text()
     assert 'id="worth"' in page
     assert "Points of success, 3 training seeds" in page
@@ -167,21 +175,25 @@ def test_what_rollouts_are_worth_in_words():
     memory = {"only_ours": 8, "only_theirs": 1, "trials": 50, "p_value": 0.039}
     experts = {"only_ours": 3, "only_theirs": 4, "trials": 50, "p_value": 1.0}
     total = {"only_ours": 9, "only_theirs": 3, "trials": 50, "p_value": 0.15}
-    found = {"worth": {"memory": memory, "experts": experts, "total": total, "flat": "flat"}}
-    text = words.success_worth(found, "DDCO")
+    worth = {"memory": memory, "experts": experts, "total": total, "flat": "flat"}
+
+    def said(**fields):
+        return words.success_worth(Rollouts.model_validate({"seed": 0, "episodes": 50, "methods": {}} | fields), "DDCO")
+
+    text = said(worth=worth)
     assert text == (
         "Of +6 successes in 50 episodes over flat, −1 (p = 1) come from several experts (mixture − flat) and "
         "+7 (p = 0.039) from options that last (DDCO − mixture). One fit of each model is no verdict."
     )
     seeds = {"training_seeds": [0, 1, 2], "success": {}, "worth": {"memory": [0.14, 0.16, 0.15]}}
     assert "DDCO − mixture +15 [13 to 17] points of success. In rollouts: options that last help." in (
-        words.success_worth(found | {"seeds": seeds}, "DDCO")
+        said(worth=worth, seeds=seeds)
     )
     same = {"training_seeds": [0, 1, 2], "success": {}, "worth": {"memory": [0.02, 0.02, 0.02]}}
-    one_more = found["worth"] | {"memory": {"only_ours": 2, "only_theirs": 1, "trials": 50, "p_value": 1.0}}
-    text = words.success_worth({"worth": one_more, "seeds": same}, "DDCO")
+    one_more = worth | {"memory": {"only_ours": 2, "only_theirs": 1, "trials": 50, "p_value": 1.0}}
+    text = said(worth=one_more, seeds=same)
     assert text.endswith("In rollouts: inconclusive.")  # seeds gave the same fit; episodes have not
-    assert words.success_worth({"methods": {}}, "DDCO") == ""
+    assert said() == ""
 
 
 @pytest.mark.parametrize(

@@ -38,8 +38,8 @@ def scores(name, valid, **settings):
 @pytest.mark.parametrize("name", ["kmeans", "gmm", "hmm", "change_points"])
 def test_kinds_that_lie_apart_are_found_in_demonstrations_not_seen(name):
     found = scores(name, planted(4, seed=1))
-    assert found["matched_globally"]["accuracy"] > 0.97
-    assert found["boundary_f1_1"] > 0.97
+    assert found.matched_globally.accuracy > 0.97
+    assert found.boundary_f1_1 > 0.97
 
 
 def test_time_tells_apart_what_a_step_alone_does_not():
@@ -49,7 +49,7 @@ def test_time_tells_apart_what_a_step_alone_does_not():
         for demos in (planted(30, noise=1.0), planted(10, seed=1, noise=1.0))
     )
     truth = [demo.labels["kind"] for demo in noisy]
-    nmi = {name: agreement(segment(name, train, noisy, 3, 0), truth)["nmi"] for name in BASELINES}
+    nmi = {name: agreement(segment(name, train, noisy, 3, 0), truth).nmi for name in BASELINES}
     assert min(nmi["hmm"], nmi["change_points"]) > nmi["kmeans"] + 0.1
 
 

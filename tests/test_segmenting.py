@@ -192,7 +192,7 @@ def test_baselines_stand_beside_the_options_on_what_was_held_out(toy_run, file, 
     truth = [demo.labels["phase"] for demo in parts["valid"]]
     for name, words in BASELINES.items():
         found = agreement(segment(name, parts["train"], parts["valid"], 2, 0, toy_run.spec.observations, 0), truth)
-        assert f"<td>{words}, 3 held out</td><td>{found['nmi']:.2f}</td>" in page.read_text()
+        assert f"<td>{words}, 3 held out</td><td>{found.nmi:.2f}</td>" in page.read_text()
         assert f"{words}, 3 held out" in shown
 
 

@@ -248,7 +248,7 @@ def test_a_killed_selection_goes_on_and_gives_the_same(tmp_path):
     select(ddco_pyro.load_spec(spec), tmp_path / "whole", told, ONE)
     assert (cut / "selection.json").read_bytes() == (tmp_path / "whole" / "selection.json").read_bytes()
     assert (cut / "selection.md").read_bytes() == (tmp_path / "whole" / "selection.md").read_bytes()
-    assert ddco_pyro.load(cut / "fit").metrics["demonstrations"]["train"] == 11  # and one to tune with
+    assert ddco_pyro.load(cut / "fit").metrics.demonstrations.train == 11  # and one to tune with
 
 
 def test_a_process_that_is_ended_from_outside_has_one_line(tmp_path, monkeypatch):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import h5py
@@ -64,12 +63,12 @@ def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Pa
     assert looked == f"next: ddco-pyro init '{path}' --out 'my demos: 1'.yaml"
     fit = ddco_pyro.load(tmp_path / "run")
     assert fit.spec == load_spec(spec)
-    held_out = Demonstrations.read(path, labels=["skill"]).select([one["name"] for one in fit.metrics["valid"]])
+    held_out = Demonstrations.read(path, labels=["skill"]).select([one.name for one in fit.metrics.valid])
     side = [np.where(demo.labels["skill"] == 5, 1, -1)[:, None] * demo.observations["place"] for demo in held_out]
     truth = stats.norm.logpdf(np.concatenate([demo.actions for demo in held_out]), np.concatenate(side), NOISE).mean()
-    assert fit.metrics["log_likelihood_per_step"]["valid"] > truth - 0.1
+    assert fit.metrics.log_likelihood_per_step.valid > truth - 0.1
     assert list(fit.baselines) == ["flat", "flat_equal"]
-    assert "agreement" in fit.metrics  # with the labels in the file
+    assert fit.metrics.agreement  # with the labels in the file
 
 
 @pytest.mark.slow
@@ -80,9 +79,9 @@ def test_what_it_writes_lets_every_method_converge(tmp_path: Path) -> None:
     ended = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run")
     assert ended.status == 0, ended.err
     metrics = ddco_pyro.load(tmp_path / "run").metrics
-    trainings = [metrics["training"], *(one["training"] for one in metrics["comparison"].values())]
-    assert [one["converged"] for one in trainings] == [True, True, True]
-    assert len({json.dumps(one["budget"]) for one in trainings}) == 1
+    trainings = metrics.trainings.values()
+    assert [one.converged for one in trainings] == [True, True, True]
+    assert len({one.budget for one in trainings}) == 1
 
 
 @pytest.mark.parametrize(
@@ -106,8 +105,8 @@ def test_three_demonstrations_are_enough(tmp_path: Path) -> None:
     assert call("init", tmp_path / "demos.hdf5", "--out", tmp_path / "spec.yaml").status == 0
     ended = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--set", "training.epochs=1")
     assert ended.status == 0, ended.err
-    numbers = ddco_pyro.load(tmp_path / "run").metrics["demonstrations"]
-    assert [numbers[part] for part in ("train", "tune", "valid")] == [1, 1, 1]
+    numbers = ddco_pyro.load(tmp_path / "run").metrics.demonstrations
+    assert [getattr(numbers, part) for part in ("train", "tune", "valid")] == [1, 1, 1]
 
 
 def test_it_says_what_it_leaves_out(path: Path, tmp_path: Path) -> None:
@@ -141,8 +140,8 @@ def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path, ke
     assert text.startswith("# A starting spec for 8 demonstrations of 3 to 6 steps.")
     ended = call("fit", written, "--out", tmp_path / "run", "--set", "training.epochs=1")
     assert ended.status == 0, ended.err
-    numbers = ddco_pyro.load(tmp_path / "run").metrics["demonstrations"]
-    assert sum(numbers[part] for part in ("train", "tune", "valid")) == 8
+    numbers = ddco_pyro.load(tmp_path / "run").metrics.demonstrations
+    assert numbers.train + numbers.tune + numbers.valid == 8
     assert call("report", tmp_path / "run").status == 0
     ended = call("segment", tmp_path / "run", path, "--csv", tmp_path / "segments.csv")
     assert ended.status == 0, ended.err

@@ -138,18 +138,18 @@ def fitted(tmp_path_factory):
 def test_a_planted_sigma_of_the_state_is_found(fitted):
     """Held out: as good as the truth, and better than a constant σ, which is least squares, by many standard errors."""
     fit, demos, truth = fitted
-    names = [row["name"] for row in fit.metrics["valid"]]
-    found = fit.metrics["log_likelihood_per_step"]["valid"]
+    names = [row.name for row in fit.metrics.valid]
+    found = fit.metrics.log_likelihood_per_step.valid
     assert found == pytest.approx(np.mean([truth[name] for name in names]), abs=0.02)
     train, valid = ([demo for demo in demos if (demo.name in names) == held_out] for held_out in (False, True))
     seen, actions = zip(*(_rows(part) for part in (train, valid)), strict=True)
     weights = np.linalg.lstsq(seen[0], actions[0], rcond=None)[0]
     std = (actions[0] - seen[0] @ weights).std(0)
     constant = stats.norm.logpdf(actions[1], seen[1] @ weights, std).sum(-1).mean()
-    other = fit.metrics["comparison"]["flat_2"]
-    assert other["log_likelihood_per_step"]["valid"] == pytest.approx(constant, abs=0.02)
-    assert other["difference"]["nats_per_step"] > 10 * other["difference"]["standard_error"] > 0
-    assert fit.metrics["engine_check"]["gradient"] < 1e-6
+    other = fit.metrics.comparison["flat_2"]
+    assert other.log_likelihood_per_step.valid == pytest.approx(constant, abs=0.02)
+    assert other.difference.nats_per_step > 10 * other.difference.standard_error > 0
+    assert fit.metrics.engine_check.gradient < 1e-6
 
 
 def _rows(demos):
@@ -159,12 +159,12 @@ def _rows(demos):
 
 def test_it_is_counted_saved_and_decomposed(fitted):
     fit, demos, _ = fitted
-    assert fit.metrics["parameters"] == 2 * 4 + 4  # two means and two y of two observations
-    assert fit.baselines["flat_2"].metrics["parameters"] == 2 * 2 + 2 + 2
+    assert fit.metrics.parameters == 2 * 4 + 4  # two means and two y of two observations
+    assert fit.baselines["flat_2"].metrics.parameters == 2 * 2 + 2 + 2
     again = ddco_pyro.load(fit.folder)
     np.testing.assert_array_equal(again.log_likelihood(demos), fit.log_likelihood(demos))
-    each = fit.metrics["log_likelihood_by_dimension"]["valid"]
-    assert sum(each["by_dimension"]) == pytest.approx(fit.metrics["log_likelihood_per_step"]["valid"], rel=1e-5)
+    each = fit.metrics.log_likelihood_by_dimension.valid
+    assert sum(each.by_dimension) == pytest.approx(fit.metrics.log_likelihood_per_step.valid, rel=1e-5)
 
 
 def test_sigma_is_no_part_of_the_measure(fitted, tmp_path):
@@ -183,10 +183,10 @@ def test_without_skill_options_lead_by_their_sigma_alone():
         hierarchy={"levels": [{"count": 2, "policy": LINEAR}], "meta_policy": LINEAR},
         compare_with=[{"kind": "flat", "policy": LINEAR}, {"kind": "flat", "policy": LINEAR, "std": OF_STATE}],
     )
-    found = ddco_pyro.fit(spec, demos).metrics["comparison"]
-    one, of_state = (found[name]["difference"] for name in ("flat", "flat_2"))
-    assert one["nats_per_step"] > 3 * one["standard_error"] > 0
-    assert of_state["nats_per_step"] < -3 * of_state["standard_error"] < 0
+    found = ddco_pyro.fit(spec, demos).metrics.comparison
+    one, of_state = (found[name].difference for name in ("flat", "flat_2"))
+    assert one.nats_per_step > 3 * one.standard_error > 0
+    assert of_state.nats_per_step < -3 * of_state.standard_error < 0
 
 
 # --- a baseline's own -------------------------------------------------------------------------------------------------

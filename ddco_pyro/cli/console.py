@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from rich import progress as rich_progress
@@ -35,7 +35,9 @@ from ddco_pyro.events import (
 
 if TYPE_CHECKING:
     from ddco_pyro.data.inspection import Field, Inspection
+    from ddco_pyro.fitting.fit import Fit
     from ddco_pyro.fitting.merging import Pair
+    from ddco_pyro.metrics import Metrics
     from ddco_pyro.model.hierarchy import Hierarchy
     from ddco_pyro.spec import Spec
     from ddco_pyro.training.labels import Labels
@@ -216,55 +218,53 @@ ONE_FIT = (
 )
 
 
-def log_likelihoods(metrics: Mapping[str, Any]) -> None:
+def log_likelihoods(metrics: Metrics) -> None:
     """Log-likelihood of the model and of its baselines, as in the report."""
-    from ddco_pyro.report import likelihood
+    from ddco_pyro.report.likelihood import table
 
-    rows = likelihood.likelihoods(metrics, {})
-    show(likelihood.table(rows, 3, "log-likelihood, nats per step (higher is better)"))
-    if "worth" in metrics:
-        said = words.worth(metrics["worth"], words.method(metrics["model"]), len(metrics["valid"]))
-        say(f"{said} {ONE_FIT if 'seeds' not in metrics else ''}".rstrip())
-    for name, training in words.trainings(metrics).items():
+    show(table(metrics, 3, "log-likelihood, nats per step (higher is better)"))
+    if metrics.worth:
+        said = words.worth(metrics.worth, words.method(metrics.model), len(metrics.valid))
+        say(said if metrics.seeds else f"{said} {ONE_FIT}")
+    for name, training in metrics.trainings.items():
         if restarts := words.restarts(training):
             say(f"{name}: {restarts}")
 
 
-def seeds(metrics: Mapping[str, Any]) -> None:
+def seeds(metrics: Metrics) -> None:
     """Variation of the models of a run over training seeds; nothing where the fit was not repeated."""
-    if "seeds" not in metrics:
+    found = metrics.seeds
+    if found is None:
         return
-    found = metrics["seeds"]
-    rows = [[words.method(name), *words.spread(values)] for name, values in found["held_out"].items()]
-    title = f"held-out nats per step over training seeds {words.listed(map(str, found['training_seeds']))}"
+    rows = [[words.method(name), *words.spread(values)] for name, values in found.held_out.items()]
+    title = f"held-out nats per step over training seeds {words.listed(map(str, found.training_seeds))}"
     show(Table(["Method", "mean", "95 % interval", "range"], rows, title=title))
-    say(words.over_seeds(found, words.method(metrics["model"]), len(metrics["valid"])))
+    say(words.over_seeds(found, words.method(metrics.model), len(metrics.valid)))
 
 
-def merged(pair: Pair, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
+def merged(pair: Pair, before: Metrics, after: Metrics) -> None:
     """The merged options and the change of held-out log-likelihood."""
     first, second = pair.options
     apart = "" if pair.divergence is None else f" ({pair.divergence:.2f} nats/step apart)"
-    values = [words.number(metrics["log_likelihood_per_step"]["valid"]) for metrics in (before, after)]
+    values = [words.number(metrics.log_likelihood_per_step.valid) for metrics in (before, after)]
     say(f"Merged options {first} and {second}{apart}: held-out {values[0]} → {values[1]} nats/step.")
 
 
-def warnings(signs: Sequence[tuple[str, str]]) -> None:
-    """Warnings, each with the usual remedy."""
-    for what, advice in signs:
+def warnings(fit: Fit) -> None:
+    """Warnings of too short a training and of a degenerate solution, each with the usual remedy."""
+    from ddco_pyro.report.training import degeneracies
+
+    for what, advice in (*words.unconverged(fit.metrics), *degeneracies(fit.spec, fit.metrics)):
         say(f"warning: {what} {advice}")
 
 
-def successes(results: Mapping[str, Any], ours: str) -> None:
-    """The measures of each method's rollouts, and what the hierarchy is worth by them.
-
-    :param ours: the model's name.
-    """
+def successes(metrics: Metrics) -> None:
+    """The measures of each method's rollouts, and what the hierarchy is worth by them."""
     from ddco_pyro.report.rollouts import measures_table
 
-    table = measures_table(results["methods"])
-    show(Table(table.head, table.rows, title=f"{results['episodes']} episodes each"))
-    if said := words.success_worth(results, words.method(ours)):
+    assert metrics.rollouts is not None  # it has been rolled out
+    show(measures_table(metrics.rollouts.methods, title=f"{metrics.rollouts.episodes} episodes each"))
+    if said := words.success_worth(metrics.rollouts, words.method(metrics.model)):
         say(said)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -17,9 +17,6 @@ from ddco_pyro.cli import AllowCode, Overrides, RunPath, SpecPath, out_folder, w
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import command
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
-
-if TYPE_CHECKING:
-    from ddco_pyro.fitting.fit import Fit
 
 
 class Backend(StrEnum):
@@ -86,7 +83,7 @@ def fit(
 ) -> None:
     """Fit the spec's hierarchy and its baselines; write the run folder with its report.
 
-    An unfinished run of this very spec in --out is continued, with any number of processes.
+    An unfinished run of the same spec in --out is continued, with any number of processes.
 
     With --seeds the fit and its baselines are repeated, in --jobs processes, with other training seeds: other first
     weights, clusters and orders of the same demonstrations. RUN/seeds has a run for each.
@@ -130,7 +127,7 @@ def _fit(
 
     console.log_likelihoods(fitted.metrics)
     console.seeds(fitted.metrics)
-    _warn(fitted)
+    console.warnings(fitted)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
     if loaded.hierarchy and loaded.demonstrations.path:
         file = loaded.demonstrations.path
@@ -180,7 +177,7 @@ def select(
     console.show(table(made.choice, "held-out log-likelihood by cross-validation, nats per step"))
     for note in made.choice.notes:
         console.say(f"note: {note}")
-    _warn(fitted)
+    console.warnings(fitted)
     print(f"selection: {folder / 'selection.json'}")
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
 
@@ -214,7 +211,7 @@ def merge(
         fitted = merging.merge(before, pair, folder, progress, jobs)
     console.log_likelihoods(fitted.metrics)
     console.merged(pair, before.metrics, fitted.metrics)
-    _warn(fitted)
+    console.warnings(fitted)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
     print(f"next: {command('compare', run, folder, *_allowed(fitted.spec))}")
 
@@ -235,14 +232,6 @@ def _continued(again: str, folder: Path) -> Iterator[None]:
             raise
         print(f"interrupted; continue with: {again}", file=sys.stderr)
         raise typer.Exit(1) from None
-
-
-def _warn(fitted: Fit) -> None:
-    """Warn of too short a training and of a degenerate solution."""
-    from ddco_pyro.cli import console
-    from ddco_pyro.report import degeneracies, unconverged
-
-    console.warnings([*unconverged(fitted.metrics), *degeneracies(fitted.spec, fitted.metrics)])
 
 
 def _allowed(spec: Spec) -> list[str]:

@@ -74,9 +74,9 @@ def rollout(
     _check_run(run, "rollouts.csv", "metrics.json")
     demos = fitted.demonstrations  # the report needs them: asked for before any episode
     with console.Progress() as progress:
-        results = roll_out(fitted, number, FILMED if video else 0, progress, jobs, resume)
+        roll_out(fitted, number, FILMED if video else 0, progress, jobs, resume)
         roll_out_repetitions(fitted, progress, jobs)
-    console.successes(results, fitted.name)
+    console.successes(fitted.metrics)
     print(f"report: {write_report(fitted, demos)}")
 
 

@@ -6,7 +6,7 @@ held-out log-likelihood of a trajectory takes the place of an observation's elpd
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,9 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import same
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import UNMATCHED
-from ddco_pyro.evaluation.schema import read_successes
 from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.fitting.fit import Fit, load
+from ddco_pyro.metrics import Training, read_successes
 from ddco_pyro.simulation.episodes import paired_difference, rate
 from ddco_pyro.training.data import parts
 
@@ -38,11 +38,10 @@ class Row:
     Errors are :func:`ddco_pyro.evaluation.worth.paired` times the steps: the variation over held-out demonstrations
     for one fit of each run.
 
-    :param total: Σ log p(ξ_n), and its standard error ``se``.
+    :param total: Σ log p(ξ_n), and its standard error ``se``; None for a single trajectory.
     :param difference: the best run's total minus this one's, and its standard error ``dse``. The trajectories are the
         same, so ``dse`` is smaller than the two ``se`` suggest.
     :param each: log p(ξ_n) of every trajectory.
-    :param training: the entry ``training`` of the run's ``metrics.json``.
     """
 
     rank: int
@@ -50,12 +49,12 @@ class Row:
     model: str
     parameters: int
     total: float
-    se: float
+    se: float | None
     difference: float
-    dse: float
+    dse: float | None
     per_step: float
     each: tuple[float, ...]
-    training: Mapping[str, Any] | None
+    training: Training
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ class Comparison:
             "trajectories": list(self.trajectories),
             "steps": sum(self.steps),
             "demonstrations": self.worst_first,
-            "rows": [asdict(row) for row in self.rows],
+            "rows": [asdict(row) | {"training": row.training.model_dump()} for row in self.rows],
             "agreement": list(self.agreement),
             "rollouts": list(self.rollouts),
         }
@@ -131,19 +130,20 @@ def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
 
 def _row(rank: int, fit: Fit, values: np.ndarray, best: np.ndarray, lengths: Sequence[int]) -> Row:
     steps = np.array(lengths, dtype=float)
-    own, apart = paired(values, np.zeros(len(steps)), steps), paired(best, values, steps)
+    own = paired(values, np.zeros(len(steps)), steps)
+    se, dse = (pair.standard_error for pair in (own, paired(best, values, steps)))
     return Row(
         rank,
         str(fit),
         fit.name,
-        int(fit.metrics["parameters"]),
+        fit.metrics.parameters,
         total=float(values.sum()),
-        se=own["standard_error"] * sum(lengths),
+        se=se and se * sum(lengths),
         difference=float((best - values).sum()),
-        dse=apart["standard_error"] * sum(lengths),
-        per_step=own["nats_per_step"],
+        dse=dse and dse * sum(lengths),
+        per_step=own.nats_per_step,
         each=tuple(values.tolist()),
-        training=fit.metrics.get("training"),
+        training=fit.metrics.training,
     )
 
 
@@ -222,12 +222,12 @@ def _agreement(fit: Fit) -> Iterator[dict[str, Any]]:
 
     A measure is None where no label is known.
     """
-    record = fit.metrics.get("agreement")
-    if not record or fit.spec.hierarchy is None:
+    record = fit.metrics.agreement
+    if not record or not record.valid or fit.spec.hierarchy is None:
         return
-    for level, labels, scores in zip(fit.spec.hierarchy.levels, record["labels"], record["valid"], strict=True):
-        found = {key: (scores or {}).get(key) for key in UNMATCHED}
-        accuracy = (scores or {}).get("matched_globally", {}).get("accuracy")
+    for level, labels, scores in zip(fit.spec.hierarchy.levels, record.labels, record.valid, strict=True):
+        found = {key: scores and getattr(scores, key) for key in UNMATCHED}
+        accuracy = scores and scores.matched_globally.accuracy
         yield {"run": str(fit), "level": level.name, "labels": labels, **found, "accuracy": accuracy}
 
 

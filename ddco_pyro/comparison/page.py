@@ -17,11 +17,11 @@ from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save, styl
 from ddco_pyro.drawing.page import Block, Cell, Page, Picture, Section, Table, Text, note
 from ddco_pyro.evaluation.agreement import UNMATCHED
 from ddco_pyro.evaluation.worth import worth
+from ddco_pyro.metrics import Difference, Rate
 from ddco_pyro.report.likelihood import SHOWN
 from ddco_pyro.segmenting.agreement import measure_names
 from ddco_pyro.segmenting.page import anchor
 from ddco_pyro.training.networks import HIERARCHY
-from ddco_pyro.training.stages import effort
 
 FILES = ("compare.png", "compare.json", "compare.md", "compare.html")
 """The files of a comparison."""
@@ -60,9 +60,8 @@ def page(compared: Comparison, picture: Picture, folder: Path) -> Page:
     blocks = [note(listed), *demonstration_table(compared, links).folded(SHOWN, "demonstrations")]
     sections.append(Section("demonstrations", "Every held-out demonstration", blocks))
     if rollouts := rollout_table(compared):
-        rates = "Rates with Wilson 95 % intervals. p: McNemar’s exact test, two-sided, not corrected for the number of "
         title = "Success in rollouts from the same initial states"
-        sections.append(Section("rollouts", title, [rollouts, note(f"{rates}comparisons.")]))
+        sections.append(Section("rollouts", title, [rollouts, note(f"Rates: Wilson 95 % intervals. {words.P_VALUE}")]))
     return Page(f"Comparison of {len(compared.rows)} runs", [Text(verdict(compared), "verdict")], sections)
 
 
@@ -75,7 +74,7 @@ def run_table(compared: Comparison) -> Table:
         if row.rank == 0:
             numbers[2:] = ["0", "0"]
         first = [str(row.rank), row.name, row.model, str(row.parameters)]
-        rows.append([*first, *numbers, words.number(row.per_step, 3), effort(row.training)])
+        rows.append([*first, *numbers, words.number(row.per_step, 3), words.effort(row.training)])
     return Table(head, rows, {0, 1, 2})
 
 
@@ -106,7 +105,7 @@ def rollout_table(compared: Comparison) -> Table | None:
     """A row for each pair of runs that were rolled out; None where there is none."""
     rows = []
     for pair in compared.rollouts:
-        runs = [pair["run"], words.rate(pair["rate"]), pair["other"], words.rate(pair["other_rate"])]
+        runs = [pair["run"], words.rate(Rate(**pair["rate"])), pair["other"], words.rate(Rate(**pair["other_rate"]))]
         counts = [str(pair["only_ours"]), str(pair["only_theirs"]), str(pair["trials"])]
         rows.append([*runs, *counts, words.p_value(pair["p_value"])])
     head = ["run", "succeeds", "other", "succeeds", "only run", "only other", "states", "p"]
@@ -118,9 +117,10 @@ def verdict(compared: Comparison) -> str:
     best, *others = compared.rows
     steps = sum(compared.steps)
     differences = {
-        row.name: {"nats_per_step": row.difference / steps, "standard_error": row.dse / steps} for row in others
+        row.name: Difference(nats_per_step=row.difference / steps, standard_error=row.dse and row.dse / steps)
+        for row in others
     }
-    rising = words.rising(row.name for row in compared.rows if row.training and not row.training["converged"])
+    rising = words.rising(row.name for row in compared.rows if not row.training.converged)
     parts = _worth(compared)
     return f"{words.explains(best.name, differences, len(compared.trajectories))}{' ' * bool(parts)}{parts}{rising}"
 
@@ -129,7 +129,7 @@ def _worth(compared: Comparison) -> str:
     """The worth of several experts and of options that last, where there is one run of each model."""
     models = [row.model for row in compared.rows]
     alone = {row.model: np.array(row.each) for row in compared.rows if models.count(row.model) == 1}
-    found = worth(HIERARCHY, alone, compared.steps) if HIERARCHY in alone else {}
+    found = worth(HIERARCHY, alone, compared.steps)
     return words.worth(found, words.method(HIERARCHY), len(compared.trajectories)) if found else ""
 
 
@@ -144,10 +144,10 @@ def _links(compared: Comparison, folder: Path) -> dict[str, str]:
 
 def _explanation(compared: Comparison) -> str:
     more = " Not converged: more epochs may change the rank of such a run."
-    rising = any(row.training and not row.training["converged"] for row in compared.rows)
+    rising = any(not row.training.converged for row in compared.rows)
     return (
         f"Held-out log-likelihood of {len(compared.trajectories)} trajectories ({sum(compared.steps)} steps), in nats: "
-        "one nat more per step means that the control of a step is e = 2.7 times as probable. total: sum over "
+        f"{words.NAT}. total: sum over "
         "trajectories; se: its standard error. diff: the best's total minus this one's, trajectory by trajectory; dse: "
         "the standard error of that difference. Errors are over trajectories, for one fit of each run. The verdict has "
         f"the same numbers per step.{more if rising else ''}"

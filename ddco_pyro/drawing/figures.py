@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.drawing.page import Picture
+from ddco_pyro.metrics import Difference
 
 WIDTH = 9.6
 """Inches. On a page of 960 pixels, text in a figure is as large as the page's own."""
@@ -106,6 +107,15 @@ class Interval:
         """The value ± an error, which may be unknown."""
         half = np.nan if error is None else error
         return cls(value, value - half, value + half, points, **looks)
+
+    @classmethod
+    def of(cls, difference: Difference | None, points: Sequence[float] = (), **looks: Any) -> Interval | None:
+        """A difference ± its standard error."""
+        return (
+            None
+            if difference is None
+            else cls.around(difference.nats_per_step, difference.standard_error, points, **looks)
+        )
 
 
 @dataclass(frozen=True)

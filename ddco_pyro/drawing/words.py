@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+from ddco_pyro.metrics import Against, Difference, Metrics, Rate, Rollouts, Seeds, Stage, SuccessWorth, Training, Worth
 
 CONFIDENCE = 0.95
 """Level of intervals; a difference is significant where its interval excludes 0."""
 
 SMALLEST = 0.01
 """The smallest useful difference in nats per step: each step's control is exp(0.01) times as probable, 1 % more."""
+
+NAT = "one nat more per step means that the control of a step is e = 2.7 times as probable"
+
+P_VALUE = "p: McNemar’s exact test, two-sided, not corrected for the number of comparisons."
 
 METHODS = {
     "ddco": "DDCO",
@@ -75,7 +81,7 @@ def percent(value: float | None, digits: int = 0) -> str:
     return "–" if value is None or not math.isfinite(value) else f"{number(100 * value, digits)} %"
 
 
-def interval(value: list[float] | None, scale: float = 1.0, digits: int = 2) -> str:
+def interval(value: Sequence[float] | None, scale: float = 1.0, digits: int = 2) -> str:
     """``low to high``."""
     return "–" if value is None else f"{number(scale * value[0], digits)} to {number(scale * value[1], digits)}"
 
@@ -85,10 +91,10 @@ def p_value(value: float) -> str:
     return "< 0.001" if value < 0.001 else f"{value:.2g}"
 
 
-def rate(result: Mapping[str, Any], of: str = "") -> str:
+def rate(result: Rate, of: str = "") -> str:
     """``41 of 50 (69 to 90 %)``: successes, trials (with a noun ``of``) and the 95 % interval of the rate."""
-    text = f"{result['successes']} of {result['trials']} {of}".rstrip()
-    return text if result["interval"] is None else f"{text} ({interval(result['interval'], 100, 0)} %)"
+    text = f"{result.successes} of {result.trials} {of}".rstrip()
+    return text if result.interval is None else f"{text} ({interval(result.interval, 100, 0)} %)"
 
 
 def measure(name: str) -> str:
@@ -103,9 +109,9 @@ def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def verdict(metrics: Mapping[str, Any]) -> str:
-    """How well the model explains held-out demonstrations, with the error, and the models that have not converged."""
-    names = (method(name) for name, training in trainings(metrics).items() if not training["converged"])
+def verdict(metrics: Metrics) -> str:
+    """The verdict on a run: differences on held-out demonstrations, and the models that have not converged."""
+    names = (method(name) for name, training in metrics.trainings.items() if not training.converged)
     return f"{_explained(metrics)}{rising(names)}"
 
 
@@ -115,29 +121,30 @@ def rising(names: Iterable[str]) -> str:
     return f" Not converged: {listed(rising)}; more epochs may change this result." if rising else ""
 
 
-def _explained(metrics: Mapping[str, Any]) -> str:
-    name, held_out = _capital(method(metrics["model"])), len(metrics["valid"])
+def _explained(metrics: Metrics) -> str:
+    ours, held_out, per_step = method(metrics.model), len(metrics.valid), metrics.log_likelihood_per_step
+    name = _capital(ours)
     if not held_out:
-        value = number(metrics["log_likelihood_per_step"]["train"])
+        value = number(per_step.train)
         return f"{name} was fitted to all demonstrations ({value} nats per step); none was held out to evaluate it."
-    if not metrics["comparison"]:
-        value = number(metrics["log_likelihood_per_step"]["valid"])
+    if not metrics.comparison:
+        value = number(per_step.valid)
         return f"{name} gives held-out demonstrations {value} nats per step; no baseline was trained to compare with."
-    differences = {method(other): comparison["difference"] for other, comparison in metrics["comparison"].items()}
+    differences = {method(other): compared.difference for other, compared in metrics.comparison.items()}
     said = [explains(name, differences, held_out)]
-    if "worth" in metrics:
-        said.append(worth(metrics["worth"], method(metrics["model"]), held_out))
-    if "seeds" in metrics:
-        said.append(over_seeds(metrics["seeds"], method(metrics["model"]), held_out))
+    if metrics.worth:
+        said.append(worth(metrics.worth, ours, held_out))
+    if metrics.seeds:
+        said.append(over_seeds(metrics.seeds, ours, held_out))
     return " ".join(said)
 
 
-def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out: int) -> str:
+def explains(name: str, differences: Mapping[str, Difference], held_out: int) -> str:
     """One sentence on the lead of a model over others on held-out demonstrations.
 
     Its ± is over these demonstrations, for one fit of each model; fits from other seeds vary, too.
 
-    :param differences: ``nats_per_step`` and ``standard_error`` of the paired difference, by the other model's name.
+    :param differences: the paired difference by the other model's name.
     """
     clauses = [_clause(other, difference, held_out) for other, difference in differences.items()]
     text = f"{name} explains held-out demonstrations {listed(clauses)}"
@@ -146,112 +153,104 @@ def explains(name: str, differences: Mapping[str, Mapping[str, float]], held_out
     return f"{text} (± is one standard error over {held_out} held-out demonstrations, for one fit of each model)."
 
 
-def worth(found: Mapping[str, Any], ours: str, held_out: int) -> str:
-    """What several experts and options that last are worth in one fit of each model.
+def worth(found: Worth, ours: str, held_out: int) -> str:
+    """The worth of several experts and of options that last, in one fit of each model.
 
-    :param found: what :func:`ddco_pyro.evaluation.worth.worth` gives, with ``steps_in_a_row`` where that is known.
     :param ours: what the hierarchy is called.
     """
-    memory = found["memory"]
-    lasting = f"{with_error(memory)} from options that last ({ours} − mixture)"
-    if "flat" in found:
-        flat = method(found["flat"])
-        total = signed(found["total"]["nats_per_step"])
-        experts = f"{with_error(found['experts'])} come from several experts (mixture − {flat})"
-        parts = f"Of {total} nats per step over {flat}, {experts} and {lasting}."
-    else:
-        parts = f"Held-out nats per step: {lasting}."
+    total = signed(found.total.nats_per_step) if found.total else ""
+    parts = _divided(found, ours, f"{total} nats per step", "Held-out nats per step", with_error)
     decided = {
         1: "In this fit options that last explain held-out controls better; one fit of each model is no verdict.",
         0: "This fit does not show that options that last are worth anything.",
         -1: "In this fit options that last explain held-out controls worse than the same experts without memory.",
-    }[_direction(memory, held_out)]
-    rows = found.get("steps_in_a_row", ())
-    short = [row for row in rows if row["options"] <= row["mixture"]]
-    if short and len(short) == len(rows):
-        own, mixture = (number(short[0][name], 1) for name in ("options", "mixture"))
+    }[_direction(found.memory, held_out)]
+    rows = found.steps_in_a_row
+    if rows and all(row.options <= row.mixture for row in rows):
+        own, mixture = number(rows[0].options, 1), number(rows[0].mixture, 1)
         decided += f" Options stay active no longer ({own} steps) than the mixture keeps to one expert ({mixture})."
     return f"{parts} {decided}"
 
 
-def success_worth(rollouts: Mapping[str, Any], ours: str) -> str:
-    """What several experts and options that last are worth in rollouts: in this fit, and over training seeds where it
-    was repeated; empty where there is no mixture. The verdict is by :func:`_wider`, with the error over episodes.
+def success_worth(rollouts: Rollouts, ours: str) -> str:
+    """The same worth in rollouts, in this fit and over its training seeds; empty without a mixture.
 
-    :param rollouts: what ``metrics.json`` has under ``rollouts``.
+    The verdict is by :func:`_wider`, with the error over episodes.
+
     :param ours: what the hierarchy is called.
     """
-    found = rollouts.get("worth")
-    if not found:
+    found = rollouts.worth
+    if found is None:
         return ""
-    lasting = f"{of_episodes(found['memory'])} from options that last ({ours} − mixture)"
-    if "flat" in found:
-        flat = method(found["flat"])
-        experts = f"{of_episodes(found['experts'])} come from several experts (mixture − {flat})"
-        total, trials = _more(found["total"]), found["total"]["trials"]
-        text = f"Of {total} successes in {trials} episodes over {flat}, {experts} and {lasting}."
-    else:
-        text = f"Successes in {found['memory']['trials']} episodes: {lasting}."
-    if "seeds" not in rollouts:
+    pair, total = found.memory, _more(found.total) if found.total else ""
+    successes = f"uccesses in {pair.trials} episodes"
+    text = _divided(found, ours, f"{total} s{successes}", f"S{successes}", of_episodes)
+    if rollouts.seeds is None:
         return f"{text} One fit of each model is no verdict."
-    seeds = rollouts["seeds"]
-    names = {"memory": f"{ours} − mixture", "experts": "mixture − flat"}
-    parts = [
-        f"{names[part]} {signed(100 * float(np.mean(values)), 0)} [{interval([*mean_interval(values)], 100, 0)}]"
-        for part, values in seeds["worth"].items()
-        if part in names
-    ]
-    pair = found["memory"]
-    discordant, lead = pair["only_ours"] + pair["only_theirs"], pair["only_ours"] - pair["only_theirs"]
-    error = math.sqrt(discordant - lead**2 / pair["trials"]) / pair["trials"]
-    low, high = _wider(seeds["worth"]["memory"], error, pair["trials"])
+    seeds = rollouts.seeds
+    discordant, lead = pair.only_ours + pair.only_theirs, pair.only_ours - pair.only_theirs
+    error = math.sqrt(discordant - lead**2 / pair.trials) / pair.trials
+    low, high = _wider(seeds.worth["memory"], error, pair.trials)
     decided = "options that last help" if low > 0 else "options that last harm" if high < 0 else "inconclusive"
-    count = len(seeds["training_seeds"])
-    return f"{text} Over {count} training seeds: {listed(parts)} points of success. In rollouts: {decided}."
+    parts = listed(_parts(seeds.worth, ours, 100, 0))
+    return f"{text} Over {len(seeds.training_seeds)} training seeds: {parts} points of success. In rollouts: {decided}."
 
 
-def _more(pair: Mapping[str, Any]) -> str:
-    return signed(pair["only_ours"] - pair["only_theirs"], 0)
+def _divided(found: Worth | SuccessWorth, ours: str, total: str, memory_alone: str, said: Callable[[Any], str]) -> str:
+    """The parts of the advantage over a flat policy; the part of memory alone where there is none."""
+    lasting = f"{said(found.memory)} from options that last ({ours} − mixture)"
+    if found.flat is None:
+        return f"{memory_alone}: {lasting}."
+    flat = method(found.flat)
+    experts = f"{said(found.experts)} come from several experts (mixture − {flat})"
+    return f"Of {total} over {flat}, {experts} and {lasting}."
 
 
-def of_episodes(pair: Mapping[str, Any] | None) -> str:
+def _parts(worth: Mapping[str, Sequence[float]], ours: str, scale: float = 1, digits: int = 2) -> list[str]:
+    """The parts of the worth over training seeds, each with its 95 % t interval."""
+    names = {"memory": f"{ours} − mixture", "experts": "mixture − flat"}
+    return [f"{names[part]} {mean_and_interval(worth[part], scale, digits)}" for part in worth if part in names]
+
+
+def mean_and_interval(values: Sequence[float], scale: float = 1, digits: int = 2) -> str:
+    """``+1.00 [0.50 to 1.50]``: the mean of a few values with its 95 % t interval."""
+    return f"{signed(scale * float(np.mean(values)), digits)} [{interval(mean_interval(values), scale, digits)}]"
+
+
+def _more(pair: Against) -> str:
+    return signed(pair.only_ours - pair.only_theirs, 0)
+
+
+def of_episodes(pair: Against | None) -> str:
     """A difference in successes with McNemar's exact p-value; a dash for None."""
     if pair is None:
         return "–"
-    return f"{_more(pair)} (p = {p_value(pair['p_value'])})".replace("= <", "<")
+    return f"{_more(pair)} (p = {p_value(pair.p_value)})".replace("= <", "<")
 
 
-def over_seeds(found: Mapping[str, Any], ours: str, held_out: int) -> str:
-    """What the parts of the worth are over training seeds, each with a 95 % t interval, and the verdict, which is about
-    options that last.
+def over_seeds(found: Seeds, ours: str, held_out: int) -> str:
+    """The parts of the worth over training seeds, and the verdict, which is about options that last.
 
-    :param found: what :func:`ddco_pyro.fitting.seeds.over_seeds` gives.
     :param ours: what the hierarchy is called.
     :param held_out: number of held-out demonstrations.
     """
-    names = {"memory": f"{ours} − mixture", "experts": "mixture − flat"}
-    parts = [
-        f"{names[part]} {signed(float(np.mean(values)))} [{spread(values)[1]}]"
-        for part, values in found["worth"].items()
-        if part in names
-    ]
-    count = len(found["training_seeds"])
+    parts = _parts(found.worth, ours)
     said = f": {listed(parts)} nats per step" if parts else ""
-    text = f"Over {count} training seeds, with the same demonstrations held out{said}."
-    if "memory" not in found["worth"]:
+    text = f"Over {len(found.training_seeds)} training seeds, with the same demonstrations held out{said}."
+    if "memory" not in found.worth:
         return text
-    return f"{text} {_lasting(found['worth']['memory'], found['standard_error']['memory'], held_out)}"
+    return f"{text} {_lasting(found.worth['memory'], found.standard_error['memory'], held_out)}"
 
 
 def _lasting(memory: Sequence[float], errors: Sequence[float | None], held_out: int) -> str:
-    """Whether options that last are worth it: by :func:`_wider` and :data:`SMALLEST`.
+    """The verdict on options that last, by :func:`_wider` and :data:`SMALLEST`.
 
     :param errors: standard errors over held-out demonstrations; None where there is one.
     """
     known = [error for error in errors if error is not None]
     low, high = _wider(memory, float(np.mean(known)) if known else 0.0, held_out)
     wider = high > mean_interval(memory)[1]
-    said = f"Over held-out demonstrations it is {interval([low, high])}. " if wider else ""
+    said = f"Over held-out demonstrations it is {interval((low, high))}. " if wider else ""
     return said + _verdict(low, high)
 
 
@@ -278,7 +277,7 @@ def _verdict(low: float, high: float) -> str:
     return "It is inconclusive whether options that last are worth anything here."
 
 
-def mean_interval(values: Sequence[float]) -> tuple[float, float]:
+def mean_interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
     """The 95 % t interval of the mean of a few values."""
     mean, count = float(np.mean(values)), len(values)
     half = float(np.std(values, ddof=1) * _t_quantile(count - 1) / math.sqrt(count))
@@ -294,84 +293,83 @@ def _t_quantile(freedom: int) -> float:
 
 def spread(values: Sequence[float]) -> tuple[str, str, str]:
     """Mean, 95 % t interval of the mean, and range of a few values."""
-    return number(float(np.mean(values))), interval([*mean_interval(values)]), interval([min(values), max(values)])
+    return number(float(np.mean(values))), interval(mean_interval(values)), interval((min(values), max(values)))
 
 
-def with_error(difference: Mapping[str, Any] | None) -> str:
-    """A difference in nats per step with its standard error over held-out demonstrations; a dash for None."""
+def with_error(difference: Difference | None, digits: int = 2, unknown: str = "–") -> str:
+    """A difference in nats per step with its standard error over held-out demonstrations."""
     if difference is None:
-        return "–"
-    return f"{signed(difference['nats_per_step'])} ± {number(difference['standard_error'])}"
+        return unknown
+    return f"{signed(difference.nats_per_step, digits)} ± {number(difference.standard_error, digits)}"
 
 
-def _direction(difference: Mapping[str, Any], held_out: int) -> int:
+def _direction(difference: Difference, held_out: int) -> int:
     """1 or -1 where the 95 % interval of a difference leaves out 0, else 0."""
-    mean, error = difference["nats_per_step"], difference["standard_error"]
-    if error is None or not math.isfinite(error) or abs(mean) <= error * _t_quantile(held_out - 1):
+    mean, error = difference.nats_per_step, difference.standard_error
+    if error is None or abs(mean) <= error * _t_quantile(held_out - 1):
         return 0
     return 1 if mean > 0 else -1
 
 
-def trainings(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """The entry ``training`` of the model and of each baseline, by name."""
-    rows = {metrics["model"]: metrics, **metrics["comparison"]}
-    return {name: row["training"] for name, row in rows.items() if "training" in row}
+def effort(training: Training) -> str:
+    """The gradient or EM steps of training for tables, marked where training had not converged."""
+    by_em, not_converged = " (EM)" * training.by_em, ", not converged" * (not training.converged)
+    return f"{training.spent.gradient_steps}{by_em}{not_converged}"
 
 
-def spent(training: Mapping[str, Any]) -> str:
+def spent(training: Training) -> str:
     """Epochs and gradient steps, the budget, and the effort of restarts."""
-    took, allowed = training["spent"], training["budget"]
-    beside = restarts(training)
-    of = "" if allowed["epochs"] is None else f" of at most {allowed['epochs']} ({allowed['gradient_steps']})"
-    steps = "EM" if training.get("by_em") else "gradient"
-    return f"{took['epochs']} epochs ({took['gradient_steps']} {steps} steps){of}{'; ' * bool(beside)}{beside}"
+    took, allowed, beside = training.spent, training.budget, restarts(training)
+    of = "" if allowed.epochs is None else f" of at most {allowed.epochs} ({allowed.gradient_steps})"
+    steps = "EM" if training.by_em else "gradient"
+    return f"{took.epochs} epochs ({took.gradient_steps} {steps} steps){of}{'; ' * bool(beside)}{beside}"
 
 
-def restarts(training: Mapping[str, Any]) -> str:
+def restarts(training: Training) -> str:
     """The best of several restarts, the ones stopped early or diverged, and the effort of all; else empty."""
-    told = training.get("restarts")
-    if told is None or len(told["each"]) == 1:
+    told = training.restarts
+    if len(told.each) == 1:
         return ""
-    stopped = [(number, each["stopped"]) for number, each in enumerate(told["each"]) if each["stopped"] is not None]
-    early = ", ".join(f"{number} after {epochs}" for number, epochs in stopped) or "none"
-    ended = ", ".join(str(number) for number, each in enumerate(told["each"]) if each.get("diverged"))
+    stopped = {number: restart.stopped for number, restart in enumerate(told.each) if restart.stopped is not None}
+    early = ", ".join(f"{number} after {epochs}" for number, epochs in stopped.items()) or "none"
+    ended = ", ".join(str(number) for number, restart in enumerate(told.each) if restart.diverged)
     early += f"; diverged: {ended}" if ended else ""
     return (
-        f"restart {told['best']} was the best of {len(told['each'])} (0 to {len(told['each']) - 1}; stopped early, "
-        f"with their epochs of the last stage: {early}), which took {told['spent']['epochs']} epochs "
-        f"({told['spent']['gradient_steps']} gradient steps) together"
+        f"restart {told.best} was the best of {len(told.each)} (0 to {len(told.each) - 1}; stopped early, "
+        f"with their epochs of the last stage: {early}), which took {told.spent.epochs} epochs "
+        f"({told.spent.gradient_steps} gradient steps) together"
     )
 
 
 RAISE = "Raise training.epochs: all compared models have this budget, whatever their number of stages."
 
 
-def unconverged(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+def unconverged(metrics: Metrics) -> list[tuple[str, str]]:
     """Every model whose budget ended a stage before it converged, in words with the numbers, and the remedy."""
     verdicts = []
-    for name, training in trainings(metrics).items():
-        stages = [_too_short(stage) for stage in training["stages"] if not stage["converged"]]
+    for name, training in metrics.trainings.items():
+        stages = [_too_short(stage) for stage in training.stages if not stage.converged]
         if stages:
             who = method(name)
-            verdict = f"Earlier stages of {who} had" if training["converged"] else f"{_capital(who)} has"
+            verdict = f"Earlier stages of {who} had" if training.converged else f"{_capital(who)} has"
             verdicts.append((f"{verdict} not converged: the budget ended {listed(stages)}.", RAISE))
     return verdicts
 
 
-def _too_short(stage: Mapping[str, Any]) -> str:
-    text = f"stage {stage['stage']} after {stage['epochs']} epochs"
-    if not stage["epochs"]:
+def _too_short(stage: Stage) -> str:
+    text = f"stage {stage.stage} after {stage.epochs} epochs"
+    if not stage.epochs:
         return text
-    return f"{text} (tuning log-likelihood up by {number(stage['rising'])} nats per step over the last {stage['over']})"
+    return f"{text} (tuning log-likelihood up by {number(stage.rising)} nats per step over the last {stage.over})"
 
 
-def _clause(other: str, difference: Mapping[str, Any], held_out: int) -> str:
-    mean, error = difference["nats_per_step"], difference["standard_error"]
+def _clause(other: str, difference: Difference, held_out: int) -> str:
+    mean, error = difference.nats_per_step, difference.standard_error
     direction = "better" if mean > 0 else "worse"
-    if error is None or not math.isfinite(error):
+    if error is None:
         return f"{number(abs(mean))} nats per step {direction} than {other} (error unknown)"
     if not _direction(difference, held_out):
-        return f"with no clear difference from {other} ({signed(mean)} ± {number(error)} nats per step)"
+        return f"with no clear difference from {other} ({with_error(difference)} nats per step)"
     return f"{number(abs(mean))} ± {number(error)} nats per step {direction} than {other}"
 
 
@@ -381,15 +379,13 @@ def listed(items: Iterable[str]) -> str:
     return items[0] if len(items) == 1 else ", ".join(items[:-1]) + " and " + items[-1]
 
 
-def success(metrics: Mapping[str, Any]) -> str:
+def success(metrics: Metrics) -> str:
     """Success in rollouts in one sentence; empty where there are none."""
-    methods = metrics.get("rollouts", {}).get("methods", {})
-    rates = {name: results["measures"].get("success") for name, results in methods.items()}
-    rates = {name: summary for name, summary in rates.items() if summary and "successes" in summary}
-    ours = metrics["model"]
-    if ours not in rates:
+    rates = metrics.rollouts.success_rates if metrics.rollouts else {}
+    if metrics.rollouts is None or metrics.model not in rates:
         return ""
-    others = [f"{method(name)} in {rate(summary)}" for name, summary in rates.items() if name != ours]
-    text = f"In rollouts {method(ours)} succeeds in {rate(rates[ours], 'episodes')}"
+    ours = method(metrics.model)
+    text = f"In rollouts {ours} succeeds in {rate(rates.pop(metrics.model), 'episodes')}"
+    others = [f"{method(name)} in {rate(summary)}" for name, summary in rates.items()]
     said = f"{text}{'; ' if others else ''}{listed(others) if others else ''}."
-    return f"{said} {success_worth(metrics['rollouts'], method(ours))}".rstrip()
+    return f"{said} {success_worth(metrics.rollouts, ours)}".rstrip()

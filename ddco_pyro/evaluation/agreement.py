@@ -12,9 +12,10 @@ option anew is no boundary.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+
+from ddco_pyro.metrics import Confusion, Matched, Scores
 
 UNKNOWN = -1
 """The label of a step without ground truth."""
@@ -26,10 +27,10 @@ OVERLAPS = (10, 25, 50)
 """Thresholds of segmental F1: intersection over union, in percent."""
 
 UNMATCHED = ("nmi", "ari", *(f"boundary_f1_{steps}" for steps in TOLERANCES))
-MATCHED = ("accuracy", "iou", *(f"f1_{percent}" for percent in OVERLAPS), "edit")
+MATCHED = tuple(Matched.model_fields)
 
 
-def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> dict[str, Any] | None:
+def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> Scores | None:
     """All measures over demonstrations, each at most 1 (perfect); None where no step has a known label.
 
     - ``nmi``: normalised mutual information, arithmetic mean of the entropies.
@@ -43,7 +44,7 @@ def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> d
       over demonstrations.
 
     >>> found = agreement([np.array([7, 7, 3, 3])], [np.array([0, 0, 0, 1])])
-    >>> found["matched_globally"]["accuracy"], found["boundary_f1_1"]
+    >>> found.matched_globally.accuracy, found.boundary_f1_1
     (0.75, 1.0)
 
     :param segments: options [T] of each demonstration, any integers.
@@ -56,35 +57,34 @@ def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> d
         return None
     (_, ours), (names, truth) = (_numbered(side) for side in zip(*pairs, strict=True))
     x, y = np.concatenate(ours), np.concatenate(truth)
-    scores = {"nmi": float(normalized_mutual_info_score(y, x)), "ari": float(adjusted_rand_score(y, x))}
-    scores |= {f"boundary_f1_{steps}": _boundary_f1(ours, truth, steps) for steps in TOLERANCES}
     match = _matching(_counts(x, y))
     each = [_matching(_counts(h, label)) for h, label in zip(ours, truth, strict=True)]
     everywhere = [match[h] for h in ours]
     by_itself = [own[h] for own, h in zip(each, ours, strict=True)]
-    return scores | {
-        "matched_globally": _matched(everywhere, truth, len(names)),
-        "matched_per_demonstration": _matched(by_itself, truth, len(names)),
-    }
+    return Scores(
+        nmi=float(normalized_mutual_info_score(y, x)),
+        ari=float(adjusted_rand_score(y, x)),
+        **{f"boundary_f1_{steps}": _boundary_f1(ours, truth, steps) for steps in TOLERANCES},  # type: ignore[arg-type]
+        matched_globally=_matched(everywhere, truth, len(names)),
+        matched_per_demonstration=_matched(by_itself, truth, len(names)),
+    )
 
 
-def confusion(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> dict[str, list[Any]]:
-    """``steps`` of each of ``labels`` (rows) in each of ``options`` (columns), and the label with which each option is
-    ``matched`` globally, None for one that is left over.
-    """
+def confusion(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> Confusion:
+    """Steps of each label (rows) in each option (columns), and the label with which each option is matched globally."""
     pairs = _known(segments, labels)
     if not pairs:
-        return {"labels": [], "options": [], "steps": [], "matched": []}
+        return Confusion(labels=[], options=[], steps=[], matched=[])
     (options, ours), (names, truth) = (_numbered(side) for side in zip(*pairs, strict=True))
     counts = _counts(np.concatenate(ours), np.concatenate(truth))
     matched = [int(names[label]) if label < len(names) else None for label in _matching(counts)]
     columns, rows = np.argsort(options), np.argsort(names)
-    return {
-        "labels": names[rows].tolist(),
-        "options": options[columns].tolist(),
-        "steps": counts[np.ix_(rows, columns)].tolist(),
-        "matched": [matched[column] for column in columns],
-    }
+    return Confusion(
+        labels=names[rows].tolist(),
+        options=options[columns].tolist(),
+        steps=counts[np.ix_(rows, columns)].tolist(),
+        matched=[matched[column] for column in columns],
+    )
 
 
 def _known(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -131,16 +131,16 @@ LARGEST = 2**32
 """More labels than there can be."""
 
 
-def _matched(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], labels: int) -> dict[str, float]:
+def _matched(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], labels: int) -> Matched:
     x, y = np.concatenate(ours), np.concatenate(truth)
     steps = [((x == label) & (y == label), (x == label) | (y == label)) for label in range(labels)]
-    scores = {
-        "accuracy": float((x == y).mean()),
-        "iou": float(np.mean([both.sum() / either.sum() for both, either in steps])),
-    }
-    scores |= {f"f1_{percent}": _overlap_f1(ours, truth, percent / 100) for percent in OVERLAPS}
     edits = [_edit(h[_starts(h)], label[_starts(label)]) for h, label in zip(ours, truth, strict=True)]
-    return scores | {"edit": float(np.mean(edits))}
+    return Matched(
+        accuracy=float((x == y).mean()),
+        iou=float(np.mean([both.sum() / either.sum() for both, either in steps])),
+        **{f"f1_{percent}": _overlap_f1(ours, truth, percent / 100) for percent in OVERLAPS},
+        edit=float(np.mean(edits)),
+    )
 
 
 def _starts(sequence: np.ndarray) -> np.ndarray:

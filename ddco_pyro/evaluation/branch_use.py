@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ddco_pyro.evaluation.inferred import Inferred
 from ddco_pyro.inference.engines import log_likelihood
+from ddco_pyro.metrics import BranchUse
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.perceptrons import Branches
@@ -20,7 +21,7 @@ SEED = 0
 """The seed of the permutation of steps."""
 
 
-def branch_use(hierarchy: Hierarchy, pieces: Iterable[Inferred]) -> list[dict[str, Any]]:
+def branch_use(hierarchy: Hierarchy, pieces: Iterable[Inferred]) -> list[BranchUse]:
     """The use of branches in each level whose policies have branches, lowest first, the meta-policy last.
 
     ``level`` is the number of the level from 0, ``branches`` has the names of the branches. Two tables have a row for
@@ -40,12 +41,12 @@ def branch_use(hierarchy: Hierarchy, pieces: Iterable[Inferred]) -> list[dict[st
                 own = _sums(hierarchy, piece, level, branch)
                 sums[level, number] = sums.get((level, number), torch.zeros(1)) + own
     return [
-        {
-            "level": level,
-            "branches": list(network.names),
-            "activation": _rows(sums, level, len(network.of), 0),
-            "loss": _rows(sums, level, len(network.of), 1),
-        }
+        BranchUse(
+            level=level,
+            branches=list(network.names),
+            activation=_rows(sums, level, len(network.of), 0),
+            loss=_rows(sums, level, len(network.of), 1),
+        )
         for level, network in branched.items()
     ]
 

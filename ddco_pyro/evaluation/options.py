@@ -1,38 +1,22 @@
-"""How options are used and how differently they act, and the signs of a degenerate solution (SM 2.1) therein."""
+"""Use and divergence of options, and the signs of a degenerate solution (SM 2.1)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ddco_pyro.inference import Posterior
+from ddco_pyro.metrics import Alike, Use
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 
 
-@dataclass(frozen=True)
-class OptionUse:
-    """The use of one choice of a level (0 is control) in demonstrations.
-
-    :param share: mean of u_t, the share of steps in which the choice is active.
-    :param selected: Σ v_t, the expected number of selections.
-    :param demonstrations: the expected number of demonstrations with a selection, Σ_n min(1, Σ_t v_t).
-    :param duration: expected steps from a selection to the next, Σ u_t / Σ v_t; None without a selection.
-    """
-
-    choice: int
-    share: float
-    selected: float
-    demonstrations: float
-    duration: float | None
-
-
-def option_use(posterior: Posterior) -> list[list[OptionUse]]:
+def option_use(posterior: Posterior) -> list[list[Use]]:
     """The use of every choice of each level, lowest first."""
     uses = []
     for u, v in zip(posterior.u, posterior.v, strict=True):
@@ -42,19 +26,15 @@ def option_use(posterior: Posterior) -> list[list[OptionUse]]:
     return uses
 
 
-def _use(choice: int, active: float, selected: np.ndarray, total: float) -> OptionUse:
+def _use(choice: int, active: float, selected: np.ndarray, total: float) -> Use:
     """The use of a choice that is ``active`` in so many of ``total`` steps; ``selected`` is by demonstration."""
     often = float(selected.sum())
     duration = active / often if often > 1e-6 else None
-    return OptionUse(choice, active / total, often, float(selected.clip(max=1.0).sum()), duration)
+    within = float(selected.clip(max=1.0).sum())
+    return Use(choice=choice, share=active / total, selected=often, demonstrations=within, duration=duration)
 
 
-def as_rows(use: Sequence[Sequence[OptionUse]]) -> list[list[dict[str, float | int | None]]]:
-    """The uses as plain data."""
-    return [[asdict(choice) for choice in level] for level in use]
-
-
-def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[dict[str, Any]]]:
+def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[Alike]]:
     """The ``divergence`` of each pair of ``options`` of each level, lowest first, nats per step.
 
     The divergence is the mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i), averaged over steps with weights u_t(i) + u_t(j);
@@ -70,7 +50,7 @@ def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[dict[s
                 level[pair] = level.get(pair, 0.0) + _divergence(own, *pair, u)
     return [
         [
-            {"options": [i + 1, j + 1], "divergence": float(total / weight) if weight > 0 else None}
+            Alike(options=(i + 1, j + 1), divergence=float(total / weight) if weight > 0 else None)
             for (i, j), (total, weight) in level.items()
         ]
         for level in levels
@@ -101,12 +81,6 @@ AGAIN_AND_AGAIN = 3.0
 HIGH_FITTING_SHARE = 0.5
 SMALLEST_DIVERGENCE = 0.1
 """Nats per step; two Gaussian policies whose means are 0.45 σ apart."""
-
-Use = Sequence[Mapping[str, Any]]
-"""The uses of the choices of one level, control (0) first: rows of ``metrics["options"]``."""
-
-Alike = Sequence[Mapping[str, Any]]
-"""The pairs of ``options`` of one level with their ``divergence``: rows of ``metrics["divergences"]``."""
 
 Kind = Literal["unused", "redundant", "dominating", "never_persisting", "high_fitting"]
 
@@ -151,8 +125,8 @@ class Finding:
         return ADVICE[self.kind]
 
 
-def diagnose(options: Sequence[Use], divergences: Sequence[Alike] = ()) -> list[Finding]:
-    """The signs of a degenerate solution in ``metrics["options"]`` and ``metrics["divergences"]``, lowest level first.
+def diagnose(options: Sequence[Sequence[Use]], divergences: Sequence[Sequence[Alike]] = ()) -> list[Finding]:
+    """The signs of a degenerate solution in the ``options`` and ``divergences`` of a run, lowest level first.
 
     - unused: an option that is active less than 1 % of the time;
     - dominating: one of several options that is active more than 90 % of the time;
@@ -166,32 +140,29 @@ def diagnose(options: Sequence[Use], divergences: Sequence[Alike] = ()) -> list[
         for option in use[1:]:
             findings += _of_option(level, option, alone=len(use) == 2)
         findings += _of_pairs(level, use, divergences[level - 1] if divergences else ())
-        above = options[level] if level < len(options) else None
-        findings += _of_caller(level, float(use[0]["share"]), float(above[0]["share"]) if above else 0.0)
+        above = options[level][0].share if level < len(options) else 0.0
+        findings += _of_caller(level, use[0].share, above)
     return findings
 
 
-def _of_option(level: int, use: Mapping[str, Any], alone: bool) -> list[Finding]:
-    choice, share, duration = int(use["choice"]), float(use["share"]), use["duration"]
-    if share < UNUSED_SHARE:
-        return [Finding("unused", level, choice, share)]
+def _of_option(level: int, use: Use, alone: bool) -> list[Finding]:
+    if use.share < UNUSED_SHARE:
+        return [Finding("unused", level, use.choice, use.share)]
     findings = []
-    if share > DOMINATING_SHARE and not alone:
-        findings.append(Finding("dominating", level, choice, share))
-    within = float(use["demonstrations"])
-    selections = float(use["selected"]) / within if within else 0.0
-    if duration is not None and duration < SHORTEST_DURATION and selections >= AGAIN_AND_AGAIN:
-        findings.append(Finding("never_persisting", level, choice, float(duration), selections=selections))
+    if use.share > DOMINATING_SHARE and not alone:
+        findings.append(Finding("dominating", level, use.choice, use.share))
+    selections = use.selected / use.demonstrations if use.demonstrations else 0.0
+    if use.duration is not None and use.duration < SHORTEST_DURATION and selections >= AGAIN_AND_AGAIN:
+        findings.append(Finding("never_persisting", level, use.choice, use.duration, selections=selections))
     return findings
 
 
-def _of_pairs(level: int, use: Use, alike: Alike) -> list[Finding]:
-    used = {int(row["choice"]) for row in use if float(row["share"]) >= UNUSED_SHARE}
+def _of_pairs(level: int, use: Sequence[Use], alike: Sequence[Alike]) -> list[Finding]:
+    used = {row.choice for row in use if row.share >= UNUSED_SHARE}
     return [
-        Finding("redundant", level, second, float(pair["divergence"]), first)
+        Finding("redundant", level, pair.options[1], pair.divergence, pair.options[0])
         for pair in alike
-        for first, second in [pair["options"]]
-        if {first, second} <= used and pair["divergence"] is not None and pair["divergence"] < SMALLEST_DIVERGENCE
+        if used.issuperset(pair.options) and pair.divergence is not None and pair.divergence < SMALLEST_DIVERGENCE
     ]
 
 

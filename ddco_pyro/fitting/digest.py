@@ -15,7 +15,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.pictures import Observed, Pictures, blocks
 from ddco_pyro.errors import BadInput
-from ddco_pyro.evaluation.schema import Record, read_record
+from ddco_pyro.metrics import Record, read_record
 
 NAME = "demonstrations.json"
 
@@ -23,7 +23,7 @@ TRAINED = ("checkpoints", "model.safetensors", "folds.json")
 """Files that a run or a selection has as soon as training begins."""
 
 
-FORMAT = 2
+FORMAT = 3
 """The version of the run folder's format."""
 
 
@@ -133,23 +133,7 @@ def record(folder: Path, demos: Demonstrations, known: Digest | None = None) -> 
     kept = recorded(folder)
     if kept is None:
         write_text(folder / NAME, digest(demos, known).model_dump_json(indent=1) + "\n")
-    else:
-        _compare(folder, kept, demos)
-
-
-def refuse_others(folder: Path, demos: Demonstrations) -> None:
-    """Refuse demonstrations other than those of a finished run.
-
-    :raises OtherDemonstrations: the folder is a run of other demonstrations.
-    :raises Damaged: ``demonstrations.json`` is damaged.
-    """
-    kept = recorded(folder)
-    assert kept is not None  # or it would not be finished
-    _compare(folder, kept, demos)
-
-
-def _compare(folder: Path, kept: Digest, demos: Demonstrations) -> None:
-    if different := difference(kept, digest(demos, kept)):
+    elif different := difference(kept, digest(demos, kept)):
         raise OtherDemonstrations(
             f"{folder}: is a run of other demonstrations ({different}); bring back those that it was fitted to, or "
             "choose another --out for these"
@@ -157,7 +141,7 @@ def _compare(folder: Path, kept: Digest, demos: Demonstrations) -> None:
 
 
 def difference(kept: Digest, now: Digest) -> str:
-    """What differs between two digests, in words; empty where they are equal."""
+    """The differences of two digests in words; empty where they are equal."""
     missing = [name for name in kept.names if name not in now.names]
     new = [name for name in now.names if name not in kept.names]
     if missing or new:

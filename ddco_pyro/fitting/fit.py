@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import numpy as np
 import torch
@@ -21,14 +21,13 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor
 from ddco_pyro.data.controls import measure
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.files import json_text, leftovers
+from ddco_pyro.data.files import leftovers
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
 from ddco_pyro.evaluation.inferred import Inferred, infer
-from ddco_pyro.evaluation.metrics import evaluate, supervisor
-from ddco_pyro.evaluation.schema import read_metrics
 from ddco_pyro.events import Event, OnEvent, TrainingBegan, ignore
-from ddco_pyro.fitting.digest import record, recorded, refuse_others
+from ddco_pyro.fitting.digest import record, recorded
+from ddco_pyro.fitting.evaluation import evaluate
 from ddco_pyro.fitting.run import (
     Clock,
     RunError,
@@ -37,10 +36,10 @@ from ddco_pyro.fitting.run import (
     is_finished,
     read_model,
     write_history,
-    write_metrics,
     write_model,
 )
 from ddco_pyro.inference import Posterior
+from ddco_pyro.metrics import Metrics
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, user_code, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
@@ -64,10 +63,10 @@ TOLERANCE = 1e-4
 class Fit:
     """A fitted model.
 
-    >>> fit.spec.hierarchy.levels[0].count, sorted(fit.baselines), fit.metrics["demonstrations"]["valid"]
+    >>> fit.spec.hierarchy.levels[0].count, sorted(fit.baselines), fit.metrics.demonstrations.valid
     (2, ['flat'], 1)
 
-    :param metrics: the contents of ``metrics.json``.
+    :param metrics: the contents of ``metrics.json``; None of a model that was not evaluated.
     :param folder: the run folder; None where nothing was written.
     :param given: the demonstrations of the fit; None for those that the spec names.
     :param beside: the fitted baselines, by name; None for those in the run folder.
@@ -75,7 +74,7 @@ class Fit:
 
     spec: Spec
     hierarchy: Hierarchy
-    metrics: dict[str, Any] = field(default_factory=dict, repr=False)
+    metrics: Metrics = field(default=cast(Metrics, None), repr=False)
     folder: Path | None = None
     given: Demonstrations | None = field(default=None, repr=False)
     beside: Mapping[str, Fit] | None = field(default=None, repr=False)
@@ -108,7 +107,7 @@ class Fit:
             return self.given
         demos = read_demonstrations(self.spec)
         if self.folder is not None:
-            refuse_others(self.folder, demos)
+            record(self.folder, demos)
         return demos
 
     @cached_property
@@ -123,7 +122,7 @@ class Fit:
     @cached_property
     def held_out(self) -> dict[str, float]:
         """log p(ξ) of each held-out demonstration by name, computed when it was fitted, nats."""
-        return {row["name"]: row["log_likelihood"] for row in self.metrics["valid"]}
+        return {row.name: row.log_likelihood for row in self.metrics.valid}
 
     def was_held_out(self, name: str, log_likelihood: float) -> bool:
         """Whether a demonstration is among the held-out ones: the name and the log-likelihood are equal."""
@@ -205,8 +204,8 @@ def fit(
     ...     return ddco_pyro.Demonstration(f"demo_{n}", {"place": place}, place * np.repeat([[-2.0], [2.0]], 5, 0))
     >>> demos = ddco_pyro.Demonstrations(tuple(demonstration(n) for n in range(6)))
     >>> fit = ddco_pyro.fit("mine.yaml", demos)
-    >>> fit.metrics["demonstrations"]
-    {'train': 4, 'tune': 1, 'valid': 1}
+    >>> fit.metrics.demonstrations
+    Counts(train=4, tune=1, valid=1, supervisor={})
     >>> ddco_pyro.fit("mine.yaml", demos, out="runs/mine").folder.as_posix()
     'runs/mine'
 
@@ -312,23 +311,27 @@ def _fit_model(
             write_model(folder, hierarchy)
         with clock("baselines"):
             beside = {name: begun[name]() if name in begun else fits[name](on_event, jobs, ranks) for name in fits}
-    fitted = Fit(spec, hierarchy, {}, folder, demos, beside)
+    fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=beside)
+    parts_of = {"train": trained.data.train, "tune": trained.data.tune, "valid": split.get("valid", ())}
+    known = {"supervisor": json.loads(str(demos.attributes.get("supervisor", "{}")))}  # a collected file has it
     with clock("evaluation"), repeatable(hierarchy.device):
-        metrics = evaluate(fitted, split, demos)
-    counts = {"train": len(trained.data.train), "tune": len(trained.data.tune), "valid": len(split.get("valid", ()))}
-    metrics |= {
-        "engine_check": trained.check._asdict(),
-        "demonstrations": counts | supervisor(demos),
-        "measure": measure(hierarchy.scaling.parts),
-        "control_dimensions": [dimension.as_data() for dimension in size.control],
-        "parameters": parameters(hierarchy),
-        "training": trained.summary,
-        "seconds": clock.end(),
-        "versions": {package: importlib.metadata.version(package) for package in PACKAGES},
-    }
+        metrics = evaluate(
+            fitted,
+            split,
+            demos,
+            engine_check=trained.check._asdict(),
+            demonstrations={name: len(part) for name, part in parts_of.items()} | known,
+            measure=measure(hierarchy.scaling.parts),
+            control_dimensions=[dimension.as_data() for dimension in size.control],
+            parameters=parameters(hierarchy),
+            training=trained.summary,
+            seconds={},
+            versions={package: importlib.metadata.version(package) for package in PACKAGES},
+        )
+    metrics.seconds = clock.end()
     if folder:
-        write_metrics(folder, metrics)
-    return replace(fitted, metrics=json.loads(json_text(metrics)))  # as they are read back
+        metrics.write(folder)
+    return replace(fitted, metrics=metrics)
 
 
 def _fit_baseline(
@@ -449,4 +452,4 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
     recorded(folder)  # or the format is another
     hierarchy = read_model(folder, spec)
     counts = [level.count for level in spec.hierarchy.levels] if spec.hierarchy else []
-    return Fit(spec, hierarchy, read_metrics(folder, counts), folder)
+    return Fit(spec, hierarchy, Metrics.read(folder, counts), folder)

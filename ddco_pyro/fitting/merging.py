@@ -91,16 +91,14 @@ def chosen(run: Fit, level: str | None = None, options: tuple[int, int] | None =
     levels = run.spec.hierarchy.levels if run.spec.hierarchy else ()
     names = [one.name for one in levels]
     if not names:
-        raise MergeError(f"{_place(run)}: is a policy without options; there are none to merge")
+        raise MergeError(f"{run}: is a policy without options; there are none to merge")
     if level is not None and level not in names:
         raise MergeError(f"there is no level {level!r}{nearest(level, names)}; there is: {', '.join(names)}")
     number = 0 if level is None else names.index(level)
     count, alike = levels[number].count, _divergences(run, number)
     if options is None:
         if not alike:
-            raise MergeError(
-                f"{_place(run)}: no two options of level {names[number]!r} are used; there are none to merge"
-            )
+            raise MergeError(f"{run}: no two options of level {names[number]!r} are used; there are none to merge")
         options = min(alike, key=alike.__getitem__)
     first, second = sorted(options)
     if not 1 <= first < second <= count:
@@ -111,8 +109,8 @@ def chosen(run: Fit, level: str | None = None, options: tuple[int, int] | None =
 
 def _divergences(run: Fit, level: int) -> dict[tuple[int, int], float]:
     """The divergence of each pair of used options of a level."""
-    rows: list[dict[str, Any]] = run.metrics["divergences"][level]
-    return {(row["options"][0], row["options"][1]): row["divergence"] for row in rows if row["divergence"] is not None}
+    rows = run.metrics.divergences[level]
+    return {row.options: row.divergence for row in rows if row.divergence is not None}
 
 
 def merged_spec(spec: Spec, level: int) -> Spec:
@@ -153,7 +151,3 @@ def merged_labels(run: Fit, pair: Pair) -> Demonstrations:
         replace(demo, labels=dict(demo.labels) | {LABELS: renumbered(choices[: len(demo)])}) for demo, choices in each
     )
     return replace(demos, demonstrations=tuple(labelled))
-
-
-def _place(run: Fit) -> str:
-    return str(run.folder) if run.folder else "the fit"

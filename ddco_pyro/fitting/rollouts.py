@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, model_validator
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking
 from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.errors import command
-from ddco_pyro.evaluation.schema import Unfinished, read_record
 from ddco_pyro.evaluation.worth import success_worth
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit
-from ddco_pyro.fitting.run import RunError, write_metrics
+from ddco_pyro.fitting.run import RunError
+from ddco_pyro.metrics import Method, Record, Rollouts, read_record, write_table
 from ddco_pyro.simulation.episodes import paired_difference, run_episode, run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task
+from ddco_pyro.spec.base import invalid
 
-Outcomes = dict[str, list[dict[str, float]]]
-"""The outcomes of each method's episodes, in the order of their seeds."""
+OrNaN = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+"""A number; NaN, null in the file, for a measure that does not apply."""
 
 
 def policies(fit: Fit) -> dict[str, Policy | str]:
@@ -47,7 +48,7 @@ def policies(fit: Fit) -> dict[str, Policy | str]:
 
 def roll_out(
     fit: Fit, episodes: int, film: int = 0, on_event: OnEvent = ignore, jobs: int = -1, resume: bool = False
-) -> dict[str, Any]:
+) -> Rollouts:
     """Roll out a fit, its baselines and the task's scripted policies from the same initial states.
 
     Writes ``rollouts.csv`` and ``videos/``, and adds ``rollouts`` to ``metrics.json``. After an interruption, finished
@@ -55,23 +56,20 @@ def roll_out(
 
     :param episodes: the number of initial states.
     :param film: the number of episodes of each method to film.
-    :param resume: return the rollouts of the run where it has these very ones.
-    :returns: ``rollouts`` of ``metrics.json``.
+    :param resume: return the finished rollouts of the run where seeds and methods are the same.
+    :returns: ``rollouts`` of the fit's metrics.
     :raises RunError: there is no task, or the fit has no folder.
     :raises Damaged: the file of an interrupted rollout is damaged.
     """
     folder = fit.run_folder
     seeds = range(fit.spec.rollout.seed, fit.spec.rollout.seed + episodes)
     played = policies(fit)
-    held = fit.metrics.get("rollouts", {})
-    whole = (held.get("seed"), held.get("episodes"), set(held.get("methods", ()))) == (
-        seeds.start,
-        episodes,
-        {*played},
-    )
-    if resume and whole and all(_filmed(fit, name, seeds[:film]) for name in played):
-        return dict(held)
-    rolled, total = _Unfinished(folder, seeds), len(played) * episodes
+    held = fit.metrics.rollouts
+    whole = held and (held.seed, held.episodes, {*held.methods}) == (seeds.start, episodes, {*played})
+    if held and whole and resume and all(_filmed(fit, name, seeds[:film]) for name in played):
+        return held
+    unfinished, total = folder / "rollouts.unfinished.json", len(played) * episodes
+    rolled = _unfinished(unfinished, seeds)
     for name, policy in played.items():
         if name in rolled.outcomes and _filmed(fit, name, seeds[:film]):
             for _ in seeds:
@@ -84,18 +82,29 @@ def roll_out(
                 _film_looks(fit, name, policy, episode.seed)
                 write_film(_film(fit, name, episode.seed), episode)
             on_event(EpisodeEnded(name, total))
-        rolled.keep(name, outcomes)
-    by_method = {name: rolled.outcomes[name] for name in played}
-    write_text(folder / "rollouts.csv", _table(by_method, seeds))
-    methods = _methods(find_task(str(fit.spec.task)), by_method, fit.name)
-    results = {"seed": seeds.start, "episodes": episodes, "methods": methods}
-    succeeded = {name: _successes(outcomes) for name, outcomes in by_method.items() if _judged(outcomes)}
-    if parts := success_worth(fit.name, succeeded):
-        results["worth"] = parts
-    fit.metrics["rollouts"] = results
-    write_metrics(folder, fit.metrics)
-    rolled.end()
-    return results
+        rolled.outcomes[name] = outcomes
+        write_text(unfinished, json_text(rolled.model_dump()))
+    task, by_method = find_task(str(fit.spec.task)), {name: rolled.outcomes[name] for name in played}
+    rows = [
+        {"method": name, "seed": seed, **outcome}
+        for name, outcomes in by_method.items()
+        for seed, outcome in zip(seeds, outcomes, strict=True)
+    ]
+    write_table(folder / "rollouts.csv", dict.fromkeys(column for row in rows for column in row), rows)
+    succeeded = {
+        name: [outcome[SUCCESS] for outcome in outcomes]
+        for name, outcomes in by_method.items()
+        if all(SUCCESS in outcome for outcome in outcomes)
+    }
+    fit.metrics.rollouts = Rollouts(
+        seed=seeds.start,
+        episodes=episodes,
+        methods={name: _method(task, name, outcomes, succeeded, fit.name) for name, outcomes in by_method.items()},
+        worth=success_worth(fit.name, succeeded),
+    )
+    fit.metrics.write(folder)
+    unfinished.unlink(missing_ok=True)
+    return fit.metrics.rollouts
 
 
 def _film_looks(fit: Fit, name: str, policy: Policy | str, seed: int) -> None:
@@ -114,59 +123,36 @@ def _filmed(fit: Fit, name: str, seeds: Sequence[int]) -> bool:
     return all(_film(fit, name, seed).exists() for seed in seeds)
 
 
-class _Unfinished:
-    """The ``outcomes`` of finished methods, kept in a file until all methods are finished."""
+class _Unfinished(Record):
+    """The outcomes of finished methods, kept in a file until all methods are finished."""
 
-    def __init__(self, folder: Path, seeds: Sequence[int]) -> None:
-        self._path = folder / "rollouts.unfinished.json"
-        models = b"".join(path.read_bytes() for path in sorted(folder.rglob("model.safetensors")))
-        self._key = {"models": hashlib.sha256(models).hexdigest(), "seeds": list(seeds)}
-        self.outcomes: Outcomes = {}
-        if self._path.exists():
-            kept = read_record(self._path, Unfinished, f"remove it and roll out again: {command('rollout', folder)}")
-            if (kept.models, kept.seeds) == (self._key["models"], self._key["seeds"]):
-                self.outcomes = {name: [_numbers(one) for one in each] for name, each in kept.outcomes.items()}
+    models: str
+    seeds: list[int]
+    outcomes: dict[str, list[dict[str, OrNaN]]]
 
-    def keep(self, name: str, outcomes: list[dict[str, float]]) -> None:
-        """Add a finished method."""
-        self.outcomes[name] = outcomes
-        write_text(self._path, json_text(self._key | {"outcomes": self.outcomes}))
-
-    def end(self) -> None:
-        """Remove the file."""
-        self._path.unlink(missing_ok=True)
+    @model_validator(mode="after")
+    def _an_outcome_for_each_seed(self) -> _Unfinished:
+        for method, outcomes in self.outcomes.items():
+            if len(outcomes) != len(self.seeds):
+                raise invalid(("outcomes", f"{method} has {len(outcomes)}, but there are {len(self.seeds)} seeds"))
+        return self
 
 
-def _numbers(outcome: Mapping[str, float | None]) -> dict[str, float]:
-    """An outcome from JSON, with NaN for a measure that does not apply."""
-    return {measure: math.nan if value is None else value for measure, value in outcome.items()}
+def _unfinished(path: Path, seeds: Sequence[int]) -> _Unfinished:
+    """The outcomes in a file where networks and seeds are the same; else none."""
+    models = b"".join(model.read_bytes() for model in sorted(path.parent.rglob("model.safetensors")))
+    fresh = _Unfinished(models=hashlib.sha256(models).hexdigest(), seeds=list(seeds), outcomes={})
+    if not path.exists():
+        return fresh
+    kept = read_record(path, _Unfinished, f"remove it and roll out again: {command('rollout', path.parent)}")
+    return kept if (kept.models, kept.seeds) == (fresh.models, fresh.seeds) else fresh
 
 
-def _judged(outcomes: Sequence[Mapping[str, float]]) -> bool:
-    return all(SUCCESS in outcome for outcome in outcomes)
-
-
-def _successes(outcomes: Sequence[Mapping[str, float]]) -> list[float]:
-    return [outcome[SUCCESS] for outcome in outcomes]
-
-
-def _methods(task: Task, by_method: Outcomes, ours: str) -> dict[str, Any]:
-    methods: dict[str, Any] = {}
-    for name, outcomes in by_method.items():
-        methods[name] = {"measures": summarize(task, outcomes)}
-        if name != ours and _judged(outcomes):
-            methods[name]["against"] = paired_difference(_successes(by_method[ours]), _successes(outcomes))
-    return methods
-
-
-def _table(by_method: Mapping[str, Sequence[Mapping[str, float]]], seeds: Sequence[int]) -> str:
-    """``rollouts.csv``: a row for each episode, a column for each measure."""
-    text = io.StringIO()
-    measures = dict.fromkeys(key for outcomes in by_method.values() for outcome in outcomes for key in outcome)
-    writer = csv.DictWriter(text, ["method", "seed", *measures], lineterminator="\n")
-    writer.writeheader()
-    for name, outcomes in by_method.items():
-        writer.writerows(
-            {"method": name, "seed": seed, **outcome} for seed, outcome in zip(seeds, outcomes, strict=True)
-        )
-    return text.getvalue()
+def _method(
+    task: Task, name: str, outcomes: list[dict[str, float]], succeeded: Mapping[str, list[float]], ours: str
+) -> Method:
+    """The measures of a method, and its successes against ours."""
+    found: dict[str, Any] = {"measures": summarize(task, outcomes)}
+    if name != ours and name in succeeded:
+        found["against"] = paired_difference(succeeded[ours], succeeded[name])
+    return Method.model_validate(found)

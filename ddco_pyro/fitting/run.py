@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import time
@@ -15,11 +13,11 @@ from typing import Any
 import torch
 
 from ddco_pyro.data.controls import ControlPart
-from ddco_pyro.data.files import Damaged, json_text, leftovers, only_one, write_text
+from ddco_pyro.data.files import Damaged, leftovers, only_one, write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.errors import BadInput
-from ddco_pyro.evaluation.schema import read_record, refit
 from ddco_pyro.events import EpochEnded, Event, OnEvent
+from ddco_pyro.metrics import read_record, refit, write_table
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, dump_spec
 from ddco_pyro.training.checkpoint import copy_of
@@ -70,11 +68,6 @@ def is_finished(folder: Path) -> bool:
     return all((folder / name).exists() for name in ("model.safetensors", "metrics.json"))
 
 
-def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
-    """Write ``metrics.json``."""
-    write_text(folder / "metrics.json", json_text(metrics))
-
-
 def write_model(folder: Path, hierarchy: Hierarchy) -> None:
     """Write ``model.safetensors``."""
     metadata = {
@@ -114,11 +107,7 @@ def read_model(folder: Path, spec: Spec) -> Hierarchy:
 
 def write_history(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Write ``history.csv``: a row for each epoch of each restart."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, ["restart", "stage", "epoch", "train", "tune"], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(folder / "history.csv", text.getvalue())
+    write_table(folder / "history.csv", ("restart", "stage", "epoch", "train", "tune"), rows)
 
 
 class Clock:

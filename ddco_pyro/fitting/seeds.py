@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import BadInput
@@ -14,8 +13,8 @@ from ddco_pyro.events import OnEvent, SeedFitted, ignore
 from ddco_pyro.fitting.fit import Fit, load
 from ddco_pyro.fitting.fit import fit as fit_again
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.fitting.run import is_finished, write_metrics
-from ddco_pyro.simulation.task import SUCCESS
+from ddco_pyro.fitting.run import is_finished
+from ddco_pyro.metrics import Metrics, Seeds, SuccessOfSeeds
 from ddco_pyro.spec import Spec, user_code, with_overrides
 from ddco_pyro.training.processes import pool, results, useful_jobs
 
@@ -44,7 +43,7 @@ def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) ->
     Each repetition is a run in ``seeds/SEED`` of the run folder. Finished repetitions are not done again.
 
     :param jobs: processes that fit side by side; -1 is one for each core. The result is the same for any number.
-    :returns: the fit, with the results of all repetitions in ``metrics["seeds"]`` and ``metrics.json``.
+    :returns: the fit, with the results of all repetitions in ``metrics.seeds`` and ``metrics.json``.
     :raises Failed: a process died.
     """
     folder = first.run_folder
@@ -60,8 +59,8 @@ def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) ->
             for _ in results(parallel, calls, DEAD):
                 on_event(SeedFitted(len(places)))
         every = [first, *(load(place, allow_code) for place in places.values())]
-        first.metrics["seeds"] = over_seeds(numbers, [fit.metrics for fit in every])
-        write_metrics(folder, first.metrics)
+        first.metrics.seeds = over_seeds(numbers, [fit.metrics for fit in every])
+        first.metrics.write(folder)
     return first
 
 
@@ -71,51 +70,47 @@ def _again(spec: Spec, seed: int, folder: Path) -> None:
 
 
 def roll_out_repetitions(first: Fit, on_event: OnEvent = ignore, jobs: int = -1) -> None:
-    """Roll the repetitions of a rolled out fit out, from the same initial states.
+    """Roll out the repetitions of a fit from the initial states of its own rollouts.
 
-    Fills ``rollouts.seeds`` of the fit's ``metrics.json``: success rates by method and the parts of the worth, in the
-    order of the training seeds. Nothing happens where the fit was not repeated.
+    Adds ``rollouts.seeds`` to the fit's metrics: success rates by method, and the parts of the worth. A fit without
+    repetitions stays as it is.
     """
-    if "seeds" not in first.metrics:
+    rollouts, seeds = first.metrics.rollouts, first.metrics.seeds
+    if seeds is None or rollouts is None:
         return
-    rollouts, numbers = first.metrics["rollouts"], first.metrics["seeds"]["training_seeds"]
     each = [rollouts]
-    for seed in numbers[1:]:
+    for seed in seeds.training_seeds[1:]:
         again = load(first.run_folder / "seeds" / str(seed), bool(user_code(first.spec)))
         alone = replace(again, spec=with_overrides(again.spec, {"rollout.policies": []}))  # scripts have no seeds
-        each.append(roll_out(alone, rollouts["episodes"], 0, on_event, jobs, resume=True))
-    rates = {
-        name: [one["methods"][name]["measures"][SUCCESS]["rate"] for one in each]
-        for name, own in each[-1]["methods"].items()
-        if "rate" in own["measures"].get(SUCCESS, {})
-    }
+        each.append(roll_out(alone, rollouts.episodes, 0, on_event, jobs, resume=True))
+    rates = {name: [one.success_rates[name].rate for one in each] for name in each[-1].success_rates}
+    pairs = [dict(one.worth or ()) for one in each]
     worth = {
-        part: [(one["worth"][part]["only_ours"] - one["worth"][part]["only_theirs"]) / one["episodes"] for one in each]
+        part: [(own[part].only_ours - own[part].only_theirs) / rollouts.episodes for own in pairs]
         for part in PARTS
-        if part in rollouts.get("worth", {})
+        if pairs[0].get(part)
     }
-    rollouts["seeds"] = {"training_seeds": numbers, "success": rates, "worth": worth}
-    write_metrics(first.run_folder, first.metrics)
+    found = SuccessOfSeeds.model_validate({"training_seeds": seeds.training_seeds, "success": rates, "worth": worth})
+    first.metrics.rollouts = rollouts.model_copy(update={"seeds": found})
+    first.metrics.write(first.run_folder)
 
 
 PARTS = ("memory", "experts", "total")
-"""What a worth consists of."""
+"""The parts of a :class:`~ddco_pyro.metrics.Worth`."""
 
 
-def over_seeds(seeds: Sequence[int], each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """``metrics["seeds"]``: the results of fits with these training seeds, from the metrics of each.
-
-    :returns: the ``training_seeds``; by model its ``held_out`` log-likelihoods per step; and the parts of ``worth``
-        (:mod:`ddco_pyro.evaluation.worth`), nats per step, each with its ``standard_error`` over held-out
-        demonstrations: all in the order of the seeds.
-    """
-    model = each[0]["model"]
-    held_out = {model: [metrics["log_likelihood_per_step"]["valid"] for metrics in each]}
-    for name in each[0]["comparison"]:
-        held_out[name] = [metrics["comparison"][name]["log_likelihood_per_step"]["valid"] for metrics in each]
-    parts = [part for part in PARTS if part in each[0].get("worth", {})]
-    worth, errors = (
-        {part: [metrics["worth"][part][key] for metrics in each] for part in parts}
-        for key in ("nats_per_step", "standard_error")
+def over_seeds(seeds: Sequence[int], each: Sequence[Metrics]) -> Seeds:
+    """The results of fits with these training seeds, from the metrics of each."""
+    held_out = {each[0].model: [metrics.log_likelihood_per_step.valid for metrics in each]}
+    for name in each[0].comparison:
+        held_out[name] = [metrics.comparison[name].log_likelihood_per_step.valid for metrics in each]
+    pairs = [dict(metrics.worth or ()) for metrics in each]
+    parts = [part for part in PARTS if pairs[0].get(part)]
+    return Seeds.model_validate(
+        {
+            "training_seeds": list(seeds),
+            "held_out": held_out,
+            "worth": {part: [own[part].nats_per_step for own in pairs] for part in parts},
+            "standard_error": {part: [own[part].standard_error for own in pairs] for part in parts},
+        }
     )
-    return {"training_seeds": list(seeds), "held_out": held_out, "worth": worth, "standard_error": errors}

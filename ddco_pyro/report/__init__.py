@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 
@@ -13,14 +11,12 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import style
 from ddco_pyro.drawing.page import Block, Facts, Page, Text, note
-from ddco_pyro.drawing.words import unconverged
 from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.metrics import Metrics, Rate
 from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, training, worth
 from ddco_pyro.report.activity import activity
 from ddco_pyro.report.training import degeneracies
 from ddco_pyro.segmenting.page import timelines
-
-__all__ = ["degeneracies", "unconverged", "write_report"]
 
 
 def write_report(fit: Fit, demos: Demonstrations) -> Path:
@@ -49,24 +45,23 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             training.warnings(fit),
             rollouts.films(fit),
             training.particulars(fit),
-            options.segments(drawn, len(metrics["demonstrations_by_likelihood"])) if drawn else None,
+            options.segments(drawn, len(metrics.demonstrations_by_likelihood)) if drawn else None,
         ]
     name = fit.run_folder.resolve().name
     write_text(path, Page(words.method(fit.name), header(fit, metrics), sections, subtitle=name).html())
     return path
 
 
-def header(fit: Fit, metrics: Mapping[str, Any]) -> list[Block]:
+def header(fit: Fit, metrics: Metrics) -> list[Block]:
     """The verdict, success in rollouts, warnings, and facts about demonstrations and training."""
-    counts = metrics["demonstrations"]
+    counts = metrics.demonstrations
     facts = {
-        "Demonstrations": f"{counts['train']} for training, {counts['tune']} for tuning, {counts['valid']} held out",
-        "Parameters": str(metrics["parameters"]),
+        "Demonstrations": f"{counts.train} for training, {counts.tune} for tuning, {counts.valid} held out",
+        "Parameters": str(metrics.parameters),
+        "Training": words.spent(metrics.training),
     }
-    if "training" in metrics:
-        facts["Training"] = words.spent(metrics["training"])
-    supervisor = counts.get("supervisor", {}).get("success")
-    if supervisor and "successes" in supervisor:
+    supervisor = counts.supervisor.get("success")
+    if isinstance(supervisor, Rate):
         facts["Supervisor’s own success"] = f"{words.rate(supervisor, 'demonstrations')}, 95 % interval"
     blocks: list[Block] = [Text(words.verdict(metrics), "verdict")]
     if success := words.success(metrics):
@@ -77,6 +72,6 @@ def header(fit: Fit, metrics: Mapping[str, Any]) -> list[Block]:
         blocks.append(Text(Markup("{} of a degenerate solution: see {}.").format(signs, link)))
     explained = (
         "Held out: used neither in training nor in tuning, which decides when to stop. A nat is the unit of "
-        "log-likelihood: one nat more per step means that the control of a step is e = 2.7 times as probable."
+        f"log-likelihood: {words.NAT}."
     )
     return [*blocks, note(explained), Facts(facts)]

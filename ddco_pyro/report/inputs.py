@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from markupsafe import Markup
@@ -16,6 +15,7 @@ from ddco_pyro.drawing.figures import FAINT, WIDTH, blank, save
 from ddco_pyro.drawing.page import Section, Table, note
 from ddco_pyro.drawing.words import number
 from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.metrics import BranchUse
 from ddco_pyro.training.data import parts
 
 COLUMNS, ROWS = 4, 3
@@ -70,13 +70,13 @@ def saliency(fit: Fit, demos: Demonstrations) -> Section | None:
 
 def branches(fit: Fit) -> Section | None:
     """The use of each branch of the networks; None where no network has branches."""
-    uses = fit.metrics.get("branches")
+    uses = fit.metrics.branches
     if not uses:
         return None
     levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
     names = [
-        [f"{levels[use['level']].name} {number + 1}" for number in range(len(use["loss"]))]
-        if use["level"] < len(levels)
+        [f"{levels[use.level].name} {number + 1}" for number in range(len(use.loss))]
+        if use.level < len(levels)
         else ["meta-policy" if levels else "policy"]
         for use in uses
     ]
@@ -92,32 +92,30 @@ def branches(fit: Fit) -> Section | None:
     return Section("branches", "Which inputs matter", [picture, branch_table(uses, names), note(explained)])
 
 
-def branch_table(uses: Sequence[Mapping[str, Any]], names: Sequence[Sequence[str]]) -> Table:
+def branch_table(uses: Sequence[BranchUse], names: Sequence[Sequence[str]]) -> Table:
     """Activation and loss of each branch, a row for each option and branch.
 
-    :param uses: as :func:`ddco_pyro.evaluation.branch_use.branch_use` gives them.
-    :param names: the options of each.
+    :param names: the options of each level.
     """
     rows = [
-        [option, branch, number(use["activation"][row][column], 3), number(use["loss"][row][column], 3)]
+        [option, branch, number(use.activation[row][column], 3), number(use.loss[row][column], 3)]
         for use, options in zip(uses, names, strict=True)
         for row, option in enumerate(options)
-        for column, branch in enumerate(use["branches"])
+        for column, branch in enumerate(use.branches)
     ]
     return Table(["Option", "Branch", "Mean activation", "Nats per step lost"], rows, {0, 1})
 
 
-def draw_branches(uses: Sequence[Mapping[str, Any]], names: Sequence[Sequence[str]]) -> Figure:
+def draw_branches(uses: Sequence[BranchUse], names: Sequence[Sequence[str]]) -> Figure:
     """The numbers of :func:`branch_table` as bars: a row of panels for each level."""
     figure = blank(2.6 * len(uses))
     axes = figure.subplots(len(uses), 2, squeeze=False)
     for row, (use, options) in enumerate(zip(uses, names, strict=True)):
-        width, places = 0.8 / len(use["branches"]), np.arange(len(options))
-        for panel, key, title in zip(
-            axes[row], ("activation", "loss"), ("mean activation", "nats per step lost"), strict=True
-        ):
-            for place, branch in enumerate(use["branches"]):
-                heights = [np.nan if value[place] is None else value[place] for value in use[key]]
+        width, places = 0.8 / len(use.branches), np.arange(len(options))
+        shown = {"mean activation": use.activation, "nats per step lost": use.loss}
+        for panel, (title, table) in zip(axes[row], shown.items(), strict=True):
+            for place, branch in enumerate(use.branches):
+                heights = [np.nan if value[place] is None else value[place] for value in table]
                 panel.bar(places + place * width, heights, width, label=branch, color=SHADES[place % len(SHADES)])
             panel.set_xticks(places + 0.4 - width / 2, options)
             panel.set_ylabel(title)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,59 +10,22 @@ from matplotlib.figure import Figure
 from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
 from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, note
-from ddco_pyro.drawing.words import about, method, number, signed
+from ddco_pyro.drawing.words import about, effort, method, number, with_error
 from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.metrics import Compared, Metrics
 from ddco_pyro.segmenting.page import anchor
-from ddco_pyro.training.stages import effort
 
 SHOWN = 20
 """Rows of the list of demonstrations that are not folded."""
 
 
-@dataclass(frozen=True)
-class Likelihood:
-    """Log-likelihood of one method, nats per step.
-
-    :param valid: NaN where no demonstration is held out.
-    :param difference: the model's held-out value minus the method's, and its standard error; None for the model.
-    :param each: the difference on each held-out demonstration.
-    :param training: the entry ``training`` of the method's ``metrics.json``.
-    """
-
-    name: str
-    train: float
-    valid: float
-    difference: tuple[float, float | None] | None = None
-    each: tuple[float, ...] = ()
-    parameters: int | None = None
-    training: Mapping[str, Any] | None = None
-
-
-def likelihoods(metrics: Mapping[str, Any], baselines: Mapping[str, Mapping[str, Any]]) -> list[Likelihood]:
-    """The model and its baselines, from their ``metrics.json``."""
-    own = metrics["log_likelihood_per_step"]
-    valid = np.nan if own["valid"] is None else own["valid"]
-    rows = [Likelihood(metrics["model"], own["train"], valid, None, (), metrics["parameters"], metrics.get("training"))]
-    for name, other in metrics["comparison"].items():
-        values, difference = other["log_likelihood_per_step"], other["difference"]
-        theirs = {row["name"]: row["log_likelihood"] for row in baselines.get(name, {}).get("valid", ())}
-        each = tuple(
-            (row["log_likelihood"] - theirs[row["name"]]) / row["steps"]
-            for row in metrics["valid"]
-            if row["name"] in theirs
-        )
-        paired = (difference["nats_per_step"], difference["standard_error"])
-        effort = other.get("parameters"), other.get("training")
-        rows.append(Likelihood(name, values["train"], values["valid"], paired, each, *effort))
-    return rows
-
-
 def section(fit: Fit) -> Section:
     """Log-likelihood of the model and its baselines."""
-    rows = likelihoods(fit.metrics, _of_baselines(fit))
-    alt = "; ".join(f"{method(row.name)}: {number(row.valid)} nats per step held out" for row in rows)
+    metrics = fit.metrics
+    valid = {method(name): number(one.log_likelihood_per_step.valid) for name, one in metrics.methods.items()}
+    alt = "; ".join(f"{name}: {value} nats per step held out" for name, value in valid.items())
     caption = "Log-likelihood of the model. Filled circle: held out; open circle: training."
-    if len(rows) > 1:
+    if metrics.comparison:
         caption = (
             "Left: log-likelihood of each method; filled circle: held out, open circle: training. Right: the model’s "
             "minus each baseline’s on the same held-out demonstrations; diamond: mean with one standard error, dots: "
@@ -75,59 +36,61 @@ def section(fit: Fit) -> Section:
         "log-probabilities. Another unit adds the same constant to every method. So differences in nats can be "
         "compared; percentages cannot."
     )
+    figure = draw(metrics, {name: one.held_out for name, one in fit.baselines.items()})
     blocks: list[Block] = [
-        Text(f"Nats per step; higher is better. {about(row.name for row in rows)}"),
-        table(rows),
-        save(draw(rows), fit.run_folder / "figures" / "likelihood.png", alt, caption),
+        Text(f"Nats per step; higher is better. {about(metrics.methods)}"),
+        table(metrics),
+        save(figure, fit.run_folder / "figures" / "likelihood.png", alt, caption),
         note(units),
     ]
     return Section("likelihood", "Held-out log-likelihood", blocks)
 
 
-def _of_baselines(fit: Fit) -> dict[str, Mapping[str, Any]]:
-    return {name: baseline.metrics for name, baseline in fit.baselines.items()}
-
-
-def table(compared: Sequence[Likelihood], digits: int = 2, title: str | None = None) -> Table:
+def table(metrics: Metrics, digits: int = 2, title: str | None = None) -> Table:
     """Log-likelihood of each method, the paired difference, parameters and gradient steps."""
     rows = []
-    for row in compared:
-        difference = ""
-        if row.difference is not None:
-            difference = f"{signed(row.difference[0], digits)} ± {number(row.difference[1], digits)}"
-        values = [number(row.valid, digits), number(row.train, digits), difference]
-        size = "–" if row.parameters is None else str(row.parameters)
-        rows.append([method(row.name), *values, size, effort(row.training)])
-    ours = f"{method(compared[0].name)} minus it, held out"
+    for name, one in metrics.methods.items():
+        values, size = one.log_likelihood_per_step, str(one.parameters)
+        difference = with_error(one.difference, digits) if isinstance(one, Compared) else ""
+        each = number(values.valid, digits), number(values.train, digits), difference
+        rows.append([method(name), *each, size, effort(one.training)])
+    ours = f"{method(metrics.model)} minus it, held out"
     return Table(["Method", "Held out", "Training", ours, "Parameters", "Gradient steps"], rows, title=title)
 
 
-def draw(compared: Sequence[Likelihood]) -> Figure:
-    """Log-likelihood of each method and, where there are several, the paired differences."""
-    values = [Interval(row.valid, hollow=row.train) for row in compared]
+def draw(metrics: Metrics, baselines: Mapping[str, Mapping[str, float]]) -> Figure:
+    """Log-likelihood of each method and, where there are several, the paired differences.
+
+    :param baselines: log p(ξ) of the held-out demonstrations by name, for each baseline.
+    """
+    per_step = [one.log_likelihood_per_step for one in metrics.methods.values()]
+    values = [Interval(np.nan if one.valid is None else one.valid, hollow=one.train) for one in per_step]
     panels = [Panel("Each method", "log-likelihood (nats per step)", values)]
-    if len(compared) > 1:
-        differences = [row.difference and Interval.around(*row.difference, row.each, marker="D") for row in compared]
-        title, axis = f"{method(compared[0].name)} minus each baseline", "nats per step above that method, held out"
+    if metrics.comparison:
+        differences: list[Interval | None] = [None]
+        for name, other in metrics.comparison.items():
+            each = [(one.log_likelihood - baselines[name][one.name]) / one.steps for one in metrics.valid]
+            differences.append(Interval.of(other.difference, each, marker="D"))
+        title, axis = f"{method(metrics.model)} minus each baseline", "nats per step above that method, held out"
         panels.append(Panel(title, axis, differences, line=0))
-    return interval_plot([method(row.name) for row in compared], panels)
+    return interval_plot(list(map(method, metrics.methods)), panels)
 
 
-def demonstrations(metrics: Mapping[str, Any], anchors: Collection[str]) -> Section:
+def demonstrations(metrics: Metrics, anchors: Collection[str]) -> Section:
     """Log-likelihood of every demonstration, the least likely first.
 
     :param anchors: the timelines on the page.
     """
-    entries = metrics["demonstrations_by_likelihood"]
-    methods = list(entries[0]["log_likelihood_per_step"])
+    entries = metrics.demonstrations_by_likelihood
+    methods = list(entries[0].log_likelihood_per_step)
     rows = []
     for entry in entries:
-        place, held_out = anchor(entry["name"]), entry["part"] == "valid"
-        name = Cell(entry["name"], link=f"#{place}" if place in anchors else "")
+        place, held_out = anchor(entry.name), entry.part == "valid"
+        name = Cell(entry.name, link=f"#{place}" if place in anchors else "")
         mark = Cell("held out" if held_out else "", mark=held_out)
-        rows.append([name, mark, str(entry["steps"]), *(number(entry["log_likelihood_per_step"][m]) for m in methods)])
+        rows.append([name, mark, str(entry.steps), *(number(entry.log_likelihood_per_step[m]) for m in methods)])
     text = (
-        f"Log-likelihood of each demonstration, nats per step. The least likely under {method(metrics['model'])} comes "
+        f"Log-likelihood of each demonstration, nats per step. The least likely under {method(metrics.model)} comes "
         "first: it is unlike the others, or the model fits it poorly."
     )
     found = Table(["Demonstration", "", "Steps", *map(method, methods)], rows, {0, 1})
@@ -140,18 +103,18 @@ def demonstrations(metrics: Mapping[str, Any], anchors: Collection[str]) -> Sect
 def dimensions(fit: Fit) -> Section:
     """The contribution of each control dimension, and of choosing options, to the log-likelihood of each method."""
     metrics = fit.metrics
-    records = {metrics["model"]: metrics, **_of_baselines(fit)}
-    parts = {name: record["log_likelihood_by_dimension"] for name, record in records.items()}
-    part = "valid" if parts[metrics["model"]]["valid"] else "train"
-    values = {name: found[part] for name, found in parts.items()}
+    methods = {metrics.model: metrics} | {name: other.metrics for name, other in fit.baselines.items()}
+    parts = {name: own.log_likelihood_by_dimension for name, own in methods.items()}
+    held_out = metrics.log_likelihood_by_dimension.valid is not None
+    values = {name: found.valid or found.train for name, found in parts.items()}
     rows = []
-    for fields in metrics["control_dimensions"]:
-        dimension = ControlDimension(**fields)
-        each = [number(value["by_dimension"][dimension.number]) for value in values.values()]
-        kind = str(metrics["measure"].get(str(dimension.number), [""])[0])
+    for fields in metrics.control_dimensions:
+        dimension = ControlDimension(**dict(fields))
+        each = [number(value.by_dimension[dimension.number]) for value in values.values()]
+        kind = str(metrics.measure.get(str(dimension.number), [""])[0])
         rows.append([str(dimension.number), *each, kind, dimension.note])
-    totals = [sum(filter(None, value["by_dimension"])) + value["options"] for value in values.values()]
-    rows += [["options", *(number(value["options"]) for value in values.values()), "", ""]]
+    totals = [sum(filter(None, value.by_dimension)) + value.options for value in values.values()]
+    rows += [["options", *(number(value.options) for value in values.values()), "", ""]]
     rows += [["sum", *map(number, totals), "", ""]]
     head = ["Control dimension", *map(method, values), "Modelled as", "In the demonstrations"]
     explained = (
@@ -161,7 +124,7 @@ def dimensions(fit: Fit) -> Section:
         "exact value grows without bound as σ shrinks; a large number there is no sign of a better model. Clipped and "
         "binary dimensions have probabilities at such values."
     )
-    shown = "held-out" if part == "valid" else "training"
+    shown = "held-out" if held_out else "training"
     text = f"Nats per step on {shown} demonstrations."
     blocks: list[Block] = [Text(text), Table(head, rows, {0, len(head) - 2, len(head) - 1}), note(explained)]
     return Section("dimensions", "Log-likelihood by control dimension", blocks)

@@ -18,8 +18,8 @@ from ddco_pyro.drawing.colours import add_legend, option_colour
 from ddco_pyro.drawing.figures import FAINT, GRID, blank, hide_frame, save
 from ddco_pyro.drawing.page import Block, Cell, Picture, Section, Table, Text, Timeline, note
 from ddco_pyro.drawing.words import number, option_name, percent
-from ddco_pyro.evaluation.schema import option_labels
 from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.metrics import Use
 from ddco_pyro.report import trajectories
 from ddco_pyro.report.activity import Activity, Bins, LevelActivity, bins
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
@@ -54,7 +54,8 @@ def section(fit: Fit, demos: Demonstrations, activity: Activity) -> Section:
         _timing_picture(fit, activity),
     )
     names = [level.name for level in fit.spec.hierarchy.levels]
-    count = sum(fit.metrics["demonstrations"][part] for part in ("train", "tune", "valid"))
+    counts = fit.metrics.demonstrations
+    count = counts.train + counts.tune + counts.valid
     used = note(
         "Over all demonstrations. Expected steps: from one selection of the option to the next selection of any option."
     )
@@ -62,7 +63,7 @@ def section(fit: Fit, demos: Demonstrations, activity: Activity) -> Section:
     if len(names) > 1:
         blocks.insert(0, Text("Each level numbers its own options: equal colours in two levels mean nothing."))
     blocks.append(Text("Use of the options", "heading"))
-    blocks.append(use_table(names, fit.metrics["options"], count, option_labels(fit.metrics)))
+    blocks.append(use_table(names, fit.metrics.options, count, fit.metrics.option_labels))
     link = Markup('<a href="#segments">segments of every demonstration</a>')
     blocks += [used, Text(Markup("Step by step: {}.").format(link))]
     return Section("options", "Which option is active when", blocks)
@@ -70,7 +71,7 @@ def section(fit: Fit, demos: Demonstrations, activity: Activity) -> Section:
 
 def use_table(
     levels: Sequence[str],
-    options: Sequence[Sequence[Mapping[str, Any]]],
+    options: Sequence[Sequence[Use]],
     demonstrations: int,
     labels: Mapping[str, Mapping[int, int]] | None = None,
 ) -> Table:
@@ -81,11 +82,11 @@ def use_table(
     rows = []
     for level, use in reversed(list(zip(levels, options, strict=True))):
         for row in use:
-            if row["choice"] or row["share"] > 0:
-                named = option_name(row["choice"], (labels or {}).get(level))
-                each = number(row["selected"] / demonstrations)
-                numbers = [percent(row["share"], 1), number(row["selected"], 1), each, number(row["duration"], 1)]
-                rows.append([level, Cell(named, colour=option_colour(row["choice"])), *numbers])
+            if row.choice or row.share > 0:
+                named = option_name(row.choice, (labels or {}).get(level))
+                each = number(row.selected / demonstrations)
+                numbers = [percent(row.share, 1), number(row.selected, 1), each, number(row.duration, 1)]
+                rows.append([level, Cell(named, colour=option_colour(row.choice)), *numbers])
     head = ["Level", "Choice", "Share of steps", "Selections", "Selections per demonstration", "Expected steps"]
     return Table(head, rows, {0, 1})
 
@@ -101,7 +102,7 @@ def quoted(names: Mapping[str, Any] | Sequence[str]) -> str:
 def _posterior_picture(
     fit: Fit, demos: Demonstrations, activity: Activity, labels: Sequence[Mapping[str, np.ndarray]]
 ) -> Picture:
-    held_out = [demo["name"] for demo in fit.metrics["valid"] if demo["name"] in demos.names]
+    held_out = [demo.name for demo in fit.metrics.valid if demo.name in demos.names]
     names = (held_out or list(demos.names))[:EXAMPLES]
     examples = {name: demos.names.index(name) for name in names}
     caption = (
@@ -300,7 +301,7 @@ def terminations(level: LevelActivity, gathered: Bins) -> np.ndarray:
 
 def segmented(fit: Fit, demos: Demonstrations, activity: Activity) -> Segmented:
     """Segments of the demonstrations in the order of ``demonstrations_by_likelihood``."""
-    entries = {entry["name"]: entry for entry in fit.metrics["demonstrations_by_likelihood"]}
+    entries = {entry.name: entry for entry in fit.metrics.demonstrations_by_likelihood}
     places = {name: row for row, name in enumerate(demos.names)}
     segments = []
     for name, entry in entries.items():
@@ -313,10 +314,10 @@ def segmented(fit: Fit, demos: Demonstrations, activity: Activity) -> Segmented:
                 for level in activity.levels
             }
             labels = {label: demo.labels[label] for label in fit.spec.demonstrations.label_names}
-            value = entry["log_likelihood_per_step"][fit.name]
-            segments.append(Segments(name, levels, value, entry["part"] == "valid", labels))
+            value = entry.log_likelihood_per_step[fit.name]
+            segments.append(Segments(name, levels, value, entry.part == "valid", labels))
     counts = {level.name: level.active.shape[2] - 1 for level in activity.levels}
-    return Segmented(tuple(segments), counts, None, option_labels=option_labels(fit.metrics))
+    return Segmented(tuple(segments), counts, None, option_labels=fit.metrics.option_labels)
 
 
 def segments(timelines: Sequence[Timeline], demonstrations: int) -> Section:

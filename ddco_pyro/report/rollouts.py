@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,9 +11,9 @@ from matplotlib.figure import Figure
 from ddco_pyro.data.sources.video import frames
 from ddco_pyro.drawing.figures import WIDTH, Interval, Panel, blank, data_uri, hide_frame, interval_plot, save
 from ddco_pyro.drawing.page import Block, Film, Films, Section, Table, Text, note
-from ddco_pyro.drawing.words import interval, measure, method, number, p_value, rate
-from ddco_pyro.evaluation.schema import read_successes
+from ddco_pyro.drawing.words import P_VALUE, interval, measure, method, number, p_value, rate
 from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.metrics import Mean, Measure, Method, read_successes
 
 MOST_BYTES = 4_000_000
 """Films are held in the page up to this size together; the page links to the others."""
@@ -25,55 +24,55 @@ COLUMNS = 4
 
 def success(fit: Fit) -> Section | None:
     """The measures of all methods and the paired comparison of success; None where nothing was rolled out."""
-    record = fit.metrics.get("rollouts")
+    record = fit.metrics.rollouts
     if not record:
         return None
-    methods = record["methods"]
+    methods = record.methods
     explained = (
         "Rates: successes of trials (Wilson 95 % interval). Other measures: mean ± standard deviation [95 % interval "
         "of the mean], n episodes in which the measure is known."
     )
-    text = f"{record['episodes']} episodes of each method from the same initial states (seeds from {record['seed']})."
+    text = f"{record.episodes} episodes of each method from the same initial states (seeds from {record.seed})."
     blocks: list[Block] = [Text(text), measures_table(methods), note(explained)]
-    found = {name: results["measures"].get("success", {}) for name, results in methods.items()}
-    if rates := {name: one for name, one in found.items() if one.get("interval") and "rate" in one}:
+    if rates := {name: one for name, one in record.success_rates.items() if one.interval}:
         alt = "Success. " + "; ".join(f"{method(name)}: {rate(one)}" for name, one in rates.items())
-        rows = [Interval(100 * one["rate"], *(100 * end for end in one["interval"])) for one in rates.values()]
+        rows = [
+            Interval(*(100 * value for value in (one.rate or 0.0, *(one.interval or ())))) for one in rates.values()
+        ]
         panel = Panel("", "success rate (%), 95 % interval", rows)
         figure = interval_plot(list(map(method, rates)), [panel])
         figure.axes[0].set_xlim(-1, 101)
         caption = "Success rate of each method with its Wilson 95 % interval."
         blocks.append(save(figure, fit.run_folder / "figures" / "success.png", alt, caption))
-    if paired := paired_table(methods, fit.metrics["model"]):
-        p = "p: McNemar’s exact test, two-sided, not corrected for the number of comparisons."
-        blocks += [Text("Paired comparison of success", "heading"), paired, note(p)]
+    if paired := paired_table(methods, fit.metrics.model):
+        blocks += [Text("Paired comparison of success", "heading"), paired, note(P_VALUE)]
     return Section("rollouts", "Success in the task", blocks)
 
 
-def measures_table(methods: Mapping[str, Mapping[str, Any]]) -> Table:
+def measures_table(methods: Mapping[str, Method], title: str | None = None) -> Table:
     """Every measure of every method, as in the paper's table."""
-    names = list(dict.fromkeys(name for entry in methods.values() for name in entry["measures"]))
-    rows = [[method(key), *(_cell(entry["measures"].get(name)) for name in names)] for key, entry in methods.items()]
-    return Table(["Method", *map(measure, names)], rows)
+    names = list(dict.fromkeys(name for entry in methods.values() for name in entry.measures))
+    rows = [[method(key), *(_cell(entry.measures.get(name)) for name in names)] for key, entry in methods.items()]
+    return Table(["Method", *map(measure, names)], rows, title=title)
 
 
-def _cell(summary: Mapping[str, Any] | None) -> str:
+def _cell(summary: Measure | None) -> str:
     if summary is None:
         return "–"
-    if "mean" not in summary:
+    if not isinstance(summary, Mean):
         return rate(summary)
-    if not summary["trials"]:
+    if not summary.trials:
         return "– (n = 0)"
-    spread = "" if summary["std"] is None else f" ± {number(summary['std'])} [{interval(summary['interval'])}]"
-    return f"{number(summary['mean'])}{spread}, n = {summary['trials']}"
+    spread = "" if summary.std is None else f" ± {number(summary.std)} [{interval(summary.interval)}]"
+    return f"{number(summary.mean)}{spread}, n = {summary.trials}"
 
 
-def paired_table(methods: Mapping[str, Mapping[str, Any]], ours: str) -> Table | None:
+def paired_table(methods: Mapping[str, Method], ours: str) -> Table | None:
     """The paired comparison of success on the same initial states; None where there is none."""
-    pairs = {name: results["against"] for name, results in methods.items() if "against" in results}
     rows = [
-        [method(name), str(pair["only_ours"]), str(pair["only_theirs"]), str(pair["trials"]), p_value(pair["p_value"])]
-        for name, pair in pairs.items()
+        [method(name), str(pair.only_ours), str(pair.only_theirs), str(pair.trials), p_value(pair.p_value)]
+        for name, results in methods.items()
+        if (pair := results.against)
     ]
     head = [f"{method(ours)} against", f"Only {method(ours)} succeeds", "Only the other succeeds", "Episodes", "p"]
     return Table(head, rows) if rows else None

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,8 +17,8 @@ from ddco_pyro.drawing.figures import INK, blank, save
 from ddco_pyro.drawing.page import Block, Code, Columns, Facts, Folded, Section, Text, Warned, note
 from ddco_pyro.drawing.words import number, percent
 from ddco_pyro.evaluation.options import Finding, diagnose
-from ddco_pyro.evaluation.schema import read_table, refit
 from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.metrics import Metrics, read_table, refit
 from ddco_pyro.spec import Spec, dump_spec
 
 COLUMNS = 4
@@ -147,14 +146,14 @@ def warnings(fit: Fit) -> Section | None:
     return Section("warnings", "Warnings", blocks)
 
 
-def degeneracies(spec: Spec, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+def degeneracies(spec: Spec, metrics: Metrics) -> list[tuple[str, str]]:
     """Signs of a degenerate solution in ``metrics.json``, each in words with its number, and the usual remedy."""
     if spec.hierarchy is None:
         return []
     levels = spec.hierarchy.levels
     return [
         (_sign(finding, levels[finding.level - 1].name), finding.advice)
-        for finding in diagnose(metrics["options"], metrics.get("divergences", ()))
+        for finding in diagnose(metrics.options, metrics.divergences)
         if finding.kind != "never_persisting" or levels[finding.level - 1].lasts
     ]
 
@@ -180,13 +179,13 @@ def _sign(finding: Finding, level: str) -> str:
 
 def particulars(fit: Fit) -> Section:
     """Seconds, engine check, versions and the spec."""
-    seconds = {name: number(value, 1) for name, value in fit.metrics["seconds"].items()}
-    check = {name: f"{value:.1e}" for name, value in fit.metrics["engine_check"].items()}
+    seconds = {name: number(value, 1) for name, value in fit.metrics.seconds.items()}
+    check = {name: f"{value:.1e}" for name, value in dict(fit.metrics.engine_check).items()}
     differences = "Largest relative difference of the two inference engines."
     facts = [
         Facts(seconds, "Seconds"),
         Facts(check, "Engine check", differences),
-        Facts(fit.metrics["versions"], "Versions"),
+        Facts(fit.metrics.versions, "Versions"),
     ]
     spec = Folded("The whole spec, with its defaults", [Code(dump_spec(fit.spec))])
     return Section("particulars", "How this run was made", [Columns(facts), spec])

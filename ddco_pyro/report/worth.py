@@ -1,14 +1,10 @@
-"""The page's section on what the hierarchy is worth: several experts and options that last, apart."""
+"""The worth of the hierarchy in the report, in two parts: several experts, and options that last."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-import numpy as np
-
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Section, Table, note
+from ddco_pyro.metrics import Metrics
 
 EXPLAINED = (
     "A mixture has the hierarchy’s experts and the gate that chooses among them, and chooses anew at every step. "
@@ -18,38 +14,30 @@ EXPLAINED = (
 )
 
 
-def section(metrics: Mapping[str, Any]) -> Section | None:
+def section(metrics: Metrics) -> Section | None:
     """The parts in held-out log-likelihood and in success, a row each; None where the run has no mixture."""
-    if "worth" not in metrics:
+    found, seeds, rollouts = metrics.worth, metrics.seeds, metrics.rollouts
+    if not found:
         return None
-    ours, rollouts = words.method(metrics["model"]), metrics.get("rollouts", {})
-    flat = words.method(metrics["worth"].get("flat", "flat"))
+    ours, flat = words.method(metrics.model), words.method(found.flat or "flat")
     parts = {
         "experts": f"Several experts: mixture − {flat}",
         "memory": f"Options that last: {ours} − mixture",
         "total": f"Together: {ours} − {flat}",
     }
-    columns = {"Nats per step, this fit": {part: words.with_error(metrics["worth"].get(part)) for part in parts}}
-    if "seeds" in metrics:
-        count = len(metrics["seeds"]["training_seeds"])
-        columns[f"Nats per step, {count} training seeds"] = _over_seeds(metrics["seeds"]["worth"], 1, 2)
-    if "worth" in rollouts:
-        column = f"Successes of {rollouts['episodes']} episodes, this fit"
-        columns[column] = {part: words.of_episodes(rollouts["worth"].get(part)) for part in parts}
-    if "seeds" in rollouts:
-        count = len(rollouts["seeds"]["training_seeds"])
-        columns[f"Points of success, {count} training seeds"] = _over_seeds(rollouts["seeds"]["worth"], 100, 0)
+    columns = {"Nats per step, this fit": {part: words.with_error(getattr(found, part)) for part in parts}}
+    if seeds:
+        each = {part: words.mean_and_interval(values) for part, values in seeds.worth.items()}
+        columns[f"Nats per step, {len(seeds.training_seeds)} training seeds"] = each
+    if rollouts and rollouts.worth:
+        column = f"Successes of {rollouts.episodes} episodes, this fit"
+        columns[column] = {part: words.of_episodes(getattr(rollouts.worth, part)) for part in parts}
+    if rollouts and rollouts.seeds:
+        each = {part: words.mean_and_interval(values, 100, 0) for part, values in rollouts.seeds.worth.items()}
+        columns[f"Points of success, {len(rollouts.seeds.training_seeds)} training seeds"] = each
     rows = [
         [name, *(values.get(part, "–") for values in columns.values())]
         for part, name in parts.items()
-        if part in metrics["worth"]
+        if getattr(found, part)
     ]
     return Section("worth", "What the hierarchy is worth", [Table(["Part", *columns], rows), note(EXPLAINED)])
-
-
-def _over_seeds(worth: Mapping[str, list[float]], scale: float, digits: int) -> dict[str, str]:
-    shown = {}
-    for part, values in worth.items():
-        mean, low_high = words.signed(scale * float(np.mean(values)), digits), [*words.mean_interval(values)]
-        shown[part] = f"{mean} [{words.interval(low_high, scale, digits)}]"
-    return shown

@@ -15,7 +15,6 @@ from ddco_pyro.data.memory import Extent, refuse_too_much
 from ddco_pyro.data.sources import Recording, Source, open_source
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.inferred import Inferred
-from ddco_pyro.evaluation.schema import option_labels
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.segmenting import baselines
@@ -131,7 +130,7 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
         on_event(DemonstrationsDone(len(segmented), len(chosen)))
     names = fit.spec.demonstrations.labels_by_level(len(counts))
     truth = dict(zip(counts, names, strict=bool(names)))
-    return Segmented(tuple(segmented), counts, source.frequency, truth, option_labels(fit.metrics))
+    return Segmented(tuple(segmented), counts, source.frequency, truth, fit.metrics.option_labels)
 
 
 def beside_baselines(segmented: Segmented, fit: Fit, source: Source, gripper: int = -1) -> Segmented:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.drawing.words import number
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED, agreement
+from ddco_pyro.metrics import Scores
 from ddco_pyro.segmenting import Segmented, Segments
 from ddco_pyro.segmenting.baselines import BASELINES
-
-Scores = Mapping[str, Any] | None
-"""Measures as :func:`ddco_pyro.evaluation.agreement.agreement` gives them; None where no label is known."""
 
 MATCHINGS = {"matched_globally": "one for all", "matched_per_demonstration": "each its own"}
 
@@ -45,16 +42,17 @@ def measure_names(keys: Iterable[str]) -> list[str]:
     return names
 
 
-def agreement_table(scores: Mapping[str, Scores], title: str | None = None) -> Table:
+def agreement_table(scores: Mapping[str, Scores | None], title: str | None = None) -> Table:
     """Two rows for each name of segments, one for each way to match options with labels."""
     head = ["Segments", *measure_names(UNMATCHED), "matching", *measure_names(MATCHED)]
     rows = []
     for name, known in scores.items():
-        found = known or {}
-        first = [name, *(number(found.get(key)) for key in UNMATCHED)]
-        for key in [key for key in MATCHINGS if key in found] or [""]:
-            matched = [number(found.get(key, {}).get(measure)) for measure in MATCHED]
-            rows.append([*first, MATCHINGS.get(key, "–"), *matched])
+        if known is None:
+            rows.append([name, *["–"] * (len(head) - 1)])
+            continue
+        first = [name, *(number(getattr(known, key)) for key in UNMATCHED)]
+        for key, matching in MATCHINGS.items():
+            rows.append([*first, matching, *(number(value) for _, value in getattr(known, key))])
             first = [""] * len(first)
     return Table(head, rows, {0, 1 + len(UNMATCHED)}, title)
 
@@ -64,7 +62,7 @@ class LevelAgreement:
     """Agreement of one level with the labels so named: the measures of each kind of segments, by its name."""
 
     labels: str
-    scores: dict[str, Scores]
+    scores: dict[str, Scores | None]
 
 
 def level_agreements(segmented: Segmented) -> dict[str, LevelAgreement]:
@@ -77,7 +75,7 @@ def level_agreements(segmented: Segmented) -> dict[str, LevelAgreement]:
         groups = _groups(segmented, truth)
         if not groups:
             continue
-        scores: dict[str, Scores] = {}
+        scores: dict[str, Scores | None] = {}
         for part, group in groups.items():
             options = [demo.levels[level].options for demo in group]
             scores[f"options, {part}"] = agreement(options, [demo.labels[truth] for demo in group])

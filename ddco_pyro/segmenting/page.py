@@ -13,7 +13,7 @@ import numpy as np
 from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Strip, Table, Text, Timeline, note
-from ddco_pyro.drawing.words import number, option_name
+from ddco_pyro.drawing.words import NAT, number, option_name
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
 from ddco_pyro.segmenting.agreement import EXPLAINED, LevelAgreement, agreement_table
 
@@ -36,8 +36,7 @@ def write_page(path: Path, segmented: Segmented, run: str, file: str, agreements
     drawn = note(
         f"Time runs to the right on one scale; the full width is {longest}. Colours are options; a white line is a new "
         "choice. Grey rows are labels in the file and baselines. Rest the pointer on a segment for its steps and its "
-        "probability. Nats per step: the log-likelihood of the demonstration's controls under the model; higher is "
-        "better, and one nat more means that each step's control is e = 2.7 times as probable."
+        f"probability. Nats per step: the log-likelihood of the demonstration's controls under the model; {NAT}."
     )
     sections.append(Section("segments", "Every demonstration", [drawn, *timelines(segmented)]))
     page = Page(file, [Text(intro)] if held_out else [], sections, subtitle=f"segmented by {run}")

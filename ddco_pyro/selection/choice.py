@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ddco_pyro.drawing.page import Page, Table, Text
-from ddco_pyro.drawing.words import number, signed
+from ddco_pyro.drawing.words import NAT, number, with_error
 from ddco_pyro.evaluation.worth import paired
+from ddco_pyro.metrics import Difference
 from ddco_pyro.selection.folds import Score
 from ddco_pyro.selection.grid import Candidate
 
@@ -51,7 +52,7 @@ class Row:
 
     :param status: ``scored``; ``failed`` where a fold failed; ``stopped`` where the candidate was given up early.
     :param mean: held-out log-likelihood per step over the scored folds, and its standard ``error``.
-    :param difference: this minus the best over the folds of both, and its standard error.
+    :param difference: this minus the best over the folds of both.
     :param folds: log-likelihood per step of each scored fold, by number.
     :param failed: the reason, by number of the fold.
     :param gradient_steps: of a fold's training, on average; None where no fold was scored.
@@ -62,7 +63,7 @@ class Row:
     status: str
     mean: float | None
     error: float | None
-    difference: tuple[float, float] | None
+    difference: Difference | None
     folds: Mapping[int, float]
     failed: Mapping[int, str]
     gradient_steps: float | None = None
@@ -133,21 +134,19 @@ class _Scored:
         if not self.good:
             return Row(self.candidate, status, None, None, None, {}, self.failed)
         values, steps = self.arrays(list(self.good))
-        error = paired(values, np.zeros(len(values)), steps)["standard_error"]
+        error = paired(values, np.zeros(len(values)), steps).standard_error
         per_fold = dict(zip(self.good, (values / steps).tolist(), strict=True))
         took = float(np.mean([score.gradient_steps for score in self.good.values()]))
         rising = tuple(fold for fold, score in self.good.items() if not score.converged)
-        shown = error if np.isfinite(error) else None
-        return Row(self.candidate, status, self.mean, shown, self.against(best), per_fold, self.failed, took, rising)
+        return Row(self.candidate, status, self.mean, error, self.against(best), per_fold, self.failed, took, rising)
 
-    def against(self, best: _Scored | None) -> tuple[float, float] | None:
-        """Difference to another candidate per step and its standard error, over the folds of both."""
+    def against(self, best: _Scored | None) -> Difference | None:
+        """Difference to another candidate per step, over the folds of both."""
         both = [fold for fold in self.good if best and fold in best.good]
         if best is None or len(both) < 2:
             return None
         (ours, steps), (theirs, _) = self.arrays(both), best.arrays(both)
-        margin = paired(ours, theirs, steps)
-        return margin["nats_per_step"], margin["standard_error"]
+        return paired(ours, theirs, steps)
 
 
 def hopeless(candidates: Sequence[Candidate], scores: Sequence[Score]) -> set[int]:
@@ -188,7 +187,7 @@ def as_data(choice: Choice) -> dict[str, Any]:
 
 
 def _row(row: Row, best: Row | None) -> dict[str, Any]:
-    mean, error = row.difference or (None, None)
+    unknown = {"nats_per_step": None, "standard_error": None}
     return {
         "number": row.candidate.number,
         "name": row.candidate.name,
@@ -197,7 +196,7 @@ def _row(row: Row, best: Row | None) -> dict[str, Any]:
         "status": row.status,
         "log_likelihood_per_step": row.mean,
         "standard_error": row.error,
-        "difference": {"nats_per_step": mean, "standard_error": error},
+        "difference": row.difference.model_dump() if row.difference else unknown,
         "within_one_standard_error": within_one_error(row, best),
         "gradient_steps": row.gradient_steps,
         "not_converged": len(row.unconverged),
@@ -213,9 +212,7 @@ def table(choice: Choice, title: str | None = None) -> Table:
 
 def _cells(row: Row, choice: Choice) -> list[str]:
     mean = "–" if row.mean is None else f"{number(row.mean, 3)} ± {number(row.error, 3)}"
-    difference = "–"
-    if row.difference is not None and row is not choice.best:
-        difference = f"{signed(row.difference[0], 3)} ± {number(row.difference[1], 3)}"
+    difference = with_error(None if row is choice.best else row.difference, 3)
     marks = [name for name, marked in (("best", choice.best), ("chosen", choice.chosen)) if marked is row]
     marks += [] if row.status == "scored" else [row.status]
     marks += [f"not converged in {len(row.unconverged)}"] if row.unconverged else []
@@ -230,8 +227,8 @@ def markdown(choice: Choice, data: Mapping[str, Any]) -> str:
     """
     intro = (
         f"{data['folds']}-fold cross-validation over {data['demonstrations']} demonstrations, with the same folds for "
-        "every candidate. Log-likelihood in nats: one nat more per step means that the control of a step is e = 2.7 "
-        "times as probable. ± is one standard error over the folds; gradient steps are the mean of a fold."
+        f"every candidate. Log-likelihood in nats: {NAT}. ± is one standard error over the folds; gradient steps are "
+        "the mean of a fold."
     )
     lines = [data["rule"] + ".", *([data["stop_early"] + "."] if data["stop_early"] else [])]
     lines += [f"**Failed:** {one['name']}, fold {one['fold']}: {one['reason']}" for one in data["failed"]]
@@ -266,7 +263,7 @@ def draw(choice: Choice) -> Figure:
         each = [value - best_folds[fold] for fold, value in row.folds.items() if fold in best_folds]
         points = list(row.folds.values())
         means.append(None if row.mean is None else Interval.around(row.mean, row.error, points, **looks))
-        differences.append(row.difference and Interval.around(*row.difference, each, **looks))
+        differences.append(Interval.of(row.difference, each, **looks))
     panels = [
         Panel("Each candidate, ± one standard error", "held-out log-likelihood (nats per step)", means, band=band),
         Panel("Minus the best, ± one standard error", "nats per step above the best, same folds", differences, line=0),

@@ -17,9 +17,9 @@ from joblib import Parallel, parallel_config
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.evaluation.schema import Record, read_record
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.inference.threads import one_thread
+from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.training import processes
 from ddco_pyro.training.networks import Dimensions
@@ -27,7 +27,7 @@ from ddco_pyro.training.processes import ALL_CORES, BackendError
 from ddco_pyro.training.restarts import train_model
 
 CONNECT_SECONDS = 10
-"""How long a dask scheduler may take to answer."""
+"""Time for a dask scheduler to answer."""
 
 
 class FoldError(BadInput):
@@ -179,7 +179,7 @@ def kept_score(folder: Path, candidate: int, fold: int) -> Score | None:
 
 @dataclass(frozen=True)
 class Workers:
-    """Where folds are trained: in ``jobs`` processes here (-1: one for each core), or by a dask ``scheduler``.
+    """Processes that train folds: ``jobs`` of them here (-1: one for each core), or those of a dask ``scheduler``.
 
     :raises BackendError: ``jobs`` is not a number of processes.
     """

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration
+from ddco_pyro.drawing.words import CONFIDENCE, mean_interval
 from ddco_pyro.simulation.task import Observation, Policy, Task, find_task
 
 if TYPE_CHECKING:
     import dm_env
-
-CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
@@ -225,11 +224,7 @@ def mean(values: np.ndarray) -> dict[str, Any]:
     centre = float(values.mean()) if trials else None
     if centre is None or trials < 2:
         return {"mean": centre, "std": None, "trials": trials, "interval": None}
-    from scipy.special import stdtrit
-
-    spread = float(values.std(ddof=1))
-    half = float(spread / np.sqrt(trials) * stdtrit(trials - 1, (1 + CONFIDENCE) / 2))
-    return {"mean": centre, "std": spread, "trials": trials, "interval": [centre - half, centre + half]}
+    return {"mean": centre, "std": float(values.std(ddof=1)), "trials": trials, "interval": [*mean_interval(values)]}
 
 
 def rate(successes: int, trials: int) -> dict[str, Any]:

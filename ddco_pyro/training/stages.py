@@ -6,9 +6,8 @@ whatever their number of stages.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from ddco_pyro.spec import Spec
 
@@ -108,11 +107,3 @@ class StageEnd:
 def share(budget: int | None, spent: int, stages_left: int) -> int | None:
     """A stage's cap: the rest of the budget, divided by the stages that are left; None without a budget."""
     return None if budget is None else (budget - spent) // stages_left
-
-
-def effort(training: Mapping[str, Any] | None) -> str:
-    """The gradient or EM steps of training for tables, marked where training had not converged."""
-    if training is None:
-        return "–"
-    by_em = " (EM)" if training.get("by_em") else ""
-    return f"{training['spent']['gradient_steps']}{by_em}{'' if training['converged'] else ', not converged'}"

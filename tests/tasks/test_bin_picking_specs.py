@@ -72,7 +72,7 @@ def test_demonstrations_show_what_the_person_saw(demonstrations: Path) -> None:
 
 def test_demonstrations_are_fitted_and_rolled_out(demonstrations: Path, tmp_path: Path) -> None:
     fitted = fit(load_spec(SPECS[0], [f"demonstrations.path={demonstrations}", *TINY]), out=tmp_path / "run")
-    assert fitted.metrics["engine_check"]["value"] < 1e-6
+    assert fitted.metrics.engine_check.value < 1e-6
     rolled = roll_out(fitted, 1, jobs=1)
     measures = rolled["methods"][fitted.name]["measures"]
     assert measures.keys() == task.measures.keys()

@@ -51,7 +51,7 @@ def test_all_specs_are_here() -> None:
 )
 def test_specs_fit_and_act(path: Path, demonstrations: Path, tmp_path: Path) -> None:
     found = fit(short(path, demonstrations), out=tmp_path / "run")
-    assert found.metrics["engine_check"]["value"] < 1e-6
+    assert found.metrics.engine_check.value < 1e-6
     brief = replace(pushing.limited, load=lambda seed: pushing.load_single(seed), cameras=CAMERAS)
     (episode,) = play(brief, Controller.from_spec(found.hierarchy, found.spec.rollout), [0], keep=("tip",))
     levels = LEVELS[path.stem.removeprefix("pushing_")]

@@ -1,38 +1,46 @@
-"""The schema of ``metrics.json``, and reading JSON and CSV files of a run: one line names the file, place and remedy.
+"""The contents of ``metrics.json`` (:class:`Metrics`), and reading JSON and CSV files of a run.
 
-Log-likelihoods are in nats. A model has ``extra="allow"``: further keys of a file are kept.
+Log-likelihoods are in nats.
 """
 
 from __future__ import annotations
 
 import csv
-import json
-from collections.abc import Callable, Mapping, Sequence
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
 
-from ddco_pyro.data.files import Damaged
+from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import command
 from ddco_pyro.spec.base import invalid, lines
 
 T = TypeVar("T")
 
 
-def _not_null(value: Any) -> Any:
-    if value is None:
-        raise invalid(("", "must not be null; where there is none the key is left out"))
-    return value
+def _empty(value: Any) -> bool:
+    return not value
 
 
-NOT_NULL = AfterValidator(_not_null)
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 AtLeastOne = Annotated[int, Field(ge=1)]
+LeftOut = Annotated[T, Field(exclude_if=_empty)]
+"""A field that is left out of the file where it is empty."""
 
 
 class Record(BaseModel):
-    """A part of a file; further keys are kept."""
+    """A part of a file; further keys of the file are kept."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -65,6 +73,15 @@ def read_table(path: Path, row: Callable[[dict[str, str]], T], remedy: str) -> l
         raise Damaged(path, f"{type(error).__name__}: {error}", remedy) from error
 
 
+def write_table(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write a CSV file with a line for each row, whole or not at all."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(columns), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
+
+
 def read_successes(folder: Path) -> dict[tuple[str, int], float]:
     """Success (1) or failure (0) of a run's rollouts by method and seed; empty without rollouts or without success.
 
@@ -80,32 +97,6 @@ def read_successes(folder: Path) -> dict[tuple[str, int], float]:
 def _success(row: Mapping[str, str]) -> tuple[str, int, float | None]:
     said = row.get("success")
     return row["method"], int(row["seed"]), float(said) if said else None
-
-
-def read_metrics(folder: Path, counts: Sequence[int]) -> dict[str, Any]:
-    """Read a run's ``metrics.json``, which has to agree with :class:`Metrics`.
-
-    :param counts: the number of options of each level, lowest first.
-    :raises Damaged: the file is damaged, or is about other levels.
-    """
-    path, remedy = folder / "metrics.json", refit(folder)
-    metrics = read_record(path, Metrics, remedy)
-    levels = [[use.choice for use in level] for level in metrics.options]
-    agreement = metrics.agreement
-    lists: list[Sequence[Any] | None] = [metrics.divergences or None]
-    if agreement is not None:
-        lists += [agreement.labels, agreement.train, agreement.valid, agreement.confusion]
-    wrong = {len(values) for values in lists if values is not None} - {len(counts)}
-    if levels != [list(range(1 + count)) for count in counts] or wrong:
-        raise Damaged(path, f"is not about levels with {', '.join(map(str, counts)) or 'no'} options", remedy)
-    data: dict[str, Any] = json.loads(path.read_bytes())
-    return data
-
-
-def option_labels(metrics: Mapping[str, Any]) -> dict[str, dict[int, int]]:
-    """The label that each option stands for, by level; empty for a run that was not trained from labels."""
-    trained = metrics.get("trained_labels")
-    return {trained["level"]: dict(enumerate(trained["values"], start=1))} if trained else {}
 
 
 def refit(folder: Path, remove: str = "it") -> str:
@@ -129,30 +120,17 @@ class HeldOut(Record):
 
 
 class Difference(Record):
-    """A paired difference in nats per step; a single demonstration has no standard error."""
+    """A paired difference in nats per step, with its standard error; a single demonstration has none."""
 
     nats_per_step: Finite
-    standard_error: float | None
+    standard_error: Finite | None
 
 
-class BothParts(PerStep):
-    """Log-likelihood of a baseline in nats per step; baselines need held-out demonstrations."""
-
-    valid: Finite
-
-
-class Allowed(Record):
-    """The budget of training; None for no limit."""
+class Effort(Record):
+    """What training took, or what it may take: None for no limit."""
 
     epochs: int | None
     gradient_steps: int | None
-
-
-class Spent(Record):
-    """The effort of training."""
-
-    epochs: int
-    gradient_steps: int
 
 
 class Stage(Record):
@@ -171,34 +149,34 @@ class Restart(Record):
 
     epochs: int
     stopped: int | None
-    diverged: bool = False
+    diverged: LeftOut[bool] = False
 
 
 class Restarts(Record):
     """All restarts of a model, and the number of the best."""
 
     best: int
-    spent: Spent
+    spent: Effort
     each: Annotated[list[Restart], Field(min_length=1)]
 
 
 class Training(Record):
     """The effort of training out of its budget, and whether training converged."""
 
-    budget: Allowed
-    spent: Spent
+    budget: Effort
+    spent: Effort
     stages: Annotated[list[Stage], Field(min_length=1)]
     converged: bool
     restarts: Restarts
     device: str
-    by_em: bool = False
+    by_em: bool
     """Whether the gradient steps are EM steps over all training demonstrations."""
 
 
 class Compared(Record):
     """A baseline and the model's difference to it."""
 
-    log_likelihood_per_step: BothParts
+    log_likelihood_per_step: PerStep
     difference: Difference
     parameters: int
     training: Training
@@ -215,14 +193,18 @@ class Worth(Record):
     """The parts of the hierarchy's advantage (:func:`ddco_pyro.evaluation.worth.worth`)."""
 
     memory: Difference
-    experts: Annotated[Difference | None, NOT_NULL] = None
-    total: Annotated[Difference | None, NOT_NULL] = None
-    flat: Annotated[str | None, NOT_NULL] = None
-    steps_in_a_row: Annotated[list[InARow], Field(min_length=1)]
+    experts: LeftOut[Difference | None] = None
+    total: LeftOut[Difference | None] = None
+    flat: LeftOut[str | None] = None
+    steps_in_a_row: LeftOut[list[InARow]] = []
 
 
 class Seeds(Record):
-    """Results of a fit and its repetitions, in the order of their training seeds."""
+    """Results of a fit and its repetitions, in the order of their training seeds.
+
+    ``held_out`` has log-likelihoods per step by model. ``worth`` has the parts of :class:`Worth`, nats per step, and
+    ``standard_error`` their errors over held-out demonstrations.
+    """
 
     training_seeds: Annotated[list[int], Field(min_length=2)]
     held_out: dict[str, list[Finite]]
@@ -245,10 +227,10 @@ class ByDimension(Record):
 
 
 class Listed(Record):
-    """A demonstration and its log-likelihood per step under each method."""
+    """A demonstration of a part (``train`` or ``valid``), and its log-likelihood per step under each method."""
 
     name: str
-    part: Literal["train", "valid"]
+    part: str
     steps: AtLeastOne
     log_likelihood_per_step: dict[str, Finite]
 
@@ -262,11 +244,11 @@ class ControlRange(Record):
     at_minimum: int
     at_maximum: int
     steps: AtLeastOne
-    inside: Finite | None = None
-    at_inside: int = 0
+    inside: Finite | None
+    at_inside: int
 
 
-class Branches(Record):
+class BranchUse(Record):
     """Use of the branches of a level's networks, by option and branch (:mod:`ddco_pyro.evaluation.branch_use`)."""
 
     level: int
@@ -276,7 +258,13 @@ class Branches(Record):
 
 
 class Use(Record):
-    """The use of a choice of a level (:class:`ddco_pyro.evaluation.options.OptionUse`)."""
+    """The use of one choice of a level (0 is control) in demonstrations.
+
+    - ``share``: mean of u_t, the share of steps in which the choice is active;
+    - ``selected``: Σ v_t, the expected number of selections;
+    - ``demonstrations``: the expected number of demonstrations with a selection, Σ_n min(1, Σ_t v_t);
+    - ``duration``: expected steps from a selection to the next, Σ u_t / Σ v_t; None without a selection.
+    """
 
     choice: int
     share: Finite
@@ -292,24 +280,30 @@ class Alike(Record):
     divergence: Finite | None
 
 
-class Measure(Record):
-    """A measure of episodes: a ``rate`` of ``successes``, or a ``mean``."""
+class Rate(Record):
+    """A success rate over ``trials`` episodes, with its 95 % interval; None without trials."""
 
+    successes: int
+    trials: int
+    rate: Finite | None
+    interval: tuple[Finite, Finite] | None
+
+
+class Mean(Record):
+    """A mean over ``trials`` episodes; None where there are too few for it."""
+
+    mean: Finite | None
+    std: Finite | None
     trials: int
     interval: tuple[Finite, Finite] | None
-    successes: int = 0
-    rate: Finite | None = None
-    mean: Finite | None = None
-    std: Finite | None = None
 
-    @model_validator(mode="after")
-    def _rate_or_mean(self) -> Measure:
-        given = self.model_fields_set
-        rate = {"successes", "rate"} <= given and (self.trials == 0 or None not in (self.rate, self.interval))
-        mean = {"mean", "std"} <= given and (self.trials == 0 or self.mean is not None)
-        if not rate and not mean:
-            raise invalid(("", "is neither a rate nor a mean"))
-        return self
+
+def _kind(measure: Any) -> str:
+    return "[Rate]" if isinstance(measure, Rate) or (isinstance(measure, dict) and "rate" in measure) else "[Mean]"
+
+
+Measure = Annotated[Annotated[Rate, Tag("[Rate]")] | Annotated[Mean, Tag("[Mean]")], Discriminator(_kind)]
+"""A measure of episodes."""
 
 
 class Against(Record):
@@ -325,16 +319,16 @@ class Method(Record):
     """The rollouts of a method."""
 
     measures: dict[str, Measure]
-    against: Annotated[Against | None, NOT_NULL] = None
+    against: LeftOut[Against | None] = None
 
 
 class SuccessWorth(Record):
     """The parts of the hierarchy's advantage in success (:func:`ddco_pyro.evaluation.worth.success_worth`)."""
 
     memory: Against
-    experts: Annotated[Against | None, NOT_NULL] = None
-    total: Annotated[Against | None, NOT_NULL] = None
-    flat: Annotated[str | None, NOT_NULL] = None
+    experts: LeftOut[Against | None] = None
+    total: LeftOut[Against | None] = None
+    flat: LeftOut[str | None] = None
 
 
 class SuccessOfSeeds(Record):
@@ -351,23 +345,14 @@ class Rollouts(Record):
     seed: int
     episodes: AtLeastOne
     methods: dict[str, Method]
-    worth: Annotated[SuccessWorth | None, NOT_NULL] = None
-    seeds: Annotated[SuccessOfSeeds | None, NOT_NULL] = None
+    worth: LeftOut[SuccessWorth | None] = None
+    seeds: LeftOut[SuccessOfSeeds | None] = None
 
-
-class Unfinished(Record):
-    """An interrupted rollout: the outcomes of finished methods by seed; null where a measure does not apply."""
-
-    models: str
-    seeds: list[int]
-    outcomes: dict[str, list[dict[str, float | None]]]
-
-    @model_validator(mode="after")
-    def _an_outcome_for_each_seed(self) -> Unfinished:
-        for method, outcomes in self.outcomes.items():
-            if len(outcomes) != len(self.seeds):
-                raise invalid(("outcomes", f"{method} has {len(outcomes)}, but there are {len(self.seeds)} seeds"))
-        return self
+    @property
+    def success_rates(self) -> dict[str, Rate]:
+        """The success rate of each method that has one."""
+        found = {name: method.measures.get("success") for name, method in self.methods.items()}
+        return {name: rate for name, rate in found.items() if isinstance(rate, Rate)}
 
 
 class Counts(Record):
@@ -376,7 +361,7 @@ class Counts(Record):
     train: AtLeastOne
     tune: int
     valid: int
-    supervisor: dict[str, Measure] = Field(default_factory=dict)
+    supervisor: LeftOut[dict[str, Measure]] = {}
 
 
 class TrainedLabels(Record):
@@ -385,6 +370,7 @@ class TrainedLabels(Record):
     level: str
     labels: str
     values: list[int]
+    demonstrations: list[str]
     agreement: Finite
 
 
@@ -412,7 +398,7 @@ class Scores(Record):
 
 
 class Confusion(Record):
-    """Steps of each label in each option, and the label that each option is matched with."""
+    """Steps of each label (rows) in each option (columns), and the label that each option is matched with, if any."""
 
     labels: list[int]
     options: list[int]
@@ -432,7 +418,7 @@ class Agreement(Record):
 
     labels: list[str]
     train: list[Scores | None]
-    valid: Annotated[list[Scores | None] | None, NOT_NULL] = None
+    valid: LeftOut[list[Scores | None] | None] = None
     confusion: list[Confusion]
 
 
@@ -443,8 +429,8 @@ class Engines(Record):
     gradient: float
 
 
-class Metrics(Record):
-    """The contents of ``metrics.json``; what does not apply to a run is left out."""
+class Metrics(Record, frozen=False):
+    """The contents of ``metrics.json``. What does not apply to a run is None or empty, and left out of the file."""
 
     model: str
     log_likelihood_per_step: PerStep
@@ -452,19 +438,57 @@ class Metrics(Record):
     valid: list[HeldOut]
     demonstrations_by_likelihood: list[Listed]
     comparison: dict[str, Compared]
-    worth: Annotated[Worth | None, NOT_NULL] = None
-    seeds: Annotated[Seeds | None, NOT_NULL] = None
-    options: list[list[Use]] = Field(default_factory=list)
-    divergences: list[list[Alike]] = Field(default_factory=list)
-    agreement: Annotated[Agreement | None, NOT_NULL] = None
-    trained_labels: Annotated[TrainedLabels | None, NOT_NULL] = None
+    worth: LeftOut[Worth | None] = None
+    branches: LeftOut[list[BranchUse]] = []
+    options: LeftOut[list[list[Use]]] = []
+    divergences: LeftOut[list[list[Alike]]] = []
+    agreement: LeftOut[Agreement | None] = None
+    trained_labels: LeftOut[TrainedLabels | None] = None
     engine_check: Engines
     demonstrations: Counts
-    control_dimensions: list[ControlRange]
     measure: dict[str, Annotated[list[Any], Field(min_length=1)]]
-    branches: list[Branches] = Field(default_factory=list)
+    control_dimensions: list[ControlRange]
     parameters: int
     training: Training
     seconds: dict[str, float]
     versions: dict[str, str]
-    rollouts: Annotated[Rollouts | None, NOT_NULL] = None
+    seeds: LeftOut[Seeds | None] = None
+    rollouts: LeftOut[Rollouts | None] = None
+
+    @classmethod
+    def read(cls, folder: Path, counts: Sequence[int]) -> Metrics:
+        """Read the ``metrics.json`` of a run.
+
+        :param counts: the number of options of each level, lowest first.
+        :raises Damaged: the file is damaged, or is about other levels.
+        """
+        path, remedy = folder / "metrics.json", refit(folder)
+        metrics = read_record(path, cls, remedy)
+        levels = [[use.choice for use in level] for level in metrics.options]
+        lists: list[Sequence[Any] | None] = [metrics.divergences or None]
+        if (agreement := metrics.agreement) is not None:
+            lists += [agreement.labels, agreement.train, agreement.valid, agreement.confusion]
+        wrong = {len(values) for values in lists if values is not None} - {len(counts)}
+        if levels != [list(range(1 + count)) for count in counts] or wrong:
+            raise Damaged(path, f"is not about levels with {', '.join(map(str, counts)) or 'no'} options", remedy)
+        return metrics
+
+    def write(self, folder: Path) -> None:
+        """Write ``metrics.json``."""
+        write_text(folder / "metrics.json", json_text(self.model_dump()))
+
+    @property
+    def methods(self) -> dict[str, Metrics | Compared]:
+        """The model itself and its baselines, by name."""
+        return {self.model: self, **self.comparison}
+
+    @property
+    def trainings(self) -> dict[str, Training]:
+        """The training of the model and of each baseline, by name."""
+        return {name: method.training for name, method in self.methods.items()}
+
+    @property
+    def option_labels(self) -> dict[str, dict[int, int]]:
+        """The label that each option stands for, by level; empty for a run that was not trained from labels."""
+        trained = self.trained_labels
+        return {trained.level: dict(enumerate(trained.values, start=1))} if trained else {}

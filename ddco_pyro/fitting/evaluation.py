@@ -1,0 +1,230 @@
+"""The evaluation of a fit: log-likelihoods, differences to baselines, use of options, agreement with labels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.errors import Failed
+from ddco_pyro.evaluation.agreement import agreement, confusion
+from ddco_pyro.evaluation.branch_use import branch_use
+from ddco_pyro.evaluation.inferred import Inferred, infer
+from ddco_pyro.evaluation.options import divergences, option_use
+from ddco_pyro.evaluation.worth import MIXTURE, mean_run, paired, worth
+from ddco_pyro.inference import Posterior
+from ddco_pyro.inference.posteriors import Decomposition
+from ddco_pyro.metrics import (
+    Agreement,
+    Alike,
+    ByDimension,
+    Compared,
+    Dimensions,
+    HeldOut,
+    InARow,
+    Listed,
+    Metrics,
+    PerStep,
+    TrainedLabels,
+    Use,
+    Worth,
+)
+from ddco_pyro.model.outputs import Outputs
+from ddco_pyro.training.labels import choices, used
+
+if TYPE_CHECKING:
+    from ddco_pyro.fitting.fit import Fit
+
+
+class NotFinite(Failed):
+    """A log-likelihood is NaN or infinite."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A model on a part of the demonstrations.
+
+    :param values: log p(ξ) of each demonstration, nats, [N].
+    :param each: the decomposition of the same.
+    :param segments: the most likely options [T] of each demonstration, for each level.
+    """
+
+    values: np.ndarray
+    each: Decomposition
+    segments: list[list[np.ndarray]]
+
+    @classmethod
+    def of(cls, fit: Fit, demos: Demonstrations) -> _Part:
+        values, parts, paths = [], [], []
+        for piece in infer(fit.hierarchy, demos):
+            values.append(_finite(fit, piece))
+            parts.append(piece.decomposition)
+            paths.append(piece.path.choices)
+        segments = [[row[row >= 0].numpy() for h in level for row in h] for level in zip(*paths, strict=True)]
+        return cls(np.concatenate(values), Decomposition.joined(parts), segments)
+
+
+def _finite(fit: Fit, piece: Inferred) -> np.ndarray:
+    """log p(ξ) of each demonstration, nats, [N].
+
+    :raises NotFinite: one is NaN or infinite.
+    """
+    for name, value in zip(piece.names, piece.log_likelihood, strict=True):
+        if not np.isfinite(value):
+            raise NotFinite(
+                f"{fit}: the log-likelihood of {name} under the fitted model is {value}; look at its values "
+                "(ddco-pyro inspect), lower training.optimizer.lr, or leave it out (demonstrations.exclude)"
+            )
+    return piece.log_likelihood
+
+
+def evaluate(fitted: Fit, parts: dict[str, Demonstrations], demos: Demonstrations, **about: Any) -> Metrics:
+    """The evaluation of a model.
+
+    It has the log-likelihood in nats per step of each part of the data and of each demonstration, and the paired
+    difference to every baseline. A hierarchy also has the use, divergences and agreement with labels of its options.
+
+    :param parts: training (``train``) and held-out (``valid``) demonstrations.
+    :param demos: all demonstrations.
+    :param about: the other fields of :class:`ddco_pyro.metrics.Metrics`: training and versions, for example.
+    :raises NotFinite: a log-likelihood is NaN or infinite.
+    """
+    ours = {name: _Part.of(fitted, part) for name, part in parts.items()}
+    by_method = {fitted.name: {name: part.values for name, part in ours.items()}}
+    for method, fit in fitted.baselines.items():
+        by_method[method] = {
+            name: np.concatenate([_finite(fit, piece) for piece in infer(fit.hierarchy, part)])
+            for name, part in parts.items()
+        }
+    values, valid, depth = by_method[fitted.name], parts.get("valid"), fitted.hierarchy.depth
+    per_step = {name: float(v.sum() / sum(parts[name].lengths)) for name, v in values.items()}
+    by_dimension = {name: _by_dimension(fitted, part.each, parts[name]) for name, part in ours.items()}
+    held_out = {} if valid is None else {name: each["valid"] for name, each in by_method.items()}
+    lengths = np.array([] if valid is None else valid.lengths, dtype=float)
+    options, alike = _options(fitted, demos) if depth else ([], [])
+    labels = fitted.spec.demonstrations.labels_by_level(depth) if depth else ()
+    return Metrics(
+        model=fitted.name,
+        log_likelihood_per_step=PerStep(train=per_step["train"], valid=per_step.get("valid")),
+        log_likelihood_by_dimension=ByDimension(train=by_dimension["train"], valid=by_dimension.get("valid")),
+        valid=[
+            HeldOut(name=demo.name, steps=len(demo), log_likelihood=float(value))
+            for demo, value in zip(valid or (), values.get("valid", ()), strict=True)
+        ],
+        demonstrations_by_likelihood=_worst_first(fitted.name, parts, by_method),
+        comparison={
+            name: Compared(
+                log_likelihood_per_step=fit.metrics.log_likelihood_per_step,
+                difference=paired(held_out[fitted.name], held_out[name], lengths),
+                parameters=fit.metrics.parameters,
+                training=fit.metrics.training,
+            )
+            for name, fit in fitted.baselines.items()
+        },
+        worth=_worth(fitted, held_out, ours["valid"], valid) if valid else None,
+        branches=branch_use(fitted.hierarchy, infer(fitted.hierarchy, valid or demos)),
+        options=options,
+        divergences=alike,
+        agreement=_agreement(labels, ours, parts) if labels else None,
+        trained_labels=_trained_labels(fitted, demos),
+        **about,
+    )
+
+
+def _worth(fit: Fit, values: Mapping[str, np.ndarray], ours: _Part, valid: Demonstrations) -> Worth | None:
+    """The parts of the hierarchy's advantage on held-out demonstrations; None without a mixture."""
+    found = worth(fit.name, values, valid.lengths)
+    if found is None:
+        return None
+    pairs = zip(ours.segments, _Part.of(fit.baselines[MIXTURE], valid).segments, strict=True)
+    rows = [InARow(options=mean_run(own), mixture=mean_run(mixture)) for own, mixture in pairs]
+    return found.model_copy(update={"steps_in_a_row": rows})
+
+
+def _options(fit: Fit, demos: Demonstrations) -> tuple[list[list[Use]], list[list[Alike]]]:
+    """The use and the divergences of options."""
+    sums: list[Posterior] = []
+
+    def pieces() -> Iterator[tuple[Outputs, Posterior]]:
+        for piece in infer(fit.hierarchy, demos):
+            sums.append(Posterior(*(tuple(h.sum(1, keepdim=True) for h in kind) for kind in piece.posterior)))
+            yield piece.outputs, piece.posterior
+
+    alike = divergences(pieces())
+    whole = Posterior(*(tuple(map(torch.cat, zip(*kind, strict=True))) for kind in zip(*sums, strict=True)))
+    return option_use(whole), alike
+
+
+def _worst_first(
+    ours: str, parts: dict[str, Demonstrations], by_method: dict[str, dict[str, np.ndarray]]
+) -> list[Listed]:
+    """Every demonstration with its part of the data and its log-likelihood per step under each method.
+
+    The least likely demonstration under the method ``ours`` comes first.
+    """
+    rows = [
+        Listed(
+            name=demo.name,
+            part=part,
+            steps=len(demo),
+            log_likelihood_per_step={name: float(values[part][row]) / len(demo) for name, values in by_method.items()},
+        )
+        for part, demos in parts.items()
+        for row, demo in enumerate(demos)
+    ]
+    return sorted(rows, key=lambda row: row.log_likelihood_per_step[ours])
+
+
+def _by_dimension(fit: Fit, each: Decomposition, demos: Demonstrations) -> Dimensions:
+    """The contributions of each control dimension, and of the choice of options, to the log-likelihood per step.
+
+    Constant dimensions, which the model leaves out, have None.
+    """
+    scaling, steps = fit.hierarchy.scaling, sum(demos.lengths)
+    values: list[float | None] = [None] * scaling.size
+    for dimension, value in zip(scaling.varying.tolist(), each.dimensions.sum(0).tolist(), strict=True):
+        values[dimension] = value / steps
+    return Dimensions(by_dimension=values, options=float(each.options.sum()) / steps)
+
+
+def _agreement(names: Sequence[str], ours: dict[str, _Part], parts: dict[str, Demonstrations]) -> Agreement:
+    """All measures of each level's segments against its labels, and the confusion matrix of the held-out part.
+
+    Without a held-out part the confusion matrix is of the training part.
+    """
+    pairs = {
+        name: [
+            (level, [demo.labels[label] for demo in part])
+            for level, label in zip(ours[name].segments, names, strict=True)
+        ]
+        for name, part in parts.items()
+    }
+    scores = {name: [agreement(*pair) for pair in each] for name, each in pairs.items()}
+    tables = [confusion(*pair) for pair in pairs.get("valid", pairs["train"])]
+    return Agreement(labels=list(names), train=scores["train"], valid=scores.get("valid"), confusion=tables)
+
+
+def _trained_labels(fit: Fit, demos: Demonstrations) -> TrainedLabels | None:
+    """The labels that a fit used in training (``training.labels``).
+
+    ``agreement`` is the fraction of the labelled steps whose most likely option, inferred without labels, is the
+    label's.
+    """
+    labels, own = used(fit.spec, demos), fit.spec.training.labels
+    if labels is None or own is None:
+        return None
+    labelled = demos.select(labels.demonstrations)
+    found = _Part.of(fit, labelled).segments[labels.level - 1]
+    known = choices(labelled, own.source, labels.values, labelled.names).numpy()
+    agree = [(ours == label[: len(ours)])[label[: len(ours)] >= 0] for ours, label in zip(found, known, strict=True)]
+    return TrainedLabels(
+        level=own.level,
+        labels=own.source,
+        values=list(labels.values),
+        demonstrations=list(labels.demonstrations),
+        agreement=float(np.concatenate(agree).mean()),
+    )
