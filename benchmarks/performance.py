@@ -169,18 +169,20 @@ def over_other_engines() -> Iterator[Row]:
 
 def kernel(tables: Tables, lengths: torch.Tensor) -> Callable[[], float]:
     """Our forward-backward with posteriors, from ready probabilities."""
+    *levels, meta_policy = tables.control
     rows = [
-        torch.cat([table.flatten(2).double() for table in group], -1).exp().numpy()
-        for group in (tables.selection, tables.termination, tables.control)
+        torch.cat([table.flatten(2).double() for table in group], -1).flatten(0, 1).exp().numpy()
+        for group in (tables.selection, tables.termination, (meta_policy, *levels))
     ]
-    nothing, structure = np.empty((*rows[0].shape[:2], 0)), Structure.of(tuple(t.shape[-1] for t in tables.selection))
+    nothing, structure = np.empty((len(rows[0]), 0)), Structure.of(tables.sizes)
+    starts = np.arange(len(lengths)) * tables.steps
     run = one_level if tables.depth == 1 else any_levels
 
     def call() -> float:
         match_torch_threads()
         value, exact = np.empty(len(lengths)), np.empty(len(lengths), dtype=np.bool_)
         posteriors = Rows(*(np.empty_like(row) for row in rows), nothing)
-        run(Rows(*rows, nothing), lengths.numpy(), value, exact, posteriors, structure)
+        run(Rows(*rows, nothing), starts, lengths.numpy(), value, exact, posteriors, structure)
         return float(value.sum())
 
     return call

@@ -150,6 +150,10 @@ class Restart(Record):
     epochs: int
     stopped: int | None
     diverged: LeftOut[bool] = False
+    initialize: LeftOut[str | None] = None
+    """The kind of initialisation (``training.initialize``); left out for a policy without options."""
+    nmi: LeftOut[Finite | None] = None
+    """NMI of its segments with the best restart's: of the training demonstrations, at the lowest level."""
 
 
 class Restarts(Record):
@@ -356,11 +360,16 @@ class Rollouts(Record):
 
 
 class Counts(Record):
-    """Numbers of demonstrations, and the success rate of their supervisor."""
+    """Numbers of demonstrations, and the success rate of their supervisor.
+
+    ``tune`` is 0 where the training demonstrations tune. Held-out demonstrations train the model, too, where
+    ``left_out`` says that each is held out from a fit without it.
+    """
 
     train: AtLeastOne
     tune: int
     valid: int
+    left_out: LeftOut[bool] = False
     supervisor: LeftOut[dict[str, Measure]] = {}
 
 

@@ -39,7 +39,21 @@ from arena import TASKS
 from arena_results import nmi
 from cells import described, printed, some
 from ddco_tasks.pushing import environment as pushing_task
-from memory_results import EM, FREE, MIXTURE, OPTIONS, checks, comparisons, draw, of_pages, page, short, with_table
+from memory_results import (
+    EM,
+    FREE,
+    MIXTURE,
+    OPTIONS,
+    checks,
+    comparisons,
+    draw,
+    everything,
+    of_pages,
+    page,
+    short,
+    shortest,
+    with_table,
+)
 from provenance import ROOT, Record, record, sentence, text
 from threadpoolctl import threadpool_limits
 
@@ -53,12 +67,12 @@ from ddco_pyro.spec import load_spec, with_overrides
 METHODS: dict[str, dict[str, Any]] = {
     MIXTURE: {"hierarchy.levels.0.termination": "always"},
     OPTIONS: {},
-    EM: {"training.optimizer": {"name": "em"}},
-    FREE: {"training.optimizer": {"name": "em", "ridge": {"policy": 0.0, "gate": 0.0, "termination": 0.0}}},
+    EM: {},
+    FREE: {"training.optimizer.ridge": {"policy": 0.0, "gate": 0.0, "termination": 0.0}},
 }
 """What each method changes in its study's spec."""
 ADAM = {"name": "adam", "lr": 3e-3}
-"""The optimiser of the arena's page, instead of the one that ``init`` writes."""
+"""The optimiser of the arena's page, instead of the one that ``init`` writes, which is expectation-maximisation."""
 ACTING = ("marginal", "sample", "most_likely")
 EPISODES = {"needle": {20: 60, 100: 200}, "arena": 20, "bins": 20, "pushing": pushing_cell.EPISODES}
 """Starts of each fit, as on the pages."""
@@ -137,7 +151,8 @@ def arena(cell: Cell, runs: Path) -> list[Measured]:
     settings = arena_cell.DEFAULTS
     source = arena_cell.recorded(cell.task, settings)
     own = arena_cell.ArenaCell(cell.task, cell.demonstrations, cell.seed)
-    changes = (f"training.optimizer={json.dumps(ADAM)}", *words(cell))  # the later one counts
+    by_em = cell.method in (EM, FREE)
+    changes = (*(() if by_em else (f"training.optimizer={json.dumps(ADAM)}",)), *words(cell))
     fitted = arena_cell.fitted_cell(own, source, changes, runs / "fits" / cell.name)
     played = arena_cell.sawyer(settings).play(cell.task, {cell.method: fitted}, source, EPISODES["arena"])
     successes = [episode["success"] for episode in played["episodes"][cell.method]]
@@ -277,7 +292,7 @@ def command(study: str, asked: Asked) -> str:
 
 
 def write_page(out: Path) -> str:
-    """``memory.md``, ``.json`` and ``.png`` beside the folder of the table, and the table of README; the page."""
+    """``memory.md``, ``.json`` and ``.png`` beside the folder of the table, README's table and its figure; the page."""
     earlier = read(out / "far_end.csv")  # of a bin that the tree has no more
     rows = read(out / "cells.csv") + [row for row in earlier if row["method"] == MIXTURE]
     pages = of_pages() + [row for row in earlier if row["method"] != MIXTURE]
@@ -287,7 +302,8 @@ def write_page(out: Path) -> str:
     shown = page(found, checks(rows, pages), missing({cell_of(row) for row in rows}), made_by)
     write_text(out.with_suffix(".json"), text(found, records))
     write_text(out.with_suffix(".md"), shown)
-    draw(found, out.with_suffix(".png"))
+    draw(everything(found), out.with_suffix(".png"))
+    draw(shortest(found), ROOT / "docs" / "images" / "worth.png", columns=1)
     readme = ROOT / "README.md"
     write_text(readme, with_table(readme.read_text(encoding="utf-8"), short(found)))
     return shown

@@ -329,32 +329,38 @@ def page(found: Sequence[Row], again: Sequence[Row], missing: Sequence[str], mad
     return "\n".join(lines) + "\n"
 
 
-SHORT = {
-    ("needle", "success"),
-    ("pushing", "goals, marginal"),
-    ("arena", "success"),
-    ("arena", "NMI"),
-    ("bins", "success"),
-}
-"""The measures beside nats in the table of README."""
+ACTED = (("needle", "success"), ("pushing", "goals"), ("arena", "success"), ("arena", "NMI"), ("bins", "success"))
+"""The measures of acting, and of segments, in the table and the figure of README."""
+
+
+def shortest(found: Sequence[Row]) -> list[Row]:
+    """The rows of README: of each measure of :data:`ACTED` the one with most demonstrations.
+
+    Options are those that were fitted again, where all were.
+    """
+    rows = [one for one in [*found, *over_tasks(found)] if one["acting"] in ("", "marginal")]
+    rows = [one for one in rows if one["task"] == one["study"] or one["task"].startswith("mean of")]
+    chosen = []
+    for named in ACTED:
+        one = max(
+            (one for one in rows if (one["study"], one["measure"]) == named), key=lambda one: one["demonstrations"]
+        )
+        lasting = one["difference"][f"{AGAIN if one['again'] else OPTIONS} - {MIXTURE}"]
+        both = {f"{MIXTURE} - {FLAT}": one["difference"][f"{MIXTURE} - {FLAT}"], f"{OPTIONS} - {MIXTURE}": lasting}
+        chosen.append(one | {"acting": "", "difference": both})
+    return chosen
 
 
 def short(found: Sequence[Row]) -> str:
-    """The table of README: the two differences of each study, of options that were fitted again where all were."""
-    main = [*(one for one in found if one["study"] not in ("arena", "planted")), *over_tasks(found)]
+    """The table of README: the two differences of each row of :func:`shortest`."""
     lines = [
-        "| | demonstrations | measure | several policies (mixture − flat) | lasting (options − mixture) | seeds |",
+        "| task | demonstrations | measure | several policies (mixture − flat) | lasting (options − mixture) | seeds |",
         "|---|---|---|---|---|---|",
     ]
-    for one in sorted(main, key=_in_order):
-        acting = f", {one['acting'].replace('_', ' ')}" if one["study"] == "pushing" and one["acting"] else ""
-        measure = one["measure"] + acting
-        if one["measure"] != "nats" and (one["study"], measure) not in SHORT:
-            continue
+    for one in shortest(found):
         name = NAMED[one["study"]] + (f", {one['task']}" if one["task"] != one["study"] else "")
-        cells = [name, str(one["demonstrations"]), measure.partition(",")[0], _difference(one, MIXTURE, FLAT)]
-        lasting = _difference(one, AGAIN if one["again"] else OPTIONS, MIXTURE)
-        lines.append(f"| {' | '.join([*cells, lasting, _seeds(one)])} |")
+        differences = [_difference(one, MIXTURE, FLAT), _difference(one, OPTIONS, MIXTURE)]
+        lines.append(f"| {' | '.join([name, str(one['demonstrations']), one['measure'], *differences, _seeds(one)])} |")
     return "\n".join(lines)
 
 
@@ -381,27 +387,36 @@ PANELS: dict[str, Callable[[str], bool]] = {
 }
 
 
-def draw(found: Sequence[Row], path: Path) -> None:
-    """The two differences of every comparison, a panel for each measure."""
-    rows = sorted([*(one for one in found if one["study"] != "arena"), *over_tasks(found)], key=_in_order)
+def everything(found: Sequence[Row]) -> list[Row]:
+    """The rows of the page's figure: every comparison, of Meta-World the means over tasks."""
+    return sorted([*(one for one in found if one["study"] != "arena"), *over_tasks(found)], key=_in_order)
+
+
+def draw(rows: Sequence[Row], path: Path, columns: int = 2) -> None:
+    """The two differences of every comparison, a panel for each measure; in one column on half the width."""
     groups = {name: [one for one in rows if belongs(one["measure"])] for name, belongs in PANELS.items()}
     groups = {name: group for name, group in groups.items() if group}
     with style():
-        figure = blank(1.2 + 0.24 * max(map(len, groups.values())) * ((len(groups) + 1) // 2))
-        panels = figure.subplots((len(groups) + 1) // 2, 2, squeeze=False).flatten()
+        sizes = [len(group) for group in groups.values()]
+        heights = sizes if columns == 1 else [max(sizes)] * -(-len(sizes) // columns)
+        figure = blank(1.2 + 0.24 * sum(heights) + (columns == 1) * 0.5 * len(heights))
+        figure.set_figwidth(figure.get_figwidth() * columns / 2)
+        panels = figure.subplots(len(heights), columns, squeeze=False, height_ratios=heights).flatten()
         for axes, (name, group) in zip(panels, groups.items(), strict=False):
             _panel(axes, name, group)
         for axes in panels[len(groups) :]:
             axes.set_axis_off()
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+        named = [one for axes in panels for one in zip(*axes.get_legend_handles_labels(), strict=True)]
+        handles = {label: handle for handle, label in named}
+        figure.legend(handles.values(), handles, loc="outside upper left", ncols=2)
         save(figure, path, "What several policies are worth, and what it is worth that they last", "")
 
 
 def _panel(axes: Axes, name: str, group: Sequence[Row]) -> None:
     for place, one in enumerate(group):
         for shift, (difference, colour) in zip((-0.22, 0, 0.22), COLOURS.items(), strict=True):
-            own = one["difference"][difference]
-            if own["mean"] is None:
+            own = one["difference"].get(difference)
+            if own is None or own["mean"] is None:
                 continue
             axes.plot(own["mean"], place + shift, "o", ms=4, color=colour, label=_once(axes, difference))
             if own["interval"]:
@@ -425,6 +440,6 @@ def _once(axes: Axes, difference: str) -> str | None:
 def _label(one: Row) -> str:
     words = [NAMED[one["study"]], str(one["demonstrations"])]
     words += [one["task"]] if one["study"] == "planted" else []
-    words += [one["acting"].replace("_", " ")] if one["measure"] == "goals" else []
+    words += [one["acting"].replace("_", " ")] if one["measure"] == "goals" and one["acting"] else []
     words += [one["measure"].removeprefix("NMI, ")] if one["measure"].startswith("NMI,") else []
     return " ".join(words)

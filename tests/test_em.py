@@ -22,6 +22,8 @@ from ddco_pyro.spec import RidgeSpec, SpecError, parse_spec, with_overrides
 from ddco_pyro.training.checkpoint import Progress, Restart
 from ddco_pyro.training.em import Expectation, is_linear
 from ddco_pyro.training.loop import train
+from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.restarts import Trainer
 
 EVERYTHING = ("levels.", "meta_policy.")
 LEARNED = {"learn": True, "floor": 0.01}
@@ -268,8 +270,9 @@ def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
     assert "(EM)" in words.effort(trained["ddco"])
 
 
-def test_a_fit_by_em_that_is_interrupted_has_the_same_bits(tmp_path):
-    spec, demos = small_spec(), demonstrations(12)
+@pytest.mark.parametrize("initialize", ["vq", "cuts", "mixture"])
+def test_a_fit_by_em_that_is_interrupted_has_the_same_bits(tmp_path, initialize):
+    spec, demos = small_spec(initialize=initialize), demonstrations(12)
     whole, cut = (make_trainer(spec, demos, tmp_path / name) for name in ("whole", "cut"))
     expected = train(whole.data, Restart(Progress(0)))
     path = tmp_path / "restart.safetensors"
@@ -292,3 +295,23 @@ def test_a_spec_that_em_would_not_follow_is_refused():
     for key, value in (("training.average", 0.9), ("training.clip_gradient", 1.0), ("training.optimizer.warmup", 2)):
         with pytest.raises(SpecError, match=f"{key}: em"):
             with_overrides(small_spec(), {key: value})
+
+
+def test_tuning_demonstrations_decide_nothing_before_the_last_stage():
+    """One tuning demonstration likes the beginning of a stage better than its end, where few train; segments then get
+    lost.
+    """
+    spec, demos = small_spec(initialize="vq_controls", epochs=None, patience=3), demonstrations(9)
+    train_with, histories = demos.select(demos.names[:6]), []
+    for tuned_by in demos.names[6:]:
+        restart = make_trainer_of(spec, train_with, demos.select([tuned_by])).restarts[0]
+        histories.append([row for row in restart.progress.history if row["stage"] != "joint"])
+        assert all(end["rising"] == 0 for end in restart.progress.ended[:-1])  # EM has converged
+    without_tuning = [[{**row, "tune": 0} for row in history] for history in histories]
+    assert without_tuning[0] == without_tuning[1] == without_tuning[2]
+
+
+def make_trainer_of(spec, train_with, tune_with):
+    trainer = Trainer(spec, Dimensions.of(train_with), train_with, tune_with)
+    trainer.run()
+    return trainer

@@ -103,14 +103,16 @@ def test_underflow_is_seen_and_mended():
 
 def exact(tables):
     """Whether the scaled pass alone passes its own check."""
+    *levels, meta_policy = tables.control
+    number, steps = meta_policy.shape[:2]
     rows = [
-        torch.cat([table.flatten(2) for table in group], -1).exp().numpy()
-        for group in (tables.selection, tables.termination, tables.control)
+        torch.cat([table.flatten(2) for table in group], -1).flatten(0, 1).exp().numpy()
+        for group in (tables.selection, tables.termination, (meta_policy, *levels))
     ]
-    number, steps = tables.control[-1].shape[:2]
-    nothing, found = np.empty((number, steps, 0)), np.empty(number, dtype=bool)
-    structure = kernel.Structure.of(tuple(table.shape[-1] for table in tables.selection))
+    nothing, found = np.empty((number * steps, 0)), np.empty(number, dtype=bool)
     run = kernel.one_level if tables.depth == 1 else kernel.any_levels
     posteriors = kernel.Rows(*(np.empty_like(row) for row in rows), nothing)
-    run(kernel.Rows(*rows, nothing), np.full(number, steps), np.empty(number), found, posteriors, structure)
+    starts, lengths = np.arange(number) * steps, np.full(number, steps)
+    structure = kernel.Structure.of(tables.sizes)
+    run(kernel.Rows(*rows, nothing), starts, lengths, np.empty(number), found, posteriors, structure)
     return bool(found.all())

@@ -95,9 +95,9 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
             )
             values[name] += math.log(total)
     assert backward(objective, model, material.train, torch.arange(len(material.train))) == pytest.approx(
-        values["train"], abs=1e-5
+        values["train"], rel=1e-6
     )
-    assert objective.tune(model) == pytest.approx(values["tune"] / STEPS, abs=1e-5)
+    assert objective.tune(model) == pytest.approx(values["tune"] / STEPS, rel=1e-6)
 
 
 def test_its_gradient_is_that_of_finite_differences():

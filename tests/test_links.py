@@ -1,15 +1,20 @@
-"""The compiled links from what networks say to log-probabilities: value, gradient and second derivative."""
+"""The links from networks' outputs to log-probabilities: compiled passes against the formulas that define them."""
 
 from __future__ import annotations
 
-import math
-
+import numpy as np
 import pytest
 import torch
+from scipy import special
 from torch.nn.functional import log_softmax, pad
 
-from ddco_pyro.model.links import TERMINATION_BOUND, log_selection, log_termination, weighted_squares
+from ddco_pyro.model.elementary import exponentials, log_normal_cdf, logarithms
+from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Density, Gaussian, Hurdle, Product
+from ddco_pyro.model.links import TERMINATION_BOUND, Alive, LogTable, Posterior, Selection, Termination
 from ddco_pyro.model.tables import NEVER
+
+NUMBER, STEPS, CALLERS = 3, 7, 4
+LENGTHS = [torch.tensor([7, 7, 7]), torch.tensor([7, 1, 4])]
 
 
 def normal(*shape, dtype=torch.float64, scale=1.0):
@@ -17,78 +22,137 @@ def normal(*shape, dtype=torch.float64, scale=1.0):
     return (scale * torch.randn(*shape, generator=generator, dtype=torch.float64)).to(dtype).requires_grad_()
 
 
-def selection(logits):
-    return log_selection(logits, 0)
+def positive(*shape):
+    return normal(*shape).detach().abs().add(0.3).requires_grad_()
 
 
-def hybrid_selection(logits):
-    return log_selection(logits, 1)[..., 1:]
+def clipped(std):
+    low, high = torch.tensor([-1.0, -torch.inf], dtype=torch.float64), torch.tensor([0.5, 1.0], dtype=torch.float64)
+    units = normal(2).detach()
+    return Clipped(normal(NUMBER, STEPS, CALLERS, 2), std, units, low, high)
 
 
-def normal_log_density(mean, std, actions):
-    return torch.distributions.Normal(mean, std).log_prob(actions.unsqueeze(-2)).sum(-1)
+def gaussian(std):
+    return Gaussian(normal(NUMBER, STEPS, CALLERS, 2), std, normal(2).detach())
 
 
-def squares_as_log_density(mean, std, actions):
-    constant = (std.log() + 0.5 * math.log(2 * math.pi)).expand(mean.shape).sum(-1)
-    return weighted_squares(mean, -0.5 / std.square(), actions) - constant
+def hurdle():
+    return Hurdle(normal(NUMBER, STEPS, CALLERS, 1), clipped(positive(2)))
 
 
-def terminations(logits):
-    probability = torch.sigmoid(TERMINATION_BOUND * torch.tanh(logits / TERMINATION_BOUND))
-    return torch.stack([(1 - probability).log(), probability.log()], -1)
+def binary():
+    return Binary(normal(NUMBER, STEPS, CALLERS, 2))
 
 
-CASES = [
-    (selection, lambda logits: log_softmax(logits, -1), [(2, 3, 4, 5)]),
-    (hybrid_selection, lambda logits: log_softmax(logits, -1), [(2, 3, 1, 4)]),
-    (log_termination, terminations, [(2, 3, 4)]),
-    (squares_as_log_density, normal_log_density, [(2, 3, 4, 2), (2,), (2, 3, 2)]),
-    (squares_as_log_density, normal_log_density, [(2, 3, 4, 2), (4, 2), (2, 3, 2)]),
-    (squares_as_log_density, normal_log_density, [(2, 3, 4, 2), (2, 3, 4, 2), (2, 3, 2)]),
+STDS = [(2,), (CALLERS, 2), (NUMBER, STEPS, CALLERS, 2)]
+EMISSIONS = [
+    *(gaussian(positive(*shape)) for shape in STDS),
+    *(clipped(positive(*shape)) for shape in STDS),
+    hurdle(),
+    Product((((1, 2), gaussian(positive(2))), ((0, 3), clipped(positive(CALLERS, 2))))),
+    Product((((3, 0), binary()), ((2, 1), gaussian(positive(2))))),
 ]
 
 
-@pytest.mark.parametrize(("link", "truth", "shapes"), CASES)
-@pytest.mark.parametrize("strided", [False, True])
-def test_value_and_gradients_are_those_of_torch(link, truth, shapes, strided):
-    inputs = [normal(*shape) for shape in shapes]
-    if len(inputs) > 1:
-        inputs[1] = inputs[1].detach().abs().add(0.3).requires_grad_()
-    if strided:
-        inputs[0] = inputs[0].detach().transpose(0, 1).contiguous().transpose(0, 1).requires_grad_()
-    value, expected = link(*inputs), truth(*inputs)
-    torch.testing.assert_close(value, expected, rtol=1e-12, atol=1e-12)
-    upstream = normal(*value.shape).detach()
-    for leaves in (inputs[:1], inputs[:2], inputs):  # the controls' gradient goes another way
-        found = torch.autograd.grad((value * upstream).sum(), leaves, retain_graph=True)
-        theirs = torch.autograd.grad((expected * upstream).sum(), leaves, retain_graph=True)
-        torch.testing.assert_close(found, theirs, rtol=1e-10, atol=1e-10)
+def controls(emission):
+    """Values within bounds and on them, switches' positions, and a hurdle's value."""
+    values = normal(NUMBER, STEPS, emission.shape[-1]).detach()
+    if isinstance(emission, Clipped | Hurdle):
+        values = torch.minimum(values.clamp(min=-1.0), torch.tensor([0.5, 1.0]))
+    if isinstance(emission, Hurdle):
+        values[:, ::2] = 0.0
+    if isinstance(emission, Product):
+        values[..., [0, 3]] = (values[..., [0, 3]] > 0).double()
+    return values
 
 
-@pytest.mark.parametrize(("link", "shape"), [(selection, (2, 3)), (log_termination, (2, 3))])
-def test_second_derivatives_are_those_of_torch(link, shape):
-    assert torch.autograd.gradgradcheck(link, normal(*shape))
+CASES = [
+    *(Selection(normal(NUMBER, STEPS, CALLERS, 3), control) for control in (0, 1)),
+    Selection(normal(STEPS, NUMBER, 1, 5).detach().transpose(0, 1).requires_grad_(), 0),
+    Termination(normal(NUMBER, STEPS, CALLERS)),
+    Termination(normal(NUMBER, STEPS, CALLERS, scale=40.0)),
+    LogTable(normal(NUMBER, STEPS, CALLERS)),
+    *(Density(emission, controls(emission)) for emission in EMISSIONS),
+    Density(
+        Categorical(normal(NUMBER, STEPS, CALLERS, 3), torch.tensor(False)),
+        torch.arange(21).reshape(3, 7, 1) % 3,
+    ),
+]
 
 
-def test_the_second_derivative_of_squares_is_that_of_torch():
-    inputs = normal(2, 3, 2), normal(2), normal(2, 2)
-    assert torch.autograd.gradgradcheck(weighted_squares, inputs)
+@pytest.mark.parametrize("lengths", LENGTHS)
+@pytest.mark.parametrize("link", CASES)
+def test_compiled_passes_are_the_formula_and_its_gradient(link, lengths):
+    """In columns 2 to 2 + n of rows of n + 3; what is past the trajectories has no gradient."""
+    alive, columns = Alive.of(lengths, STEPS), slice(2, 2 + link.columns)
+    rows = np.full((len(alive.rows), link.columns + 3), np.nan)
+    kept = link.fill(alive, rows, 2)
+    table, steps = link.formula(), torch.arange(STEPS) < lengths[:, None]
+    logs = isinstance(link, Density)
+    expected = (table if logs else table.exp())[steps].flatten(1).detach()
+    torch.testing.assert_close(torch.from_numpy(rows[:, columns]), expected, rtol=1e-12, atol=1e-12)
+    posterior, weight = normal(*rows.shape).detach().numpy(), normal(len(rows)).detach().numpy()
+    found = link.gradients(alive, Posterior(rows, posterior, weight), 2, kept)
+    upstream = torch.from_numpy(posterior[:, columns] * weight[:, None]).reshape(-1, *link.shape[2:])
+    upstream = torch.where(table[steps] > NEVER, upstream, 0.0)
+    wanted = [tensor for tensor in link.inputs if tensor.requires_grad]
+    truth = torch.autograd.grad(table[steps], wanted, upstream, allow_unused=True)
+    ours = [own for own, tensor in zip(found, link.inputs, strict=True) if tensor.requires_grad]
+    for own, theirs in zip(ours, truth, strict=True):
+        torch.testing.assert_close(own, theirs, rtol=1e-9, atol=1e-11)
 
 
-def test_a_choice_that_is_not_there_is_impossible():
-    found = log_selection(normal(2, 3, 1, 4), 1)
-    torch.testing.assert_close(found, pad(log_softmax(normal(2, 3, 1, 4), -1), (1, 0), value=NEVER))
-
-
-@pytest.mark.parametrize("link", [selection, hybrid_selection, log_termination])
-def test_single_precision_keeps_what_it_can(link):
-    """However large the logits are; rounding of the logits themselves left out."""
-    single = normal(20, 6, dtype=torch.float32, scale=30.0)
-    torch.testing.assert_close(link(single).double(), link(single.double()), rtol=3e-6, atol=1e-12)
+def test_single_precision_loses_only_the_rounding_of_the_outputs():
+    """However large the logits are."""
+    lengths = LENGTHS[0]
+    alive = Alive.of(lengths, STEPS)
+    single = normal(NUMBER, STEPS, 1, 6, dtype=torch.float32, scale=30.0)
+    for link, exact in (
+        (Selection(single, 1), Selection(single.double(), 1)),
+        (Termination(single.squeeze(2)), Termination(single.squeeze(2).double())),
+    ):
+        rows = [np.empty((len(alive.rows), link.columns)) for _ in range(2)]
+        for one, own in zip((link, exact), rows, strict=True):
+            one.fill(alive, own, 0)
+        np.testing.assert_allclose(*rows, rtol=1e-12)
 
 
 def test_what_is_not_a_number_stays_visible():
-    logits = torch.tensor([[0.0, torch.nan, 1.0]])
-    assert selection(logits).isnan().all()
-    assert log_termination(logits)[:, 1].isnan().all()
+    logits = torch.tensor([0.0, torch.nan, 1.0]).reshape(1, 1, 1, 3)
+    alive, chosen, ended = Alive.of(torch.tensor([1]), 1), np.empty((1, 3)), np.empty((1, 6))
+    Selection(logits, 0).fill(alive, chosen, 0)
+    Termination(logits[0]).fill(alive, ended, 0)
+    assert np.isnan(chosen).all()
+    assert np.isnan(ended).tolist() == [[False, False, True, True, False, False]]
+
+
+def test_formulas_are_those_of_the_model():
+    logits = normal(2, 3, 1, 4)
+    torch.testing.assert_close(Selection(logits, 1).table, pad(log_softmax(logits, -1), (1, 0), value=NEVER))
+    probability = torch.sigmoid(TERMINATION_BOUND * torch.tanh(logits[:, :, 0] / TERMINATION_BOUND))
+    expected = torch.stack([(1 - probability).log(), probability.log()], -1)
+    torch.testing.assert_close(Termination(logits[:, :, 0]).table, expected)
+
+
+def test_elementary_functions_have_the_errors_that_they_state():
+    x = np.concatenate([np.linspace(-50, 40, 20_001), -np.logspace(0, 12, 2001), np.logspace(-12, 3, 2001)])
+    value, slope = x.copy(), np.empty_like(x)
+    log_normal_cdf(value, slope)
+    truth = special.log_ndtr(x)
+    assert (np.abs(value - truth) / np.maximum(1, np.abs(truth))).max() < 2e-15
+    low, high = x <= 0, (x > 0) & (x < 37)
+    hazard = np.sqrt(2 / np.pi) / special.erfcx(-x[low] / np.sqrt(2))
+    np.testing.assert_allclose(slope[low], hazard, rtol=2e-15)
+    density = np.exp(-0.5 * x[high] ** 2) / np.sqrt(2 * np.pi) / special.ndtr(x[high])
+    np.testing.assert_allclose(slope[high], density, rtol=4e-15)
+    x = np.linspace(-708, 709, 20_001)
+    value = x.copy()
+    exponentials(value)
+    np.testing.assert_allclose(value, np.exp(x), rtol=1e-15)
+    special_values = np.array([-709.0, -np.inf, np.nan])
+    exponentials(special_values)
+    np.testing.assert_array_equal(special_values, [0.0, 0.0, np.nan])
+    x = np.logspace(-300, 300, 20_001)
+    value = x.copy()
+    logarithms(value)
+    assert (np.abs(value - np.log(x)) / np.maximum(1, np.abs(np.log(x)))).max() < 1e-15

@@ -7,12 +7,14 @@ import pytest
 import torch
 import user_networks
 from planted import make_spec, make_trainer
+from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing import words
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import EpochEnded, RestartDiverged, RestartStopped
 from ddco_pyro.fitting.fit import fit
+from ddco_pyro.inference import segment
 from ddco_pyro.metrics import Training
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.training import loop as training
@@ -274,7 +276,8 @@ def test_a_restart_that_diverges_ends_there_and_is_not_the_best(with_diverging):
         assert ended == [number for number in range(6) if starts[number]]
     if passes == 10:  # the last one that was left: another goes on, which had been stopped
         assert best in {event.restart for event in told if isinstance(event, RestartStopped)}
-        assert trainer.summary["restarts"]["each"][best] == {"epochs": 12, "stopped": None}
+        each = trainer.summary["restarts"]["each"][best]
+        assert (each["epochs"], each["stopped"]) == (12, None)
     assert all(torch.equal(model[name], value) for name, value in made.states["best"].items())
 
 
@@ -312,6 +315,27 @@ def test_where_all_diverge_the_trajectory_is_named(demos, tmp_path, monkeypatch,
 def _nan_in_training(network, inputs):
     found = (inputs.vector @ network.weight).unflatten(-1, network.size)
     return found * torch.nan if network.training else found
+
+
+def test_each_restart_begins_from_the_next_kind(demos, tmp_path):
+    kinds = ["random", "cuts", "mixture"]
+    spec = make_spec((2,), restarts=4, control={"std": 1.0}, **{**QUICK, "initialize": kinds})
+    trainer = make_trainer(spec, demos, tmp_path)
+    trainer.run()
+    stages = [list(dict.fromkeys(row["stage"] for row in one.progress.history)) for one in trainer.restarts]
+    assert stages == [["joint"], ["cuts-1", "joint"], ["vq-1", "mixture", "joint"], ["joint"]]
+    each = trainer.summary["restarts"]["each"]
+    assert [one["initialize"] for one in each] == [*kinds, "random"]
+    said = words.restarts(Training.model_validate(trainer.summary))
+    assert "(0 from random, 1 from cuts, 2 from mixture, 3 from random; stopped early" in said
+    best, batch = trainer.summary["restarts"]["best"], trainer.data.train
+    for number, one in enumerate(each):
+        models = [trainer.data.hierarchy(n, trainer.restarts[n].states["best"]) for n in (best, number)]
+        with torch.no_grad():
+            ours, theirs = (segment(model.tabulate(batch), batch.lengths)[0].flatten() for model in models)
+        nmi = normalized_mutual_info_score(ours, theirs)
+        assert nmi == pytest.approx(1.0 if number == best else one["nmi"])
+        assert number == best or f"{words.number(nmi)} of {number}" in said
 
 
 def test_restarts_in_words(undisturbed):

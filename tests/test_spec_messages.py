@@ -189,6 +189,25 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "training.labels.hold: false uses labels in initialisation alone, and that is random; say vq there",
     ),
     (
+        {"training.initialize": "clusters"},
+        "training.initialize: must be one of 'vq', 'vq_controls', 'equal_parts', 'cuts', 'mixture', 'random', or a "
+        "list of them, got 'clusters' (did you mean 'cuts'?)",
+    ),
+    (
+        {"training": {"initialize": ["vq", "cut"], "restarts": 2}},
+        "training.initialize.1: must be vq or vq_controls or equal_parts or cuts or mixture or random, "
+        "got 'cut' (did you mean 'cuts'?)",
+    ),
+    ({"training.initialize": []}, "training.initialize: must have at least 1 item(s), got []"),
+    (
+        {"training.initialize": ["vq", "cuts"]},
+        "training.initialize: has 2 kinds, but training.restarts is 1; give as many restarts",
+    ),
+    (
+        {"training": {"initialize": "mixture", "lower_levels": "frozen"}},
+        "training.lower_levels: mixture trains all levels together in the end; say fine_tuned",
+    ),
+    (
         {"training.duration.mean": 0.5},
         "training.duration.mean: must be a number of steps, at least 1, or a list of them, got 0.5",
     ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -9,14 +10,14 @@ import numpy as np
 import pytest
 from command_line import call
 from gripper import planted
-from random_demonstrations import demonstrations
+from random_demonstrations import demonstration, demonstrations
 from scipy import stats
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import PICTURES, VECTORS, Recipe, _batch, _epochs, starting_spec
-from ddco_pyro.spec import load_spec
+from ddco_pyro.spec import Spec, load_spec
 
 
 @pytest.fixture
@@ -179,7 +180,8 @@ def test_a_control_that_never_changes_is_refused(path: Path) -> None:
 
 
 def test_masks_of_the_file_decide_what_is_held_out(path: Path, tmp_path: Path) -> None:
-    assert load_spec(write(tmp_path, starting_spec(inspect(path), path))).demonstrations.valid_fraction == 0.25
+    demonstrations(8).write(path)
+    assert load_spec(write(tmp_path, starting_spec(inspect(path), path))).demonstrations.valid_fraction == 0.2
     demonstrations(6, {"train": ("demo_0", "demo_3"), "valid": ("demo_1",), "better": ("demo_2",)}).write(path)
     text = starting_spec(inspect(path), path)
     assert "# held out: as mask/train and mask/valid in the file say" in text
@@ -241,3 +243,16 @@ def test_a_file_that_is_there_is_not_replaced_unasked(path: Path, tmp_path: Path
     assert ended.err == f"ddco-pyro: {spec}: exists; choose another --out, or replace it with --force\n"
     assert call("init", path, "--out", spec, "--force").status == 0
     assert spec.read_text() != "mine"
+
+
+def test_few_demonstrations_all_train_and_few_steps_have_stronger_ridges(path: Path, tmp_path: Path) -> None:
+    def spec(*steps: int) -> Spec:
+        records = tuple(demonstration(f"demo_{n}", length, n) for n, length in enumerate(steps))
+        vectors = (replace(one, observations={"pose": one.observations["pose"]}) for one in records)
+        Demonstrations(tuple(vectors)).write(path)
+        return load_spec(write(tmp_path, starting_spec(inspect(path), path)))
+
+    few, short, long = spec(*[200] * 7), spec(*[20] * 8), spec(*[200] * 8)
+    assert [one.demonstrations.leave_one_out for one in (few, short, long)] == [True, False, False]
+    assert [one.training.tune_fraction for one in (few, short, long)] == [0, 0.1, 0.1]
+    assert [one.training.optimizer.ridge.policy for one in (few, short, long)] == [10, 10, 1]

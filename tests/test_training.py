@@ -57,6 +57,9 @@ def flat(kind="flat", network="linear", lr=0.03, **training):
         ({"upper_levels": "segments"}, 1, ["vq-1", "level-1", "meta-policy", "joint"]),
         ({"upper_levels": "segments"}, 3, ["vq-1", "level-1", "segments", "upper", "joint"]),
         ({"layerwise": False}, 2, ["vq-1", "vq-2", "joint"]),
+        ({"initialize": "cuts"}, 1, ["cuts-1", "level-1", "meta-policy", "joint"]),
+        ({"initialize": "mixture"}, 1, ["vq-1", "mixture", "joint"]),
+        ({"initialize": "mixture", "upper_levels": "segments"}, 3, ["vq-1", "vq-2", "vq-3", "mixture", "joint"]),
         ({"layerwise": False, "initialize": "random"}, 3, ["joint"]),
         ({}, 0, ["policy"]),
     ],
@@ -275,8 +278,9 @@ def test_the_running_mean_of_the_weights_is_evaluated_and_kept(tmp_path, monkeyp
         pytest.param("adam", {"epochs": 30, "patience": 1}, None, marks=pytest.mark.slow),
         ("adam", {"epochs": 20, "upper_levels": "segments"}, 2 * 5 * 4),
         ("adam", {"epochs": 18, "average": 0.9}, 2 * 6 * 3),
+        ("adam", {"epochs": 12, "initialize": ["cuts", "mixture"]}, 12 + 12),
     ],
-    ids=["adam", "momentum", "stages that stop early", "levels from segments", "mean weights"],
+    ids=["adam", "momentum", "stages that stop early", "levels from segments", "mean weights", "starts that differ"],
 )
 def test_resuming_gives_the_same_bits(tmp_path, optimizer, training, rows):
     spec = make_spec((2, 2), optimizer={"name": optimizer, "lr": 0.01}, restarts=2, **training)
@@ -333,7 +337,7 @@ def test_both_engines_train_to_the_same_model(tmp_path):
 
 def test_what_is_not_finite_names_the_demonstration(tmp_path):
     trainer = make_trainer(make_spec(), random_demonstrations(), tmp_path)
-    trainer.data.train.actions[trainer.data.names.index("demo_0")] *= 1e30  # its square is more than float32 can hold
+    trainer.data.train.actions[trainer.data.names.index("demo_0")] = torch.inf
     with pytest.raises(TrainingError, match=r"demo_0 is not finite"):
         trainer.run()
 
@@ -385,6 +389,58 @@ def test_what_is_called_converged_is_at_the_optimum(tmp_path):
 
 
 # --- planted hierarchies ----------------------------------------------------------------------------------------------
+
+
+EM = {"optimizer": {"name": "em"}, "epochs": 300}
+
+
+def test_a_planted_hierarchy_is_recovered_from_the_best_of_several_cuts(tmp_path):
+    spec = make_spec((4,), control=CONTROL, initialize="cuts", restarts=6, **EM)
+    truth = make_truth(spec)
+    trainer = make_trainer(spec, plant(truth, 80, 40, seed=1)[0], tmp_path)
+    values = recovered(trainer.run(), truth, *plant(truth, 40, 40, seed=2))
+    assert values["found"] > values["truth"] - 0.02 * abs(values["truth"])
+    assert values["found nmi"][0] > values["truth nmi"][0] - 0.05
+    segments = trainer.restarts[0].states["best"], trainer.restarts[1].states["best"]
+    assert any(not torch.equal(segments[0][name], segments[1][name]) for name in segments[0])
+    told = trainer.summary["restarts"]
+    assert [each["initialize"] for each in told["each"]] == ["cuts"] * 6
+    assert [each["nmi"] is not None for each in told["each"]] == [number != told["best"] for number in range(6)]
+
+
+@pytest.mark.parametrize("optimizer", [{"name": "em"}, {"name": "adam", "lr": 0.03}], ids=["em", "adam"])
+@pytest.mark.parametrize("counts", [(3,), (3, 2)])
+def test_a_hierarchy_begins_from_the_mixtures_fit_with_psi_one_half(tmp_path, counts, optimizer):
+    """The stage before the last maximises the likelihood of the spec whose options always end."""
+    spec = make_spec(counts, control=CONTROL, initialize="mixture", optimizer=optimizer, epochs=240)
+    data = make_trainer(spec, plant(make_truth(spec), 30, 20, seed=1)[0], tmp_path).data
+    restart = train(data, Restart(Progress(0)), until=0)
+    model = data.hierarchy(0, restart.states["model"])
+    always = {f"hierarchy.levels.{n}.termination": "always" for n in range(len(counts))}
+    mixture = replace(data, spec=with_overrides(spec, always)).hierarchy(0)
+    mixture.load_state_dict({name: restart.states["model"][name] for name in mixture.state_dict()})
+    with torch.no_grad():
+        ends = [level[..., 1].exp() for level in model.tabulate(data.train).termination]
+        without = [
+            float(log_likelihood(mixture.tabulate(batch), batch.lengths).sum()) / batch.steps
+            for batch in (data.train, data.tune)
+        ]
+    assert all(torch.allclose(level, torch.tensor(0.5)) for level in ends)
+    tuned = [row["tune"] for row in restart.progress.history if row["stage"] == "mixture"]
+    kept = tuned[-1] if optimizer["name"] == "em" else max(tuned)  # EM before the last stage keeps what converged
+    assert kept == pytest.approx(without[1], abs=1e-5)
+    restart = train(data, restart)
+    assert restart.progress.ended[-1]["stage"] == "joint"
+    assert restart.progress.best > without[1]
+    found = data.hierarchy(0, restart.states["best"])
+    with torch.no_grad():
+        assert (
+            float(log_likelihood(found.tabulate(data.train), data.train.lengths).sum()) / data.train.steps > without[0]
+        )
+        assert any(
+            not torch.allclose(level[..., 1].exp(), torch.tensor(0.5))
+            for level in found.tabulate(data.train).termination
+        )
 
 
 @pytest.mark.parametrize("counts", [(4,), pytest.param((4, 2), marks=pytest.mark.slow)])

@@ -210,7 +210,7 @@ def _log_likelihoods(fit: Fit, demos: Demonstrations) -> np.ndarray:
 
     :raises CompareError: a value is not the one in ``metrics.json``.
     """
-    values = fit.log_likelihood(demos)
+    values = np.concatenate([piece.log_likelihood for piece in fit.infer(demos, held_out=True)])
     for name, value in zip(demos.names, values, strict=True):
         if not fit.was_held_out(name, float(value)):
             raise CompareError(f"{fit}: {name} has changed since this run was fitted to it; fit it again")

@@ -8,7 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.metrics import Against, Difference, Metrics, Rate, Rollouts, Seeds, Stage, SuccessWorth, Training, Worth
+from ddco_pyro.metrics import (
+    Against,
+    Counts,
+    Difference,
+    Metrics,
+    Rate,
+    Rollouts,
+    Seeds,
+    Stage,
+    SuccessWorth,
+    Training,
+    Worth,
+)
 
 CONFIDENCE = 0.95
 """Level of intervals; a difference is significant where its interval excludes 0."""
@@ -45,9 +57,9 @@ def about(names: Iterable[str]) -> str:
 def stage(name: str) -> str:
     """A stage of training in words: ``vq-1`` is ``level 1 from clusters``."""
     kind, _, level = name.partition("-")
-    whole = {"meta-policy": "meta-policy alone", "joint": "all together"}
+    whole = {"meta-policy": "meta-policy alone", "joint": "all together", "mixture": "all together without memory"}
     whole |= {"segments": "levels above the lowest from segments", "upper": "levels above the lowest together"}
-    how = {"vq": "from clusters", "parts": "from equal parts", "level": "alone"}.get(kind)
+    how = {"vq": "from clusters", "parts": "from equal parts", "cuts": "from random cuts", "level": "alone"}.get(kind)
     return f"level {level} {how}" if how else whole.get(name, name)
 
 
@@ -115,6 +127,12 @@ def verdict(metrics: Metrics) -> str:
     return f"{_explained(metrics)}{rising(names)}"
 
 
+def division(counts: Counts) -> str:
+    """The numbers of demonstrations that train, tune, and are held out."""
+    held_out = "each held out from a fit without it" if counts.left_out else f"{counts.valid} held out"
+    return f"{counts.train} for training, {counts.tune} for tuning, {held_out}"
+
+
 def rising(names: Iterable[str]) -> str:
     """A sentence, after a space, on models that have not converged; empty where there are none."""
     rising = list(names)
@@ -132,6 +150,8 @@ def _explained(metrics: Metrics) -> str:
         return f"{name} gives held-out demonstrations {value} nats per step; no baseline was trained to compare with."
     differences = {method(other): compared.difference for other, compared in metrics.comparison.items()}
     said = [explains(name, differences, held_out)]
+    if metrics.demonstrations.left_out:
+        said.append("Every demonstration trains the model; each is held out from a fit without it.")
     if metrics.worth:
         said.append(worth(metrics.worth, ours, held_out))
     if metrics.seeds:
@@ -326,7 +346,9 @@ def spent(training: Training) -> str:
 
 
 def restarts(training: Training) -> str:
-    """The best of several restarts, the ones stopped early or diverged, and the effort of all; else empty."""
+    """The best of several restarts, their starts, the ones stopped early or diverged, their effort and how their
+    segments agree with the best one's; empty for a single restart.
+    """
     told = training.restarts
     if len(told.each) == 1:
         return ""
@@ -334,10 +356,16 @@ def restarts(training: Training) -> str:
     early = ", ".join(f"{number} after {epochs}" for number, epochs in stopped.items()) or "none"
     ended = ", ".join(str(number) for number, restart in enumerate(told.each) if restart.diverged)
     early += f"; diverged: {ended}" if ended else ""
+    starts = [restart.initialize for restart in told.each]
+    every = f"0 to {len(starts) - 1}" + (f" from {starts[0]}" if starts[0] else "")
+    if len(set(starts)) > 1:
+        every = ", ".join(f"{number} from {start}" for number, start in enumerate(starts))
+    alike = ", ".join(f"{number(one.nmi)} of {n}" for n, one in enumerate(told.each) if one.nmi is not None)
     return (
-        f"restart {told.best} was the best of {len(told.each)} (0 to {len(told.each) - 1}; stopped early, "
+        f"restart {told.best} was the best of {len(starts)} ({every}; stopped early, "
         f"with their epochs of the last stage: {early}), which took {told.spent.epochs} epochs "
         f"({told.spent.gradient_steps} gradient steps) together"
+        + (f"; NMI of its segments of the training demonstrations with those of the others: {alike}" if alike else "")
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import Failed
@@ -33,6 +34,7 @@ from ddco_pyro.metrics import (
     Use,
     Worth,
 )
+from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.training.labels import choices, used
 
@@ -58,14 +60,43 @@ class _Part:
     segments: list[list[np.ndarray]]
 
     @classmethod
-    def of(cls, fit: Fit, demos: Demonstrations) -> _Part:
+    def of(cls, fit: Fit, demos: Demonstrations, held_out: bool = False) -> _Part:
         values, parts, paths = [], [], []
-        for piece in infer(fit.hierarchy, demos):
+        for piece in fit.infer(demos, held_out):
             values.append(_finite(fit, piece))
             parts.append(piece.decomposition)
-            paths.append(piece.path.choices)
+            paths.append(_named_alike(fit, piece, demos))
         segments = [[row[row >= 0].numpy() for h in level for row in h] for level in zip(*paths, strict=True)]
         return cls(np.concatenate(values), Decomposition.joined(parts), segments)
+
+
+def _named_alike(fit: Fit, piece: Inferred, demos: Demonstrations) -> tuple[Tensor, ...]:
+    """The most likely choices of each level, with the options of a model without a demonstration named as the fit's.
+
+    Options are matched so that both models agree on as many steps of the other demonstrations as possible.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    choices = piece.path.choices
+    if piece.hierarchy is fit.hierarchy:
+        return choices
+    others = demos.select(name for name in demos.names if name not in piece.names)
+    pairs = zip(*(_choices(model, others) for model in (piece.hierarchy, fit.hierarchy)), strict=True)
+    matched = []
+    for own, (theirs, ours) in zip(choices, pairs, strict=True):
+        names = np.arange(max(theirs.max(), ours.max(), int(own.max())) + 1)
+        together = np.zeros((len(names), len(names)))
+        np.add.at(together, (theirs, ours), 1)
+        names[1:] = 1 + linear_sum_assignment(together[1:, 1:], maximize=True)[1]  # 0 is the control
+        matched.append(torch.where(own < 0, own, torch.as_tensor(names)[own.clamp(min=0)]))
+    return tuple(matched)
+
+
+def _choices(model: Hierarchy, demos: Demonstrations) -> Iterator[np.ndarray]:
+    """The most likely choice at every step of demonstrations, [steps], for each level."""
+    paths = [piece.path.choices for piece in infer(model, demos)]
+    for level in zip(*paths, strict=True):
+        yield np.concatenate([part[part >= 0].numpy() for part in level])
 
 
 def _finite(fit: Fit, piece: Inferred) -> np.ndarray:
@@ -93,11 +124,11 @@ def evaluate(fitted: Fit, parts: dict[str, Demonstrations], demos: Demonstration
     :param about: the other fields of :class:`ddco_pyro.metrics.Metrics`: training and versions, for example.
     :raises NotFinite: a log-likelihood is NaN or infinite.
     """
-    ours = {name: _Part.of(fitted, part) for name, part in parts.items()}
+    ours = {name: _Part.of(fitted, part, name == "valid") for name, part in parts.items()}
     by_method = {fitted.name: {name: part.values for name, part in ours.items()}}
     for method, fit in fitted.baselines.items():
         by_method[method] = {
-            name: np.concatenate([_finite(fit, piece) for piece in infer(fit.hierarchy, part)])
+            name: np.concatenate([_finite(fit, piece) for piece in fit.infer(part, name == "valid")])
             for name, part in parts.items()
         }
     values, valid, depth = by_method[fitted.name], parts.get("valid"), fitted.hierarchy.depth
@@ -140,7 +171,7 @@ def _worth(fit: Fit, values: Mapping[str, np.ndarray], ours: _Part, valid: Demon
     found = worth(fit.name, values, valid.lengths)
     if found is None:
         return None
-    pairs = zip(ours.segments, _Part.of(fit.baselines[MIXTURE], valid).segments, strict=True)
+    pairs = zip(ours.segments, _Part.of(fit.baselines[MIXTURE], valid, held_out=True).segments, strict=True)
     rows = [InARow(options=mean_run(own), mixture=mean_run(mixture)) for own, mixture in pairs]
     return found.model_copy(update={"steps_in_a_row": rows})
 

@@ -33,6 +33,7 @@ from ddco_pyro.fitting.run import (
     RunError,
     claim,
     claimed,
+    has_model,
     is_finished,
     read_model,
     write_history,
@@ -70,6 +71,8 @@ class Fit:
     :param folder: the run folder; None where nothing was written.
     :param given: the demonstrations of the fit; None for those that the spec names.
     :param beside: the fitted baselines, by name; None for those in the run folder.
+    :param apart: models that were trained without a demonstration, by its name (``demonstrations.leave_one_out``); None
+        for those in the run folder.
     """
 
     spec: Spec
@@ -78,6 +81,7 @@ class Fit:
     folder: Path | None = None
     given: Demonstrations | None = field(default=None, repr=False)
     beside: Mapping[str, Fit] | None = field(default=None, repr=False)
+    apart: Mapping[str, Hierarchy] | None = field(default=None, repr=False)
 
     def __str__(self) -> str:
         return str(self.folder or "this fit")
@@ -120,6 +124,14 @@ class Fit:
         return {folder.name: load(folder, allow_code) for folder in folders if is_finished(folder)}
 
     @cached_property
+    def without(self) -> Mapping[str, Hierarchy]:
+        """The model without each demonstration, by its name; empty without ``demonstrations.leave_one_out``."""
+        if self.apart is not None or self.folder is None or not self.spec.demonstrations.leave_one_out:
+            return self.apart or {}
+        places = _left_out(self.folder, self.demonstrations)
+        return {name: read_model(place, self.spec) for name, place in places.items()}
+
+    @cached_property
     def held_out(self) -> dict[str, float]:
         """log p(ξ) of each held-out demonstration by name, computed when it was fitted, nats."""
         return {row.name: row.log_likelihood for row in self.metrics.valid}
@@ -128,7 +140,7 @@ class Fit:
         """Whether a demonstration is among the held-out ones: the name and the log-likelihood are equal."""
         return bool(np.isclose(self.held_out.get(name, np.nan), log_likelihood, rtol=TOLERANCE, atol=TOLERANCE))
 
-    def infer(self, demos: Iterable[Demonstration]) -> Iterator[Inferred]:
+    def infer(self, demos: Iterable[Demonstration], held_out: bool = False) -> Iterator[Inferred]:
         """The model's outputs, posteriors and paths for demonstrations, in pieces that fit into memory, in order.
 
         >>> for piece in fit.infer(demos):
@@ -136,9 +148,14 @@ class Fit:
         (6,) torch.Size([6, 10, 3]) torch.Size([6, 10])
 
         :param demos: :class:`~ddco_pyro.Demonstrations`, or an iterable that reads one after the other.
+        :param held_out: with ``demonstrations.leave_one_out``, each by the model that was trained without it.
         :raises DemonstrationsError: there are none, or a number is too large for networks.
         """
-        return infer(self.hierarchy, demos)
+        if not (held_out and self.without):
+            yield from infer(self.hierarchy, demos)
+        else:
+            for demo in demos:
+                yield from infer(self.without[demo.name], [demo])
 
     def log_likelihood(self, demos: Iterable[Demonstration]) -> np.ndarray:
         """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units.
@@ -311,8 +328,11 @@ def _fit_model(
             write_model(folder, hierarchy)
         with clock("baselines"):
             beside = {name: begun[name]() if name in begun else fits[name](on_event, jobs, ranks) for name in fits}
-    fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=beside)
-    parts_of = {"train": trained.data.train, "tune": trained.data.tune, "valid": split.get("valid", ())}
+    with clock("training"):
+        apart = _leave_one_out(spec, size, demos, folder, on_event, jobs, ranks)
+    fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=beside, apart=apart)
+    train, valid = len(trained.data.train), len(split.get("valid", ()))
+    counts = {"train": train, "tune": len(split["train"]) - train, "valid": valid, "left_out": bool(apart)}
     known = {"supervisor": json.loads(str(demos.attributes.get("supervisor", "{}")))}  # a collected file has it
     with clock("evaluation"), repeatable(hierarchy.device):
         metrics = evaluate(
@@ -320,7 +340,7 @@ def _fit_model(
             split,
             demos,
             engine_check=trained.check._asdict(),
-            demonstrations={name: len(part) for name, part in parts_of.items()} | known,
+            demonstrations=counts | known,
             measure=measure(hierarchy.scaling.parts),
             control_dimensions=[dimension.as_data() for dimension in size.control],
             parameters=parameters(hierarchy),
@@ -332,6 +352,39 @@ def _fit_model(
     if folder:
         metrics.write(folder)
     return replace(fitted, metrics=metrics)
+
+
+def _leave_one_out(
+    spec: Spec,
+    size: Dimensions,
+    demos: Demonstrations,
+    folder: Path | None,
+    on_event: OnEvent,
+    jobs: int,
+    ranks: Ranks,
+) -> dict[str, Hierarchy]:
+    """The model trained without each demonstration, by its name, each kept in the run folder as soon as it is done."""
+    models: dict[str, Hierarchy] = {}
+    if not spec.demonstrations.leave_one_out:
+        return models
+    places = _left_out(folder, demos) if folder else {}
+    for name in demos.names:
+        place = places.get(name)
+        if place and has_model(place):
+            models[name] = read_model(place, spec)
+            continue
+        others = demos.select(other for other in demos.names if other != name)
+        checkpoints = place / "checkpoints" if place else None
+        event = f"{model_name(spec)} without {name}"
+        models[name] = train_model(spec, size, others, on_event, checkpoints, None, event, jobs, ranks).hierarchy
+        if place:
+            write_model(place, models[name])
+    return models
+
+
+def _left_out(folder: Path, demos: Demonstrations) -> dict[str, Path]:
+    """The folder of the model without each demonstration, by its name."""
+    return {name: folder / "left_out" / str(number) for number, name in enumerate(demos.names)}
 
 
 def _fit_baseline(

@@ -128,7 +128,7 @@ def merged_spec(spec: Spec, level: int) -> Spec:
         f"hierarchy.levels.{level}.count": own.count - 1,
         "training.labels": {"level": own.name, "from": LABELS, "hold": False},
     }
-    if spec.training.initialize == "random":  # which would not begin from anything
+    if "random" in spec.training.starts:  # which would not begin from anything
         changes["training.initialize"] = "vq"
     return with_overrides(spec, changes)
 

@@ -68,6 +68,11 @@ def is_finished(folder: Path) -> bool:
     return all((folder / name).exists() for name in ("model.safetensors", "metrics.json"))
 
 
+def has_model(folder: Path) -> bool:
+    """Whether a trained model is in the folder."""
+    return (folder / "model.safetensors").exists()
+
+
 def write_model(folder: Path, hierarchy: Hierarchy) -> None:
     """Write ``model.safetensors``."""
     metadata = {

@@ -26,7 +26,7 @@ def check_seeds(spec: Spec, seeds: int) -> None:
 
     :raises BadInput: no demonstrations are held out, or the last seed is too large.
     """
-    if spec.demonstrations.valid_fraction == 0:
+    if not spec.demonstrations.validates:
         raise BadInput("--seeds compares on held-out demonstrations; raise demonstrations.valid_fraction")
     with_overrides(spec, {"training.seed": training_seeds(spec, seeds)[-1]})
 

@@ -8,8 +8,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from ddco_pyro.inference import enumeration, logspace
-from ddco_pyro.inference.fused import Eliminate
+from ddco_pyro.inference import enumeration, fused, logspace
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.model.tables import Tables, complete
 
@@ -45,9 +44,8 @@ def log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") ->
     """
     if engine == "enumerate":
         return enumeration.log_likelihood(tables, lengths)
-    if tables.depth and tables.control[-1].device.type == "cpu":
-        value: Tensor = Eliminate.apply(lengths, tables.depth, *tables.leaves())
-        return value
+    if tables.depth and lengths.device.type == "cpu":
+        return fused.log_likelihood(tables, lengths)
     return logspace.log_likelihood(complete(tables, lengths))
 
 

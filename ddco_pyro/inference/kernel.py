@@ -19,13 +19,16 @@ import numba
 import numpy as np
 import torch
 
-Array = np.ndarray
+from ddco_pyro.model.elementary import Array, exponentials
 
 IMPOSSIBLE = -1
 """Marks a joint choice with an option below a choice 0, and a caller that is itself below a choice 0."""
 
 TOLERANCE = 1e-9
 """Allowed error of Σ_s α_t(s) β_t(s) = 1. Rounding changes the sum by less than 1e-12 over 10 000 steps."""
+
+SMALL = 1e-150
+"""Logarithms of products are taken before the product of two such numbers underflows."""
 
 jit = numba.njit(cache=True, error_model="numpy", forceinline=True)
 parallel = numba.njit(cache=True, error_model="numpy", parallel=True)
@@ -43,8 +46,8 @@ class Structure(NamedTuple):
     :param ends: first column of each level in a row of terminations, where a level has [k_d, 2], [D].
     :param callers: for each message entry, its first column in a row of selections as the caller of the level below,
         where a level has [callers, C_d]; :data:`IMPOSSIBLE` for a caller below a choice 0.
-    :param actors: for each joint choice, the acting caller's column in a row of controls, [S]. A row has each level's
-        k_d options, then the meta-policy; the column is :data:`IMPOSSIBLE` where the joint choice is.
+    :param actors: for each joint choice, the acting caller's column in a row of controls, [S]. A row has the
+        meta-policy, then each level's k_d options; the column is :data:`IMPOSSIBLE` where the joint choice is.
     :param choices: for each joint choice, the columns of its choices in a row of marginals, [S, D].
     """
 
@@ -68,8 +71,8 @@ class Structure(NamedTuple):
             digit = np.arange(messages[level + 1]) % sizes[level + 1] if level + 1 < depth else np.ones(1, np.int64)
             callers.append(np.where(digit > 0, first + (digit - 1) * size, IMPOSSIBLE))
             first += size * (sizes[level + 1] - 1 if level + 1 < depth else 1)
-        controls = _offsets([size - 1 for size in sizes])
-        actors = np.full(len(digits), controls[-1])  # the meta-policy, where every choice is 0
+        controls = _offsets([1, *(size - 1 for size in sizes)])[1:]
+        actors = np.zeros(len(digits), np.int64)  # the meta-policy, where every choice is 0
         for level in range(depth - 1, -1, -1):
             chosen = digits[:, level] > 0
             valid = (digits[chosen, level:] > 0).all(1)
@@ -98,13 +101,13 @@ def _offsets(sizes: Sequence[int]) -> tuple[int, ...]:
 
 
 class Rows(NamedTuple):
-    """Tables of all levels side by side, [N, T, ...], or [T, ...] for one trajectory.
+    """Tables of all levels side by side, [M, ...]: a row for each step of all trajectories, one after the other.
 
-    :param selection: selection probabilities, [..., Σ callers·C_d].
-    :param termination: termination probabilities, [..., Σ 2·k_d].
-    :param control: densities of the controls, scaled at each step, [..., 1 + Σ k_d].
-    :param choice: factors of the joint choices, [..., S]; among posteriors, the marginals of the choices,
-        [..., Σ C_d]. The last dimension is 0 where there are none.
+    :param selection: selection probabilities, [M, Σ callers·C_d].
+    :param termination: termination probabilities, [M, Σ 2·k_d].
+    :param control: densities of the controls, scaled at each step, [M, 1 + Σ k_d].
+    :param choice: factors of the joint choices, [M, S]; among posteriors, the marginals of the choices, [M, Σ C_d].
+        The last dimension is 0 where there are none.
     """
 
     selection: Array
@@ -116,14 +119,18 @@ class Rows(NamedTuple):
 def match_torch_threads() -> None:
     """Let compiled loops run on ``torch.get_num_threads()`` threads."""
     threads = torch.get_num_threads()
-    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
-    torch.set_num_threads(threads)  # numba's first call sets OpenMP's number for the whole process
+    own = min(threads, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    if numba.get_num_threads() != own:
+        numba.set_num_threads(own)
+    if torch.get_num_threads() != threads:  # numba's first call sets OpenMP's number for the whole process
+        torch.set_num_threads(threads)
 
 
 @jit
-def trajectory(rows: Rows, n: int, steps: int) -> Rows:
-    """The first ``steps`` of trajectory n."""
-    return Rows(rows.selection[n, :steps], rows.termination[n, :steps], rows.control[n, :steps], rows.choice[n, :steps])
+def trajectory(rows: Rows, start: int, steps: int) -> Rows:
+    """The rows of the trajectory of so many steps that begins at row ``start``."""
+    own = slice(start, start + steps)
+    return Rows(rows.selection[own], rows.termination[own], rows.control[own], rows.choice[own])
 
 
 @jit
@@ -177,7 +184,7 @@ def _act(t: int, rows: Rows, messages: Array, spread: Array, of: Structure) -> f
             message *= rows.selection[t, first]
             for j in range(1, c):
                 kept = messages[t, below + j] * rows.termination[t, 2 * j - 2]
-                option = (mass * rows.selection[t, first + j] + kept) * rows.control[t, j - 1]
+                option = (mass * rows.selection[t, first + j] + kept) * rows.control[t, j]
                 if weighted:
                     option *= rows.choice[t, below + j]
                 messages[t + 1, below + j] = option
@@ -213,8 +220,8 @@ def _adjoint_act(
             for j in range(1, c):
                 both = messages[t + 1, below + j] * back[below + j]
                 total += both
-                sums.control[j - 1] += both
-                here = back[below + j] * rows.control[t, j - 1] * scale
+                sums.control[j] += both
+                here = back[below + j] * rows.control[t, j] * scale
                 if weighted:
                     here *= rows.choice[t, below + j]
                 back[below + j] = here
@@ -320,89 +327,74 @@ def _backward(rows: Rows, messages: Array, spread: Array, scale: Array, posterio
 
 
 @parallel
-def any_levels(rows: Rows, lengths: Array, value: Array, exact: Array, posteriors: Rows, of: Structure) -> None:
-    """Fill log-likelihoods ``value`` [N], whether they are ``exact`` [N], and the posteriors of the rows."""
-    sizes, starts, ends, callers, actors, choices = of  # a parallel loop takes no tuple within a tuple
+def any_levels(
+    rows: Rows, starts: Array, lengths: Array, value: Array, exact: Array, posteriors: Rows, of: Structure
+) -> None:
+    """Fill log-likelihoods ``value`` [N], whether they are ``exact`` [N], and the posteriors of the rows.
+
+    :param starts: the first row of each trajectory, [N].
+    """
+    sizes, firsts, ends, callers, actors, choices = of  # a parallel loop takes no tuple within a tuple
     for n in numba.prange(len(lengths)):
-        steps, own_structure = lengths[n], Structure(sizes, starts, ends, callers, actors, choices)
-        messages, spread = np.empty((1 + steps, starts[-1])), np.empty((steps, starts[-1]))
-        scale, own = np.empty(steps), trajectory(rows, n, steps)
+        steps, own_structure = lengths[n], Structure(sizes, firsts, ends, callers, actors, choices)
+        messages, spread = np.empty((1 + steps, firsts[-1])), np.empty((steps, firsts[-1]))
+        scale, own = np.empty(steps), trajectory(rows, starts[n], steps)
         value[n] = _forward(own, messages, spread, scale, own_structure)
-        exact[n] = _backward(own, messages, spread, scale, trajectory(posteriors, n, steps), own_structure)
-        _clear(posteriors, n, steps)
-
-
-@jit
-def _clear(posteriors: Rows, n: int, steps: int) -> None:
-    posteriors.selection[n, steps:] = 0.0
-    posteriors.termination[n, steps:] = 0.0
-    posteriors.control[n, steps:] = 0.0
-    posteriors.choice[n, steps:] = 0.0
+        exact[n] = _backward(own, messages, spread, scale, trajectory(posteriors, starts[n], steps), own_structure)
 
 
 # One level is the common case, and four times faster on its own: nothing goes up or comes down. Its ``messages``
-# [1 + T, C + 1] hold in row t the distribution of the choice at t - 1 before normalisation, so that a step need not
-# wait for the division. The last column is the mass that terminated at t.
+# [1 + T, C] hold in row t the distribution of the choice at t - 1 before normalisation, so that a step need not wait
+# for the division. ``ended`` [T] is the mass that terminated at t. Column j of a row of controls is that of choice j.
 
 
 @jit
-def _likelihood(rows: Rows) -> Array:
-    """Each choice's likelihood of a step's control, [T, C]; the meta-policy acts where the choice is 0."""
-    steps, c = rows.control.shape
-    likelihood = np.empty((steps, c))
-    for t in range(steps):
-        likelihood[t, 0] = rows.control[t, c - 1]
-        for j in range(1, c):
-            likelihood[t, j] = rows.control[t, j - 1]
-        if rows.choice.shape[1]:
-            for j in range(c):
-                likelihood[t, j] *= rows.choice[t, j]
-    return likelihood
-
-
-@jit
-def _forward_one(rows: Rows, likelihood: Array, messages: Array, scale: Array) -> float:
-    """Fill ``messages`` and ``scale`` [T]; the log-likelihood, NaN where a step leaves no mass."""
+def _forward_one(rows: Rows, messages: Array, ended: Array, scale: Array) -> float:
+    """Fill ``messages``, ``ended`` and ``scale`` [T]; the log-likelihood, NaN where a step leaves no mass."""
     select, end = rows.selection, rows.termination
-    steps, c = likelihood.shape
+    steps, c = rows.control.shape
     messages[0] = 0.0
     messages[0, 0] = 1.0  # at t = 0 everything is selected
-    value, before = 0.0, 1.0
+    value, before, product = 0.0, 1.0, 1.0
     for t in range(steps):
         mass = messages[t, 0]
         for j in range(1, c):
             mass += messages[t, j] * end[t, 2 * j - 1]
         mass *= before
-        messages[t, c] = mass
-        total = mass * select[t, 0] * likelihood[t, 0]
+        ended[t] = mass
+        total = mass * select[t, 0] * rows.control[t, 0]
         messages[t + 1, 0] = total
         for j in range(1, c):
             kept = messages[t, j] * before * end[t, 2 * j - 2]
-            message = (mass * select[t, j] + kept) * likelihood[t, j]
+            message = (mass * select[t, j] + kept) * rows.control[t, j]
             messages[t + 1, j] = message
             total += message
-        value += np.log(total) if total > 0.0 else np.nan
+        if total < SMALL:
+            value += np.log(total) if total > 0.0 else np.nan
+        else:
+            product *= total
+            if product < SMALL:
+                value += np.log(product)
+                product = 1.0
         before = 1.0 / total
         scale[t] = before
-    return value
+    return value + np.log(product)
 
 
 @jit
-def _backward_one(rows: Rows, likelihood: Array, messages: Array, scale: Array, posterior: Rows) -> bool:
-    """:func:`_backward` for one level."""
+def _backward_one(rows: Rows, messages: Array, ended: Array, scale: Array, posterior: Rows) -> bool:
+    """:func:`_backward` for one level; the marginals of choices are the posteriors of controls."""
     select, end = rows.selection, rows.termination
-    steps, c = likelihood.shape
+    steps, c = rows.control.shape
     back, exact = np.ones(c), True
     for t in range(steps - 1, -1, -1):
-        mass, total, over = messages[t, c], 0.0, 0.0
+        mass, total, over = ended[t], 0.0, 0.0
         for j in range(c):
             beta = back[j] * scale[t]
             both = messages[t + 1, j] * beta
             total += both
-            posterior.control[t, j - 1 if j else c - 1] = both
-            if posterior.choice.shape[1]:
-                posterior.choice[t, j] = both
-            back[j] = beta * likelihood[t, j]
+            posterior.control[t, j] = both
+            back[j] = beta * rows.control[t, j]
             term = back[j] * select[t, j]
             over += term
             posterior.selection[t, j] = mass * term
@@ -421,28 +413,32 @@ def _backward_one(rows: Rows, likelihood: Array, messages: Array, scale: Array, 
 
 
 @parallel
-def one_level(rows: Rows, lengths: Array, value: Array, exact: Array, posteriors: Rows, _: Structure) -> None:
-    """:func:`any_levels` for one level."""
+def one_level(
+    rows: Rows, starts: Array, lengths: Array, value: Array, exact: Array, posteriors: Rows, _: Structure
+) -> None:
+    """:func:`any_levels` for one level, whose factors of choices are in the controls."""
     for n in numba.prange(len(lengths)):
-        steps, own = lengths[n], trajectory(rows, n, lengths[n])
-        messages, scale = np.empty((1 + steps, own.selection.shape[1] + 1)), np.empty(steps)
-        likelihood = _likelihood(own)
-        value[n] = _forward_one(own, likelihood, messages, scale)
-        exact[n] = _backward_one(own, likelihood, messages, scale, trajectory(posteriors, n, steps))
-        _clear(posteriors, n, steps)
+        steps, own = lengths[n], trajectory(rows, starts[n], lengths[n])
+        messages, ended, scale = np.empty((1 + steps, own.selection.shape[1])), np.empty(steps), np.empty(steps)
+        value[n] = _forward_one(own, messages, ended, scale)
+        exact[n] = _backward_one(own, messages, ended, scale, trajectory(posteriors, starts[n], steps))
 
 
 @numba.njit(cache=True, error_model="numpy")
-def subtract_largest(rows: Array, lengths: Array, shift: Array) -> None:
-    """Subtract from each step's log-densities the largest, if it is finite; ``shift`` [N] becomes their sum."""
-    for n in range(len(rows)):
-        shift[n] = 0.0
-        for t in range(rows.shape[1]):
-            top = rows[n, t, 0]
-            for j in range(1, rows.shape[2]):
-                top = max(top, rows[n, t, j])
+def scale_densities(rows: Array, starts: Array, lengths: Array, shift: Array) -> None:
+    """Log-densities [M, n] to densities over the step's largest; ``shift`` [N] becomes the sum of its logarithms.
+
+    A step without a finite largest is not scaled.
+    """
+    for n in range(len(lengths)):
+        own, total = rows[starts[n] : starts[n] + lengths[n]], 0.0
+        for t in range(len(own)):
+            top = own[t, 0]
+            for j in range(1, own.shape[1]):
+                top = max(top, own[t, j])
             if np.isfinite(top):
-                for j in range(rows.shape[2]):
-                    rows[n, t, j] -= top
-                if t < lengths[n]:
-                    shift[n] += top
+                total += top
+                for j in range(own.shape[1]):
+                    own[t, j] -= top
+        shift[n] = total
+    exponentials(rows.reshape(-1))

@@ -15,9 +15,12 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.inference.arguments import refuse_impossible
-from ddco_pyro.inference.fused import joint_evidence, side_by_side
-from ddco_pyro.inference.kernel import Array, Rows, Structure, jit, match_torch_threads, parallel, trajectory
+from ddco_pyro.inference.fused import choice_factors
+from ddco_pyro.inference.kernel import Array, Rows, Structure, match_torch_threads, parallel, trajectory
+from ddco_pyro.model.links import Alive
 from ddco_pyro.model.tables import Tables
+
+jit = numba.njit(cache=True, error_model="numpy")
 
 
 class Path(NamedTuple):
@@ -86,19 +89,23 @@ def segment(tables: Tables, lengths: Tensor) -> tuple[Tensor, ...]:
 def _trace(tables: Tables, lengths: Tensor, best: bool, uniforms: np.ndarray) -> Path:
     if not tables.depth:
         return Path((), ())
-    structure = Structure.of(tuple(table.shape[-1] for table in tables.selection))
+    structure, alive = Structure.of(tables.sizes), Alive.of(lengths, tables.steps)
     joint, terminated = np.full((2, *uniforms.shape[:2], tables.steps), -1, dtype=np.int64)
     possible = np.ones(len(lengths), dtype=np.bool_)
-    logs = (*(side_by_side(group) for group in (tables.selection, tables.termination, tables.control)),)
-    rows = Rows(*(table.numpy() for table in (*logs, joint_evidence(tables))))
+    *levels, meta_policy = tables.control
+    groups = tables.selection, tables.termination, (meta_policy, *levels)
+    selection, termination, control = (
+        np.concatenate([alive.take(table.flatten(2)) for table in group], axis=1, dtype=np.float64) for group in groups
+    )
+    rows = Rows(selection, termination, control, choice_factors(tables, alive))
+    starts = (lengths.cumsum(0) - lengths).numpy()
     match_torch_threads()
-    _trace_all(rows, lengths.numpy(), best, uniforms, joint, terminated, possible, structure)
+    _trace_all(rows, starts, lengths.numpy(), best, uniforms, joint, terminated, possible, structure)
     refuse_impossible(torch.from_numpy(possible))
-    alive = joint >= 0
-    levels = range(tables.depth)
+    within = joint >= 0
     return Path(
-        tuple(torch.from_numpy(np.where(alive, digit, -1)) for digit in structure.digits(joint)),
-        tuple(torch.from_numpy(np.where(alive, terminated > level, -1)) for level in levels),
+        tuple(torch.from_numpy(np.where(within, digit, -1)) for digit in structure.digits(joint)),
+        tuple(torch.from_numpy(np.where(within, terminated > level, -1)) for level in range(tables.depth)),
     )
 
 
@@ -147,15 +154,27 @@ def _forward(rows: Rows, best: bool, messages: Array, spread: Array, of: Structu
     messages[0, of.starts[depth]] = 0.0  # at t = 0 everything is selected
     for t in range(len(spread)):
         for d in range(depth if t > 0 else 0):
-            messages[t, of.starts[d + 1] : of.starts[d + 2]] = -np.inf
-            for below in range(of.starts[d], of.starts[d + 1]):
-                above = _above(d, below, of)
-                messages[t, above] = _plus(messages[t, above], _ended(t, d, below, rows, messages, of), best)
+            c, below = of.sizes[d], of.starts[d]
+            for above in range(of.starts[d + 1], of.starts[d + 2]):
+                total = messages[t, below]  # choice 0 lasts one step
+                for j in range(1, c):
+                    ended = messages[t, below + j] + rows.termination[t, of.ends[d] + 2 * j - 1]
+                    total = _plus(total, ended, best)
+                messages[t, above] = total
+                below += c
         spread[t, of.starts[depth]] = messages[t, of.starts[depth]]
         for d in range(depth - 1, -1, -1):
-            for below in range(of.starts[d], of.starts[d + 1]):
-                kept = _kept(t, d, below, rows, messages, of)
-                spread[t, below] = _plus(kept, _selected(t, d, below, rows, spread, of), best)
+            c, below = of.sizes[d], of.starts[d]
+            for above in range(of.starts[d + 1], of.starts[d + 2]):
+                mass, first = spread[t, above], of.callers[above]
+                spread[t, below] = mass if first < 0 else mass + rows.selection[t, first]
+                for j in range(1, c):
+                    if first < 0:
+                        spread[t, below + j] = -np.inf
+                    else:
+                        kept = messages[t, below + j] + rows.termination[t, of.ends[d] + 2 * j - 2]
+                        spread[t, below + j] = _plus(kept, mass + rows.selection[t, first + j], best)
+                below += c
         for s in range(len(of.actors)):
             actor = of.actors[s]
             messages[t + 1, s] = spread[t, s] + rows.control[t, actor] if actor >= 0 else -np.inf
@@ -226,8 +245,8 @@ def _back(
 
 @parallel
 def _trace_all(
-    rows: Rows, lengths: Array, best: bool, uniforms: Array, joint: Array, terminated: Array, possible: Array,
-    of: Structure,
+    rows: Rows, starts: Array, lengths: Array, best: bool, uniforms: Array, joint: Array, terminated: Array,
+    possible: Array, of: Structure,
 ) -> None:  # fmt: skip
     """Fill the ``joint`` choices [M, N, T] of M paths, and how many levels ``terminated`` before each.
 
@@ -237,11 +256,11 @@ def _trace_all(
     :param best: the most likely path instead of a draw from the posterior.
     :param uniforms: numbers uniform in [0, 1), [M, N, 1 + T, 2·D].
     """
-    sizes, starts, ends, callers, actors, choices = of  # a parallel loop takes no tuple within a tuple
+    sizes, firsts, ends, callers, actors, choices = of  # a parallel loop takes no tuple within a tuple
     for n in numba.prange(len(lengths)):
-        structure = Structure(sizes, starts, ends, callers, actors, choices)
-        own = trajectory(rows, n, lengths[n])
-        messages, spread = np.empty((1 + lengths[n], starts[-1])), np.empty((lengths[n], starts[-1]))
+        structure = Structure(sizes, firsts, ends, callers, actors, choices)
+        own = trajectory(rows, starts[n], lengths[n])
+        messages, spread = np.empty((1 + lengths[n], firsts[-1])), np.empty((lengths[n], firsts[-1]))
         _forward(own, best, messages, spread, structure)
         for m in range(len(joint)):
             possible[n] = _back(

@@ -50,14 +50,15 @@ def posterior(tables: Tables, lengths: Tensor) -> Posterior:
     """
     if not tables.depth:
         return Posterior((), (), ())
-    result = fused.eliminate(tables, lengths, marginals=True)
-    refuse_impossible(result.value > NEVER)
-    u = result.marginals
+    found = fused.eliminate(tables, lengths, marginals=True)
+    refuse_impossible(found.value > NEVER)
+    posteriors, shape = found.tables, torch.Size([len(lengths), tables.steps, sum(tables.sizes)])
+    u = found.alive.put(torch.from_numpy(found.posteriors.choice), shape).split(tables.sizes, dim=-1)
     v = tuple(
         torch.cat([u_d[..., :1], selected.sum(2)[..., 1:]], dim=-1)  # choice 0 lasts one step: it is always selected
-        for u_d, selected in zip(u, result.tables.selection, strict=True)
+        for u_d, selected in zip(u, posteriors.selection, strict=True)
     )
-    w = tuple(_not_ending(u_d, ended[..., 1], lengths) for u_d, ended in zip(u, result.tables.termination, strict=True))
+    w = tuple(_not_ending(u_d, end[..., 1], lengths) for u_d, end in zip(u, posteriors.termination, strict=True))
     return Posterior(u, v, w)
 
 

@@ -14,13 +14,15 @@ from functools import reduce
 from operator import add
 from typing import Any, Protocol, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 from torch.nn.functional import logsigmoid, one_hot, pad
 from torch.special import ndtr
 
-from ddco_pyro.model.links import weighted_squares
+from ddco_pyro.model.elementary import Array, jit, log_normal_cdf
+from ddco_pyro.model.links import Alive, Gradients, Link, Posterior
 from ddco_pyro.model.tables import NEVER
 
 LOG_2PI = math.log(2 * math.pi)
@@ -101,6 +103,40 @@ class Emission(ABC):
         }
         return replace(self, **changed)  # type: ignore[type-var]
 
+    def tensors(self) -> tuple[Tensor, ...]:
+        """The floating-point tensors, those of other emissions included."""
+        found: list[Tensor] = []
+        for value in self._fields().values():
+            own = (value,) if isinstance(value, Tensor) else value.tensors()
+            found.extend(tensor for tensor in own if tensor.is_floating_point())
+        return tuple(found)
+
+    def add(self, actions: Tensor, alive: Alive, rows: Array, first: int) -> Any:
+        """Add log π(a | s) to K columns of ``rows`` [M, n], from ``first`` on; what :meth:`gradients` needs of it.
+
+        A kind without a compiled pass is differentiated by torch.
+        """
+        leaves: list[Tensor] = []
+
+        def leaf(tensor: Tensor) -> Tensor:
+            if not tensor.is_floating_point():
+                return tensor
+            leaves.append(tensor.detach().requires_grad_())
+            return leaves[-1]
+
+        with torch.enable_grad():
+            value = self.map(leaf).log_density(actions)
+        rows[:, first : first + value.shape[-1]] += alive.take(value)
+        return value, leaves
+
+    def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
+        """The gradient of each of the :meth:`tensors`, given how likely each caller acts, in the same columns."""
+        value, leaves = kept
+        own = torch.from_numpy(posterior.found)[:, first : first + value.shape[-1]]
+        weighted = own * torch.from_numpy(posterior.weight).unsqueeze(-1)
+        upstream = alive.put(weighted.to(value.dtype), value.shape)
+        return torch.autograd.grad(value, leaves, upstream, retain_graph=True, allow_unused=True)
+
     def _fields(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
 
@@ -127,7 +163,38 @@ class Gaussian(Emission):
         """log N(a; μ, σ²), [..., K]."""
         constant = self.std.log().sum(-1) + 0.5 * LOG_2PI * self.std.shape[-1] + self.log_scale.sum(-1)
         weight = (-0.5 / self.std.square()).to(self.mean.dtype)
-        return weighted_squares(self.mean, weight, actions) - constant.to(self.mean.dtype)
+        error = actions.to(self.mean.dtype).unsqueeze(-2) - self.mean
+        return (error.square() * weight).sum(-1) - constant.to(self.mean.dtype)
+
+    def add(self, actions: Tensor, alive: Alive, rows: Array, first: int) -> Any:
+        """The density in a compiled pass where σ does not depend on the state; kept is φ / Φ of each mass."""
+        if self.std.dim() > 2:
+            return super().add(actions, alive, rows, first)
+        std = self.std.detach().numpy().astype(np.float64)
+        constant = np.log(std) + (0.5 * LOG_2PI + self.log_scale.detach().numpy())
+        inverse, constant = (np.array(np.broadcast_to(own, self.mean.shape[-2:])) for own in (1 / std, constant))
+        low, high = self._bounds()
+        given = alive.take(self.mean), inverse, low, high, alive.take(actions)
+        return given, _add_normal(*given, constant, rows, first)
+
+    def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
+        """The gradients of μ, σ and the units, and those of bounds."""
+        if self.std.dim() > 2:
+            return super().gradients(actions, alive, posterior, first, kept)
+        mean, sums = alive.empty(self.mean), np.zeros((4, *self.mean.shape[-2:]))
+        (means, inverse, low, high, acts), slope = kept
+        found, weight = posterior.found, posterior.weight
+        _normal_gradient(means, inverse, low, high, acts, found, weight, first, slope, mean.numpy(), sums)
+        fixed = zip(self.tensors()[1:], sums, strict=False)
+        others = (
+            torch.from_numpy(own).sum_to_size(of.shape).to(of.dtype) if of.requires_grad else None for of, own in fixed
+        )
+        return alive.put(mean, self.mean.shape), *others
+
+    def _bounds(self) -> tuple[Array, Array]:
+        """The lower and the upper bound of each dimension, float64 [A]."""
+        none = np.full(self.mean.shape[-1], np.inf)
+        return -none, none
 
     @property
     def mode(self) -> Tensor:
@@ -179,6 +246,9 @@ class Clipped(Gaussian):
         """The sum over dimensions, float64 [..., K]."""
         return self.by_dimension(actions).sum(-1)
 
+    def _bounds(self) -> tuple[Array, Array]:
+        return self.low.detach().double().numpy(), self.high.detach().double().numpy()
+
     @property
     def mode(self) -> Tensor:
         """μ within the bounds: the control without noise."""
@@ -187,6 +257,114 @@ class Clipped(Gaussian):
     def draw(self, noise: Tensor) -> Tensor:
         """μ + σ·z within the bounds."""
         return super().draw(noise).clamp(self.low, self.high)
+
+
+SIDE_BY_SIDE = 128
+"""Steps whose densities are computed side by side in vector instructions."""
+
+
+@jit
+def _add_normal(
+    mean: Array, inverse: Array, low: Array, high: Array, actions: Array, constant: Array, rows: Array, first: int
+) -> Array:
+    """Add log-densities within the bounds and log-masses on them; φ / Φ of each mass, in order.
+
+    :param mean: [M, K, A].
+    :param inverse: 1/σ, [K, A].
+    """
+    steps, callers, size = mean.shape
+    whole, masses = rows[:, first : first + callers], 0
+    control, free, total = np.empty(SIDE_BY_SIDE), np.empty(SIDE_BY_SIDE), np.empty((callers, SIDE_BY_SIDE))
+    for begin in range(0, steps, SIDE_BY_SIDE):
+        own, act = mean[begin : begin + SIDE_BY_SIDE], actions[begin : begin + SIDE_BY_SIDE]
+        total[:] = 0.0
+        for d in range(size):
+            for i in range(len(act)):
+                control[i] = act[i, d]
+                free[i] = low[d] < act[i, d] < high[d]
+            for j in range(callers):
+                for i in range(len(act)):
+                    z = (control[i] - own[i, j, d]) * inverse[j, d]
+                    total[j, i] += free[i] * (0.5 * z * z + constant[j, d])
+            for i in range(len(act)):
+                masses += free[i] == 0.0
+        out = whole[begin : begin + SIDE_BY_SIDE]
+        for i in range(len(act)):
+            for j in range(callers):
+                out[i, j] -= total[j, i]
+    beyond, slope, i = np.empty((masses, callers)), np.empty((masses, callers)), 0
+    for m in range(steps if masses else 0):
+        for d in range(size):
+            a = np.float64(actions[m, d])
+            if not low[d] < a < high[d]:
+                for j in range(callers):
+                    beyond[i, j] = _beyond(a, np.float64(mean[m, j, d]), low[d], high[d]) * inverse[j, d]
+                i += 1
+    log_normal_cdf(beyond.reshape(-1), slope.reshape(-1))
+    i = 0
+    for m in range(steps if masses else 0):
+        for d in range(size):
+            if not low[d] < actions[m, d] < high[d]:
+                for j in range(callers):
+                    whole[m, j] += beyond[i, j]
+                i += 1
+    return slope
+
+
+@jit
+def _beyond(action: float, mean: float, low: float, high: float) -> float:
+    """x·σ of the mass Φ(x) that lies on or beyond the bound that a control is on."""
+    return low - mean if action <= low else mean - high
+
+
+@jit
+def _normal_gradient(
+    mean: Array, inverse: Array, low: Array, high: Array, actions: Array, posterior: Array, weight: Array,
+    first: int, slope: Array, of_mean: Array, sums: Array,
+) -> None:  # fmt: skip
+    """The gradient of μ; those of σ, the units' logarithms and both bounds are added to ``sums`` [4, K, A]."""
+    of_std, of_scale, of_low, of_high = sums[0], sums[1], sums[2], sums[3]
+    steps, callers, size = mean.shape
+    acts, i = posterior[:, first : first + callers], 0
+    control, free, acting = np.empty(SIDE_BY_SIDE), np.empty(SIDE_BY_SIDE), np.empty((callers, SIDE_BY_SIDE))
+    squares, counts = np.zeros((2, size, callers, SIDE_BY_SIDE))
+    for begin in range(0, steps, SIDE_BY_SIDE):
+        own, act = mean[begin : begin + SIDE_BY_SIDE], actions[begin : begin + SIDE_BY_SIDE]
+        out, likely = of_mean[begin : begin + SIDE_BY_SIDE], acts[begin : begin + SIDE_BY_SIDE]
+        step = weight[begin : begin + SIDE_BY_SIDE]
+        for i in range(len(act)):
+            for j in range(callers):
+                acting[j, i] = step[i] * likely[i, j]
+        for d in range(size):
+            for i in range(len(act)):
+                control[i] = act[i, d]
+                free[i] = low[d] < act[i, d] < high[d]
+            for j in range(callers):
+                square, count = squares[d, j], counts[d, j]
+                for i in range(len(act)):
+                    z, share = (control[i] - own[i, j, d]) * inverse[j, d], free[i] * acting[j, i]
+                    out[i, j, d] = share * z * inverse[j, d]
+                    square[i] += share * z * z
+                    count[i] += share
+    i = 0
+    for m in range(steps if len(slope) else 0):
+        for d in range(size):
+            a = np.float64(actions[m, d])
+            if not low[d] < a < high[d]:
+                for j in range(callers):
+                    share = weight[m] * acts[m, j] * slope[i, j]
+                    of_mean[m, j, d] = (-share if a <= low[d] else share) * inverse[j, d]
+                    of_low[j, d] += share if a <= low[d] else 0.0
+                    of_high[j, d] -= 0.0 if a <= low[d] else share
+                    of_std[j, d] -= share * _beyond(a, np.float64(mean[m, j, d]), low[d], high[d]) * inverse[j, d]
+                i += 1
+    for j in range(callers):
+        for d in range(size):
+            count = counts[d, j].sum()
+            of_scale[j, d] -= count
+            of_std[j, d] = (of_std[j, d] + squares[d, j].sum() - count) * inverse[j, d]
+            of_low[j, d] *= inverse[j, d]
+            of_high[j, d] *= inverse[j, d]
 
 
 @dataclass(frozen=True)
@@ -358,6 +536,21 @@ class Product(Emission):
         """log π(a | s), [..., K]."""
         return reduce(add, (emission.log_density(actions[..., dims]) for dims, emission in self.groups))
 
+    def tensors(self) -> tuple[Tensor, ...]:
+        """Those of the groups."""
+        return tuple(tensor for _, emission in self.groups for tensor in emission.tensors())
+
+    def add(self, actions: Tensor, alive: Alive, rows: Array, first: int) -> Any:
+        """The groups' one after the other."""
+        return [emission.add(actions[..., dims], alive, rows, first) for dims, emission in self.groups]
+
+    def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
+        """Those of the groups."""
+        found: list[Tensor | None] = []
+        for (dims, emission), own in zip(self.groups, kept, strict=True):
+            found.extend(emission.gradients(actions[..., dims], alive, posterior, first, own))
+        return tuple(found)
+
     @property
     def mode(self) -> Tensor:
         """The most likely control of each group."""
@@ -395,6 +588,27 @@ class Product(Emission):
         """The groups' values [..., K, A_g] in the order of the dimensions."""
         order = torch.tensor([dimension for dimensions, _ in self.groups for dimension in dimensions]).argsort()
         return torch.cat(list(values), dim=-1)[..., order]
+
+
+class Density(Link):
+    """log π(a | s) of K callers, for controls [N, T, A] without a gradient."""
+
+    def __init__(self, emission: Emission, actions: Tensor) -> None:
+        self.emission, self.actions = emission, actions
+        self.inputs, self.shape = emission.tensors(), emission.shape[:-1]
+
+    def formula(self) -> Tensor:
+        """[N, T, K]."""
+        return self.emission.log_density(self.actions)
+
+    def fill(self, alive: Alive, rows: Array, first: int) -> Any:
+        """The log-density; kept is what its parts keep."""
+        rows[:, first : first + self.columns] = 0.0
+        return self.emission.add(self.actions, alive, rows, first)
+
+    def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
+        """Those of the emission."""
+        return self.emission.gradients(self.actions, alive, posterior, first, kept)
 
 
 TAIL = -30.0

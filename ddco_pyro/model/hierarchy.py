@@ -195,6 +195,12 @@ class Hierarchy(nn.Module):
             each |= {} if level.termination is None else {f"{place}.termination": level.termination}
         return each | {"meta_policy": self.meta_policy.network}
 
+    def begin_terminations(self) -> None:
+        """Have every ψ start at 1/2 at every state; those of a user's network keep their start."""
+        for level in self.option_levels():
+            if level.termination is not None:
+                level.termination.begin_at_zero(1)
+
     def named_networks(self) -> Iterator[tuple[str, nn.Module]]:
         """Every network, with the σ of its control, by its place in the spec."""
         for place in self.networks():

@@ -1,49 +1,30 @@
-"""Compiled links from network outputs to log-probabilities; torch's own take longer than inference on few columns.
+"""Links from networks' outputs to log-probabilities, each by a formula in torch and in compiled passes.
 
-torch computes the exponentials, many at once; the sums over columns are compiled. Each link also has a formula in
-torch, which defines it and is used for second derivatives, on other devices and in exported programs.
+The formula defines a link: evaluation, the Pyro program and log space use it. The fused engine uses the compiled
+passes. They give the probabilities for the elimination, and turn its posteriors into gradients of the outputs, so that
+training builds no table of logarithms. Compiled arrays have M rows: the steps within their trajectories, one trajectory
+after the other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid, pad
 
-from ddco_pyro.model.tables import NEVER
+from ddco_pyro.model.elementary import BLOCK, Array, exponentials, jit
+from ddco_pyro.model.tables import NEVER, Group, Tables, always_ending
 
 TERMINATION_BOUND = 12.0
 """Termination logits lie within ±12 (ψ between 6e-6 and 1 - 6e-6), so no path's probability is ever exactly 0."""
 
-Array = np.ndarray
 Gradients = tuple[Tensor | None, ...]
-Wanted = tuple[bool, ...]
-"""Whether the gradient of each input is wanted."""
-
-jit = numba.njit(cache=True, error_model="numpy")
-
-
-def log_selection(logits: Tensor, control: int) -> Tensor:
-    """Log-softmax over the last dimension, after ``control`` (0 or 1) impossible choices."""
-    return _linked(_SELECTION, logits, torch.empty(control))
-
-
-def log_termination(logits: Tensor) -> Tensor:
-    """(log(1 - ψ), log ψ) [..., 2] of logits, which are bounded first."""
-    return _linked(_TERMINATION, logits)
-
-
-def weighted_squares(mean: Tensor, weight: Tensor, actions: Tensor) -> Tensor:
-    """Σ_d w_d (a_d - μ_d)², [..., K], of means [..., K, A], weights [A], [K, A] or [..., K, A] and actions [..., A]."""
-    actions = actions.to(mean.dtype)
-    if actions.shape[:-1] != mean.shape[:-2] or weight.dim() > 2:
-        return _squares_formula(mean, weight, actions)
-    return _linked(_SQUARES, mean, weight, actions)
 
 
 def bounded(logits: Tensor) -> Tensor:
@@ -51,196 +32,319 @@ def bounded(logits: Tensor) -> Tensor:
     return TERMINATION_BOUND * torch.tanh(logits / TERMINATION_BOUND)
 
 
-class Link(NamedTuple):
-    """A function of tensors, in torch (``formula``) and compiled.
-
-    ``forward`` gives the value, then further tensors for ``backward``. ``backward`` takes which gradients are wanted,
-    the gradient of the value, the inputs and those tensors. It returns the gradients of the first ``differentiable``
-    inputs.
-    """
-
-    formula: Callable[..., Tensor]
-    forward: Callable[..., tuple[Tensor, ...]]
-    backward: Callable[..., Gradients]
-    differentiable: int = 1
+def log_selection(logits: Tensor, control: int) -> Tensor:
+    """Log-softmax over the last dimension, after ``control`` (0 or 1) impossible choices."""
+    return pad(logits.log_softmax(-1), (control, 0), value=NEVER)
 
 
-def _linked(link: Link, *inputs: Tensor) -> Tensor:
-    if any(tensor.device.type != "cpu" for tensor in inputs) or torch.compiler.is_compiling():
-        return link.formula(*inputs)
-    value: Tensor = _Compiled.apply(link, *inputs)
-    return value
-
-
-class _Compiled(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, link: Link, *inputs: Tensor) -> Tensor:
-        value, *kept = link.forward(*inputs)
-        ctx.link, ctx.inputs = link, len(inputs)
-        ctx.save_for_backward(*inputs, *kept)
-        return value
-
-    @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        link, saved, wanted = ctx.link, ctx.saved_tensors, ctx.needs_input_grad[1:]
-        inputs, kept = saved[: ctx.inputs], saved[ctx.inputs :]
-        if not torch.is_grad_enabled() and not any(wanted[link.differentiable :]):
-            derivatives = link.backward(wanted, upstream.contiguous(), *inputs, *kept)
-            return None, *derivatives, *(None,) * (ctx.inputs - len(derivatives))
-        with torch.enable_grad():
-            value = link.formula(*inputs)
-        leaves = [tensor for tensor, needed in zip(inputs, wanted, strict=True) if needed]
-        gradients = iter(torch.autograd.grad(value, leaves, upstream, create_graph=torch.is_grad_enabled()))
-        return None, *(next(gradients) if needed else None for needed in wanted)
-
-
-def _selection_forward(logits: Tensor, control: Tensor) -> tuple[Tensor, Tensor]:
-    *batch, size = logits.shape
-    value = logits.new_empty(*batch, len(control) + size)
-    shares = torch.empty(value.numel() // max(value.shape[-1], 1), size, dtype=torch.float64)
-    rows, out = _rows(logits, 1), _rows(value, 1)
-    _below_largest(rows, shares.numpy())
-    _normalise(rows, shares.exp_().numpy(), out)
-    return value, shares
-
-
-def _selection_backward(_: Wanted, upstream: Tensor, logits: Tensor, control: Tensor, shares: Tensor) -> Gradients:
-    gradient = torch.empty_like(logits, memory_format=torch.contiguous_format)
-    _normalise_gradient(_rows(upstream, 1), shares.numpy(), _rows(gradient, 1))
-    return (gradient,)
-
-
-@jit
-def _below_largest(logits: Array, shares: Array) -> None:
-    for row in range(logits.shape[0]):
-        top = logits[row, 0]
-        for j in range(1, logits.shape[1]):
-            top = max(top, logits[row, j])
-        for j in range(logits.shape[1]):
-            shares[row, j] = np.float64(logits[row, j]) - top
-
-
-@jit
-def _normalise(logits: Array, shares: Array, value: Array) -> None:
-    extra = value.shape[1] - logits.shape[1]
-    for row in range(logits.shape[0]):
-        total, largest = 0.0, 0
-        for j in range(logits.shape[1]):
-            total += shares[row, j]
-            largest = j if shares[row, j] == 1.0 else largest
-        normaliser = logits[row, largest] + np.log(total)
-        value[row, :extra] = -np.inf
-        for j in range(logits.shape[1]):
-            value[row, extra + j] = logits[row, j] - normaliser
-            shares[row, j] /= total
-
-
-@jit
-def _normalise_gradient(upstream: Array, shares: Array, gradient: Array) -> None:
-    extra = upstream.shape[1] - gradient.shape[1]
-    for row in range(gradient.shape[0]):
-        total = 0.0
-        for j in range(gradient.shape[1]):
-            total += upstream[row, extra + j]
-        for j in range(gradient.shape[1]):
-            gradient[row, j] = upstream[row, extra + j] - shares[row, j] * total
-
-
-def _termination_forward(logits: Tensor) -> tuple[Tensor, Tensor]:
-    within = bounded(logits.detach())
-    lost = within.abs().neg_().exp_().log1p_()
-    value = within.new_empty(*within.shape, 2)
-    _both(_rows(within, 0), _rows(lost, 0), _rows(value, 1))
-    return value, within
-
-
-def _termination_backward(_: Wanted, upstream: Tensor, logits: Tensor, within: Tensor) -> Gradients:
-    gradient = torch.empty_like(logits, memory_format=torch.contiguous_format)
-    _bounded_gradient(_rows(upstream, 1), _rows(within, 0), _rows(within.sigmoid(), 0), _rows(gradient, 0))
-    return (gradient,)
-
-
-@jit
-def _both(within: Array, lost: Array, value: Array) -> None:
-    for i in range(len(within)):
-        value[i, 0] = min(-within[i], 0) - lost[i]
-        value[i, 1] = min(within[i], 0) - lost[i]
-
-
-@jit
-def _bounded_gradient(upstream: Array, within: Array, ending: Array, gradient: Array) -> None:
-    for i in range(len(within)):
-        slope = 1.0 - (within[i] / TERMINATION_BOUND) ** 2
-        gradient[i] = (upstream[i, 1] * (1.0 - ending[i]) - upstream[i, 0] * ending[i]) * slope
-
-
-def _squares_forward(mean: Tensor, weight: Tensor, actions: Tensor) -> tuple[Tensor]:
-    value = mean.new_empty(mean.shape[:-1])
-    _sum_squares(_rows(mean, 2), _rows(weight.expand(mean.shape[-2:]), 1), _rows(actions, 1), _rows(value, 1))
-    return (value,)
-
-
-def _squares_backward(wanted: Wanted, upstream: Tensor, mean: Tensor, weight: Tensor, actions: Tensor) -> Gradients:
-    weights = weight.expand(mean.shape[-2:])
-    rows = _rows(upstream, 1), _rows(mean, 2), _rows(weights, 1), _rows(actions, 1)
-    gradient = torch.empty_like(mean, memory_format=torch.contiguous_format)
-    _mean_gradient(*rows, _rows(gradient, 2))
-    if not wanted[1]:
-        return gradient, None
-    spread = torch.empty(mean.shape[-2:], dtype=torch.float64)
-    _weight_gradient(*rows, spread.numpy())
-    return gradient, spread.sum_to_size(weight.shape).to(weight.dtype)
-
-
-@jit
-def _sum_squares(mean: Array, weight: Array, actions: Array, value: Array) -> None:
-    for row in range(mean.shape[0]):
-        for j in range(mean.shape[1]):
-            total = 0.0
-            for d in range(mean.shape[2]):
-                error = np.float64(actions[row, d]) - mean[row, j, d]
-                total += error * error * weight[j, d]
-            value[row, j] = total
-
-
-@jit
-def _mean_gradient(upstream: Array, mean: Array, weight: Array, actions: Array, gradient: Array) -> None:
-    for row in range(mean.shape[0]):
-        for j in range(mean.shape[1]):
-            for d in range(mean.shape[2]):
-                error = np.float64(actions[row, d]) - mean[row, j, d]
-                gradient[row, j, d] = -2.0 * upstream[row, j] * weight[j, d] * error
-
-
-@jit
-def _weight_gradient(upstream: Array, mean: Array, weight: Array, actions: Array, gradient: Array) -> None:
-    for j in range(mean.shape[1]):
-        for d in range(mean.shape[2]):
-            total = 0.0
-            for row in range(mean.shape[0]):
-                total += upstream[row, j] * (np.float64(actions[row, d]) - mean[row, j, d]) ** 2
-            gradient[j, d] = total
-
-
-def _rows(table: Tensor, columns: int) -> Array:
-    """A table as an array, its dimensions before the last ``columns`` as one."""
-    array = np.ascontiguousarray(table.detach().numpy())
-    return array.reshape(-1, *array.shape[array.ndim - columns :])
-
-
-def _selection_formula(logits: Tensor, control: Tensor) -> Tensor:
-    return pad(logits.log_softmax(-1), (len(control), 0), value=NEVER)
-
-
-def _termination_formula(logits: Tensor) -> Tensor:
+def log_termination(logits: Tensor) -> Tensor:
+    """(log(1 - ψ), log ψ) [..., 2] of logits, which are bounded first."""
     within = bounded(logits)
     return torch.stack([logsigmoid(-within), logsigmoid(within)], dim=-1)
 
 
-def _squares_formula(mean: Tensor, weight: Tensor, actions: Tensor) -> Tensor:
-    return ((actions.unsqueeze(-2) - mean).square() * weight).sum(-1)
+class Alive(NamedTuple):
+    """The M steps of a batch within their trajectories, of N·T.
+
+    :param rows: their indices in a table [N·T, ...], int64 [M].
+    :param number: N·T.
+    """
+
+    rows: Array
+    number: int
+
+    @classmethod
+    def of(cls, lengths: Tensor, steps: int) -> Alive:
+        """The steps of trajectories with these lengths [N] in a batch padded to ``steps``."""
+        alive = np.arange(steps) < lengths.numpy()[:, None]
+        return cls(np.flatnonzero(alive), alive.size)
+
+    def take(self, table: Tensor) -> Array:
+        """The rows of a table [N, T, ...], contiguous: [M, ...]."""
+        rows = table.detach().reshape(self.number, *table.shape[2:])
+        if len(self.rows) < self.number:
+            rows = rows[torch.from_numpy(self.rows)]
+        return np.ascontiguousarray(rows.numpy())
+
+    def empty(self, table: Tensor) -> Tensor:
+        """Room for the rows of a table [N, T, ...], [M, ...]."""
+        return torch.empty(len(self.rows), *table.shape[2:], dtype=table.dtype)
+
+    def put(self, rows: Tensor, shape: torch.Size) -> Tensor:
+        """The table of rows [M, ...]; 0 past the trajectories."""
+        if len(self.rows) == self.number:
+            return rows.reshape(shape)
+        table = rows.new_zeros(self.number, *rows.shape[1:])
+        table[torch.from_numpy(self.rows)] = rows
+        return table.reshape(shape)
 
 
-_SELECTION = Link(_selection_formula, _selection_forward, _selection_backward)
-_TERMINATION = Link(_termination_formula, _termination_forward, _termination_backward)
-_SQUARES = Link(_squares_formula, _squares_forward, _squares_backward, 2)
+class Posterior(NamedTuple):
+    """The posterior of the rows of a group of tables.
+
+    :param rows: as links filled them, [M, n].
+    :param found: the posterior of each entry, [M, n].
+    :param weight: the gradient of a step's log-likelihood, [M].
+    """
+
+    rows: Array
+    found: Array
+    weight: Array
+
+
+class Link(ABC):
+    """A log-table [N, T, ...] as a function of outputs.
+
+    :ivar inputs: the outputs.
+    :ivar shape: of the table.
+    :ivar probe: a tensor of zeros in the table's shape that is added to the table. Its gradient is the table's: the
+        posterior of each entry.
+    """
+
+    inputs: tuple[Tensor, ...]
+    shape: torch.Size
+    probe: Tensor | None = None
+
+    @abstractmethod
+    def formula(self) -> Tensor:
+        """The table."""
+
+    @cached_property
+    def table(self) -> Tensor:
+        """The table, with the probe."""
+        return self.formula() if self.probe is None else self.formula() + self.probe
+
+    @property
+    def columns(self) -> int:
+        """Entries of the table in a step."""
+        return self.shape[2:].numel()
+
+    @abstractmethod
+    def fill(self, alive: Alive, rows: Array, first: int) -> Any:
+        """Fill :attr:`columns` columns of ``rows`` [M, n] from ``first`` on; what :meth:`gradients` needs of it.
+
+        Links of selections and terminations fill in probabilities, those of controls log-densities.
+        """
+
+    @abstractmethod
+    def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
+        """The gradient of each input, given the posterior of the rows that :meth:`fill` filled."""
+
+
+class LogTable(Link):
+    """A table that is given.
+
+    :param log: whether rows are filled with logarithms.
+    """
+
+    def __init__(self, table: Tensor, log: bool = False) -> None:
+        self.inputs, self.shape, self.log = (table,), table.shape, log
+
+    def formula(self) -> Tensor:
+        """The table."""
+        return self.inputs[0]
+
+    def fill(self, alive: Alive, rows: Array, first: int) -> None:
+        """Copy the table, or its exponentials."""
+        own = torch.from_numpy(rows)[:, first : first + self.columns]
+        own.copy_(torch.from_numpy(alive.take(self.inputs[0])).flatten(1))
+        if not self.log:
+            own.exp_()
+
+    def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
+        """The posterior itself."""
+        own = torch.from_numpy(posterior.found)[:, first : first + self.columns]
+        weighted = own * torch.from_numpy(posterior.weight).unsqueeze(-1)
+        return (alive.put(weighted.to(self.inputs[0].dtype), self.shape),)
+
+
+class Selection(Link):
+    """log η of K callers: :func:`log_selection` of logits [N, T, K, C]."""
+
+    def __init__(self, logits: Tensor, control: int) -> None:
+        self.inputs, self.control = (logits,), control
+        self.shape = torch.Size([*logits.shape[:-1], control + logits.shape[-1]])
+
+    def formula(self) -> Tensor:
+        """[N, T, K, control + C]."""
+        return log_selection(self.inputs[0], self.control)
+
+    def fill(self, alive: Alive, rows: Array, first: int) -> None:
+        """η."""
+        _softmax(alive.take(self.inputs[0]), rows, first, self.control)
+
+    def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
+        """Posterior minus η times the posterior of its caller."""
+        logits = self.inputs[0]
+        gradient = alive.empty(logits)
+        _softmax_gradient(*posterior, first, self.control, gradient.numpy())
+        return (alive.put(gradient, logits.shape),)
+
+
+@jit
+def _softmax(logits: Array, rows: Array, first: int, control: int) -> None:
+    """Blocks of steps lie side by side in memory, so that all but the copies vectorises."""
+    steps, callers, choices = logits.shape
+    block = max(8, BLOCK // choices)
+    shares, top, total = np.empty((choices, block)), np.empty(block), np.empty(block)
+    for c in range(callers):
+        column = first + c * (control + choices)
+        for begin in range(0, steps, block):
+            own = logits[begin : begin + block, c]
+            out = rows[begin : begin + block, column : column + control + choices]
+            for i in range(len(own)):
+                for j in range(choices):
+                    shares[j, i] = own[i, j]
+            for i in range(len(own)):
+                top[i] = shares[0, i]
+                total[i] = 0.0
+            for j in range(1, choices):
+                for i in range(len(own)):
+                    top[i] = shares[j, i] if shares[j, i] > top[i] else top[i]
+            for j in range(choices):
+                for i in range(len(own)):
+                    shares[j, i] -= top[i]
+                exponentials(shares[j, : len(own)])
+                for i in range(len(own)):
+                    total[i] += shares[j, i]
+            for i in range(len(own)):
+                total[i] = 1.0 / total[i]
+            out[:, :control] = 0.0
+            chosen = out[:, control:]
+            for i in range(len(own)):
+                for j in range(choices):
+                    chosen[i, j] = shares[j, i] * total[i]
+
+
+@jit
+def _softmax_gradient(rows: Array, posterior: Array, weight: Array, first: int, control: int, gradient: Array) -> None:
+    steps, callers, choices = gradient.shape
+    for c in range(callers):
+        column = first + c * (control + choices) + control
+        p, q = rows[:, column : column + choices], posterior[:, column : column + choices]
+        for m in range(steps):
+            total = 0.0
+            for j in range(choices):
+                total += q[m, j]
+            for j in range(choices):
+                gradient[m, c, j] = weight[m] * (q[m, j] - p[m, j] * total)
+
+
+class Termination(Link):
+    """(log(1 - ψ), log ψ): :func:`log_termination` of logits [N, T, k]."""
+
+    def __init__(self, logits: Tensor) -> None:
+        self.inputs, self.shape = (logits,), torch.Size([*logits.shape, 2])
+
+    def formula(self) -> Tensor:
+        """[N, T, k, 2]."""
+        return log_termination(self.inputs[0])
+
+    def fill(self, alive: Alive, rows: Array, first: int) -> Array:
+        """1 - ψ and ψ; kept is tanh of the logits over their bound."""
+        logits = alive.take(self.inputs[0])
+        tanh = np.empty(logits.shape)
+        _terminate(logits.reshape(-1), tanh.reshape(-1), rows, first, logits.shape[1])
+        return tanh
+
+    def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Array) -> Gradients:
+        """(q_1 (1 - ψ) - q_0 ψ) times the slope of the bound, for posteriors q."""
+        logits = self.inputs[0]
+        gradient = alive.empty(logits)
+        _terminate_gradient(*posterior, first, kept, gradient.numpy())
+        return (alive.put(gradient, logits.shape),)
+
+
+@jit
+def _terminate(logits: Array, tanh: Array, rows: Array, first: int, options: int) -> None:
+    block = max(BLOCK // options, 1) * options
+    x, ending = np.empty(block), np.empty(block)
+    for begin in range(0, len(logits), block):
+        own, bound = logits[begin : begin + block], tanh[begin : begin + block]
+        for i in range(len(own)):
+            v = np.float64(own[i]) * (2.0 / TERMINATION_BOUND)
+            x[i] = 700.0 if v > 700.0 else v  # NaN stays
+        exponentials(x[: len(own)])
+        for i in range(len(own)):
+            bound[i] = 1.0 - 2.0 / (1.0 + x[i])
+            x[i] = -TERMINATION_BOUND * bound[i]
+        exponentials(x[: len(own)])
+        for i in range(len(own)):
+            ending[i] = 1.0 / (1.0 + x[i])
+            x[i] *= ending[i]
+        out = rows[begin // options : (begin + block) // options, first : first + 2 * options]
+        i = 0
+        for m in range(len(out)):
+            for j in range(options):
+                out[m, 2 * j], out[m, 2 * j + 1] = x[i], ending[i]
+                i += 1
+
+
+@jit
+def _terminate_gradient(rows: Array, posterior: Array, weight: Array, first: int, tanh: Array, gradient: Array) -> None:
+    steps, options = gradient.shape
+    p, q = rows[:, first : first + 2 * options], posterior[:, first : first + 2 * options]
+    for m in range(steps):
+        for j in range(options):
+            change = q[m, 2 * j + 1] * p[m, 2 * j] - q[m, 2 * j] * p[m, 2 * j + 1]
+            gradient[m, j] = weight[m] * change * (1.0 - tanh[m, j] * tanh[m, j])
+
+
+class LinkedTables(Tables):
+    """The tables that links stand for; a table is computed when it is first read.
+
+    :param control: links of each level's options and, last, of the meta-policy; empty where no control is known.
+    """
+
+    links: dict[Group, tuple[Link, ...]]
+
+    def __init__(
+        self,
+        selection: Sequence[Link | Tensor],
+        termination: Sequence[Link | Tensor],
+        control: Sequence[Link | Tensor] = (),
+        evidence: tuple[Tensor | None, ...] = (),
+    ) -> None:
+        links = {"selection": _links(selection), "termination": _links(termination), "control": _links(control, True)}
+        self.__dict__.update(links=links, evidence=evidence)  # tables are frozen
+
+    selection = cached_property(lambda self: self._tables("selection"))  # type: ignore[assignment]
+    termination = cached_property(lambda self: self._tables("termination"))  # type: ignore[assignment]
+    control = cached_property(lambda self: self._tables("control"))  # type: ignore[assignment]
+
+    def with_evidence(self, evidence: tuple[Tensor | None, ...]) -> LinkedTables:
+        """The same links with this evidence."""
+        return LinkedTables(self.parts("selection"), self.parts("termination"), self.parts("control"), evidence)
+
+    def memoryless(self) -> LinkedTables:
+        """The same links with ψ = 1 at every level."""
+        ended = [always_ending(part.shape[:-1]) for part in self.parts("termination")]
+        return LinkedTables(self.parts("selection"), ended, self.parts("control"), self.evidence)
+
+    def parts(self, group: Group) -> tuple[Any, ...]:
+        """The links of a group; its tables once they are computed, as their reader may have changed them."""
+        return self.__dict__.get(group, self.links[group])  # type: ignore[no-any-return]
+
+    def probe(self) -> Tables:
+        """Give each link a probe; the probes. Their gradients are the posteriors of the tables."""
+
+        def probes(group: Group) -> tuple[Tensor, ...]:
+            each = [torch.zeros((), dtype=torch.float64).expand(link.shape) for link in self.links[group]]
+            for link, probe in zip(self.links[group], each, strict=True):
+                link.probe = probe.requires_grad_()
+            return tuple(each)
+
+        return Tables(probes("selection"), probes("termination"), probes("control"))
+
+    def _tables(self, group: Group) -> tuple[Tensor, ...]:
+        return tuple(link.table for link in self.links[group])
+
+
+def links_of(tables: Tables, group: Group) -> tuple[Link, ...]:
+    """The links of a group of tables."""
+    return _links(tables.parts(group), group == "control")
+
+
+def _links(parts: Sequence[Link | Tensor], log: bool = False) -> tuple[Link, ...]:
+    """A table that is given is a link of itself."""
+    return tuple(LogTable(part, log) if isinstance(part, Tensor) else part for part in parts)

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ddco_pyro.model.emissions import Emission
-from ddco_pyro.model.links import log_selection, log_termination
-from ddco_pyro.model.tables import NEVER, Tables
+from ddco_pyro.model.emissions import Density, Emission
+from ddco_pyro.model.links import Link, LinkedTables, LogTable, Selection, Termination
+from ddco_pyro.model.tables import NEVER, always_ending
 
 
 @dataclass(frozen=True)
@@ -41,18 +41,26 @@ class CallerOutputs:
     @property
     def selection(self) -> Tensor | None:
         """log η [N, T, K, 1 + k]; None without options."""
+        link = self.selection_link
+        return None if link is None else link.table
+
+    @property
+    def selection_link(self) -> Link | None:
+        """log η, not computed."""
         if not self.options:
             return None
         if self.logits is not None:
-            return log_selection(self.logits, 1 + self.options - self.logits.shape[-1])
-        return pad(torch.zeros(*self.shape, 1), (0, self.options), value=NEVER)
+            return Selection(self.logits, 1 + self.options - self.logits.shape[-1])
+        return LogTable(pad(torch.zeros(*self.shape, 1), (0, self.options), value=NEVER))
 
-    def log_density(self, actions: Tensor) -> Tensor:
-        """log π(a | s) of each caller, [N, T, K]; -inf for a caller that emits no control."""
+    def density_link(self, actions: Tensor) -> Link:
+        """log π(a | s) of each caller, [N, T, K], not computed; -inf for a caller that emits no control."""
         if self.emission is None:
             assert self.logits is not None  # a caller emits something
-            return self.logits.new_full(self.logits.shape[:-1], NEVER)
-        return self.emission.log_density(actions)
+            return LogTable(self.logits.new_full(self.logits.shape[:-1], NEVER), log=True)
+        if actions.requires_grad:
+            return LogTable(self.emission.log_density(actions), log=True)
+        return Density(self.emission, actions)
 
 
 @dataclass(frozen=True)
@@ -75,14 +83,19 @@ class Outputs:
     @property
     def termination(self) -> tuple[Tensor, ...]:
         """(log(1 - ψ), log ψ) of each level, [N, T, k, 2]."""
-        levels = zip(self.callers, self.termination_logits, strict=False)  # the meta-policy has none
-        return tuple(_always(level.shape) if logit is None else log_termination(logit) for level, logit in levels)
+        return tuple(link.table for link in self._termination_links())
 
-    def tables(self, actions: Tensor | None = None) -> Tables:
+    def _termination_links(self) -> tuple[Link, ...]:
+        levels = zip(self.callers, self.termination_logits, strict=False)  # the meta-policy has none
+        return tuple(
+            LogTable(always_ending(level.shape)) if logit is None else Termination(logit) for level, logit in levels
+        )
+
+    def tables(self, actions: Tensor | None = None) -> LinkedTables:
         """The tables for controls [N, T, A] in scaled units; without them, of selections and terminations alone."""
-        selection = (caller.selection for caller in self.callers)
-        control = () if actions is None else tuple(caller.log_density(actions) for caller in self.callers)
-        return Tables(tuple(table for table in selection if table is not None), self.termination, control)
+        selection = (caller.selection_link for caller in self.callers)
+        control = () if actions is None else tuple(caller.density_link(actions) for caller in self.callers)
+        return LinkedTables(tuple(link for link in selection if link is not None), self._termination_links(), control)
 
     def tensors(self) -> list[Tensor]:
         """All outputs of the networks, each [N, T, ...]."""
@@ -106,8 +119,3 @@ class Outputs:
             for caller in self.callers
         )
         return Outputs(tuple(callers), tuple(changed(logit) for logit in self.termination_logits))
-
-
-def _always(shape: torch.Size) -> Tensor:
-    """The termination table of options that end after every step, [N, T, k, 2]."""
-    return torch.tensor([NEVER, 0.0]).expand(*shape, 2)

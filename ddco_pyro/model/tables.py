@@ -12,13 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 NEVER = -torch.inf
 """Log-probability of an impossible event: a true zero, not a small number."""
+
+Group = Literal["selection", "termination", "control"]
 
 
 @dataclass(frozen=True)
@@ -44,12 +46,21 @@ class Tables:
     @property
     def depth(self) -> int:
         """The number D of option levels; 0 is a flat policy."""
-        return len(self.selection)
+        return len(self.parts("selection"))
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """C_d = 1 + k_d of each level, lowest first."""
+        return tuple(part.shape[-1] for part in self.parts("selection"))
 
     @property
     def steps(self) -> int:
         """T, padding included."""
-        return (self.selection or self.control)[-1].shape[1]
+        return int((self.parts("selection") or self.parts("control"))[-1].shape[1])
+
+    def parts(self, group: Group) -> tuple[Any, ...]:
+        """The tables of a group, or what they are computed from, in the tables' shapes."""
+        return tuple(getattr(self, group))
 
     @classmethod
     def of(cls, depth: int, leaves: Sequence[Tensor | None]) -> Tables:
@@ -65,13 +76,12 @@ class Tables:
     def joint_evidence(self) -> Tensor | None:
         """The evidence of every joint choice, float64 [N, T, C_D, ..., C_1]; None where there is none."""
         total: Tensor | None = None
-        sizes = [table.shape[-1] for table in self.selection]
         for level, evidence in enumerate(self.evidence, start=1):
             if evidence is not None:
                 shape = evidence.shape[:2] + (1,) * (self.depth - level) + evidence.shape[2:] + (1,) * (level - 1)
                 own = evidence.double().reshape(shape)
                 total = own if total is None else total + own
-        return None if total is None else total.expand(*total.shape[:2], *reversed(sizes))
+        return None if total is None else total.expand(*total.shape[:2], *reversed(self.sizes))
 
     def clamp(self, level: int, choices: Tensor) -> Tables:
         """These tables with the choices of one level clamped to ``choices`` [N, T]; -1 leaves a step free.
@@ -79,9 +89,17 @@ class Tables:
         :param level: 1 is the lowest.
         """
         evidence = list(self.evidence or (None,) * self.depth)
-        each, choices = torch.arange(self.selection[level - 1].shape[-1]), choices.unsqueeze(-1)
+        each, choices = torch.arange(self.sizes[level - 1]), choices.unsqueeze(-1)
         evidence[level - 1] = torch.where((choices == each) | (choices < 0), 0.0, NEVER)
-        return replace(self, evidence=tuple(evidence))
+        return self.with_evidence(tuple(evidence))
+
+    def with_evidence(self, evidence: tuple[Tensor | None, ...]) -> Tables:
+        """The same tables with this evidence."""
+        return replace(self, evidence=evidence)
+
+    def memoryless(self) -> Tables:
+        """These tables with ψ = 1 at every level: every option ends after every step."""
+        return replace(self, termination=tuple(always_ending(table.shape[:-1]) for table in self.termination))
 
     def apart(self) -> tuple[Tables, Tables]:
         """These tables with a uniform meta-policy, and these tables with a gradient for the meta-policy alone."""
@@ -89,7 +107,8 @@ class Tables:
         uniform = torch.full_like(top, -math.log(top.shape[-1] - 1))
         uniform[..., 0] = NEVER
         fixed = Tables.of(self.depth, [None if table is None else table.detach() for table in self.leaves()])
-        return replace(self, selection=(*lower, uniform)), replace(fixed, selection=(*fixed.selection[:-1], top))
+        levels = Tables((*lower, uniform), self.termination, self.control, self.evidence)
+        return levels, replace(fixed, selection=(*fixed.selection[:-1], top))
 
     def trajectory(self, n: int, length: int) -> Tables:
         """The first ``length`` steps of trajectory ``n`` alone, as tables with N = 1."""
@@ -98,6 +117,11 @@ class Tables:
             return tuple(None if table is None else table[n : n + 1, :length] for table in tables)
 
         return Tables(cut(self.selection), cut(self.termination), cut(self.control), cut(self.evidence))
+
+
+def always_ending(shape: torch.Size) -> Tensor:
+    """The termination table of options that end after every step, [N, T, k, 2], from [N, T, k]."""
+    return torch.tensor([NEVER, 0.0]).expand(*shape, 2)
 
 
 def always_ends(termination: Tensor) -> bool:

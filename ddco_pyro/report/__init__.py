@@ -56,7 +56,7 @@ def header(fit: Fit, metrics: Metrics) -> list[Block]:
     """The verdict, success in rollouts, warnings, and facts about demonstrations and training."""
     counts = metrics.demonstrations
     facts = {
-        "Demonstrations": f"{counts.train} for training, {counts.tune} for tuning, {counts.valid} held out",
+        "Demonstrations": words.division(counts),
         "Parameters": str(metrics.parameters),
         "Training": words.spent(metrics.training),
     }

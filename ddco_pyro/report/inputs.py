@@ -30,7 +30,7 @@ def saliency(fit: Fit, demos: Demonstrations) -> Section | None:
     if not keys:
         return None
     split = parts(fit.spec, demos)
-    part = "valid" if "valid" in split else "train"
+    part = "valid" if "valid" in split and not fit.without else "train"
     chosen = split[part].select(split[part].names[:1])
     paths = [level[0] for level in fit.segment(chosen)]
     demo, gradients = chosen[0], Saliency(fit.hierarchy)

@@ -55,7 +55,7 @@ def section(fit: Fit, demos: Demonstrations, activity: Activity) -> Section:
     )
     names = [level.name for level in fit.spec.hierarchy.levels]
     counts = fit.metrics.demonstrations
-    count = counts.train + counts.tune + counts.valid
+    count = counts.train + counts.tune + (0 if counts.left_out else counts.valid)
     used = note(
         "Over all demonstrations. Expected steps: from one selection of the option to the next selection of any option."
     )

@@ -29,6 +29,9 @@ STAGES = {
     "beginning. Its values can be compared within the panel only.",
     "parts": "“From equal parts” trains each option of a level on one of equally long parts of every demonstration. "
     "Its values can be compared within the panel only.",
+    "cuts": "“From random cuts” trains each option of a level on one of the parts that every demonstration is cut into "
+    "at random. Its values can be compared within the panel only.",
+    "mixture": "“All together without memory” trains all policies while every option ends after every step.",
     "level": "“Alone” trains a level’s options while all are equally likely.",
     "meta": "“Meta-policy alone” then trains the policy that selects the options.",
     "joint": "“All together” trains all networks.",

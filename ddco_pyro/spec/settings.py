@@ -35,11 +35,19 @@ class DemonstrationsSpec(Model):
     """Which of the task's scripted policies is recorded."""
     valid_fraction: Share = 0.1
     """Fraction of the demonstrations held out for validation, unless the file has ``mask/valid``; 0 for none."""
+    leave_one_out: bool = False
+    """Whether every demonstration trains the model. Held-out results of a demonstration are then of a further fit,
+    which leaves it out. For few demonstrations; ``valid_fraction`` does not apply."""
     exclude: Items[Text] = ()
     """Names of demonstrations that are not read."""
     labels: Labels | None = None
     """Ground-truth labels in the file, with which discovered options are compared: one name for all levels, or a list
     with a name for each level, lowest first. Steps labelled −1 are ignored."""
+
+    @property
+    def validates(self) -> bool:
+        """Whether there are held-out results, by the spec alone."""
+        return self.leave_one_out or self.valid_fraction > 0
 
     @property
     def label_names(self) -> tuple[str, ...]:

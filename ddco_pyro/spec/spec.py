@@ -131,7 +131,7 @@ class Spec(Model):
             for name in baseline.levels:
                 if known and name not in known:
                     yield f"{place}.levels", _no_level(name, known)
-        if self.compare_with and self.demonstrations.valid_fraction == 0:
+        if self.compare_with and not self.demonstrations.validates:
             yield "compare_with", "needs held-out demonstrations to compare on; raise demonstrations.valid_fraction"
 
     def _observed(self) -> Iterator[tuple[str, str]]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import ConfigDict, Field, TypeAdapter, model_validator
 
-from ddco_pyro.spec.base import Count, Fraction, Items, Model, Positive, Seed, Share, Text, invalid, nested
+from ddco_pyro.spec.base import Count, Items, Model, Positive, Seed, Share, Text, invalid, nested
 
 
 class RidgeSpec(Model):
@@ -86,13 +86,29 @@ class DurationSpec(Model):
     demonstrations; 0 for no prior."""
 
 
+Start = Literal["vq", "vq_controls", "equal_parts", "cuts", "mixture", "random"]
+Starts = Annotated[Items[Start], Field(min_length=1)]
+
+
 class TrainingSpec(Model):
     """How the model is trained."""
 
-    initialize: Literal["vq", "vq_controls", "equal_parts", "random"] = "vq"
+    initialize: Annotated[
+        Start | Starts,
+        nested(
+            (list, tuple),
+            TypeAdapter(Starts, config=Model.model_config).validate_python,
+            f"one of {', '.join(map(repr, get_args(Start)))}, or a list of them",
+            get_args(Start),
+        ),
+    ] = "vq"
     """``vq``: vector quantisation of the observations that the options' policies read (SM 2.2). ``vq_controls``: vector
     quantisation of these observations and the controls. ``equal_parts``: each demonstration cut into k parts of equal
-    length, for skills that follow one another. ``random``: random weights."""
+    length, for skills that follow one another. ``cuts``: each demonstration cut into k parts at random, other ones in
+    each restart. ``mixture``: first the memoryless mixture (ψ = 1) is trained from ``vq_controls``; then ψ starts at
+    1/2, and all levels train together, whatever ``layerwise`` says. ``random``: random weights. A list has a kind for
+    each of several restarts in turn, the first again after the last. The first restart has the best of ten runs of
+    k-means, each further one a run from random steps."""
     layerwise: bool = True
     """Whether levels are discovered one after another, lowest first, rather than all at once."""
     upper_levels: Literal["clusters", "segments"] = "clusters"
@@ -121,8 +137,9 @@ class TrainingSpec(Model):
     seed: Seed | None = None
     """Seed of initial weights, clusters, the order of demonstrations, and dropout; null: the spec's ``seed``. The split
     into training, tuning and held-out demonstrations does not depend on this seed."""
-    tune_fraction: Fraction = 0.1
-    """Fraction of the training demonstrations used for tuning: early stopping and the choice among restarts."""
+    tune_fraction: Share = 0.1
+    """Fraction of the training demonstrations used for tuning: early stopping and the choice among restarts; at least
+    one demonstration. With 0, ``em`` trains on all of them until it converges."""
     tune_by: Literal["mean", "median"] = "mean"
     """The tuning score: ``mean`` of the objective over steps, or ``median`` over demonstrations, which is robust to a
     single outlier."""
@@ -151,6 +168,25 @@ class TrainingSpec(Model):
                 raise invalid((unused[0], "em takes no gradient steps and would not use it; leave it out"))
         return self
 
+    def start(self, restart: int) -> Start:
+        """The kind of initialisation that a restart begins from (``initialize``)."""
+        kinds = self.starts
+        return kinds[restart % len(kinds)]
+
+    @property
+    def starts(self) -> tuple[Start, ...]:
+        """The kinds of initialisation, one or more."""
+        return self.initialize if isinstance(self.initialize, tuple) else (self.initialize,)
+
+    @model_validator(mode="after")
+    def _starts_apply(self) -> TrainingSpec:
+        if len(self.starts) > self.restarts:
+            text = f"has {len(self.starts)} kinds, but training.restarts is {self.restarts}; give as many restarts"
+            raise invalid(("initialize", text))
+        if "mixture" in self.starts and self.lower_levels == "frozen":
+            raise invalid(("lower_levels", "mixture trains all levels together in the end; say fine_tuned"))
+        return self
+
     @model_validator(mode="after")
     def _ends(self) -> TrainingSpec:
         if self.epochs is None and self.patience is None:
@@ -159,7 +195,7 @@ class TrainingSpec(Model):
             raise invalid(("optimizer.schedule", "cosine ends at training.epochs, which is null"))
         if self.upper_levels == "segments" and not self.layerwise:
             raise invalid(("upper_levels", "segments needs the lowest level discovered first; say layerwise: true"))
-        if self.labels is not None and not self.labels.hold and self.initialize == "random":
+        if self.labels is not None and not self.labels.hold and "random" in self.starts:
             raise invalid(
                 ("labels.hold", "false uses labels in initialisation alone, and that is random; say vq there")
             )

@@ -18,7 +18,8 @@ from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.simulation.collect import cache_path, collect
 from ddco_pyro.simulation.task import find_task
 from ddco_pyro.spec import Spec
-from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.em import uses_em
+from ddco_pyro.training.networks import Dimensions, check_networks
 
 
 def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
@@ -50,11 +51,32 @@ def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
 
 
 def parts(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
-    """The demonstrations to train with, ``train``, and the held-out ones, ``valid``, where there are any."""
+    """The demonstrations to train with, ``train``, and the held-out ones, ``valid``, where there are any.
+
+    :raises DemonstrationsError: one part is empty, masks overlap, or masks hold out what ``leave_one_out`` trains with.
+    """
+    if spec.demonstrations.leave_one_out:
+        if demos.masks.keys() & {"train", "valid"}:
+            raise DemonstrationsError(
+                "demonstrations.leave_one_out: trains with every demonstration, but the file has mask/train or "
+                "mask/valid; leave it out, or the masks"
+            )
+        return {"train": demos, "valid": demos}
     if spec.demonstrations.valid_fraction == 0 and not demos.masks.keys() & {"train", "valid"}:
         return {"train": demos}
     train, valid = demos.split(spec.demonstrations.valid_fraction, spec.seed)
     return {"train": train, "valid": valid}
+
+
+def tuning_split(spec: Spec, dimensions: Dimensions, train: Demonstrations) -> tuple[Demonstrations, Demonstrations]:
+    """The training demonstrations of a model in those that it is fitted to, and those that it is tuned by.
+
+    With ``training.tune_fraction: 0`` both are all of them where EM trains the model, which needs no early stopping.
+    """
+    fraction = spec.training.tune_fraction
+    if fraction == 0 and uses_em(spec.training.optimizer, check_networks(spec, dimensions)):
+        return train, train
+    return train.split(fraction, spec.seed)
 
 
 def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:

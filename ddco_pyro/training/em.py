@@ -28,7 +28,7 @@ from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.perceptrons import Mlp, StackedLinear
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import Tables
-from ddco_pyro.spec import RidgeSpec
+from ddco_pyro.spec import OptimizerSpec, RidgeSpec
 
 LARGEST = 3.0
 """The most that a weight of a logit changes in a step: Fisher scoring overshoots where a logistic curve is flat."""
@@ -38,6 +38,8 @@ ABOVE_FLOOR = 1e-4
 """A learned σ stays so far above its floor."""
 TOLERANCE = 1e-5
 """EM has converged where a step gains less, in nats per step of the demonstrations."""
+ROUGHLY = 1e-3
+"""The same in a stage whose end is a start alone."""
 BIAS = 1e-6
 """Ridge of biases, and the least of weights: an option that is never active keeps its own."""
 
@@ -51,6 +53,11 @@ def is_linear(model: Hierarchy) -> bool:
         isinstance(network, Mlp) and network.trunk_size is None and len(network.layers) == 1
         for network in model.networks().values()
     )
+
+
+def uses_em(spec: OptimizerSpec, model: Hierarchy) -> bool:
+    """Whether a model is trained by EM: where the spec asks for it, and every network is linear."""
+    return spec.name == "em" and is_linear(model)
 
 
 @dataclass(frozen=True)
@@ -210,10 +217,9 @@ class Expectation:
         self._before: dict[str, Tensor] | None = None
         self.value, self.gain = -math.inf, math.inf
 
-    @property
-    def converged(self) -> bool:
-        """Whether the last step gained less than :data:`TOLERANCE`."""
-        return self.gain < TOLERANCE
+    def converged(self, roughly: bool = False) -> bool:
+        """Whether the last step gained less than :data:`TOLERANCE`, or roughly: less than :data:`ROUGHLY`."""
+        return self.gain < (ROUGHLY if roughly else TOLERANCE)
 
     def states(self) -> dict[str, Tensor]:
         """What a checkpoint keeps: the weights in float64, and those before the last step with their value."""
@@ -315,29 +321,27 @@ class Expectation:
             top = CallerOutputs(levels[-1].count, uniform, None)
         outputs = Outputs((*(callers[f"{name}.policy"] for name in named), top), tuple(logits))
         tables = outputs.tables(piece.actions)
+        probes = tables.probe()
         value = self._score(tables, piece, rows)
-        leaves = [*said.values(), *stds.values()]
-        present = [table for table in tables.leaves() if table is not None and table.requires_grad]
-        gradients = iter(torch.autograd.grad(value, [*leaves, *present], allow_unused=True))
+        leaves = [*said.values(), *stds.values(), *probes.leaves()]
+        gradients = iter(torch.autograd.grad(value, [leaf for leaf in leaves if leaf is not None], allow_unused=True))
         of = {name: next(gradients) for name in said}
         of_std = {name: next(gradients) for name in stds}
-        of_table = {id(table): next(gradients) for table in present}
-
-        def posterior(table: Tensor | None) -> Tensor | None:
-            return None if table is None else of_table.get(id(table))
-
+        depth = len(levels)
+        chosen, ended, acted = (tuple(next(gradients) for _ in range(size)) for size in (depth, depth, depth + 1))
         every = [*(f"{name}.policy" for name in named), *([] if self._discovering else ["meta_policy"])]
-        selection = dict(zip((name for name in every if callers[name].options), tables.selection, strict=False))
+        choosing = [name for name in every if callers[name].options]
+        selection = dict(zip(choosing, zip(tables.selection, chosen, strict=True), strict=False))
         for place, name in enumerate(every):
             if name not in sums or of[name] is None:
                 continue
             caller, groups = self._callers[name], list[Information]()
-            choices = posterior(selection.get(name))
-            if caller.sizes[0] and choices is not None:
+            table, choices = selection.get(name, (None, None))
+            if caller.sizes[0] and table is not None and choices is not None:
                 extra = choices.shape[-1] - caller.sizes[0]
-                probabilities = selection[name].detach().exp()[..., extra:]
+                probabilities = table.detach().exp()[..., extra:]
                 groups.append(Information(slice(0, caller.sizes[0]), choices.sum(-1).double(), probabilities))
-            acting = posterior(tables.control[place])
+            acting = acted[place]
             if caller.std is not None and acting is not None:
                 emitted = _emitted(
                     caller, self.model, said[name].detach(), self._stds[name].value, acting, piece.actions
@@ -347,12 +351,10 @@ class Expectation:
         for place, prefix in enumerate(named):
             name = f"{prefix}.termination"
             if name in sums and of[name] is not None:
-                table = posterior(tables.termination[place])
-                assert table is not None
                 within = bounded(said[name].detach())
                 slope = 1 - (within / TERMINATION_BOUND).square()
                 ending = within.sigmoid()
-                weight = table.sum(-1, keepdim=True).double() * ending * (1 - ending) * slope.square()
+                weight = ended[place].sum(-1, keepdim=True) * ending * (1 - ending) * slope.square()
                 sums[name].add(xs[self._networks[name].reads], of[name], [Information(slice(0, 1), weight)], None)
         return float(value.detach())
 

@@ -1,7 +1,7 @@
-"""Initial segments of a level: clusters of observations (vector quantisation, SM 2.2), or parts of equal length.
+"""Initial segments of a level: clusters of observations (vector quantisation, SM 2.2), equal parts, or random cuts.
 
 The paper clones one policy from each cluster. Here the whole model is trained with the choices of a level clamped to
-the clusters. This clones the policies and starts the terminations from the clusters' boundaries, at any level.
+these segments. This clones the policies and starts the terminations from the clusters' boundaries, at any level.
 
 Labels name clusters. Where every option has labelled steps, multinomial logistic regression assigns the other steps.
 Where some options have labelled steps, their clusters start from the means of these steps (seeded k-means, Basu et al.
@@ -40,6 +40,8 @@ class Clusters:
         observations and different controls are then in different clusters.
     :param labels: the options of labelled steps, 1 to m, and -1 for the others, [N, T].
     :param read: names of the observations that are clustered; all where it is empty.
+    :param best: the best of ten runs of k-means, nearly the same ones whatever the seed; otherwise a single run from
+        steps drawn at random.
     """
 
     def __init__(
@@ -50,6 +52,7 @@ class Clusters:
         controls: bool = False,
         labels: Tensor | None = None,
         read: Sequence[str] = (),
+        best: bool = True,
     ) -> None:
         self._controls, self._read = controls, read
         self._most = most_rows(next(self._blocks(batch)).shape[1])
@@ -65,9 +68,11 @@ class Clusters:
         else:
             from sklearn.cluster import KMeans
 
-            start = "k-means++" if known is None else _Start(known)
+            start = ("k-means++" if best else "random") if known is None else _Start(known)
             number = distinct(rows, options)
-            self._namer = KMeans(number, init=start, n_init=10, max_iter=ITERATIONS, random_state=seed).fit(rows)
+            self._namer = KMeans(
+                number, init=start, n_init=10 if best else 1, max_iter=ITERATIONS, random_state=seed
+            ).fit(rows)
 
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
@@ -132,6 +137,25 @@ class EqualParts:
     def choices(self, batch: Batch) -> Tensor:
         """The part of each step, [N, T], 1 to k; 0 where there is padding."""
         part = batch.inputs.time * self.options // batch.lengths[:, None] + 1
+        return torch.where(_alive(batch), part, 0)
+
+
+class RandomCuts:
+    """Every trajectory cut at random into ``options`` parts, named as the options 1 to k in order.
+
+    The k - 1 cuts of a trajectory are different steps, drawn uniformly. A trajectory of fewer than k steps has parts of
+    one step. Batches draw on from a single generator: a batch and its pieces in order have the same cuts.
+    """
+
+    def __init__(self, options: int, seed: int) -> None:
+        self.options, self._random = options, np.random.default_rng(seed)
+
+    def choices(self, batch: Batch) -> Tensor:
+        """The part of each step, [N, T], 1 to k; 0 where there is padding."""
+        part = torch.ones(batch.inputs.batch, dtype=torch.long)
+        for row, length in zip(part, batch.lengths.tolist(), strict=True):
+            for cut in self._random.choice(length - 1, min(self.options, length) - 1, replace=False):
+                row[cut + 1 :] += 1
         return torch.where(_alive(batch), part, 0)
 
 

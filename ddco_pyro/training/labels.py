@@ -12,7 +12,8 @@ from torch.nn.utils.rnn import pad_sequence
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.spec import LevelSpec, Spec, SpecError
-from ddco_pyro.training.data import parts
+from ddco_pyro.training.data import parts, tuning_split
+from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.stages import Stage
 
 
@@ -70,7 +71,7 @@ def used(spec: Spec, demos: Demonstrations) -> Labels | None:
     """
     if spec.training.labels is None:
         return None
-    return Labels.of(spec, *parts(spec, demos)["train"].split(spec.training.tune_fraction, spec.seed))
+    return Labels.of(spec, *tuning_split(spec, Dimensions.of(demos), parts(spec, demos)["train"]))
 
 
 def _known(labels: Any) -> tuple[int, ...]:

@@ -34,7 +34,7 @@ from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import OptimizerSpec
 from ddco_pyro.training.checkpoint import Restart, State, TrainingData, copy_of, optimizer_state, restore_optimizer
 from ddco_pyro.training.devices import device_of, repeatable
-from ddco_pyro.training.em import Expectation, is_linear
+from ddco_pyro.training.em import Expectation, uses_em
 from ddco_pyro.training.objective import Diverged, Objective, read_ahead
 from ddco_pyro.training.processes import ALONE, Ranks
 from ddco_pyro.training.stages import Stage, StageEnd, plan, share
@@ -67,12 +67,12 @@ def train(
     with one_thread(), repeatable(device), Readers(spec.workers) as readers:
         data = data.read_by(readers).held(device)
         model = data.hierarchy(now.restart, states.get("model"))
-        stages = plan(data.spec, model.depth)
+        stages = plan(data.spec, model.depth, now.restart)
         try:
             while not now.done:
                 last = now.stage == len(stages) - 1
                 cap = share(spec.epochs, now.spent, len(stages) - now.stage)
-                stage, begun = StageTraining(data, model, stages[now.stage], restart, ranks), now.epoch
+                stage, begun = StageTraining(data, model, stages[now.stage], restart, ranks, last), now.epoch
                 while (cap is None or now.epoch < cap) and not stage.converged:
                     overdue = now.epoch > begun and time.monotonic() > deadline
                     if overdue or (last and until is not None and now.epoch >= until):
@@ -94,15 +94,21 @@ def train(
 class StageTraining:
     """A stage of a restart in training: the model, the objective, the optimiser, and the running mean of the weights.
 
-    The stage begins, or goes on from the restart's checkpoint.
+    The stage begins, or goes on from the restart's checkpoint. Tuning demonstrations end it and choose its epoch; EM
+    before the last stage goes on until it converges instead, since a stage is a start for the next one.
 
+    :param last: whether it is the last stage of the restart.
     :ivar kept: the model that is evaluated and kept: the exponential running mean of the weights over gradient steps
         (Polyak and Juditsky 1992) where ``training.average`` asks for it, the trained model otherwise.
     """
 
-    def __init__(self, data: TrainingData, model: Hierarchy, stage: Stage, restart: Restart, ranks: Ranks) -> None:
+    def __init__(
+        self, data: TrainingData, model: Hierarchy, stage: Stage, restart: Restart, ranks: Ranks, last: bool
+    ) -> None:
         self.data, self.model, self.stage, self.restart, self.ranks = data, model, stage, restart, ranks
-        self.spec, now = data.spec.training, restart.progress
+        self.spec, self.last, now = data.spec.training, last, restart.progress
+        if stage.memoryless:
+            model.begin_terminations()
         self.objective = Objective(data, now, stage, ranks, restart.states if now.epoch else None)
         self.parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
         self.em: Expectation | None = None
@@ -129,9 +135,14 @@ class StageTraining:
     @property
     def converged(self) -> bool:
         """Whether patience has run out, or EM gains nothing more."""
-        patience = self.spec.patience
+        patience = self.spec.patience if self._tuned else None
         out = patience is not None and self.restart.progress.stale >= patience
-        return out or (self.em is not None and self.em.converged)
+        return out or (self.em is not None and self.em.converged(roughly=not self.last))
+
+    @property
+    def _tuned(self) -> bool:
+        """Whether tuning demonstrations end the stage and choose its epoch."""
+        return self.em is None or self.last
 
     @property
     def kept(self) -> Hierarchy:
@@ -156,7 +167,7 @@ class StageTraining:
             total = self._gradient_steps(place)
         tune = self.objective.tune(self.kept)
         now.epoch += 1
-        if tune > now.best:
+        if tune > now.best or not self._tuned:
             now.best, now.stale = tune, 0
             self.restart.states["best"] = copy_of(self.kept)
         else:
@@ -249,7 +260,7 @@ class StageTraining:
         now = self.restart.progress
         self.model.load_state_dict(self.restart.states["best"])
         end = StageEnd.of(self.stage.name, cap, now.tune, self.spec.patience)
-        if self.em is not None and self.em.converged:
+        if self.em is not None and self.em.converged(roughly=not self.last):
             end = replace(end, rising=0.0)  # at an optimum of the penalised likelihood
         now.ended.append(asdict(end))
 
@@ -273,11 +284,6 @@ def backward(objective: Objective, model: Hierarchy, batch: Batch, rows: Tensor,
         (-value / (steps or batch.steps)).backward()  # posteriors weight the networks' gradients
         total += float(value.detach())
     return total / objective.likelihoods
-
-
-def uses_em(spec: OptimizerSpec, model: Hierarchy) -> bool:
-    """Whether a model is trained by EM: where the spec asks for it, and every network is linear."""
-    return spec.name == "em" and is_linear(model)
 
 
 def learning_rate(spec: OptimizerSpec, epoch: int, cap: int | None) -> float:

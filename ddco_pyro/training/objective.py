@@ -19,7 +19,7 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables, always_ends
 from ddco_pyro.spec import DurationSpec
 from ddco_pyro.training.checkpoint import Progress, State, TrainingData
-from ddco_pyro.training.initialization import Clusters, EqualParts
+from ddco_pyro.training.initialization import Clusters, EqualParts, RandomCuts
 from ddco_pyro.training.processes import ALONE, Ranks
 from ddco_pyro.training.stages import Stage
 from ddco_pyro.training.upper import Constants, expected, fitted
@@ -82,13 +82,17 @@ class Objective:
         """A step without a label has its cluster, or the part of the demonstration it is in, as known choice."""
         data, hierarchy = self.data, self.data.spec.hierarchy
         assert hierarchy is not None  # only levels are clamped
-        kind, count = data.spec.training.initialize, hierarchy.levels[level - 1].count
+        kind, count = data.spec.training.start(self.progress.restart), hierarchy.levels[level - 1].count
+        seed = data.seed(self.progress.restart, self.progress.stage)
+        start: EqualParts | RandomCuts | Clusters
         if kind == "equal_parts":
-            start: EqualParts | Clusters = EqualParts(count)
+            start = EqualParts(count)
+        elif kind == "cuts":
+            start = RandomCuts(count, seed)
         else:
-            seed = data.seed(self.progress.restart, self.progress.stage)
             labels, read = self.known[0].get(level), hierarchy.read_by(level)
-            start = Clusters(data.train, count, seed, kind == "vq_controls", labels, read)
+            best = self.progress.restart == 0  # further restarts are to differ
+            start = Clusters(data.train, count, seed, kind != "vq", labels, read, best)
         for known, batch in zip(self.known, (data.train, data.tune), strict=True):
             choices = start.choices(batch)
             labelled = known.get(level, choices)
@@ -113,7 +117,9 @@ class Objective:
         return self.clamped(tables, rows, tuning)
 
     def clamped(self, tables: Tables, rows: Tensor, tuning: bool = False) -> Tables:
-        """The tables with the choices that are known clamped."""
+        """The tables with the choices that are known clamped, and ψ = 1 in a stage that is memoryless."""
+        if self.stage.memoryless:
+            tables = tables.memoryless()
         for level, choices in self.known[tuning].items():
             tables = tables.clamp(level, choices[rows, : tables.steps])
         return tables

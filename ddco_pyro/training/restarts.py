@@ -16,7 +16,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
@@ -30,15 +32,18 @@ from ddco_pyro.events import (
     ignore,
 )
 from ddco_pyro.inference.engines import STEPS, TRAJECTORIES, EngineCheck, compare_engines
+from ddco_pyro.inference.paths import segment
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.batch import encode, refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import Spec
 from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData
+from ddco_pyro.training.data import tuning_split
 from ddco_pyro.training.devices import described, device_of
+from ddco_pyro.training.em import uses_em
 from ddco_pyro.training.labels import Labels
-from ddco_pyro.training.loop import train, uses_em
+from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
 from ddco_pyro.training.processes import ALONE, Ranks, pool, results, useful_jobs
@@ -78,7 +83,7 @@ def train_model(
     """
     budget = spec.training
     with one_thread():
-        split = demos.split(budget.tune_fraction, spec.seed)
+        split = tuning_split(spec, dimensions, demos)
         trainer = Trainer(spec, dimensions, *split, checkpoints, on_event, jobs, ranks)
         if held_out is not None:
             refuse_unusable(held_out, trainer.hierarchy.encoder, trainer.hierarchy.scaling)
@@ -96,6 +101,8 @@ class Trainer:
     :ivar hierarchy: the model: before :meth:`run` without training, then the best restart's.
     :ivar check: how far the engines are apart, once :meth:`check_engines` has compared them.
     :ivar stopped: the restarts that were stopped early, with their epochs of the last stage.
+    :ivar agreement: the NMI of the other restarts' segments with the best restart's, once :meth:`run` has compared
+        them: of the training demonstrations, at the lowest level.
 
     :param checkpoints: the folder for a checkpoint of each restart; None for nowhere.
     :param jobs: processes that train restarts side by side; -1 is one for each core. The result is the same for any
@@ -128,8 +135,8 @@ class Trainer:
         self.data = TrainingData(spec, dimensions, *encoded, train.names, *fitted, Labels.of(spec, train, tune))
         self.restarts: list[Restart] = []
         self.stopped: dict[int, int] = {}
+        self.agreement: dict[int, float] = {}
         self.check = EngineCheck(math.nan, math.nan)
-        self._last = len(plan(spec, self.hierarchy.depth)) - 1  # the last stage
 
     def check_engines(self) -> None:
         """Compare the engines before any training, on a few of the training demonstrations.
@@ -167,7 +174,8 @@ class Trainer:
         while epochs is not None and len(left) > 1:
             before = len(self.history)
             self._train(left, epochs)
-            order = ranked({number: best_until(self.restarts[number].progress, epochs, self._last) for number in left})
+            tops = {n: best_until(self.restarts[n].progress, epochs, self._last(n)) for n in left}
+            order = ranked(tops)
             better, behind = sorted(order[: (len(order) + 1) // 2]), order[(len(order) + 1) // 2 :]
             self._stop(sorted(behind), tell=len(self.history) > before)
             left, worse, epochs = better, behind + worse, 2 * epochs
@@ -180,6 +188,10 @@ class Trainer:
         if (why := self.restarts[self.best].progress.diverged) is not None:
             self.ranks.share(None)  # no further model
             raise TrainingError(why)
+        if len(self.restarts) > 1 and self.hierarchy.depth:
+            found = {n: self._segments(n) for n, restart in enumerate(self.restarts) if "best" in restart.states}
+            own = found.pop(self.best)
+            self.agreement = {n: float(normalized_mutual_info_score(own, other)) for n, other in found.items()}
         self.hierarchy.load_state_dict(self.restarts[self.best].states["best"])
         return self.hierarchy.place(device_of(self.spec.training)).eval()
 
@@ -202,8 +214,13 @@ class Trainer:
         best, updates = self.best, 1 if by_em else math.ceil(len(self.data.train) / self.spec.training.batch_size)
         ends = [StageEnd(**end) for end in self.restarts[best].progress.ended]
         each = [
-            {"epochs": len(restart.progress.history), "stopped": self.stopped.get(number)}
-            | ({} if restart.progress.diverged is None else {"diverged": True})
+            {
+                "epochs": len(restart.progress.history),
+                "stopped": self.stopped.get(number),
+                "diverged": restart.progress.diverged is not None,
+                "initialize": self.spec.training.start(number) if self.hierarchy.depth else None,
+                "nmi": self.agreement.get(number),
+            }
             for number, restart in enumerate(self.restarts)
         ]
 
@@ -219,6 +236,18 @@ class Trainer:
             "device": self.restarts[best].progress.device,
             "by_em": by_em,
         }
+
+    def _segments(self, number: int) -> np.ndarray:
+        """A restart's option of the lowest level at each step of the training demonstrations."""
+        model = self.data.hierarchy(number, self.restarts[number].states["best"])
+        with torch.no_grad():
+            pieces = (piece for _, piece in self.data.train.pieces(model.steps_at_once))
+            found = [segment(model.tabulate(piece), piece.lengths)[0] for piece in pieces]
+        return torch.cat([choices[choices >= 0] for choices in found]).numpy()
+
+    def _last(self, number: int) -> int:
+        """The last stage of a restart."""
+        return len(plan(self.spec, self.hierarchy.depth, number)) - 1
 
     @property
     def _whole(self) -> list[Restart]:
@@ -240,7 +269,7 @@ class Trainer:
         :raises OtherDevice: it was begun on another kind of device.
         """
         device = described(device_of(self.spec.training))
-        if progress.device != device and not progress.reached(self._last, until):
+        if progress.device != device and not progress.reached(self._last(progress.restart), until):
             raise OtherDevice(
                 f"{self._path(progress.restart)}: was trained on {progress.device}, and networks are on {device} here, "
                 "where the last digits differ; continue it there, or remove it: this restart then begins anew"
@@ -291,7 +320,7 @@ class Trainer:
                     self._keep(restart)
                     for row in restart.progress.history[len(before.history) :]:
                         self.on_event(EpochEnded(**row))
-                left = [number for number in left if not self.restarts[number].progress.reached(self._last, until)]
+                left = [n for n in left if not self.restarts[n].progress.reached(self._last(n), until)]
 
     def _keep(self, restart: Restart) -> None:
         number, why = restart.progress.restart, restart.progress.diverged

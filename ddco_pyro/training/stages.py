@@ -27,6 +27,7 @@ class Stage:
     :param trained: prefixes of the names of the parameters that are trained.
     :param selecting: train the meta-policy on the clamped choices, beside the levels under a uniform one.
     :param from_constants: train the networks to :class:`ddco_pyro.training.upper.Constants`.
+    :param memoryless: every option ends after every step (ψ = 1); the networks of ψ start at ψ = 1/2 in later stages.
     """
 
     name: str
@@ -35,44 +36,59 @@ class Stage:
     trained: tuple[str, ...]
     selecting: bool = False
     from_constants: bool = False
+    memoryless: bool = False
 
 
-def plan(spec: Spec, depth: int) -> list[Stage]:
-    """The stages of training for D levels: from the lowest level up, the meta-policy last."""
+_CLAMPING = {"vq": "vq", "vq_controls": "vq", "mixture": "vq", "equal_parts": "parts", "cuts": "cuts"}
+"""The name of stages that train on initial segments, for each kind of them."""
+
+
+def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
+    """The stages of training of a restart for D levels: from the lowest level up, the meta-policy last."""
     training = spec.training
     everything = ("trunk.", "levels.", "meta_policy.")
     if depth == 0:
         return [Stage("policy", None, None, everything)]
     stages: list[Stage] = []
-    together = training.upper_levels == "segments" and depth > 1
+    kind = training.start(restart)
+    mixed = kind == "mixture"
+    layerwise = training.layerwise and not mixed
+    together = training.upper_levels == "segments" and depth > 1 and not mixed
     for level in range(1, 2 if together else depth + 1):
-        own = (f"levels.{level - 1}.",) if level > 1 else ("trunk.", "levels.0.")
-        if training.initialize != "random":
-            kind = "parts" if training.initialize == "equal_parts" else "vq"
-            if level == depth and _meta_policy_begins(spec):
-                stages.append(Stage(f"{kind}-{level}", None, level, (*own, "meta_policy."), selecting=True))
+        own = _memoryless(level) if mixed else (f"levels.{level - 1}.",)
+        own = own if level > 1 else ("trunk.", *own)
+        if kind != "random":
+            name = f"{_CLAMPING[kind]}-{level}"
+            if level == depth and not layerwise and _meta_policy_selects(spec):
+                trained = (*own, "meta_policy.")
+                stages.append(Stage(name, None, level, trained, selecting=True, memoryless=mixed))
             else:
-                stages.append(Stage(f"{kind}-{level}", level, level, own))
-        if training.layerwise:
+                stages.append(Stage(name, level, level, own, memoryless=mixed))
+        if layerwise:
             stages.append(Stage(f"level-{level}", level, None, own))
     if together:
         upper = (*(f"levels.{level}." for level in range(1, depth)), "meta_policy.")
         stages.append(Stage("segments", None, None, upper, from_constants=True))
         stages.append(Stage("upper", None, None, upper))
-    elif training.layerwise:
+    elif layerwise:
         stages.append(Stage("meta-policy", None, None, ("meta_policy.",)))
-    if not training.layerwise or training.lower_levels == "fine_tuned":
+    if mixed:
+        policies = (name for level in range(1, depth + 1) for name in _memoryless(level))
+        stages.append(Stage("mixture", None, None, ("trunk.", *policies, "meta_policy."), memoryless=True))
+    if not layerwise or training.lower_levels == "fine_tuned":
         stages.append(Stage("joint", None, None, everything))
     return stages
 
 
-def _meta_policy_begins(spec: Spec) -> bool:
-    """Whether the meta-policy is trained on the clamped choices of the highest level.
+def _memoryless(level: int) -> tuple[str, ...]:
+    """The networks of a level without its terminations."""
+    return f"levels.{level - 1}.trunk.", f"levels.{level - 1}.policy."
 
-    That is so where no earlier stage trains it, and it does not emit the control itself, which clusters do not show.
-    """
+
+def _meta_policy_selects(spec: Spec) -> bool:
+    """Whether the meta-policy can be trained on clamped choices: they do not show when it emits the control itself."""
     assert spec.hierarchy is not None  # only levels are clamped
-    return not spec.training.layerwise and "control" not in spec.hierarchy.meta_policy.emits
+    return "control" not in spec.hierarchy.meta_policy.emits
 
 
 @dataclass(frozen=True)
