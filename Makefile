@@ -34,11 +34,12 @@ test-all: lint
 	$(BIN)/pytest -n 2 --dist worksteal -q -m ''
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-# Ratios against other tools, measured side by side; writes benchmarks/*.json and the tables of docs/performance.md.
+# Measured side by side with other tools; writes benchmarks/results and the tables of docs/performance.md. What is known of
+# this very code is not measured again; one part alone: .venv/bin/python benchmarks/performance.py inference
+# DEMONSTRATIONS=FILE: the file that `init` writes a spec for, instead of made-up demonstrations.
 bench: $(DEMO)
-	$(PIP) -e '.[bench]'
+	$(PIP) -e '.[bench,segments]'
 	$(BIN)/python benchmarks/performance.py
-	$(BIN)/python benchmarks/throughput.py
 
 docs: $(DEMO)
 	$(PIP) -e '.[docs,export]'

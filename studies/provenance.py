@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ("docs/results", "benchmarks/latest.json", "benchmarks/throughput.json")
+RESULTS = ("docs/results", "benchmarks/results")
 PACKAGES = {"ddco_pyro": "ddco_pyro", "ddco_tasks": "tasks"}
 """Import name to folder."""
 NO_NUMBERS = ("ddco_pyro/report/", "studies/provenance.py")
