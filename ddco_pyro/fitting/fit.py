@@ -222,7 +222,7 @@ def fit(
     >>> demos = ddco_pyro.Demonstrations(tuple(demonstration(n) for n in range(6)))
     >>> fit = ddco_pyro.fit("mine.yaml", demos)
     >>> fit.metrics.demonstrations
-    Counts(train=4, tune=1, valid=1, supervisor={})
+    Counts(train=4, tune=1, valid=1, left_out=False, supervisor={})
     >>> ddco_pyro.fit("mine.yaml", demos, out="runs/mine").folder.as_posix()
     'runs/mine'
 

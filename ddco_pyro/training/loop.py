@@ -302,7 +302,7 @@ def _optimizer(spec: OptimizerSpec, parameters: list[nn.Parameter]) -> torch.opt
     common = {"params": parameters, "lr": spec.lr, "weight_decay": spec.weight_decay}
     if spec.name == "momentum":
         return _uncompiled(torch.optim.SGD)(**common, momentum=spec.momentum)
-    return _uncompiled(torch.optim.AdamW if spec.name == "adamw" else torch.optim.Adam)(**common, fused=True)
+    return _uncompiled(torch.optim.AdamW if spec.name == "adamw" else torch.optim.Adam)(**common)
 
 
 def _uncompiled(kind: type[torch.optim.Optimizer]) -> Callable[..., torch.optim.Optimizer]:
