@@ -247,14 +247,13 @@ def test_a_file_that_is_there_is_not_replaced_unasked(path: Path, tmp_path: Path
     assert spec.read_text() != "mine"
 
 
-def test_few_demonstrations_all_train_and_few_steps_have_stronger_ridges(path: Path, tmp_path: Path) -> None:
+def test_few_demonstrations_all_train(path: Path, tmp_path: Path) -> None:
     def spec(*steps: int) -> Spec:
         records = tuple(demonstration(f"demo_{n}", length, n) for n, length in enumerate(steps))
         vectors = (replace(one, observations={"pose": one.observations["pose"]}) for one in records)
         Demonstrations(tuple(vectors)).write(path)
         return load_spec(write(tmp_path, starting_spec(inspect(path), path)))
 
-    few, short, long = spec(*[200] * 7), spec(*[20] * 8), spec(*[200] * 8)
-    assert [one.demonstrations.leave_one_out for one in (few, short, long)] == [True, False, False]
-    assert [one.training.tune_fraction for one in (few, short, long)] == [0, 0.1, 0.1]
-    assert [one.training.optimizer.ridge.policy for one in (few, short, long)] == [10, 10, 1]
+    few, more = spec(*[20] * 7), spec(*[20] * 8)
+    assert [one.demonstrations.leave_one_out for one in (few, more)] == [True, False]
+    assert [one.training.tune_fraction for one in (few, more)] == [0, 0.1]
