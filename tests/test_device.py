@@ -40,7 +40,7 @@ BRANCHES = {"network": "branches", "of": {"camera": MEANS, "pose": {"network": "
 SAME = {
     "mlp": {"policy": MLP, "termination": LINEAR},
 }
-"""Those of which a double computes every number as the host does, but for the last digit of a matrix product."""
+"""Those of which a double computes every number as the host does."""
 
 DROPPING = {"policy": {**MLP, "dropout": 0.2}, "termination": LINEAR}
 """Dropout draws other numbers on every kind of device."""
@@ -109,7 +109,11 @@ def weights(fit: ddco_pyro.Fit) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("network", ALL)
 def test_a_fit_with_networks_elsewhere(demos: Demonstrations, network: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each tensor that meets another is asked for its device; weights and numbers are those of a fit on the host."""
-    spec = spec_of((SAME | OTHER)[network], optimizer={"name": "momentum", "lr": 0.01})  # Adam's steps hide their sizes
+    spec = spec_of(
+        (SAME | OTHER)[network],
+        optimizer={"name": "momentum", "lr": 0.01},  # Adam's steps hide their sizes
+        clip_gradient=100.0 if network in SAME else 1.0,  # a norm over two devices is summed in another order
+    )
     here = ddco_pyro.fit(spec, demos)
     monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", 6 * here.hierarchy.step_bytes)  # in chunks too
     here = ddco_pyro.fit(spec, demos)
@@ -124,15 +128,14 @@ def test_a_fit_with_networks_elsewhere(demos: Demonstrations, network: str, monk
         assert {p.device.type for p in there.hierarchy.parameters() if id(p) in others} == {"cpu"}
         moved = weights(there)
         acted = there.controller().act({key: values[0] for key, values in demos[0].observations.items()})
-    # The double copies chunks, and a matrix product rounds its last digit by where in memory an operand begins.
-    close = {"rtol": 1e-6, "atol": 1e-7} if network in SAME else {"rtol": 1e-4, "atol": 1e-5}
+    close = {"rtol": 0, "atol": 0} if network in SAME else {"rtol": 1e-4, "atol": 1e-5}
     for name, values in weights(here).items():
         np.testing.assert_allclose(moved[name], values, err_msg=name, **close)
     expected = here.controller().act({key: values[0] for key, values in demos[0].observations.items()})
     np.testing.assert_allclose(acted, expected, **close)
     assert there.metrics.training.device == THERE.type
     each = [fit.metrics.log_likelihood_per_step.valid for fit in (there, here)]
-    assert each[0] == pytest.approx(each[1], rel=1e-6 if network in SAME else 1e-3)
+    assert each[0] == pytest.approx(each[1], rel=0 if network in SAME else 1e-3)
 
 
 def test_pictures_stay_on_a_device_with_room(demos: Demonstrations, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -83,7 +83,7 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
     for name, batch in (("train", material.train), ("tune", material.tune)):
         names = material.names if name == "train" else [n for n in demos.names if n not in material.names]
         with torch.no_grad():
-            tables = model.tabulate(batch)
+            tables = model(batch.inputs).map(torch.Tensor.double).tables(batch.actions)  # as precise as the engine
         values[name] = 0.0
         for n, demo in enumerate(demos.select(names)):
             known = options(demo.labels["phase"].tolist())
@@ -95,9 +95,9 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
             )
             values[name] += math.log(total)
     assert backward(objective, model, material.train, torch.arange(len(material.train))) == pytest.approx(
-        values["train"], rel=1e-6
+        values["train"], abs=1e-5
     )
-    assert objective.tune(model) == pytest.approx(values["tune"] / STEPS, rel=1e-6)
+    assert objective.tune(model) == pytest.approx(values["tune"] / STEPS, abs=1e-5)
 
 
 def test_its_gradient_is_that_of_finite_differences():

@@ -57,7 +57,11 @@ ASIDE = "check", "segment"
 
 
 class Tried(NamedTuple):
-    """A command, how it ended, whether all else stayed as it was, and the names of what it wrote."""
+    """A command that was called.
+
+    :param stayed: whether all other files are unchanged.
+    :param wrote: the names of the files that it wrote.
+    """
 
     command: tuple[object, ...]
     ended: Ended

@@ -56,8 +56,9 @@ class Elimination(NamedTuple):
     :param value: log p(ξ), [N] float64.
     :param rows: the probabilities that the links gave.
     :param posteriors: posterior probabilities of the same entries.
-    :param marginals: p(h^d_t = h | ξ), levels side by side, [M, Σ C_d]; of several levels where it was asked for.
     :param kept: what each link keeps for its gradient.
+    :param alive: the steps that the rows hold.
+    :param parts: the links, and their places in the rows.
     """
 
     value: Tensor
