@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from ddco_pyro.comparison import compare
     from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
     from ddco_pyro.exporting import export
-    from ddco_pyro.fitting.fit import Fit, fit, load
+    from ddco_pyro.fitting.fit import fit
+    from ddco_pyro.fitting.fitted import Fit, load
     from ddco_pyro.inference.marginal import EliminatedAHMM
     from ddco_pyro.segmenting import segment
     from ddco_pyro.selection import select

@@ -21,7 +21,7 @@ from provenance import ROOT, code, sources, tree
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import only_one
 from ddco_pyro.exporting import write_numpy
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 
 HERE = Path(__file__).parent
 HELD_OUT = 20

@@ -26,7 +26,8 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.fit import Fit, fit
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.spec import load_spec
 
 OURS = "ddco"

@@ -20,7 +20,7 @@ from cells import Cell, Settings
 
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.training.data import parts
 
 TRAINED = 50

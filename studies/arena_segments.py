@@ -9,7 +9,7 @@ from needle_success import over_seeds, spread
 from scipy import stats
 
 from ddco_pyro.evaluation.agreement import agreement
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Scores as Measures
 from ddco_pyro.segmenting.baselines import BASELINES, segment
 from ddco_pyro.training.data import parts

@@ -25,7 +25,8 @@ from cells import Cell, Settings
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.evaluation.agreement import agreement
-from ddco_pyro.fitting.fit import Fit, fit
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.segmenting import baselines
 from ddco_pyro.spec import load_spec
 

@@ -28,7 +28,8 @@ from provenance import record, sentence, text
 from scipy import stats
 
 from ddco_pyro.data.files import write_text
-from ddco_pyro.fitting.fit import Fit, fit
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.simulation.episodes import rate
 from ddco_pyro.spec import load_spec

@@ -28,7 +28,7 @@ from provenance import record, sentence, text
 
 from ddco_pyro.data.files import whole_file, write_text
 from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.fitting.fit import Fit, load
+from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.simulation.episodes import Episode
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import find_task

@@ -35,7 +35,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import whole_file, write_text
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.evaluation.inferred import infer
-from ddco_pyro.fitting.fit import Fit, load
+from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.outputs import Outputs

@@ -25,7 +25,7 @@ from joblib import Parallel, delayed
 from provenance import record, sentence, text
 
 from ddco_pyro.data.files import write_text
-from ddco_pyro.fitting.fit import Fit, load
+from ddco_pyro.fitting.fitted import Fit, load
 
 OUT = Path("docs/results/bin_picking")
 NUMBERS = ("nothing", "one", "several")

@@ -10,7 +10,7 @@ import numpy as np
 from ddco_tasks.bin_picking.geometry import SHOWING
 from ddco_tasks.bin_picking.trials import Attempt, End, Trials
 
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.simulation.episodes import Episode, run_episode
 from ddco_pyro.simulation.task import Task
 

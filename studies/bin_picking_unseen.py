@@ -25,7 +25,7 @@ from joblib import Parallel, delayed
 from provenance import record, sentence, text
 
 from ddco_pyro.data.files import write_text
-from ddco_pyro.fitting.fit import load
+from ddco_pyro.fitting.fitted import load
 from ddco_pyro.simulation.episodes import rate
 
 OUT = Path("docs/results/bin_picking")

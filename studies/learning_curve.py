@@ -24,7 +24,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing.figures import blank, save, style
 from ddco_pyro.evaluation.worth import paired
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.selection.folds import Folds, divide
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations

@@ -59,7 +59,8 @@ from threadpoolctl import threadpool_limits
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.files import only_one, write_text
-from ddco_pyro.fitting.fit import Fit, fit
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.simulation.episodes import play
 from ddco_pyro.spec import load_spec, with_overrides

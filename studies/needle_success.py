@@ -27,7 +27,8 @@ from provenance import Record, is_kept, record, sentence, text
 from scipy import stats
 
 from ddco_pyro.data.files import whole_file, write_text
-from ddco_pyro.fitting.fit import Fit, fit
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.simulation.episodes import rate

@@ -22,7 +22,7 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.simulation.episodes import Episode, play, run_episode
 from ddco_pyro.simulation.task import Task

@@ -28,7 +28,7 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import whole_file, write_text
 from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.simulation.episodes import play
 
 EPISODES = 3

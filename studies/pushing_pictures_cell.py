@@ -28,7 +28,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import MOVED, Transform, shifted
 from ddco_pyro.encoding.fitted import FittedReader, from_fit
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.simulation.cameras import Camera, Encoded
 from ddco_pyro.simulation.episodes import play, run_episode
 from ddco_pyro.simulation.task import Task

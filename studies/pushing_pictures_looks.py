@@ -33,7 +33,7 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.figures import WIDTH, blank, save
 from ddco_pyro.evaluation.agreement import agreement
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.simulation.episodes import Episode, run_episode
 from ddco_pyro.simulation.task import Policy
 

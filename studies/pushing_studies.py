@@ -53,7 +53,7 @@ from pushing_results import grouped, write
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.simulation.episodes import play
 from ddco_pyro.spec import Spec

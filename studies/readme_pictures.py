@@ -24,7 +24,7 @@ from PIL import Image, ImageChops, ImageOps
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.colours import legend, option_colour
 from ddco_pyro.drawing.figures import STYLE
-from ddco_pyro.fitting.fit import load
+from ddco_pyro.fitting.fitted import load
 from ddco_pyro.simulation.episodes import Episode, run_episode
 from ddco_pyro.simulation.task import find_task
 

@@ -30,7 +30,7 @@ from scipy import stats
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.files import write_text
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.simulation.episodes import play
 from ddco_pyro.simulation.task import find_task

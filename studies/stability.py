@@ -36,7 +36,7 @@ from ddco_pyro.evaluation.options import (
     divergences,
     option_use,
 )
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.spec import Spec, load_spec
 from ddco_pyro.training.data import demonstrations, parts
 from ddco_pyro.training.networks import Dimensions

@@ -20,7 +20,7 @@ from arena_segments import MEASURES
 
 from ddco_pyro.errors import BadInput
 from ddco_pyro.exporting import write_numpy
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import parse_spec
 

@@ -17,7 +17,8 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.comparison import CompareError, compare
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.exporting import TOLERANCE, export, runner
-from ddco_pyro.fitting.fit import Fit, fit
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.spec import Spec, parse_spec, with_overrides
 

@@ -24,7 +24,7 @@ from ddco_pyro.cli import console
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.drawing import words
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.metrics import Metrics, read_successes
 from ddco_pyro.report import agreement, header, likelihood, options, rollouts, training

@@ -16,7 +16,7 @@ import ddco_pyro.exporting as module
 from ddco_pyro.errors import Failed
 from ddco_pyro.exporting import export, runner
 from ddco_pyro.exporting.recording import record, tolerance
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import UserNetwork
 from ddco_pyro.spec import parse_spec

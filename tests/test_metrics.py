@@ -73,7 +73,7 @@ def test_a_baseline_of_the_models_own_kind_has_numbers_of_its_own(tmp_path):
 
 def test_methods_of_one_kind_are_rolled_out_each_under_its_name(toy_run):
     spec = toy_run.spec.model_copy(update={"hierarchy": None, "baseline": toy_run.spec.compare_with[0]})
-    own = ddco_pyro.fitting.fit.Fit(spec, toy_run.baselines["flat"].hierarchy, beside={"flat_2": toy_run})
+    own = ddco_pyro.fitting.fitted.Fit(spec, toy_run.baselines["flat"].hierarchy, beside={"flat_2": toy_run})
     assert list(policies(own))[-2:] == ["flat_2", "flat"]
 
 

@@ -12,7 +12,8 @@ from command_line import call
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.fitting.evaluation import NotFinite, evaluate
-from ddco_pyro.fitting.fit import Fit, fit
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.model.networks import Inputs, InputShape
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.training.objective import TrainingError

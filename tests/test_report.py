@@ -9,7 +9,8 @@ import toy_task
 from moving_demonstrations import made, reaches, recorded
 
 from ddco_pyro.drawing import words
-from ddco_pyro.fitting.fit import fit, load
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import load
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import rollouts as rolling
 from ddco_pyro.report import write_report

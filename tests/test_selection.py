@@ -19,7 +19,7 @@ from selecting import Told, data_at, kept, score, spec_at, two_skills
 import ddco_pyro
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.digest import OtherDemonstrations
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.run import RunError
 from ddco_pyro.selection import SelectionFailed, Workers, check, final_spec, folds, select
 from ddco_pyro.selection.folds import BackendError, FoldError

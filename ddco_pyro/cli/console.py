@@ -35,7 +35,7 @@ from ddco_pyro.events import (
 
 if TYPE_CHECKING:
     from ddco_pyro.data.inspection import Field, Inspection
-    from ddco_pyro.fitting.fit import Fit
+    from ddco_pyro.fitting.fitted import Fit
     from ddco_pyro.fitting.merging import Pair
     from ddco_pyro.metrics import Metrics
     from ddco_pyro.model.hierarchy import Hierarchy

@@ -199,7 +199,7 @@ def merge(
     """
     from ddco_pyro.cli import console
     from ddco_pyro.fitting import merging
-    from ddco_pyro.fitting.fit import load
+    from ddco_pyro.fitting.fitted import load
     from ddco_pyro.report import write_report
 
     named = run if run.name else run.resolve()

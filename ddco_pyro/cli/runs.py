@@ -17,7 +17,7 @@ from ddco_pyro.errors import BadInput, command
 if TYPE_CHECKING:
     from ddco_pyro.data.sources import Source
     from ddco_pyro.events import OnEvent
-    from ddco_pyro.fitting.fit import Fit
+    from ddco_pyro.fitting.fitted import Fit
     from ddco_pyro.segmenting import Segmented
 
 FILMED = 3
@@ -64,7 +64,7 @@ def rollout(
     out, too.
     """
     from ddco_pyro.cli import console
-    from ddco_pyro.fitting.fit import load
+    from ddco_pyro.fitting.fitted import load
     from ddco_pyro.fitting.rollouts import roll_out
     from ddco_pyro.fitting.seeds import roll_out_repetitions
     from ddco_pyro.report import write_report
@@ -82,7 +82,7 @@ def rollout(
 
 def report(run: RunPath, allow_code: AllowCode = False) -> None:
     """Write the report of a run again."""
-    from ddco_pyro.fitting.fit import load
+    from ddco_pyro.fitting.fitted import load
     from ddco_pyro.report import write_report
 
     fitted = load(run, allow_code)
@@ -173,7 +173,7 @@ def segment(
         raise BadInput(f"{demos}: labels go into whole files only; first: {again}")
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
-    from ddco_pyro.fitting.fit import load
+    from ddco_pyro.fitting.fitted import load
     from ddco_pyro.segmenting import beside_baselines, chosen_names, segments
     from ddco_pyro.segmenting.agreement import agreement_table, level_agreements
     from ddco_pyro.segmenting.baselines import BASELINES, check_installed
@@ -277,7 +277,7 @@ def export(
     is more. Otherwise nothing is written.
     """
     from ddco_pyro.exporting import export as write
-    from ddco_pyro.fitting.fit import load
+    from ddco_pyro.fitting.fitted import load
 
     check_outputs([Output("--out", out, "folder")], [run])
     exported = write(load(run, allow_code), out, onnx)

@@ -19,7 +19,7 @@ from ddco_pyro.data.pictures import same
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import UNMATCHED
 from ddco_pyro.evaluation.worth import paired
-from ddco_pyro.fitting.fit import Fit, load
+from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.metrics import Training, read_successes
 from ddco_pyro.simulation.episodes import paired_difference, rate
 from ddco_pyro.training.data import parts

@@ -12,7 +12,7 @@ from torch import nn
 
 from ddco_pyro.data.pictures import Transform
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.fit import Fit, load
+from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.model.networks import Inputs, InputShape, Network, build_trunk
 from ddco_pyro.model.networks.conv import Conv
 from ddco_pyro.model.networks.lstm import Lstm

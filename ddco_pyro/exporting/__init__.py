@@ -21,7 +21,7 @@ from ddco_pyro.exporting.description import describe
 from ddco_pyro.exporting.program import StepProgram
 from ddco_pyro.exporting.recording import MOST, record, tolerance
 from ddco_pyro.exporting.runner import TOLERANCE
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.model.seeding import HOST
 
 __all__ = ["TOLERANCE", "Exported", "export", "write_numpy"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from ddco_pyro.evaluation.branch_use import branch_use
 from ddco_pyro.evaluation.inferred import Inferred, infer
 from ddco_pyro.evaluation.options import divergences, option_use
 from ddco_pyro.evaluation.worth import MIXTURE, mean_run, paired, worth
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import Posterior
 from ddco_pyro.inference.posteriors import Decomposition
 from ddco_pyro.metrics import (
@@ -37,9 +38,6 @@ from ddco_pyro.metrics import (
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.training.labels import choices, used
-
-if TYPE_CHECKING:
-    from ddco_pyro.fitting.fit import Fit
 
 
 class NotFinite(Failed):
@@ -62,41 +60,48 @@ class _Part:
     @classmethod
     def of(cls, fit: Fit, demos: Demonstrations, held_out: bool = False) -> _Part:
         values, parts, paths = [], [], []
+        named = _Names(fit, demos) if held_out and fit.without else None
         for piece in fit.infer(demos, held_out):
             values.append(_finite(fit, piece))
             parts.append(piece.decomposition)
-            paths.append(_named_alike(fit, piece, demos))
+            paths.append(named.alike(piece) if named else piece.path.choices)
         segments = [[row[row >= 0].numpy() for h in level for row in h] for level in zip(*paths, strict=True)]
         return cls(np.concatenate(values), Decomposition.joined(parts), segments)
 
 
-def _named_alike(fit: Fit, piece: Inferred, demos: Demonstrations) -> tuple[Tensor, ...]:
-    """The most likely choices of each level, with the options of a model without a demonstration named as the fit's.
+class _Names:
+    """Names the options of models without a demonstration as a fit's own.
 
     Options are matched so that both models agree on as many steps of the other demonstrations as possible.
     """
-    from scipy.optimize import linear_sum_assignment
 
-    choices = piece.path.choices
-    if piece.hierarchy is fit.hierarchy:
-        return choices
-    others = demos.select(name for name in demos.names if name not in piece.names)
-    pairs = zip(*(_choices(model, others) for model in (piece.hierarchy, fit.hierarchy)), strict=True)
-    matched = []
-    for own, (theirs, ours) in zip(choices, pairs, strict=True):
-        names = np.arange(max(theirs.max(), ours.max(), int(own.max())) + 1)
-        together = np.zeros((len(names), len(names)))
-        np.add.at(together, (theirs, ours), 1)
-        names[1:] = 1 + linear_sum_assignment(together[1:, 1:], maximize=True)[1]  # 0 is the control
-        matched.append(torch.where(own < 0, own, torch.as_tensor(names)[own.clamp(min=0)]))
-    return tuple(matched)
+    def __init__(self, fit: Fit, demos: Demonstrations) -> None:
+        self.demos, self.own = demos, _choices(fit.hierarchy, demos)
+
+    def alike(self, piece: Inferred) -> tuple[Tensor, ...]:
+        """The most likely choices of each level for the demonstration of a piece, by the model without it."""
+        from scipy.optimize import linear_sum_assignment
+
+        others = [name for name in self.demos.names if name not in piece.names]
+        theirs, choices = _choices(piece.hierarchy, self.demos.select(others)), piece.path.choices
+        matched = []
+        for level, own in enumerate(choices):
+            pairs = np.concatenate([np.stack([theirs[name][level], self.own[name][level]]) for name in others], axis=1)
+            names = np.arange(max(int(pairs.max()), int(own.max())) + 1)
+            together = np.zeros((len(names), len(names)))
+            np.add.at(together, tuple(pairs), 1)
+            names[1:] = 1 + linear_sum_assignment(together[1:, 1:], maximize=True)[1]  # 0 is the control
+            matched.append(torch.where(own < 0, own, torch.as_tensor(names)[own.clamp(min=0)]))
+        return tuple(matched)
 
 
-def _choices(model: Hierarchy, demos: Demonstrations) -> Iterator[np.ndarray]:
-    """The most likely choice at every step of demonstrations, [steps], for each level."""
-    paths = [piece.path.choices for piece in infer(model, demos)]
-    for level in zip(*paths, strict=True):
-        yield np.concatenate([part[part >= 0].numpy() for part in level])
+def _choices(model: Hierarchy, demos: Demonstrations) -> dict[str, list[np.ndarray]]:
+    """The most likely choices of each demonstration by its name, [T] for each level."""
+    return {
+        name: [level[row, : piece.lengths[row]].numpy() for level in piece.path.choices]
+        for piece in infer(model, demos)
+        for row, name in enumerate(piece.names)
+    }
 
 
 def _finite(fit: Fit, piece: Inferred) -> np.ndarray:

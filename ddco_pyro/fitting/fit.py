@@ -1,4 +1,4 @@
-"""``ddco_pyro.fit``, the fitted model that it gives, and ``ddco_pyro.load``."""
+"""``ddco_pyro.fit``: train a model and its baselines, evaluate them, and write the run folder."""
 
 from __future__ import annotations
 
@@ -6,31 +6,25 @@ import importlib.metadata
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import cast
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from ddco_pyro.acting.controller import Controller
-from ddco_pyro.acting.monitor import Monitor
 from ddco_pyro.data.controls import measure
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import leftovers
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
-from ddco_pyro.evaluation.inferred import Inferred, infer
 from ddco_pyro.events import Event, OnEvent, TrainingBegan, ignore
 from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.evaluation import evaluate
+from ddco_pyro.fitting.fitted import Fit, left_out, load
 from ddco_pyro.fitting.run import (
     Clock,
-    RunError,
     claim,
     claimed,
     has_model,
@@ -39,167 +33,20 @@ from ddco_pyro.fitting.run import (
     write_history,
     write_model,
 )
-from ddco_pyro.inference import Posterior
-from ddco_pyro.metrics import Metrics
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import Spec, load_spec, user_code, with_overrides
+from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.data import dimensions, known_demonstrations, parts, refuse_unfit, seen
 from ddco_pyro.training.devices import device_of, repeatable
 from ddco_pyro.training.labels import used
 from ddco_pyro.training.launching import check_processes, together
 from ddco_pyro.training.loop import uses_em
-from ddco_pyro.training.networks import Dimensions, check_models, model_name, named_baselines, parameters
+from ddco_pyro.training.networks import Dimensions, check_models, model_name, parameters
 from ddco_pyro.training.processes import ALONE, Ranks, check_jobs, pool, results, useful_jobs
 from ddco_pyro.training.restarts import train_model
 
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
 """Packages whose versions are in ``metrics.json``."""
-
-TOLERANCE = 1e-4
-"""Relative; a log-likelihood computed again on another machine differs in the last digits of float32."""
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A fitted model.
-
-    >>> fit.spec.hierarchy.levels[0].count, sorted(fit.baselines), fit.metrics.demonstrations.valid
-    (2, ['flat'], 1)
-
-    :param metrics: the contents of ``metrics.json``; None of a model that was not evaluated.
-    :param folder: the run folder; None where nothing was written.
-    :param given: the demonstrations of the fit; None for those that the spec names.
-    :param beside: the fitted baselines, by name; None for those in the run folder.
-    :param apart: models that were trained without a demonstration, by its name (``demonstrations.leave_one_out``); None
-        for those in the run folder.
-    """
-
-    spec: Spec
-    hierarchy: Hierarchy
-    metrics: Metrics = field(default=cast(Metrics, None), repr=False)
-    folder: Path | None = None
-    given: Demonstrations | None = field(default=None, repr=False)
-    beside: Mapping[str, Fit] | None = field(default=None, repr=False)
-    apart: Mapping[str, Hierarchy] | None = field(default=None, repr=False)
-
-    def __str__(self) -> str:
-        return str(self.folder or "this fit")
-
-    @property
-    def run_folder(self) -> Path:
-        """The run folder.
-
-        :raises RunError: the fit has none.
-        """
-        if self.folder is None:
-            raise RunError("this fit has no run folder; fit with out=FOLDER, which this needs")
-        return self.folder
-
-    @property
-    def name(self) -> str:
-        """The name of the model in tables."""
-        return model_name(self.spec)
-
-    @cached_property
-    def demonstrations(self) -> Demonstrations:
-        """The demonstrations of the fit, training and held out; those of a run are read when asked for.
-
-        :raises OtherDemonstrations: their file holds other demonstrations.
-        """
-        if self.given is not None:
-            return self.given
-        demos = read_demonstrations(self.spec)
-        if self.folder is not None:
-            record(self.folder, demos)
-        return demos
-
-    @cached_property
-    def baselines(self) -> Mapping[str, Fit]:
-        """The fitted baselines, by name."""
-        if self.beside is not None or self.folder is None:
-            return self.beside or {}
-        folders = [self.folder / "baselines" / name for name in named_baselines(self.spec)]
-        allow_code = bool(user_code(self.spec))  # the spec names theirs too
-        return {folder.name: load(folder, allow_code) for folder in folders if is_finished(folder)}
-
-    @cached_property
-    def without(self) -> Mapping[str, Hierarchy]:
-        """The model without each demonstration, by its name; empty without ``demonstrations.leave_one_out``."""
-        if self.apart is not None or self.folder is None or not self.spec.demonstrations.leave_one_out:
-            return self.apart or {}
-        places = _left_out(self.folder, self.demonstrations)
-        return {name: read_model(place, self.spec) for name, place in places.items()}
-
-    @cached_property
-    def held_out(self) -> dict[str, float]:
-        """log p(ξ) of each held-out demonstration by name, computed when it was fitted, nats."""
-        return {row.name: row.log_likelihood for row in self.metrics.valid}
-
-    def was_held_out(self, name: str, log_likelihood: float) -> bool:
-        """Whether a demonstration is among the held-out ones: the name and the log-likelihood are equal."""
-        return bool(np.isclose(self.held_out.get(name, np.nan), log_likelihood, rtol=TOLERANCE, atol=TOLERANCE))
-
-    def infer(self, demos: Iterable[Demonstration], held_out: bool = False) -> Iterator[Inferred]:
-        """The model's outputs, posteriors and paths for demonstrations, in pieces that fit into memory, in order.
-
-        >>> for piece in fit.infer(demos):
-        ...     print(piece.log_likelihood.shape, piece.posterior.u[0].shape, piece.path.choices[0].shape)
-        (6,) torch.Size([6, 10, 3]) torch.Size([6, 10])
-
-        :param demos: :class:`~ddco_pyro.Demonstrations`, or an iterable that reads one after the other.
-        :param held_out: with ``demonstrations.leave_one_out``, each by the model that was trained without it.
-        :raises DemonstrationsError: there are none, or a number is too large for networks.
-        """
-        if not (held_out and self.without):
-            yield from infer(self.hierarchy, demos)
-        else:
-            for demo in demos:
-                yield from infer(self.without[demo.name], [demo])
-
-    def log_likelihood(self, demos: Iterable[Demonstration]) -> np.ndarray:
-        """log p(ξ) of each demonstration, nats, [N]; the density is in the control's own units.
-
-        >>> fit.log_likelihood(demos).shape
-        (6,)
-        """
-        return np.concatenate([piece.log_likelihood for piece in self.infer(demos)])
-
-    def posterior(self, demos: Iterable[Demonstration]) -> Posterior:
-        """u, v and w of §4.1 for every level, each [N, T, 1 + k] with control as choice 0.
-
-        >>> (u,) = fit.posterior(demos).u
-        >>> u.shape, float(u[0, 0].sum().round(decimals=6))
-        (torch.Size([6, 10, 3]), 1.0)
-        """
-        parts = [piece.posterior for piece in self.infer(demos)]
-        return Posterior(
-            *(tuple(_stacked(level, 0.0) for level in zip(*kind, strict=True)) for kind in zip(*parts, strict=True))
-        )
-
-    def segment(self, demos: Iterable[Demonstration]) -> tuple[np.ndarray, ...]:
-        """Choices of the most likely path, a [N, T] for each level, lowest first; -1 past a demonstration's end.
-
-        >>> (options,) = fit.segment(demos)
-        >>> options.shape, sorted(set(options[options >= 0].tolist()) - {1, 2})
-        ((6, 10), [])
-        """
-        parts = [piece.path.choices for piece in self.infer(demos)]
-        return tuple(_stacked(level, -1).numpy() for level in zip(*parts, strict=True))
-
-    def controller(self, seed: int = 0) -> Controller:
-        """The model as a policy that acts, as the spec's ``rollout`` says."""
-        return Controller.from_spec(self.hierarchy, self.spec.rollout, seed)
-
-    def monitor(self) -> Monitor:
-        """A live monitor of the active options while another policy, or a person, acts."""
-        return Monitor(self.hierarchy)
-
-
-def _stacked(parts: Sequence[Tensor], padding: float) -> Tensor:
-    """Parts [N_i, T_i, ...] stacked along N, padded to the longest."""
-    rows = [row for part in parts for row in part]
-    return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=padding)
 
 
 def fit(
@@ -367,7 +214,7 @@ def _leave_one_out(
     models: dict[str, Hierarchy] = {}
     if not spec.demonstrations.leave_one_out:
         return models
-    places = _left_out(folder, demos) if folder else {}
+    places = left_out(folder, demos) if folder else {}
     for name in demos.names:
         place = places.get(name)
         if place and has_model(place):
@@ -380,11 +227,6 @@ def _leave_one_out(
         if place:
             write_model(place, models[name])
     return models
-
-
-def _left_out(folder: Path, demos: Demonstrations) -> dict[str, Path]:
-    """The folder of the model without each demonstration, by its name."""
-    return {name: folder / "left_out" / str(number) for number, name in enumerate(demos.names)}
 
 
 def _fit_baseline(
@@ -478,31 +320,3 @@ def _with_events(name: str, fit: Callable[[OnEvent], Fit], parent: int) -> tuple
         events.append(event)
 
     return name, replace(fit(tell), given=None), events
-
-
-def load(folder: str | Path, allow_code: bool = False) -> Fit:
-    """The fit in a run folder.
-
-    >>> again = ddco_pyro.load("runs/mine")
-    >>> again.metrics == fit.metrics, (again.log_likelihood(demos) == fit.log_likelihood(demos)).all()
-    (True, np.True_)
-
-    :param allow_code: import the user code (``module:name``) that its spec names; nothing else in a run is ever
-        executed.
-    :raises RunError: the folder has no finished fit, or its model is of another spec.
-    :raises OtherVersion: the folder was written in another format.
-    :raises Damaged: the model or ``metrics.json`` is damaged.
-    :raises SpecError: its spec names user code, and that is not allowed.
-    """
-    folder = Path(folder)
-    missing = [name for name in ("spec.yaml", "model.safetensors", "metrics.json") if not (folder / name).exists()]
-    if missing:
-        what = "not a run folder" if "spec.yaml" in missing else "an unfinished run: fit it again to continue it"
-        if (folder / "folds.json").exists():
-            what = f"a selection; the fit of what it chose is in {folder / 'fit'} once it is done"
-        raise RunError(f"{folder}: {what} (it has no {missing[0]})")
-    spec = load_spec(folder / "spec.yaml", allow_code=allow_code)
-    recorded(folder)  # or the format is another
-    hierarchy = read_model(folder, spec)
-    counts = [level.count for level in spec.hierarchy.levels] if spec.hierarchy else []
-    return Fit(spec, hierarchy, Metrics.read(folder, counts), folder)

@@ -17,7 +17,7 @@ from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.errors import command
 from ddco_pyro.evaluation.worth import success_worth
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.run import RunError
 from ddco_pyro.metrics import Method, Record, Rollouts, read_record, write_table
 from ddco_pyro.simulation.episodes import paired_difference, run_episode, run_episodes, summarize

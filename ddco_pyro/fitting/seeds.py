@@ -10,8 +10,8 @@ from pathlib import Path
 from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import OnEvent, SeedFitted, ignore
-from ddco_pyro.fitting.fit import Fit, load
 from ddco_pyro.fitting.fit import fit as fit_again
+from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import is_finished
 from ddco_pyro.metrics import Metrics, Seeds, SuccessOfSeeds

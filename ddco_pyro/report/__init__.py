@@ -11,7 +11,7 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import style
 from ddco_pyro.drawing.page import Block, Facts, Page, Text, note
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Metrics, Rate
 from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, training, worth
 from ddco_pyro.report.activity import activity

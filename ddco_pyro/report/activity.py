@@ -8,7 +8,7 @@ import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.evaluation.inferred import Inferred
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 
 MOST_BINS = 60
 

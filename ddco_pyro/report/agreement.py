@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ddco_pyro.drawing.page import Block, Section, Table, Text, note
 from ddco_pyro.drawing.words import option_name, percent
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Confusion
 from ddco_pyro.report.options import quoted
 from ddco_pyro.segmenting.agreement import EXPLAINED, agreement_table

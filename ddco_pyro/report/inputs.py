@@ -14,7 +14,7 @@ from ddco_pyro.drawing.colours import option_colour, with_heat
 from ddco_pyro.drawing.figures import FAINT, WIDTH, blank, save
 from ddco_pyro.drawing.page import Section, Table, note
 from ddco_pyro.drawing.words import number
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import BranchUse
 from ddco_pyro.training.data import parts
 

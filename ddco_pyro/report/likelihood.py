@@ -11,7 +11,7 @@ from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
 from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, note
 from ddco_pyro.drawing.words import about, effort, method, number, with_error
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Compared, Metrics
 from ddco_pyro.segmenting.page import anchor
 

@@ -18,7 +18,7 @@ from ddco_pyro.drawing.colours import add_legend, option_colour
 from ddco_pyro.drawing.figures import FAINT, GRID, blank, hide_frame, save
 from ddco_pyro.drawing.page import Block, Cell, Picture, Section, Table, Text, Timeline, note
 from ddco_pyro.drawing.words import number, option_name, percent
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Use
 from ddco_pyro.report import trajectories
 from ddco_pyro.report.activity import Activity, Bins, LevelActivity, bins

@@ -17,7 +17,7 @@ from ddco_pyro.drawing.figures import INK, blank, save
 from ddco_pyro.drawing.page import Block, Code, Columns, Facts, Folded, Section, Text, Warned, note
 from ddco_pyro.drawing.words import number, percent
 from ddco_pyro.evaluation.options import Finding, diagnose
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Metrics, read_table, refit
 from ddco_pyro.spec import Spec, dump_spec
 

@@ -14,7 +14,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.colours import add_legend, option_colour
 from ddco_pyro.drawing.figures import FAINT, INK, blank, save
 from ddco_pyro.drawing.page import Picture
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.report.activity import Activity, LevelActivity
 
 MOST_TRAJECTORIES = 40

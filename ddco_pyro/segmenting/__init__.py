@@ -16,7 +16,7 @@ from ddco_pyro.data.sources import Recording, Source, open_source
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.inferred import Inferred
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.segmenting import baselines
 from ddco_pyro.spec import LevelSpec
 from ddco_pyro.training.data import parts

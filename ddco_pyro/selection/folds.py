@@ -17,7 +17,7 @@ from joblib import Parallel, parallel_config
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.selection.grid import Candidate

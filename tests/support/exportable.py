@@ -7,7 +7,7 @@ from types import MappingProxyType
 import torch
 from hierarchies import varied
 
-from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import parse_spec
 
