@@ -70,8 +70,8 @@ def header(fit: Fit, metrics: Metrics) -> list[Block]:
         signs = "1 sign" if len(found) == 1 else f"{len(found)} signs"
         link = Markup('<a href="#warnings">Warnings</a>')
         blocks.append(Text(Markup("{} of a degenerate solution: see {}.").format(signs, link)))
-    explained = (
-        "Held out: used neither in training nor in tuning, which decides when to stop. A nat is the unit of "
-        f"log-likelihood: {words.NAT}."
-    )
+    held_out = "used neither in training nor in tuning, which decides when to stop"
+    if counts.left_out:
+        held_out = "each demonstration by the fit that was trained and tuned without it"
+    explained = f"Held out: {held_out}. A nat is the unit of log-likelihood: {words.NAT}."
     return [*blocks, note(explained), Facts(facts)]
