@@ -22,10 +22,12 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import leftovers
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
+from ddco_pyro.drawing.words import choice_names
 from ddco_pyro.evaluation.inferred import Inferred, infer
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.evaluation import evaluate
+from ddco_pyro.fitting.names import Named, checked, label_names, proposed, read_names, write_names
 from ddco_pyro.fitting.run import (
     Clock,
     RunError,
@@ -70,6 +72,7 @@ class Fit:
     :param beside: the fitted baselines, by name; None for those in the run folder.
     :param apart: models that were trained without a demonstration, by its name (``demonstrations.leave_one_out``); None
         for those in the run folder.
+    :param named: the names of the options of each level that has names; :meth:`name_options` changes them.
     """
 
     spec: Spec
@@ -79,6 +82,7 @@ class Fit:
     given: Demonstrations | None = field(default=None, repr=False)
     beside: Mapping[str, Fit] | None = field(default=None, repr=False)
     apart: Mapping[str, Hierarchy] | None = field(default=None, repr=False)
+    named: Named = field(default_factory=dict, repr=False)
 
     def __str__(self) -> str:
         return str(self.folder or "this fit")
@@ -97,6 +101,25 @@ class Fit:
     def name(self) -> str:
         """The name of the model in tables."""
         return model_name(self.spec)
+
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """The name of each choice of each level, lowest first: ``control``, then the options 1 to k."""
+        levels = self.spec.hierarchy.levels if self.spec.hierarchy else ()
+        return {level.name: choice_names(level.count, self.named.get(level.name, ())) for level in levels}
+
+    def name_options(self, level: str, names: Sequence[str]) -> None:
+        """Name the options 1 to k of a level, in ``names.yaml`` of the run folder too.
+
+        >>> fit.name_options("option", ["go there", "go back"])
+        >>> fit.names["option"]
+        ('control', 'go there', 'go back')
+
+        :raises BadInput: there is no such level, or the names are not k different texts.
+        """
+        self.named.update(checked(self.spec, {**self.named, level: names}))
+        if self.folder is not None:
+            write_names(self.folder, self.named)
 
     @cached_property
     def demonstrations(self) -> Demonstrations:
@@ -186,11 +209,11 @@ class Fit:
 
     def controller(self, seed: int = 0) -> Controller:
         """The model as a policy that acts, as the spec's ``rollout`` says."""
-        return Controller.from_spec(self.hierarchy, self.spec.rollout, seed)
+        return Controller.from_spec(self.hierarchy, self.spec.rollout, seed, self.names)
 
     def monitor(self) -> Monitor:
         """A live monitor of the active options while another policy, or a person, acts."""
-        return Monitor(self.hierarchy)
+        return Monitor(self.hierarchy, self.names)
 
 
 def _stacked(parts: Sequence[Tensor], padding: float) -> Tensor:
@@ -262,9 +285,11 @@ def fit(
         if demos is not None:
             refuse_unfit(spec, demos)
             used(spec, demos)
+            label_names(demos)
     with ExitStack() as stack:  # all checks are done: from here on files are written
         if folder is not None:
             stack.enter_context(claimed(folder, spec, resume))
+            read_names(folder, spec)  # or they are refused
         finished = folder is not None and is_finished(folder)
         with clock("demonstrations"):
             if demos is None and not finished:
@@ -344,10 +369,15 @@ def _fit_model(
             seconds={},
             versions={package: importlib.metadata.version(package) for package in PACKAGES},
         )
+        named = read_names(folder, spec) if folder else None
+        if named is None and spec.hierarchy and name is None:
+            named = proposed(spec, split["train"], fitted.segment(split["train"]))
+            if folder and named:
+                write_names(folder, named)
     metrics.seconds = clock.end()
     if folder:
         metrics.write(folder)
-    return replace(fitted, metrics=metrics)
+    return replace(fitted, metrics=metrics, named=named or {})
 
 
 def _leave_one_out(
@@ -395,6 +425,7 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
     :raises RunError: the folder has no finished fit, or its model is of another spec.
     :raises OtherVersion: the folder was written in another format.
     :raises Damaged: the model or ``metrics.json`` is damaged.
+    :raises BadInput: ``names.yaml`` does not fit the spec.
     :raises SpecError: its spec names user code, and that is not allowed.
     """
     folder = Path(folder)
@@ -408,4 +439,4 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
     recorded(folder)  # or the format is another
     hierarchy = read_model(folder, spec)
     counts = [level.count for level in spec.hierarchy.levels] if spec.hierarchy else []
-    return Fit(spec, hierarchy, Metrics.read(folder, counts), folder)
+    return Fit(spec, hierarchy, Metrics.read(folder, counts), folder, named=read_names(folder, spec) or {})
