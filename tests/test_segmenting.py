@@ -130,7 +130,15 @@ def test_tables_have_a_row_for_each_step(toy_run, file, tmp_path):
     assert call("segment", toy_run.folder, file, "--csv", table, "--parquet", binary).status == 0
     found = look(toy_run.folder, file)
     rows = list(csv.DictReader(table.open()))
-    assert list(rows[0]) == ["demonstration", "step", "seconds", "option", "option_boundary", "option_probability"]
+    assert list(rows[0]) == [
+        "demonstration",
+        "step",
+        "seconds",
+        "option",
+        "option_boundary",
+        "option_probability",
+        "option_name",
+    ]
     assert len(rows) == sum(len(one) for one in found.segments)
     at = 0
     for one in found.segments:
