@@ -161,9 +161,10 @@ def test_the_page_shows_every_segment(toy_run, file, tmp_path):
     assert call("segment", toy_run.folder, file, "--html", page).status == 0
     text, found = page.read_text(), look(toy_run.folder, file)
     assert len(re.findall('class="demonstration"', text)) == len(found)
-    titles = re.findall(r'title="option (\d), steps (\d+) to (\d+), probability', text)
+    number = {name: option for option, name in enumerate(toy_run.names["option"])}
+    titles = re.findall(r'title="([^"]+), steps (\d+) to (\d+), probability', text)
     runs = [run for one in found.segments for run in one.levels["option"].runs()]
-    assert [(int(o), int(a), int(b) + 1) for o, a, b in titles] == runs
+    assert [(number[o], int(a), int(b) + 1) for o, a, b in titles] == runs
     assert "http" not in text
     assert "<script" not in text
 
