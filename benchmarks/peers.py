@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.model.tables import Chain
+from ddco_pyro.inference import log_likelihood
+from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.tables import Chain, Tables
+from ddco_pyro.spec.training import RidgeSpec
+from ddco_pyro.training.em import Expectation
 
 NEVER = -1e3
 """The others' gradients are NaN where a logarithm is -inf; this is as good as never here."""
@@ -87,3 +93,54 @@ def funsor_elimination(chain: Chain) -> Tensor:
     )
     total = whole.reduce(funsor.ops.logaddexp, frozenset({"before", "now"})).reduce(funsor.ops.add, "n")
     return total.data
+
+
+def plain_hmm(number: int, steps: int, options: int = 5, controls: int = 3) -> tuple[Tables, Any, np.ndarray]:
+    """A hidden Markov model as our tables and as hmmlearn's, and controls [N·T, A]: options that see nothing."""
+    from hmmlearn.hmm import GaussianHMM
+
+    random = np.random.default_rng(0)
+    values, means = random.normal(size=(number, steps, controls)), random.normal(size=(options, controls))
+    end, choice = random.uniform(0.05, 0.3, options), random.dirichlet(np.ones(options))
+    model = GaussianHMM(options, "diag")
+    model.startprob_, model.means_, model.covars_ = choice, means, np.ones((options, controls))
+    model.transmat_ = np.diag(1 - end) + end[:, None] * choice
+    density = -0.5 * ((values[:, :, None] - means) ** 2 + np.log(2 * np.pi)).sum(-1)
+    selection = np.log(np.append(1e-300, choice))
+    selection[0] = -np.inf
+    tables = Tables(
+        selection=(torch.as_tensor(selection).expand(number, steps, 1, -1),),
+        termination=(torch.as_tensor(np.log(np.stack([1 - end, end], -1))).expand(number, steps, -1, -1),),
+        control=(torch.as_tensor(density), torch.full((number, steps, 1), -torch.inf, dtype=torch.float64)),
+    )
+    return tables, model, values.reshape(-1, controls)
+
+
+def em_steps(hierarchy: Hierarchy, batch: Batch) -> tuple[Callable[[], object], Callable[[], object]]:
+    """An iteration of EM of linear options, and one of dynamax's for an HMM with linear regressions as emissions.
+
+    Ours learns terminations and a meta-policy that see the state, dynamax's a matrix of transitions.
+    """
+    import jax
+    from dynamax.hidden_markov_model import LinearRegressionHMM
+
+    seen = jax.numpy.asarray(torch.cat(list(batch.inputs.vectors.values()), -1).numpy())
+    controls = jax.numpy.asarray(batch.actions.numpy())
+    model = LinearRegressionHMM(hierarchy.levels[0].count, seen.shape[-1], controls.shape[-1])
+    parameters, properties = model.initialize(jax.random.PRNGKey(0))
+
+    @jax.jit
+    def iteration(parameters, state):
+        statistics, values = jax.vmap(lambda u, a: model.e_step(parameters, a, u))(seen, controls)
+        return model.m_step(parameters, properties, statistics, state), values.sum()
+
+    state = model.initialize_m_step_state(parameters, properties)
+
+    def theirs() -> None:
+        jax.block_until_ready(iteration(parameters, state))
+
+    def score(tables: Tables, piece: Batch, rows: Tensor) -> Tensor:
+        return log_likelihood(tables, piece.lengths).sum()
+
+    ours = Expectation(hierarchy, ("",), score, RidgeSpec())
+    return lambda: ours.step(batch), theirs

@@ -1,112 +1,174 @@
-"""What exact inference costs, as ratios measured side by side: ``make bench``.
+"""What fits, gradient steps and exact inference cost: ``python benchmarks/performance.py [PART ...]``.
 
-Writes ``benchmarks/latest.json`` and the table in ``docs/performance.md``. Every ratio is the median of pairs that ran
-one right after the other; the networks, the data and the tables are the same in both.
+Each part measures pairs that run one right after the other, on one thread. A part's rows go to
+``benchmarks/results/PART.json`` as soon as they are known, and all tables into ``docs/performance.md``. Parts that are
+not named are measured unless their result is what this very code has given: an interrupted run goes on.
 """
 
 from __future__ import annotations
 
-import statistics
+import argparse
+import json
+import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 import peers
+import pictures
 import torch
+import yaml
+from measuring import Row, of_pairs, seconds, side_by_side, table
 
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.events import EpochEnded, Event
 from ddco_pyro.inference import Engine, fused, log_likelihood
-from ddco_pyro.inference.kernel import Rows, Structure, any_levels, one_level
+from ddco_pyro.inference.kernel import Rows, Structure, any_levels, match_torch_threads, one_level
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import Tables, complete
-from ddco_pyro.spec import parse_spec
+from ddco_pyro.spec import Spec, load_spec, parse_spec, with_overrides
+from ddco_pyro.training.data import demonstrations, parts
+from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.restarts import Trainer
 
-sys.path.append(str(Path(__file__).parents[1] / "studies"))
-from provenance import record, sentence, text
+ROOT = Path(__file__).parents[1]
+sys.path.append(str(ROOT / "studies"))
+from provenance import is_kept, record, sentence, text  # noqa: E402
 
-HERE = Path(__file__).parent
+COMMAND = ROOT / ".venv/bin/ddco-pyro" if (ROOT / ".venv").exists() else Path(sys.executable).with_name("ddco-pyro")
+RESULTS, PAGE = ROOT / "benchmarks/results", ROOT / "docs/performance.md"
+BEGIN, END = "<!-- tables, written by make bench -->\n", "<!-- end of tables -->\n"
 SIZES = ((100, 15), (50, 200), (50, 2000))
 FEATURES, CONTROLS = 10, 3
-EXPECTED = {
-    "step_over_networks mlp 50 × 2000": ("≤", 1.10),
-    "step_over_networks linear 50 × 2000": ("≤", 2.0),
-    "enumerate_over_step mlp 100 × 15": ("≥", 5.0),
-    "enumerate_over_step mlp 50 × 2000": ("≥", 20.0),
-    "enumeration_alone_over_kernel 50 × 2000": ("≥", 1000.0),
-    "dynamax_over_kernel 50 × 2000": ("≥", 5.0),
-    "discretehmm_over_kernel 50 × 2000": ("≥", 20.0),
-    "growth_T": ("≤", 2.1),
-    "growth_k": ("≤", 4.5),
-    "kernel_one_thread_over_all": ("≥", 1.7),
-    "memory_step_over_networks mlp": ("≤", 1.5),
+EMISSIONS = ("gaussian", "clipped", "binary")
+
+AIMS = {
+    "step mlp gaussian 50 × 2000 / networks": ("≤", 1.10),
+    "step linear gaussian 50 × 2000 / networks": ("≤", 2.0),
+    "step linear clipped 50 × 2000 / networks": ("≤", 3.0),
+    "Pyro enumeration step 100 × 15 / step": ("≥", 5.0),
+    "Pyro enumeration step 50 × 2000 / step": ("≥", 20.0),
+    "Pyro enumeration 50 × 2000 / pass": ("≥", 1000.0),
+    "dynamax smoother 50 × 2000 / pass": ("≥", 5.0),
+    "Pyro DiscreteHMM 50 × 2000 / pass": ("≥", 20.0),
+    "4000 steps / 2000 steps": ("≤", 2.1),
+    "20 options / 5 options": ("≤", 4.5),
+    "pass, one thread / all threads": ("≥", 1.7),
+    "step mlp / networks": ("≤", 1.5),
+    **pictures.AIMS,
 }
 
 
-def problem(network: str, number: int, steps: int, counts: tuple[int, ...] = (5,)) -> tuple[Hierarchy, Batch]:
-    """Freshly initialised networks over random observations and controls."""
+# --- problems ---------------------------------------------------------------------------------------------------------
+
+
+def problem(
+    network: str,
+    number: int,
+    steps: int,
+    counts: tuple[int, ...] = (5,),
+    kind: str = "gaussian",
+    controls: int = CONTROLS,
+) -> tuple[Hierarchy, Batch]:
+    """Freshly initialised networks over random observations and controls, of which a third is on a bound if clipped."""
     torch.manual_seed(0)
     levels = [{"name": f"level-{d}", "count": k, "policy": {"network": network}} for d, k in enumerate(counts, 1)]
+    std = {} if kind == "binary" else {"std": 0.5}
     spec = parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5"},
             "observations": ["state"],
-            "control": {"std": 0.5},
+            "control": {"kind": kind, **std},
             "hierarchy": {"levels": levels, "meta_policy": {"network": network}},
         }
     )
-    hierarchy = Hierarchy(spec, {"state": (FEATURES,)}, CONTROLS, steps)
-    inputs = Inputs({"state": torch.randn(number, steps, FEATURES)}, {}, torch.arange(steps))
-    return hierarchy, Batch(inputs, torch.randn(number, steps, CONTROLS), torch.full((number,), steps))
+    state, actions = np.random.default_rng(0).normal(size=(2, number, steps, FEATURES))
+    actions = {"gaussian": actions, "clipped": actions.clip(-1, 1), "binary": np.sign(actions)}[kind][..., :controls]
+    demos = (Demonstration(f"demo_{row}", {"state": state[row]}, actions[row]) for row in range(number))
+    return trained_on(spec, Demonstrations(tuple(demos)))
 
 
-def networks_alone(hierarchy: Hierarchy, batch: Batch, pieces: bool = True) -> Callable[[], None]:
-    """Forward and backward of the same networks with a sum as loss, and the optimiser's step."""
-    optimizer = torch.optim.Adam(hierarchy.parameters(), lr=1e-3)
-    networks = [hierarchy.meta_policy.network]
-    for level in hierarchy.levels:
-        networks += [level.policy.network, level.termination]
+def trained_on(spec: Spec, demos: Demonstrations) -> tuple[Hierarchy, Batch]:
+    """The spec's model without training, and the demonstrations as training sees them."""
+    trainer = Trainer(spec, Dimensions.of(demos), demos, demos)
+    return trainer.hierarchy, trainer.data.train
+
+
+def tables_of(number: int, steps: int, counts: tuple[int, ...] = (5,)) -> tuple[Tables, torch.Tensor]:
+    """Tables of linear networks, detached."""
+    hierarchy, batch = problem("linear", number, steps, counts)
+    with torch.no_grad():
+        return hierarchy.tabulate(batch), batch.lengths
+
+
+# --- gradient steps ---------------------------------------------------------------------------------------------------
+
+
+def step(
+    hierarchy: Hierarchy, batch: Batch, loss: Callable[[Batch], torch.Tensor], pieces: bool = True
+) -> Callable[[], None]:
+    """A gradient step that minimises a loss of each piece of the batch."""
+    optimizer = torch.optim.Adam(hierarchy.parameters(), lr=1e-3, fused=True)
 
     def run() -> None:
         optimizer.zero_grad()
         for _, piece in batch.pieces() if pieces else [(None, batch)]:
-            sum(network(piece.inputs).sum() for network in networks).backward()
+            loss(piece).backward()
         optimizer.step()
 
     return run
 
 
-def step(hierarchy: Hierarchy, batch: Batch, engine: Engine = "fused") -> Callable[[], None]:
-    """A whole gradient step, as training does it."""
-    optimizer = torch.optim.Adam(hierarchy.parameters(), lr=1e-3)
-
-    def run() -> None:
-        optimizer.zero_grad()
-        for _, piece in batch.pieces():
-            (-log_likelihood(hierarchy.tabulate(piece), piece.lengths, engine).sum() / batch.steps).backward()
-        optimizer.step()
-
-    return run
+def by_engine(hierarchy: Hierarchy, engine: Engine = "fused") -> Callable[[Batch], torch.Tensor]:
+    """The loss of training."""
+    return lambda piece: -log_likelihood(hierarchy.tabulate(piece), piece.lengths, engine).sum() / piece.steps
 
 
-def funsor_step(hierarchy: Hierarchy, batch: Batch) -> Callable[[], None]:
-    """The same step with funsor's elimination."""
-    optimizer = torch.optim.Adam(hierarchy.parameters(), lr=1e-3)
+def by_funsor(hierarchy: Hierarchy) -> Callable[[Batch], torch.Tensor]:
+    """The same loss by funsor's elimination."""
+    return lambda piece: (
+        -peers.funsor_elimination(complete(hierarchy.tabulate(piece), piece.lengths)).sum() / piece.steps
+    )
 
-    def run() -> None:
-        optimizer.zero_grad()
-        chain = complete(hierarchy.tabulate(batch), batch.lengths)
-        (-peers.funsor_elimination(chain) / batch.steps).backward()
-        optimizer.step()
 
-    return run
+def of_networks(hierarchy: Hierarchy) -> Callable[[Batch], torch.Tensor]:
+    """The sum of all that the networks say: forward and backward alone."""
+    networks = list(hierarchy.networks().values())
+    return lambda piece: sum(network(piece.inputs)[0].sum() for network in networks)
+
+
+def over_networks() -> Iterator[Row]:
+    """A whole gradient step, as training does it, over the same with a sum as loss."""
+    for network, kind in (("mlp", "gaussian"), *(("linear", kind) for kind in EMISSIONS)):
+        for number, steps in SIZES:
+            case = problem(network, number, steps, kind=kind)
+            names = f"step {network} {kind} {number} × {steps}", "networks"
+            yield side_by_side(names, step(*case, by_engine(case[0])), step(*case, of_networks(case[0])))
+
+
+def over_other_engines() -> Iterator[Row]:
+    """A gradient step of perceptrons through Pyro's and funsor's elimination, over ours."""
+    for number, steps in SIZES:
+        case, size = problem("mlp", number, steps), f"{number} × {steps}"
+        ours, few = step(*case, by_engine(case[0])), 1 if steps > 1000 else 5
+        pyro = step(*case, by_engine(case[0], "enumerate"))
+        yield side_by_side((f"Pyro enumeration step {size}", "step"), pyro, ours, few, warm=few > 1)
+        yield side_by_side((f"funsor step {size}", "step"), step(*case, by_funsor(case[0])), ours, 3)
+
+
+# --- inference alone --------------------------------------------------------------------------------------------------
 
 
 def kernel(tables: Tables, lengths: torch.Tensor) -> Callable[[], float]:
-    """Our forward-backward with posteriors, from ready tables; log-likelihoods of scaled densities come out."""
+    """Our forward-backward with posteriors, from ready probabilities."""
     *levels, meta_policy = tables.control
     rows = [
         torch.cat([table.flatten(2).double() for table in group], -1).flatten(0, 1).exp().numpy()
@@ -117,6 +179,7 @@ def kernel(tables: Tables, lengths: torch.Tensor) -> Callable[[], float]:
     run = one_level if tables.depth == 1 else any_levels
 
     def call() -> float:
+        match_torch_threads()
         value, exact = np.empty(len(lengths)), np.empty(len(lengths), dtype=np.bool_)
         posteriors = Rows(*(np.empty_like(row) for row in rows), nothing)
         run(Rows(*rows, nothing), starts, lengths.numpy(), value, exact, posteriors, structure)
@@ -135,148 +198,238 @@ def enumeration(tables: Tables, lengths: torch.Tensor) -> Callable[[], None]:
     return run
 
 
-def ratio(first: Callable[[], object], second: Callable[[], object], rounds: int = 7, warm: bool = True) -> float:
-    """Median of the ratios of times of pairs that run one right after the other."""
-    if warm:
-        first()
-    second()
-    return statistics.median(seconds(first) / seconds(second) for _ in range(rounds))
-
-
-def seconds(call: Callable[[], object]) -> float:
-    """Wall time of one call."""
-    start = time.perf_counter()
-    call()
-    return time.perf_counter() - start
-
-
-def tables_of(number: int, steps: int, counts: tuple[int, ...] = (5,)) -> tuple[Tables, torch.Tensor]:
-    """Tables of linear networks, detached."""
-    hierarchy, batch = problem("linear", number, steps, counts)
-    with torch.no_grad():
-        return hierarchy.tabulate(batch), batch.lengths
-
-
-def measured() -> Iterator[tuple[str, float]]:
-    """Name and value of every ratio, for the present number of threads."""
-    for number, steps in SIZES:
-        size = f"{number} × {steps}"
-        for network in ("mlp", "linear"):
-            hierarchy, batch = problem(network, number, steps)
-            yield (
-                f"step_over_networks {network} {size}",
-                ratio(step(hierarchy, batch), networks_alone(hierarchy, batch)),
-            )
-        hierarchy, batch = problem("mlp", number, steps)
-        few = 1 if steps > 1000 else 5
-        slow = ratio(step(hierarchy, batch, "enumerate"), step(hierarchy, batch), few, warm=few > 1)
-        yield f"enumerate_over_step mlp {size}", slow
-        yield f"funsor_over_step mlp {size}", ratio(funsor_step(hierarchy, batch), step(hierarchy, batch), 3)
-        tables, lengths = tables_of(number, steps)
-        own = kernel(tables, lengths)
-        yield f"enumeration_alone_over_kernel {size}", ratio(enumeration(tables, lengths), own, few, warm=few > 1)
-        whole = ratio(lambda t=tables, n=lengths: fused.eliminate(t, n), own)
-        yield f"log_tables_to_posterior_over_kernel {size}", whole
-        chain = complete(tables, lengths)
-        same(own(), float(peers.funsor_elimination(chain)))
-        for name, peer in (("dynamax", peers.dynamax_smoother(chain)), ("discretehmm", peers.discrete_hmm(chain))):
-            same(own(), peer())
-            yield f"{name}_over_kernel {size}", ratio(peer, own)
-    base = kernel(*tables_of(50, 2000))
-    yield "growth_T", ratio(kernel(*tables_of(50, 4000)), base)
-    yield "growth_k", ratio(kernel(*tables_of(50, 2000, (20,))), base)
-    short = kernel(*tables_of(50, 200))
-    yield "growth_depth 2 over 1 (36 over 6 joint choices)", ratio(kernel(*tables_of(50, 200, (5, 5))), short)
-    yield "growth_depth 3 over 1 (216 over 6 joint choices)", ratio(kernel(*tables_of(50, 200, (5, 5, 5))), short)
-
-
 def same(ours: float, theirs: float) -> None:
     """:raises AssertionError: the peer does not compute what we compute, so its time would mean nothing."""
     assert abs(ours - theirs) <= 1e-6 * abs(ours), f"{ours} against {theirs}"
 
 
-def threads_ratio(threads: int) -> float:
-    """The kernel on one thread over the kernel on all."""
-    own = kernel(*tables_of(50, 2000))
+def inference() -> Iterator[Row]:
+    """Other tools over our pass with all posteriors, from the same tables."""
+    for number, steps in SIZES:
+        tables, lengths = tables_of(number, steps)
+        size, ours, chain = f"{number} × {steps}", kernel(tables, lengths), complete(tables, lengths)
+        few = 1 if steps > 1000 else 5
+        logs = partial(fused.eliminate, tables, lengths)
+        yield side_by_side((f"pass from logarithms {size}", "pass"), logs, ours)
+        yield side_by_side((f"Pyro enumeration {size}", "pass"), enumeration(tables, lengths), ours, few, warm=few > 1)
+        same(ours(), float(peers.funsor_elimination(chain)))
+        for name, peer in (
+            ("dynamax smoother", peers.dynamax_smoother(chain)),
+            ("Pyro DiscreteHMM", peers.discrete_hmm(chain)),
+        ):
+            same(ours(), peer())
+            yield side_by_side((f"{name} {size}", "pass"), peer, ours)
+        plain, model, controls = peers.plain_hmm(number, steps)
+        ours = kernel(plain, lengths)
+        theirs = partial(model.score_samples, controls, [steps] * number)
+        same(ours(), theirs()[0])
+        yield side_by_side((f"hmmlearn posteriors of a plain HMM {size}", "pass"), theirs, ours)
 
-    def on(number: int) -> Callable[[], float]:
-        def run() -> float:
-            torch.set_num_threads(number)
-            return own()
 
-        return run
+def growth() -> Iterator[Row]:
+    """Our pass and a gradient step as the problem grows."""
+    base, short = kernel(*tables_of(50, 2000)), kernel(*tables_of(50, 200))
+    yield side_by_side(("4000 steps", "2000 steps"), kernel(*tables_of(50, 4000)), base)
+    yield side_by_side(("20 options", "5 options"), kernel(*tables_of(50, 2000, (20,))), base)
+    for levels, choices in ((2, 36), (3, 216)):
+        names = f"{levels} levels of 5 options ({choices} joint choices)", "one level (6 choices)"
+        yield side_by_side(names, kernel(*tables_of(50, 200, (5,) * levels)), short)
+    steps = [step(*case, by_engine(case[0])) for n in (9, 3) for case in [problem("linear", 50, 200, controls=n)]]
+    yield side_by_side(("step with 9 control dimensions", "3 dimensions"), *steps)
 
-    return ratio(on(1), on(threads), 15)
+
+def threads() -> Iterator[Row]:
+    """Our pass on one thread over that on all."""
+    ours, every = kernel(*tables_of(50, 2000)), os.cpu_count() or 1
+
+    def on(number: int) -> None:
+        torch.set_num_threads(number)
+        ours()
+
+    yield side_by_side(("pass, one thread", "all threads"), partial(on, 1), partial(on, every), 15)
+    torch.set_num_threads(1)
+
+
+# --- memory -----------------------------------------------------------------------------------------------------------
+
+
+def memory() -> Iterator[Row]:
+    """Peak memory of a step of 50 × 2000 over that of the networks alone on all steps at once."""
+    for network in ("mlp", "linear"):
+        pair = [_in_process(what, network) for what in ("step", "networks")]
+        yield of_pairs((f"step {network}", "networks"), [(pair[0], pair[1])], "MiB")
+
+
+def _in_process(*what: str) -> float:
+    ended = subprocess.run([sys.executable, __file__, "--peak", *what], capture_output=True, text=True, check=True)
+    return float(ended.stdout)
 
 
 def peak(what: str, network: str) -> float:
     """Peak memory in MiB that 50 × 2000 steps take beyond what the process had before."""
-    torch.set_num_threads(1)
-    hierarchy, batch = problem(network, 50, 2000)
-    small = problem(network, 2, 20)
-    calls = {
-        "networks": (networks_alone(*small, False), networks_alone(hierarchy, batch, False)),
-        "step": (step(*small), step(hierarchy, batch)),
-    }
-    warm, measured_call = calls[what]
-    warm()
+    for size in ((2, 20), (50, 2000)):
+        case = problem(network, *size)
+        loss = by_engine(case[0]) if what == "step" else of_networks(case[0])
+        call = step(*case, loss, pieces=what == "step")
+        if size == (2, 20):
+            call()
     Path("/proc/self/clear_refs").write_text("5")  # the highest mark begins anew
-    before = memory("VmRSS")
-    measured_call()
-    return (memory("VmHWM") - before) / 1024
+    before = _status("VmRSS")
+    call()
+    return (_status("VmHWM") - before) / 1024
 
 
-def memory(what: str) -> float:
+def _status(what: str) -> float:
     """A line of this process's status, KiB."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(float(line.split()[1]) for line in lines if line.startswith(f"{what}:"))
 
 
-def peak_in_process(what: str, network: str) -> float:
-    """:func:`peak` in a process of its own."""
-    ended = subprocess.run([sys.executable, __file__, what, network], capture_output=True, text=True, check=True)
-    return float(ended.stdout)
+# --- EM and whole fits ------------------------------------------------------------------------------------------------
+
+
+def em() -> Iterator[Row]:
+    """EM until the training likelihood of Adam's whole training, processor time; and a step of EM beside dynamax's."""
+    with tempfile.TemporaryDirectory() as folder:
+        spec = load_spec(initial_spec(Path(folder)))
+        train, tune = parts(spec, demonstrations(spec))["train"].split(spec.training.tune_fraction, spec.seed)
+        traces = {}
+        for name in ("em", "adam"):
+            trace: list[tuple[float, float]] = []
+            traces[name] = trace
+            budget = {"training.optimizer.name": name, "training.layerwise": False, "training.epochs": 1000}
+            trainer = Trainer(with_overrides(spec, budget), Dimensions.of(train), train, tune)
+            trainer.on_event = partial(_traced, trace)
+            start = time.process_time()
+            trainer.run()
+            traces[name] = [(1e3 * (at - start), value) for at, value in trace]
+        best = max(value for _, value in traces["adam"])
+        reached = next((at for at, value in traces["em"] if value >= best), float("nan"))
+        yield of_pairs(("Adam, until it converges", "EM, until as likely"), [(traces["adam"][-1][0], reached)])
+    for number, steps in SIZES[:2]:
+        ours, theirs = peers.em_steps(*problem("linear", number, steps))
+        yield side_by_side((f"dynamax EM iteration {number} × {steps}", "EM iteration"), theirs, ours, 3)
+
+
+def _traced(trace: list[tuple[float, float]], event: Event) -> None:
+    if isinstance(event, EpochEnded) and event.stage == "joint":
+        trace.append((time.process_time(), event.train))
+
+
+def initial_spec(folder: Path) -> Path:
+    """What ``init`` writes for the demonstrations of ``$DEMONSTRATIONS``, or for made-up ones of their size."""
+    path, spec = Path(os.environ.get("DEMONSTRATIONS", folder / "made.hdf5")).resolve(), folder / "init.yaml"
+    if not path.exists():
+        random = np.random.default_rng(0)
+        with h5py.File(path, "w") as file:
+            for number in range(50):
+                state = random.normal(size=(60, 12)).cumsum(0) / 8
+                kind = np.repeat(np.arange(4), 15)
+                controls = np.einsum("tf,tfa->ta", state, GAINS[kind])
+                group = file.create_group(f"data/demo_{number}")
+                group["obs/state"] = state
+                group["actions"] = (controls + 0.1 * random.normal(size=controls.shape)).clip(-1, 1)
+    subprocess.run([COMMAND, "init", path, "--out", spec], check=True, capture_output=True)
+    return spec
+
+
+GAINS = np.random.default_rng(1).normal(size=(4, 12, 4), scale=0.5)
+"""Of each of four skills in made-up demonstrations."""
+
+
+def fits() -> Iterator[Row]:
+    """Whole fits from the shell with an empty cache of compiled functions, over the same with a full one."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        collected, needle = folder / "needle.hdf5", folder / "needle.yaml"
+        data = yaml.safe_load((ROOT / "specs/needle.yaml").read_text())
+        data["demonstrations"]["path"] = str(collected)
+        data["training"]["epochs"] = 40
+        needle.write_text(yaml.safe_dump(data))
+        subprocess.run([COMMAND, "collect", needle, "--out", collected], check=True, capture_output=True)
+        for what, spec in (("needle 100 × 15, 40 epochs", needle), ("init's spec 50 × 60", initial_spec(folder))):
+            runs = [_fit(spec, folder, cache) for cache in ("cache", "cache")]
+            for clock, unit in enumerate(("wall", "CPU")):
+                names = f"fit {what}, nothing compiled, {unit}", "compiled before"
+                yield of_pairs(names, [(runs[0][clock], runs[1][clock])], "s")
+
+
+def _fit(spec: Path, folder: Path, cache: str) -> tuple[float, float]:
+    """Wall and processor seconds of a fit from the shell."""
+    with tempfile.TemporaryDirectory() as out:
+        before, environment = os.times(), {**os.environ, "NUMBA_CACHE_DIR": str(folder / cache / spec.stem)}
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)
+        wall = seconds(
+            partial(
+                subprocess.run,
+                [COMMAND, "fit", spec, "--out", f"{out}/run"],
+                check=True,
+                capture_output=True,
+                env=environment,
+            )
+        )
+    after = os.times()
+    return wall, sum(after[2:4]) - sum(before[2:4])
+
+
+# --- all parts --------------------------------------------------------------------------------------------------------
+
+PARTS: dict[str, Callable[[], Iterator[Row]]] = {
+    "fits": fits,
+    "em": em,
+    "networks": over_networks,
+    "engines": over_other_engines,
+    "inference": inference,
+    "growth": growth,
+    "threads": threads,
+    "memory": memory,
+    **pictures.PARTS,
+}
+
+
+def measure(part: str, again: bool) -> None:
+    """Measure a part and keep its rows; nothing where this very code has given those that are kept."""
+    path, made_by = RESULTS / f"{part}.json", record(f"python benchmarks/performance.py {part}")
+    if not again and path.exists() and is_kept(json.loads(path.read_text()), {}, made_by):
+        return
+    rows = []
+    for row in PARTS[part]():
+        rows.append(row._asdict())
+        print(
+            f"{part}: {row.first} {row.value:.3g} {row.unit}, {row.second} {row.other:.3g}: {row.ratio:.3g}", flush=True
+        )
+    RESULTS.mkdir(exist_ok=True)
+    path.write_text(text({"rows": rows}, [made_by]))
+
+
+def tables() -> str:
+    """All kept rows in Markdown, a table for each part."""
+    shown = []
+    for part, rows in PARTS.items():
+        path = RESULTS / f"{part}.json"
+        if path.exists():
+            kept: dict[str, Any] = json.loads(path.read_text())
+            made = sentence(f"python benchmarks/performance.py {part}", kept["provenance"])
+            title = " ".join((rows.__doc__ or "").split())
+            shown.append(f"### {part}\n\n{title} {made}\n\n" + table([Row(**r) for r in kept["results"]["rows"]], AIMS))
+    return "\n".join(shown)
 
 
 def main() -> None:
-    """Measure everything, and write it down."""
-    most, made_by = torch.get_num_threads(), record("python benchmarks/performance.py")
-    found: dict[str, dict[str, float]] = {}
-    for threads in sorted({1, most}):
-        torch.set_num_threads(threads)
-        found[f"{threads} thread{'s' if threads > 1 else ''}"] = rows = {}
-        for name, value in measured():
-            rows[name] = value
-            print(f"{threads} thread(s)  {name}: {value:.3g}", flush=True)
-    both = found["1 thread"]
-    both["kernel_one_thread_over_all"] = threads_ratio(most)
-    for network in ("mlp", "linear"):
-        both[f"memory_step_over_networks {network}"] = peak_in_process("step", network) / peak_in_process(
-            "networks", network
-        )
-    (HERE / "latest.json").write_text(text({"threads": most, "ratios": found}, [made_by]))
-    page = HERE.parent / "docs" / "performance.md"
-    above, mark, _ = page.read_text().partition("<!-- written by make bench -->\n")
-    page.write_text(f"{above}{mark}{sentence(made_by['command'], [made_by])}\n\n{table(found)}")
-    print(table(found))
-
-
-def table(found: dict[str, dict[str, float]]) -> str:
-    """The ratios in Markdown."""
-    columns = list(found)
-    lines = ["| ratio | " + " | ".join(columns) + " | aim (one thread) |", "|---" * (len(columns) + 2) + "|"]
-    for name in found["1 thread"]:
-        sign, bound = EXPECTED.get(name, ("", None))
-        value = found["1 thread"][name]
-        reached = "" if bound is None else (" reached" if (value <= bound) == (sign == "≤") else " **not reached**")
-        aim = "" if bound is None else f"{sign} {bound:g}{reached}"
-        values = [f"{rows[name]:.3g}" if name in rows else "" for rows in found.values()]
-        lines.append(f"| `{name}` | " + " | ".join(values) + f" | {aim} |")
-    return "\n".join(lines) + "\n"
+    """Measure the parts that are named, or all that are not known."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(PARTS))
+    parser.add_argument("--peak", nargs=2, help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    torch.set_num_threads(1)
+    if asked.peak:
+        print(peak(*asked.peak))
+        return
+    for part in asked.parts or PARTS:
+        measure(part, again=bool(asked.parts))
+    above, _, rest = PAGE.read_text().partition(BEGIN)
+    PAGE.write_text(f"{above}{BEGIN}{tables()}{END}{rest.partition(END)[2]}")
 
 
 if __name__ == "__main__":
-    if len(sys.argv) == 3:
-        print(peak(sys.argv[1], sys.argv[2]))
-    else:
-        main()
+    main()

@@ -316,9 +316,9 @@ def page(found: Sequence[Row], again: Sequence[Row], missing: Sequence[str], mad
             "",
             "## By expectation-maximisation",
             "",
-            "The same specs with `training.optimizer: {name: em}` instead of Adam, paired by seed with the page's "
-            "options. They differ in two things: the optimiser, which trains until it converges, and its ridges, which "
-            "Adam has not. EM without ridges leaves the one.",
+            "The same specs with the optimiser that `init` writes instead of Adam: expectation-maximisation, with "
+            "ridges of 1. Pairs are by seed with the page's options. They differ in two things: the optimiser, which "
+            "trains until it converges, and its ridges, which Adam has not. EM without ridges leaves the one.",
             "",
             *by_em,
         ]

@@ -1,6 +1,6 @@
 """Which code made a result, and whether that code has changed since.
 
-    python studies/provenance.py          # names the results that are older than their code, as `make lint` does
+    python studies/provenance.py          # names the results that are older than their code
     python studies/provenance.py adopt    # gives results that do not say what made them what git knows of it
 
 A result is a file under ``docs/results``, with the page, table and picture of the same name beside it. Its JSON has
@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ("docs/results", "benchmarks/latest.json", "benchmarks/throughput.json")
+RESULTS = ("docs/results", "benchmarks/results")
 PACKAGES = {"ddco_pyro": "ddco_pyro", "ddco_tasks": "tasks"}
 """Import name to folder."""
 NO_NUMBERS = ("ddco_pyro/report/", "studies/provenance.py")

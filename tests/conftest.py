@@ -5,8 +5,10 @@ No test depends on how busy the machine is, and every run draws the same example
 
 from __future__ import annotations
 
+import io
 import os
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,7 @@ import toy_task
 import yaml
 from dots import followed
 from hypothesis import settings
+from matplotlib.figure import Figure
 
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
@@ -27,6 +30,7 @@ INSTALLED = HERE / "fixtures" / "installed"
 sys.path.append(str(INSTALLED))
 os.environ["PYTHONPATH"] = f"{SUPPORT}:{INSTALLED}"  # of the processes that tests start
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that run episodes
+os.environ["LOKY_MAX_CPU_COUNT"] = "1"  # "all cores" is one: the workers of pytest-xdist have the others
 torch.set_num_threads(1)
 settings.register_profile("deterministic", deadline=None, derandomize=True)
 settings.load_profile("deterministic")
@@ -38,6 +42,44 @@ def cache(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cache")
     os.environ["DDCO_PYRO_CACHE"] = str(folder)
     return folder
+
+
+SAVEFIG = Figure.savefig
+
+
+@pytest.fixture(scope="session", autouse=True)
+def undrawn():
+    """Every figure is saved as the same small picture: rendering takes most of the time of a report."""
+    content = io.BytesIO()
+    SAVEFIG(Figure(figsize=(0.1, 0.1)), content, format="png")
+
+    def savefig(figure, file, **options):
+        file.write(content.getvalue()) if hasattr(file, "write") else Path(file).write_bytes(content.getvalue())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", savefig)
+        yield
+
+
+@contextmanager
+def rendering():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", SAVEFIG)
+        yield
+
+
+@pytest.fixture(scope="module")
+def drawn(undrawn):
+    """Figures are rendered, in the modules that ask for it."""
+    with rendering():
+        yield
+
+
+@pytest.fixture
+def drawn_here(undrawn):
+    """Figures are rendered, in the tests that ask for it."""
+    with rendering():
+        yield
 
 
 class Watched:

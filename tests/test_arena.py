@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import stat
-import sys
-from dataclasses import replace
 
 import apart
-import arena
 import arena_cell
-import arena_decay
-import arena_decay_cell
-import arena_decay_results
-import arena_labels
-import arena_venv
+import arena_playing
+import arena_recording
+import cells
 import h5py
 import numpy as np
 import pytest
@@ -24,7 +18,7 @@ from arena_playing import controls, exported, play
 from arena_results import draw, mean_success, page, summarize
 from arena_segments import MEASURES
 
-from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.errors import BadInput
 from ddco_pyro.exporting import write_numpy
 from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -95,85 +89,93 @@ def test_an_exported_controller_plays_as_its_fit_does(fitted, runner, goal, succ
         np.testing.assert_allclose(controls(runner, observed, 0), apart.acted(fitted, rows), atol=1e-5)
 
 
-def test_where_nothing_was_exported_that_is_said(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no controller was exported there"):
-        exported(tmp_path)
+# --- recording --------------------------------------------------------------------------------------------------------
 
 
-# --- the environment --------------------------------------------------------------------------------------------------
+def episode(seed):
+    """Those of every third seed fail; observations named after what they are."""
+    if seed % 3 == 2:
+        return None
+    steps = 4 + seed
+    return {
+        "actions": np.arange(steps)[:, None] % 6,
+        "obs/body": np.arange(steps, dtype=np.float32)[:, None],
+        "obs/instruction_4": np.zeros((steps, 2), np.float32),
+        "obs/done": (np.arange(steps)[:, None] > 2).astype(np.float32),
+        "labels/subgoal": np.array([-1] + [1] * (steps - 1)),
+        "labels/mission": np.zeros(steps, int),
+    }
 
 
-def python_that(tmp_path, pip):
-    """A stand-in for Python, whose environments have a Python that does this instead of installing."""
-    path = tmp_path / "python"
-    inner = f"#!/bin/sh\\necho installed >> {tmp_path}/log\\n{pip}\\n"
-    path.write_text(f"#!/bin/sh\nmkdir -p $4/bin\nprintf '{inner}' > $4/bin/python\nchmod +x $4/bin/python\n")
-    path.chmod(path.stat().st_mode | stat.S_IXUSR)
-    return str(path)
+def test_the_first_successes_are_recorded(tmp_path):
+    path = tmp_path / "demos.hdf5"
+    arena_recording.collect(path, "toy", episode, 4, 1, {"subgoal": 3, "mission": 1}, noise=0)
+    with h5py.File(path) as file:
+        assert [group.attrs["seed"] for group in file["data"].values()] == [0, 1, 3, 4]
+        assert (list(file["mask/valid"]), list(file["mask/train"])) == ([b"demo_0"], [b"demo_1", b"demo_2", b"demo_3"])
+        assert file["data/demo_2/dones"][()].tolist() == [False] * 6 + [True]
+        said = json.loads(file.attrs["expert"])
+    steps = 4 + 5 + 7 + 8
+    shares = {"subgoal": [0, pytest.approx((steps - 4) / steps), 0], "mission": [1]}
+    assert said == {"successes": 4, "attempts": 5, "shares": shares, "noise": 0}
 
 
-def test_an_environment_is_made_once_and_again_for_other_pins(tmp_path):
-    pins, folder, python = tmp_path / "pins.txt", tmp_path / "venv", python_that(tmp_path, "exit 0")
-    for content, times in (("a==1\n", 1), ("a==1\n", 1), ("a==2\n", 2)):
-        pins.write_text(content)
-        assert arena_venv.made(folder, pins, python) == folder / "bin" / "python"
-        assert (tmp_path / "log").read_text().count("installed") == times
+def test_an_expert_that_fails_is_one_line_and_no_file(tmp_path):
+    with pytest.raises(SystemExit, match="toy: the expert succeeded in 0 of 20 episodes; 2 are needed"):
+        arena_recording.collect(tmp_path / "demos.hdf5", "toy", lambda _: None, 2, 1, {})
+    assert not list(tmp_path.iterdir())
 
 
-def test_an_environment_that_cannot_be_made_is_one_line(tmp_path):
-    pins, folder = tmp_path / "pins.txt", tmp_path / "venv"
-    pins.write_text("a==1\n")
-    failing = python_that(tmp_path, "echo looking >&2; echo ERROR: no a==1 >&2; exit 1")
-    for python, why in ((failing, "ERROR: no a==1"), ("/no/such/python", "No such file or directory")):
-        with pytest.raises(Failed, match=why) as refused:
-            arena_venv.made(folder, pins, python)
-        assert "\n" not in str(refused.value)
-        assert f"{folder}: an environment with pins.txt cannot be made" in str(refused.value)
-        assert not (folder / arena_venv.MADE).exists()
+class Line:
+    """An agent at 0 that has to get to 3 within five steps."""
+
+    def reset(self, seed):
+        self.place, self.time = 0, 0
+        return {"body": np.array([0.0])}
+
+    def step(self, control):
+        self.place, self.time = self.place + int(control[0]), self.time + 1
+        return {"body": np.array([float(self.place)])}, self.place == 3, self.time == 5
 
 
-def test_a_study_without_its_environment_ends_with_that_line(tmp_path, monkeypatch, capsys):
-    (tmp_path / "venv").write_text("")  # a file is in its place
-    words = ["arena.py", "--runs", str(tmp_path), "--tasks", "pick-place-v3", "--out", str(tmp_path / "out")]
-    monkeypatch.setattr(sys, "argv", words)
-    with pytest.raises(SystemExit) as ended:
-        arena.main()
-    told = capsys.readouterr().err
-    assert (ended.value.code, told.count("\n"), "venv" in told) == (2, 1, True)
-    assert not (tmp_path / "out").exists()
+class Walker:
+    """Takes a step while it sees less than this."""
+
+    def __init__(self, until):
+        self.until = until
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        return np.array([int(observation["body"][0] < self.until)])
 
 
-def test_an_error_in_the_environment_is_its_last_line():
-    with pytest.raises(Failed) as refused:
-        arena_venv.run(sys.executable, apart.HERE / "arena_metaworld.py", "collect", "pick-place-v3", "out.hdf5")
-    assert str(refused.value).startswith("arena_metaworld.py collect pick-place-v3: ModuleNotFoundError")
+def test_controllers_are_played_and_shown_a_demonstration_scripted_ones_played_alone(tmp_path):
+    arena_recording.collect(tmp_path / "demos.hdf5", "toy", episode, 2, 1, {})
+    players, out = {"good": Walker(3), "short": Walker(2)}, tmp_path / "played.json"
+    arena_playing.play_all(Line(), out, players, range(2), tmp_path / "demos.hdf5", {"late": Walker(9)})
+    done, failed = {"success": True, "steps": 3}, {"success": False, "steps": 5}
+    assert json.loads(out.read_text()) == {
+        "episodes": {"good": [done, done], "short": [failed, failed], "late": [done, done]},
+        "demonstration": "demo_0",
+        "controls": {"good": [[1], [1], [1], [0]], "short": [[1], [1], [0], [0]]},
+    }
 
 
-def test_what_the_environments_script_cannot_use_is_bad_input(tmp_path):
-    script = tmp_path / "world.py"
-    script.write_text("import sys\nprint('there is no task x', file=sys.stderr)\nraise SystemExit(2)\n")
-    with pytest.raises(BadInput, match=r"^world.py collect x: there is no task x$"):
-        arena_venv.run(sys.executable, script, "collect", "x")
+def test_a_cell_is_done_once_for_each_code_and_settings(tmp_path):
+    done = []
 
+    def work():
+        done.append(len(done))
+        return {"value": done[-1]}
 
-@pytest.mark.parametrize(
-    ("study", "words", "why"),
-    [
-        (arena, ["--counts", "5", "0"], "0 demonstrations to train on: it has to be 1 or more"),
-        (arena, ["--seeds", "0"], "arena.py: there is nothing to do: a list or a number is empty or 0"),
-        (arena_labels, ["--labelled", "60"], "60 labelled demonstrations: it has to be 0 to 50, which are trained on"),
-        (arena_decay, ["--steps", "-80"], "a decay that is 1 with -80 steps: it has to be 0 or more"),
-    ],
-)
-def test_cells_that_there_cannot_be_are_refused_before_an_environment_is_made(
-    tmp_path, monkeypatch, capsys, study, words, why
-):
-    where = ["--runs", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
-    monkeypatch.setattr(sys, "argv", [f"{study.__name__}.py", *words, *where])
-    with pytest.raises(SystemExit) as ended:
-        study.main()
-    assert (ended.value.code, capsys.readouterr().err) == (2, f"{why}\n")
-    assert list(tmp_path.iterdir()) == []
+    for code, settings, value in (("a", {"seed": 1}, 0), ("a", {"seed": 1}, 0), ("b", {"seed": 1}, 1)):
+        content = cells.kept(tmp_path / "cell.json", settings, {"code": code}, work)
+        assert content == {"provenance": [{"code": code}], "results": settings | {"value": value}}
+    assert cells.kept(tmp_path / "cell.json", {"seed": 2}, {"code": "b"}, work)["results"] == {"seed": 2, "value": 2}
+    with pytest.raises(ValueError, match="results are named like settings: seed"):  # it would be done each time
+        cells.kept(tmp_path / "cell.json", {"seed": 3}, {"code": "b"}, lambda: {"seed": [1.0]})
 
 
 # --- cells ------------------------------------------------------------------------------------------------------------
@@ -196,48 +198,6 @@ def test_the_same_demonstrations_are_held_out_from_all_cells(tmp_path):
     assert used[5, 0] != used[5, 1]
     with pytest.raises(BadInput, match="has 8 demonstrations to train on, 9 are asked for"):
         arena_cell.chosen(tmp_path / "demos.hdf5", arena_cell.ArenaCell("task", 9, 0))
-
-
-def decay_cell(steps, ours, flat, nmi):
-    return {
-        "count": 5,
-        "steps": steps,
-        "weight_decay": 0.5,
-        "held_out": {"ddco": ours, "flat": flat},
-        "success": {"ddco": [True, False], "flat": [False, False]},
-        "agreement": {"nmi": nmi, "matched_globally": {"f1_50": 0.5}},
-    }
-
-
-def test_the_decay_page_of_two_fits_worked_by_hand():
-    """An odd demonstration is in the means, of -18 and 0, and not in the medians, 1 and 0."""
-    fits = [decay_cell(250.0, [1.0, 1.0, -56.0], [0.0, 2.0, 4.0], 0.6), decay_cell(250.0, [0.0] * 3, [-1.0] * 3, 0.8)]
-    found = arena_decay_results.summarize([*fits, decay_cell(0.0, [-1.0], [-2.0], 0.5)])
-    assert list(found["5"]) == ["0", "250"]
-    lines = arena_decay_results.page(found, "").splitlines()
-    assert "| 5 | 250 | 0.5 | -9.00; 0.50 | 0.50; 0.50 | 0.70 | 0.50 | 2 of 4 | 0 of 4 |" in lines
-
-
-def test_a_decays_steps_are_those_of_the_demonstrations_trained_on(tmp_path):
-    with h5py.File(tmp_path / "demos.hdf5", "w") as file:
-        for number, steps in enumerate([3, 5, 7, 11]):
-            file[f"data/demo_{number}/actions"] = np.zeros((steps, 2))
-        file["mask/train"], file["mask/valid"] = [b"demo_0", b"demo_1", b"demo_3"], [b"demo_2"]
-    cell = arena_cell.ArenaCell("hammer-v3", 2, 0)
-    used = arena_cell.chosen(tmp_path / "demos.hdf5", cell)[0]
-    steps = {"demo_0": 3, "demo_1": 5, "demo_3": 11}
-    assert arena_decay_cell.trained_steps(tmp_path / "demos.hdf5", cell) == sum(steps[name] for name in used)
-
-
-def test_other_settings_are_other_cells():
-    cell = arena_cell.ArenaCell("pick-place-v3", 5, 0)
-    settings = [
-        replace(arena_cell.DEFAULTS, values=arena_cell.DEFAULTS.values | {"episodes": episodes}, overrides=overrides)
-        for episodes, overrides in ((50, ()), (20, ()), (50, ("training.epochs=3",)))
-    ]
-    assert len({cell.path(one) for one in settings}) == 3
-    assert cell.command(settings[2]).endswith("pick-place-v3 5 0 --demonstrations 70 --noise 0.1 --episodes 50 "
-                                              "--set 'training.epochs=3'")  # fmt: skip
 
 
 def cell(seed, nmi, ours, flat, success, task="hammer-v3"):

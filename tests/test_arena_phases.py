@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import sys
 
 import pytest
 from arena_phases import Phases
@@ -55,13 +54,6 @@ def test_a_phase_is_the_return_statement_that_was_reached(x, phase):
     assert (value, reached) == (expert.get_action(x), phase)
 
 
-def test_lines_are_those_of_the_file():
-    with open(__file__) as file:
-        text = file.read().splitlines()
-    first, second, third, fourth = (text[line - 1].strip() for line in Phases(Expert._desired_pos).lines)
-    assert (first, second, third, fourth) == ("return place", "return [", "return [number, x]", "return [4, x]")
-
-
 def test_a_decorated_function_is_seen_through():
     @twice
     def desired(x):
@@ -71,25 +63,6 @@ def test_a_decorated_function_is_seen_through():
 
     phases = Phases(desired)
     assert [phases.of(desired, x) for x in (True, False)] == [([1], 0), ([0], 1)]
-
-
-def test_tracing_is_left_as_it_was():
-    def fails():
-        raise KeyError
-
-    def mine(*_):
-        return None
-
-    phases, before = Phases(Expert._desired_pos), sys.gettrace()
-    try:
-        sys.settrace(mine)
-        phases.of(Expert._desired_pos, 0)
-        assert sys.gettrace() is mine
-        with pytest.raises(KeyError):
-            phases.of(fails)
-        assert sys.gettrace() is mine
-    finally:
-        sys.settrace(before)
 
 
 def test_what_has_no_phase_is_refused():

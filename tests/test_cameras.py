@@ -135,7 +135,7 @@ def test_a_spec_with_a_camera_is_checked_fitted_and_rolled_out(tmp_path):
     assert dimensions(spec).shapes["camera"] == (48, 65, 3)
     fit = ddco_pyro.fit(spec, out=tmp_path / "run")
     DRAWN.clear()
-    measured = roll_out(fit, 2, film=1, jobs=1)["methods"]["flat"]["measures"]["success"]
+    measured = roll_out(fit, 2, film=1, jobs=1).methods["flat"].measures["success"]
     assert DRAWN
     film, looks = (list(frames(fit.folder / "videos" / place / "flat-1000.mp4")) for place in ("", "saliency"))
     assert len(film) == len(looks) + 1  # the end is seen by nobody
@@ -143,7 +143,7 @@ def test_a_spec_with_a_camera_is_checked_fitted_and_rolled_out(tmp_path):
     alone = play(
         watched, Controller.from_spec(fit.hierarchy, RolloutSpec()), range(1000, 1002), fit.hierarchy.encoder.shapes
     )
-    assert [one.outcome["success"] for one in alone].count(1.0) == measured["successes"]
+    assert [one.outcome["success"] for one in alone].count(1.0) == measured.successes
 
 
 def test_without_the_camera_nothing_is_drawn(tmp_path):

@@ -146,11 +146,11 @@ def test_a_gradient_takes_the_memory_of_a_chunk() -> None:
     alone = subprocess.run([sys.executable, __file__], env=giving, check=True, capture_output=True, text=True)
     chunked, whole = map(float, alone.stdout.split())
     print(f"in chunks {chunked / 1e6:.0f} MB, at once {whole / 1e6:.0f} MB")
-    assert chunked < 2e7 < 1e8 < whole
+    assert chunked < 2e7 < 5e7 < whole
 
 
 def peaks() -> tuple[float, float]:
-    """What a gradient takes in chunks and at once: 900 pictures of 64 × 64, of which convolutions keep over 100 MB."""
+    """What a gradient takes in chunks and at once: 450 pictures of 64 × 64, of which convolutions keep over 50 MB."""
     torch.set_num_threads(1)
     conv = {"network": "conv", "filters": 8, "hidden": []}
     spec = {
@@ -158,9 +158,9 @@ def peaks() -> tuple[float, float]:
         "observations": ["camera"],
         "baseline": {"kind": "flat", "policy": conv},
     }
-    model = Hierarchy(parse_spec(spec), {"camera": (64, 64, 3)}, 2, 900)
-    pictures = torch.randint(256, (1, 900, 64, 64, 3), dtype=torch.uint8)
-    seen = Batch(Inputs({}, {"camera": pictures}, torch.arange(900)), torch.randn(1, 900, 2), torch.tensor([900]))
+    model = Hierarchy(parse_spec(spec), {"camera": (64, 64, 3)}, 2, 450)
+    pictures = torch.randint(256, (1, 450, 64, 64, 3), dtype=torch.uint8)
+    seen = Batch(Inputs({}, {"camera": pictures}, torch.arange(450)), torch.randn(1, 450, 2), torch.tensor([450]))
 
     def peak(at_once: int) -> float:
         chunking.BYTES_AT_ONCE = at_once

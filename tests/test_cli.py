@@ -174,9 +174,6 @@ def test_nothing_at_all_is_help():
 
 # --- what does not ----------------------------------------------------------------------------------------------------
 
-OWN = "hierarchy.levels.0.policy.network=user_networks:Own"
-WITH_MEMORY = "{network: 'user_networks:WithMemory', options: {how: over time}}"
-
 
 GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
 
@@ -187,38 +184,12 @@ GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
         (["check", "nowhere.yaml"], "nowhere.yaml: cannot be read: No such file or directory; check the path"),
         (["check"], "name a spec, such as: ddco-pyro check specs/needle.yaml"),
         (["check", "SPEC", *with_set("training.epochs=many")], "training.epochs: must be a whole number"),
-        (["check", "SPEC", *with_set("training.epoch=3")], "training.epoch: .*did you mean training.epochs"),
-        (["check", "SPEC", *with_set("seed")], "override 'seed': write it as key.path=value"),
-        (["check", "SPEC", *with_set("observations=[pose]")], r"observations: there is no pose \(there are: offsets, "),
         (["check", "SPEC", *with_set("task=toi")], "no task is registered as 'toi'"),
-        (
-            ["check", "SPEC", "--allow-code", *with_set(OWN, "hierarchy.levels.0.policy.options={gian: 1}")],
-            r"hierarchy\.levels\.0\.policy\.options\.gian: unknown option \(did you mean 'gain'\?\); .*: gain",
-        ),
-        (
-            ["check", "SPEC", "--allow-code", *with_set(f"hierarchy.levels.0.policy={WITH_MEMORY}")],
-            r"hierarchy\.levels\.0\.policy: network .*; one that remembers has to have initial_state",
-        ),
-        (
-            ["check", "SPEC", *with_set("control.scale=[1, 2, 3]")],
-            "control.scale: has 3 numbers, but the control has 2",
-        ),
-        (
-            ["check", "SPEC", *with_set("control.parts=[{name: hand, dims: [2]}]")],
-            r"control\.parts\.0\.dims: there is no control dimension 2; the control has 2, counted from 0",
-        ),
-        (
-            ["check", "SPEC", *with_set(OWN)],
-            r"hierarchy\.levels\.0\.policy\.network: would import user code \(user_networks:Own\); pass --allow-code",
-        ),
+        (["check", "SPEC", *with_set("observations=[pose]")], r"observations: there is no pose \(there are: offsets, "),
         (["check", "--foo"], "No such option: --foo; see ddco-pyro check --help"),
         (["fit"], "Missing argument 'SPEC'; see ddco-pyro fit --help"),
         (["chekc"], "No such command 'chekc'.*; see ddco-pyro --help"),
         (["rollout", "RUN", "--episodes", "0"], "Invalid value for '--episodes': .*; see ddco-pyro rollout --help"),
-        (
-            ["collect", "SPEC", *with_set("demonstrations.supervisor=expert")],
-            "task 'toy' has no policy 'expert' to rec",
-        ),
         (
             ["collect", "SPEC", *with_set("task=null", "demonstrations.path=x")],
             r"toy\.yaml: names no task, so there is no supervisor to record",
@@ -227,18 +198,8 @@ GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
         (["fit", "RUN/spec.yaml", "--out", "RUN"], "holds a run of this spec already; show it with --resume, or"),
         (["fit", "SPEC", "--out", "SPEC"], r"toy\.yaml: is a file; name a folder"),
         (["select", "SPEC"], "selection.grid: is empty; name what to try, such as selection.grid: {.*}"),
-        (["select", "SPEC", "--folds", "1"], "selection.folds: must be at least 2, got 1"),
-        (["select", "SPEC", *GRID, "--folds", "13"], "selection.folds: 13 folds of 12 demonstrations; use at most 12"),
         (["select", "SPEC", *GRID, "--jobs", "0"], "--jobs 0: give a number of processes, or -1 for one on each core"),
         (["select", "SPEC", *GRID, "--out", "RUN"], "holds a run of another spec; choose another --out or remove it"),
-        (
-            ["select", "SPEC", *with_set("selection.grid.hierarchy.levels.0.cuont=[1]")],
-            "selection.grid.hierarchy.levels.0.cuont: .*did you mean hierarchy.levels.0.count.*",
-        ),
-        (
-            ["select", "SPEC", *GRID, *with_set("selection.grid.demonstrations.count=[3]")],
-            "selection.grid.demonstrations.count: candidates are compared on the same data; remove it",
-        ),
         (
             ["select", "SPEC", *GRID, "--backend", "dask"],
             "--backend dask and --scheduler tcp://HOST:PORT go together.*",
@@ -246,9 +207,6 @@ GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
         (["select", "SPEC", *GRID, "--backend", "spark"], "Invalid value for '--backend': .*'spark' is not one of .*"),
         (["compare"], r"Missing argument 'RUN RUN...'; see ddco-pyro compare --help"),
         (["compare", "RUN"], "one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat"),
-        (["compare", "RUN", "RUN"], "the same run is given twice; name each once"),
-        (["compare", "RUN", "nowhere"], r"nowhere: not a run folder \(it has no spec\.yaml\)"),
-        (["rollout", "nowhere"], r"nowhere: not a run folder \(it has no spec\.yaml\)"),
         (["report", "nowhere"], r"nowhere: not a run folder \(it has no spec\.yaml\)"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -420,8 +378,15 @@ finally:
 HEAVY = ("h5py", "matplotlib", "pandas", "pyro", "scipy.stats", "sklearn", "sympy", "torch", "torch._dynamo")
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["fit", "--help"], ["check", "--schema"], ["check", "nowhere.yaml"]])
-@pytest.mark.parametrize("module", ["ddco_pyro.cli", "ddco_pyro.cli.app"])
+@pytest.mark.parametrize(
+    ("module", "arguments"),
+    [
+        ("ddco_pyro.cli.app", ["--help"]),
+        ("ddco_pyro.cli", ["fit", "--help"]),
+        ("ddco_pyro.cli", ["check", "--schema"]),
+        ("ddco_pyro.cli", ["check", "nowhere.yaml"]),
+    ],
+)
 def test_help_and_refusals_load_nothing_heavy(module, arguments):
     """Loading torch, pyro and scikit-learn takes seconds."""
     program = LIGHT.format(module=module, arguments=["ddco-pyro", *arguments], heavy=HEAVY)

@@ -347,6 +347,7 @@ class Cells(HTMLParser):
         self.inside = False
 
 
+@pytest.mark.usefixtures("drawn_here")
 def test_the_files_say_the_same(found, tmp_path):
     path = write(found, tmp_path / "comparison")
     folder = path.parent

@@ -21,7 +21,6 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.events import EpochEnded
 from ddco_pyro.fitting import digest as fitted_to
 from ddco_pyro.fitting.digest import difference, digest
-from ddco_pyro.fitting.merging import Pair, merge
 from ddco_pyro.spec import Spec, parse_spec, with_overrides
 
 FLAT = {"kind": "flat", "policy": {"network": "linear"}}
@@ -185,15 +184,6 @@ def test_a_baseline_of_other_demonstrations_is_not_taken_over(finished: Path, tm
     here.write_text(here.read_text().replace(str(tmp_path / "demos.hdf5"), str(path)))
     with pytest.raises(BadInput, match=rf"^{flat}: is a run of other demonstrations \(actions changed\)"):
         ddco_pyro.fit(spec, out=tmp_path / "here")
-
-
-def test_the_merger_of_another_pair_is_another_run(finished: Path, tmp_path: Path) -> None:
-    spec = with_overrides(spec_of(finished / "demos.hdf5"), {"hierarchy.levels.0.count": 3, "compare_with": []})
-    run = ddco_pyro.fit(with_overrides(spec, {"training.epochs": 1}))
-    merged = merge(run, Pair(0, (1, 2), None), out=tmp_path / "merged")
-    assert merge(run, Pair(0, (1, 2), None), out=tmp_path / "merged").metrics == merged.metrics
-    with pytest.raises(BadInput, match=r"holds options 1 and 2 of level 'option', merged"):
-        merge(run, Pair(0, (2, 3), None), out=tmp_path / "merged")
 
 
 def test_a_selection_of_a_file_that_has_changed_is_not_continued(tmp_path: Path) -> None:

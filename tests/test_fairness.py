@@ -18,7 +18,6 @@ from ddco_pyro.comparison import compare
 from ddco_pyro.comparison.page import write
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import write_report
 from ddco_pyro.selection import Workers, select
@@ -122,19 +121,6 @@ def test_flat_equal_has_as_many_parameters_as_the_hierarchy(fitted):
     assert equal.spec.baseline.kind == equal.name == "flat_equal"
 
 
-def test_check_shows_the_width_and_the_sizes(spec, fitted):
-    run, _ = fitted
-    printed = call("check", spec, "--set", "compare_with=[flat, flat_equal]").out  # the toy task does not say its steps
-    shown = [[cell.strip() for cell in line.split("│")] for line in printed.splitlines() if "│" in line]
-    sizes = {name: str(one.metrics.parameters) for name, one in run.baselines.items()}
-    width = run.baselines["flat_equal"].spec.baseline.policy.hidden[0]
-    assert shown[-3:] == [
-        ["all networks", str(run.metrics.parameters)],
-        ["compare_with.0: flat, hidden: [64]", sizes["flat"]],
-        [f"compare_with.1: flat_equal, hidden: [{width}]", sizes["flat_equal"]],
-    ]
-
-
 def test_flat_equal_is_a_run_of_its_own(fitted, tmp_path):
     run, _ = fitted
     alone = ddco_pyro.load(shutil.copytree(run.folder / "baselines" / "flat_equal", tmp_path / "alone"))
@@ -145,14 +131,6 @@ def test_flat_equal_is_a_run_of_its_own(fitted, tmp_path):
     assert again.status == 0, again.err
     assert ddco_pyro.load(tmp_path / "again").metrics.parameters == alone.metrics.parameters
     assert (tmp_path / "again" / "spec.yaml").read_text() == dump_spec(alone.spec)
-
-
-def test_flat_equal_is_rolled_out_and_compared(fitted, tmp_path):
-    copied = ddco_pyro.load(shutil.copytree(fitted[0].folder, tmp_path / "run"))
-    assert set(roll_out(copied, 2, jobs=1).methods) >= {"ddco", *BASELINES}
-    found = compare([copied.folder, *(copied.folder / "baselines" / name for name in BASELINES)])
-    assert {row.model for row in found.rows} == {"ddco", *BASELINES}
-    assert len(found.rollouts) == 3
 
 
 # --- equal budgets ----------------------------------------------------------------------------------------------------
@@ -205,16 +183,6 @@ def test_earlier_stages_are_named_where_the_last_one_has_converged(fitted):
     assert text.endswith(") and stage meta-policy after 0 epochs.")
     assert "level-1" not in text
     assert "joint" not in text
-
-
-def test_the_report_says_so_too(fitted):
-    run, _ = fitted
-    shown = (run.folder / "report.html").read_text()
-    for text, advice in words.unconverged(run.metrics):
-        assert text in shown
-        assert advice in shown
-    assert shown.count("<td>27, not converged</td>") == 4
-    assert "Not converged: DDCO, flat, flat of equal size and per-timestep; more epochs may change this" in shown
 
 
 def test_where_nothing_rises_nothing_is_said(still, tmp_path):

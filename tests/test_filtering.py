@@ -37,14 +37,14 @@ def test_the_belief_is_what_the_past_says(counts, hybrid, steps):
     torch.testing.assert_close(filtering.log_likelihood, log_likelihood(tables, torch.tensor([steps, steps])))
 
 
-def test_ten_thousand_steps_do_not_drift():
-    tables = random_tables((4,), (True,), steps=10_000, seed=22)
+def test_thousands_of_steps_do_not_drift():
+    tables = random_tables((4,), (True,), steps=3000, seed=22)
     filtering = Filter()
-    for now in complete(tables, torch.tensor([10_000])).steps():
+    for now in complete(tables, torch.tensor([3000])).steps():
         belief = filtering.predict(now)
         filtering.update(now.emission)
     assert float(belief.choices[0].sum()) == pytest.approx(1.0, abs=1e-12)
-    torch.testing.assert_close(filtering.log_likelihood, log_likelihood(tables, torch.tensor([10_000])))
+    torch.testing.assert_close(filtering.log_likelihood, log_likelihood(tables, torch.tensor([3000])))
 
 
 def test_updates_without_a_step_or_a_possible_control_are_refused():

@@ -127,5 +127,5 @@ def test_the_example_collects_fits_and_rolls_out(tmp_path, monkeypatch):
     )
     fitted = fit(spec, out=tmp_path / "run")
     found = roll_out(fitted, 2, film=1, jobs=1)
-    assert found["methods"]["supervisor"]["measures"]["success"]["successes"] == 2
+    assert found.methods["supervisor"].measures["success"].successes == 2
     assert list((tmp_path / "run" / "videos").rglob("*.mp4"))

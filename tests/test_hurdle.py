@@ -35,7 +35,7 @@ def spec_of(options=3, epochs=6, path="unused.hdf5", **control):
 # --- without skill ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("at_once", [True, False])
+@pytest.mark.parametrize("at_once", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_without_skill_options_gain_nothing(at_once):
     """Half of the steps are exactly 0 at random: three options and a flat policy, held out, nats per step.
 
@@ -176,14 +176,16 @@ def test_scaling_keeps_exactly_the_value_apart(fitted):
     np.testing.assert_array_equal(scaling.unscaled(torch.from_numpy(scaled))[0], rows[0])
 
 
-@pytest.mark.parametrize("control", ["mean", "sample"])
-def test_values_are_emitted_exactly_and_exports_act_alike(fitted, control, tmp_path):
+@pytest.mark.parametrize(
+    ("control", "onnx"), [("mean", False), ("sample", False), pytest.param("sample", True, marks=pytest.mark.slow)]
+)
+def test_values_are_emitted_exactly_and_exports_act_alike(fitted, control, onnx, tmp_path):
     rollout = fitted.spec.rollout.model_copy(update={"control": control})
     acting = ddco_pyro.load(fitted.folder)
     changed = acting.__class__(
         acting.spec.model_copy(update={"rollout": rollout}), acting.hierarchy, acting.metrics, acting.folder
     )
-    differences = export(changed, tmp_path / "out", onnx=control == "sample")
+    differences = export(changed, tmp_path / "out", onnx=onnx)
     assert all(difference < TOLERANCE for difference, _ in differences.values())
     exported, original = runner.Runner(tmp_path / "out"), changed.controller()
     ours, theirs = [], []

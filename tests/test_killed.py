@@ -246,11 +246,6 @@ def check(case: Case, tmp_path: Path, kills: int, seed: int, by: signal.Signals 
     return killed
 
 
-@pytest.mark.slow
-def test_killed_and_called_again(cases: dict[str, Case], tmp_path: Path) -> None:
-    check(cases["import"], tmp_path, kills=2, seed=7)
-
-
 ALL = ["collect", "import", "fit", "fit to pictures", "select", "segment", "segment in place", "merge", "rollout"]
 
 

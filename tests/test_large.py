@@ -154,16 +154,6 @@ def test_a_fit_to_pictures_stays_within_what_is_allowed(tmp_path: Path) -> None:
     assert ended.peak < 850e6
 
 
-@pytest.mark.slow
-def test_eight_gigabytes_of_pictures_are_fitted(tmp_path: Path) -> None:
-    path = camera(tmp_path / "demos.hdf5", 9, 970, 480, 640)
-    assert path.stat().st_size > 8 * GIGABYTE
-    ended = measured("fit", flat_fit(path, resize=[24, 32]), "--out", tmp_path / "run")
-    print(f"{path.stat().st_size / 1e9:.1f} GB of pictures: {ended.peak / 1e6:.0f} MB at most")
-    assert ended.status == 0, ended.err
-    assert ended.peak < LIMIT
-
-
 def test_a_demonstration_that_cannot_be_segmented_is_refused(toy_run, tmp_path: Path) -> None:
     path = toy_like(tmp_path / "long.hdf5", 2, 1_000_000)
     ended = call("segment", toy_run.folder, path, "--in-place")
@@ -228,18 +218,6 @@ def test_looking_does_not_take_more_than_a_block(tmp_path: Path) -> None:
     assert (base.status, found.status) == (0, 0)
     assert "3 demonstrations of 20000 to 20000 steps" in found.out
     assert found.peak - base.peak < 150e6  # of 480 MB
-
-
-@pytest.mark.slow
-def test_eight_gigabytes_are_looked_at(eight: Path, tmp_path: Path) -> None:
-    ended = measured("inspect", eight)
-    print(f"inspect of 8 GB: {ended.peak / 1e6:.0f} MB at most")
-    assert ended.status == 0
-    assert "10 demonstrations of 100000 to 100000 steps" in ended.out
-    assert ended.peak < LIMIT
-    ended = measured("init", eight, "--out", tmp_path / "spec.yaml")
-    assert (ended.status, ended.peak < LIMIT) == (0, True)
-    assert "# - state   # is constant" in (tmp_path / "spec.yaml").read_text()
 
 
 @pytest.mark.slow

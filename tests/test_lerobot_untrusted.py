@@ -120,21 +120,6 @@ def test_missing_files_and_episodes_are_skipped_by_name(tmp_path: Path) -> None:
         assert import_demonstrations(dataset, out, choice=Choice(skip_broken=True)).names == left
 
 
-@pytest.mark.parametrize(
-    "name",
-    [name for name in odd.ROWS if name not in {*odd.PATHS, *odd.EPISODES_NOT_WHOLE} and "key" in name]
-    + [
-        "lerobot uncounted episode",
-        "lerobot many episodes counted",
-        "lerobot uncounted frames",
-        "lerobot without episodes",
-    ],
-)
-def test_a_dataset_that_contradicts_itself_is_refused(name: str, tmp_path: Path) -> None:
-    dataset = odd.ROWS[name].make(tmp_path)
-    refused(call("import", dataset, "--out", tmp_path / "demos.hdf5"), odd.ROWS[name].says)
-
-
 def test_odd_but_harmless_metadata(tmp_path: Path) -> None:
     dataset = odd.changed(odd.info(splits=[1], fps=float("inf")))(tmp_path)
     assert inspect(dataset).frequency is None

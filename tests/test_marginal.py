@@ -72,8 +72,8 @@ def test_svi_reaches_the_posterior_mode():
     hierarchy, batch = make_hierarchy((2,), network="linear"), make_batch(trajectories=6, steps=8)
     model = bayesian(hierarchy, batch, True)
     guide = AutoDelta(model)
-    svi = SVI(model, guide, pyro.optim.Adam({"lr": 0.02}), Trace_ELBO())
-    for _ in range(1500):
+    svi = SVI(model, guide, pyro.optim.Adam({"lr": 0.03}), Trace_ELBO())
+    for _ in range(800):
         svi.step()
     found = {
         name: guide()[name.replace(".", "_")].detach().requires_grad_() for name, _ in hierarchy.named_parameters()
@@ -92,7 +92,7 @@ def test_draws_follow_the_model():
     with torch.no_grad():
         outputs = hierarchy(batch.inputs)
         distribution = EliminatedAHMM(outputs, batch.lengths)
-        drawn = torch.stack([distribution.sample() for _ in range(1000)])
+        drawn = torch.stack([distribution.sample() for _ in range(400)])
         tables = outputs.tables(batch.actions)
         uninformed = tables.__class__(
             tables.selection, tables.termination, tuple(torch.zeros_like(c) for c in tables.control)
@@ -101,7 +101,7 @@ def test_draws_follow_the_model():
         means = torch.cat([outputs.emissions[1].mean, outputs.emissions[0].mean], dim=2).double()
         expected = (weights.unsqueeze(-1) * means).sum(2)
     for n, length in enumerate(batch.lengths.tolist()):
-        np.testing.assert_allclose(drawn[:, n, :length].mean(0), expected[n, :length], atol=5 * 1.0 / 1000**0.5)
+        np.testing.assert_allclose(drawn[:, n, :length].mean(0), expected[n, :length], atol=5 * 1.0 / 400**0.5)
         assert not drawn[:, n, length:].any()
     assert drawn[0].shape == (*distribution.batch_shape, *distribution.event_shape)
 

@@ -113,7 +113,7 @@ def test_options_remember_what_a_mixture_cannot(name):
         assert {outcome["side"] for outcome in options} == {-1.0, 1.0}
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", [TASKS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in TASKS[1:])])
 def test_where_the_intention_is_seen_there_is_nothing_to_remember(name):
     fit, options, mixture = fitted(name, ["seen", "intention"])
     mean, low, high = worth(fit)

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import json
-
-import needle_success
 import numpy as np
 import pytest
-from needle_curve import joined
 from needle_success import POOLED, differences, over_seeds, page, summarize
-from provenance import ROOT, is_kept
 
 SEEDS, DRAWS = 5, 4000
 
@@ -93,71 +88,3 @@ def test_the_two_fits_of_one_flat_network_are_pooled_by_seed(seeds):
     assert found["success"]["by_seed"] == pytest.approx([0.3 - 0.15, 0.8 - 0.25])
     assert found["log_likelihood_valid"]["by_seed"] == pytest.approx([21.0 - 19.0, 25.0 - 20.0])
     assert "one network" in page({"methods": summarize(seeds), "differences": differences(seeds)}, 2, "Made.")
-
-
-def test_a_seed_that_lacks_a_method_has_no_part_in_its_pairs(seeds):
-    more = {part: {"ddco": each["ddco"]} for part, each in seeds[1].items()}
-    assert differences([*seeds, more]) == differences(seeds)
-
-
-def test_the_page_gives_the_spread_between_seeds(seeds):
-    text = page({"methods": summarize(seeds), "differences": differences(seeds)}, 2, "Made.")
-    assert text.startswith("Made.\n")
-    assert "| ddco | 55% [0%, 100%] | 30% to 80% | 0% to 100% | 70% [0%, 100%] |" in text
-    assert "| open_loop | 10% [2%, 40%] | - | - |" in text
-    assert "Wilson intervals over episodes" in text
-
-
-def test_a_seed_is_kept_where_code_and_settings_are_the_same():
-    made_by = {"command": "a", "commit": "1", "code": "x"}
-    settings = {"seed": 1, "episodes": 200, "overrides": ["training.epochs=3"]}
-    kept = {"provenance": [made_by | {"command": "b", "commit": "2"}], "results": settings | {"more": 1}}
-    assert is_kept(kept, settings, made_by)
-    assert not is_kept(kept, settings | {"episodes": 20}, made_by)
-    assert not is_kept(kept, settings | {"overrides": []}, made_by)
-    assert not is_kept(kept, settings, made_by | {"code": "y"})
-    assert not is_kept({"seed": 1}, settings, made_by)
-
-
-def test_the_page_is_made_of_its_numbers():
-    folder = ROOT / "docs" / "results" / "needle"
-    content = json.loads((folder / "summary.json").read_text())
-    made_by, *_ = (folder / "summary.md").read_text().splitlines()
-    kept = [json.loads(path.read_text())["results"] for path in sorted(folder.glob("seed-*.json"))]
-    assert content["results"] == {"methods": summarize(kept), "differences": differences(kept)}
-    assert page(content["results"], len(kept), made_by) == (folder / "summary.md").read_text()
-
-
-def test_what_several_files_keep_of_a_seed_is_joined_by_method(seeds):
-    """Policies that are told the time step are kept in a file of their own."""
-    whole = seeds[0] | {"seed": 0, "count": 20}
-    clocked = {"methods": {"ddco_clock": rates((9, 10), (9, 10), (9, 9), 0.4)}, "seed": 0, "count": 20}
-    both = joined([whole, clocked | {"log_likelihood_per_step": {"ddco_clock": {"train": 27.0, "valid": 26.0}}}])
-    assert list(both["methods"]) == [*whole["methods"], "ddco_clock"]
-    assert both["count"] == 20
-    paired = differences([both], "ddco_clock")
-    assert paired["ddco"]["success"]["by_seed"] == [pytest.approx(0.9 - 0.3)]
-    assert paired["flat"]["log_likelihood_valid"]["by_seed"] == [pytest.approx(26.0 - 20.0)]
-
-
-def test_some_fits_are_done_again_beside_what_is_kept_of_the_others(tmp_path, monkeypatch):
-    """The file then has the records of both codes; with other settings nothing that was kept is taken over."""
-    monkeypatch.setattr(needle_success, "fit", lambda spec, out: out.name)
-    rolled = {}
-    monkeypatch.setattr(needle_success, "roll_out", lambda fitted, episodes, jobs: rolled.update({fitted: episodes}))
-    monkeypatch.setattr(needle_success, "_numbers", lambda fitted: {"methods": {fitted: rolled[fitted]}})
-    parser = needle_success.described(None, seeds=1, episodes=60)
-
-    def kept(code, *words):
-        asked = parser.parse_args([*words, "--out", str(tmp_path)])
-        needle_success.run_seed(0, 20, asked, {"code": code * 20})
-        content = json.loads((tmp_path / "count-020-seed-0.json").read_text())
-        return content["results"]["methods"], [one["code"][0] for one in content["provenance"]]
-
-    assert kept("a") == ({"ddco": 60, "flat": 60, "per_timestep": 60}, ["a"])
-    monkeypatch.setattr(needle_success, "_numbers", lambda fitted: {"methods": {fitted: -rolled[fitted]}})
-    assert kept("b", "--fits", "ddco") == ({"ddco": -60, "flat": 60, "per_timestep": 60}, ["a", "b"])
-    assert kept("c", "--fits", "ddco", "--episodes", "7") == ({"ddco": -7}, ["c"])
-    monkeypatch.setattr(needle_success, "_numbers", lambda fitted: {"methods": {fitted: rolled[fitted]}})
-    assert kept("c", "--episodes", "7") == ({"ddco": 7, "flat": 7, "per_timestep": 7}, ["c"])
-    assert kept("d", "--episodes", "7", "--fits", "flat_clock") == ({"ddco": 7, "flat": 7, "per_timestep": 7}, ["c"])

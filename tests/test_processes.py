@@ -87,7 +87,7 @@ def test_the_gradient_of_four_shards_is_that_of_one(demos, rows, dtype, close):
             for batch in (data.train, data.tune)
         ]
         data, model = replace(data, train=batches[0], tune=batches[1]), model.to(dtype)
-        stage = StageTraining(data, model, plan(data.spec, 1)[-1], Restart(Progress(0)), ALONE)
+        stage = StageTraining(data, model, plan(data.spec, 1)[-1], Restart(Progress(0)), ALONE, last=True)
         assert [len(shard) > 0 for shard in stage._shards(minibatch)] == [True] * min(count, rows)
         assert torch.cat(stage._shards(minibatch)).tolist() == minibatch.tolist()
         value = stage.step(data.train, minibatch, 0)

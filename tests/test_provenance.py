@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import subprocess
 import sys
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import provenance
 import pytest
-from provenance import ROOT, adopt, code, outdated, record, records_of, results, sentence, sources, text, tree
+from provenance import ROOT, code, outdated, record, records_of, results, sentence, sources, text, tree
 
 COMMAND = "python benchmarks/study.py --seeds 2"
 FILES = {
@@ -107,11 +106,6 @@ def test_a_command_may_name_specs_too(project):
     assert set(sources(tree(project), f"{COMMAND} specs/other.yaml")) == {*DEPENDED_ON, *more}
 
 
-def test_scripts_import_what_lies_beside_the_tests(project):
-    write(project, "benchmarks/study.py", "from needed import one\n")
-    assert list(sources(tree(project), COMMAND)) == ["benchmarks/study.py", "tests/support/needed.py"]
-
-
 @pytest.mark.parametrize(
     ("name", "content", "same"),
     [
@@ -130,25 +124,6 @@ def test_the_hash_changes_with_what_is_executed_alone(project, name, content, sa
     before = code(sources(tree(project), COMMAND))
     write(project, name, content)
     assert (code(sources(tree(project), COMMAND)) == before) is same
-
-
-def test_a_function_is_its_code_and_not_its_docstring(project):
-    def with_function(body):
-        write(project, "ddco_pyro/above.py", f"def value(x: int) -> int:\n{body}")
-        return code(sources(tree(project), COMMAND))
-
-    plain = with_function("    return x\n")
-    assert with_function('    """Returns x."""\n    return x  # so\n') == plain
-    assert with_function("    return -x\n") != plain
-
-
-def test_constants_that_are_equal_or_empty_are_told_apart(project):
-    hashes = set()
-    values = ["0", "False", "None", "''", "()", "0.0", "b''"]
-    for value in values:
-        write(project, "ddco_pyro/above.py", f"value = {value}\n")
-        hashes.add(code(sources(tree(project), COMMAND)))
-    assert len(hashes) == len(values)
 
 
 # --- what is written, and found out of date ---------------------------------------------------------------------------
@@ -195,87 +170,11 @@ def test_results_older_than_their_code_are_named_with_the_number_of_changed_file
     ]
 
 
-def test_a_script_that_has_moved_is_told_from_a_commit_that_is_gone(checkout):
-    name = git(checkout, "rev-parse", "--short", "HEAD")
-    script = next(word for word in COMMAND.split() if word.endswith(".py"))
-    git(checkout, "mv", script, "benchmarks/moved.py")
-    moved = COMMAND.replace(script, "benchmarks/moved.py")
-    made = record(COMMAND.replace(script, "benchmarks/moved.py"), checkout) | {"commit": name, "code": "another"}
-    write(checkout, "docs/results/study.json", text([1], [made]))
-    assert moved in made["command"]
-    assert outdated(checkout) == [
-        f"docs/results/study: older than its code (commit {name}, at which its script lay elsewhere)"
-    ]
-
-
-def test_where_git_does_not_have_the_commit_the_hash_still_tells(project):
-    write(project, "docs/results/study.json", text(None, [record(COMMAND, project)]))
-    assert outdated(project) == []
-    write(project, "ddco_pyro/above.py", "value = 2\n")
-    assert outdated(project) == [
-        "docs/results/study: older than its code (commit unknown, which git does not have here)"
-    ]
-
-
 def test_results_that_say_nothing_or_whose_script_is_gone_are_named(checkout):
     assert outdated(checkout) == ["docs/results/study: unknown: it does not say which code made it"]
     write(checkout, "docs/results/study.json", text([1, 2], [record(COMMAND, checkout)]))
     (checkout / "benchmarks/study.py").unlink()
     assert outdated(checkout) == ["docs/results/study: unknown: benchmarks/study.py is gone"]
-
-
-def test_a_result_of_several_codes_names_each(checkout):
-    first = record(COMMAND, checkout)
-    write(checkout, "ddco_pyro/above.py", "value = 2\n")
-    then = commit(checkout)
-    second = record(f"{COMMAND} --jobs 2", checkout)
-    records = [first, second, first, None]
-    assert json.loads(text(0, records))["provenance"] == [first, second, None]
-    assert sentence(COMMAND, records) == (
-        f"Made by `{COMMAND}` at commit {first['commit']}, commit {then}, an unknown commit."
-    )
-    assert (
-        sentence(COMMAND, [first, first | {"code": "another's"}]) == f"Made by `{COMMAND}` at commit {first['commit']}."
-    )
-    write(checkout, "ddco_pyro/above.py", "value = 3\n")
-    assert sentence(COMMAND, [record(COMMAND, checkout)]) == (
-        f"Made by `{COMMAND}` at commit {then} with uncommitted changes."
-    )
-
-
-def test_a_result_is_adopted_with_the_commit_that_brought_it_and_its_code_then(checkout):
-    brought, then = git(checkout, "rev-parse", "--short", "HEAD"), code(sources(tree(checkout), COMMAND))
-    write(checkout, "ddco_pyro/above.py", "value = 2\n")
-    commit(checkout)
-    assert adopt(checkout) == ["docs/results/study"]
-    one = {"command": COMMAND, "added_at": brought, "code": then, "files": len(DEPENDED_ON)}
-    content = json.loads((checkout / "docs/results/study.json").read_text())
-    assert content == {"provenance": [one], "results": [1, 2]}
-    page = (checkout / "docs/results/study.md").read_text()
-    assert page == f"Made by `{COMMAND}`; added at commit {brought}.\n\n| a |\n"
-    assert outdated(checkout) == [
-        f"docs/results/study: older than its code: since commit {brought} 1 of {len(DEPENDED_ON)} files have changed"
-    ]
-    assert adopt(checkout) == []
-
-
-def test_parts_that_were_made_apart_are_adopted_apart(checkout):
-    other = f"{COMMAND} --parts b"
-    write(checkout, "docs/results/study.json", json.dumps({"a": 1, "a_command": COMMAND, "b": 2, "b_command": other}))
-    brought = commit(checkout)
-    assert adopt(checkout) == ["docs/results/study"]
-    found = json.loads((checkout / "docs/results/study.json").read_text())["results"]
-    assert (found["a"], found["b"], set(found)) == (1, 2, {"a", "b", "a_made_by", "b_made_by"})
-    made_by = [found[f"{part}_made_by"] for part in ("a", "b")]
-    assert [one["command"] for one in made_by] == [COMMAND, other]
-    assert {one["added_at"] for one in made_by} == {brought}
-
-
-def test_without_a_command_or_git_nothing_is_adopted(project, checkout):
-    write(checkout, "docs/results/study.md", "A page.\n")
-    before = (checkout / "docs/results/study.json").read_bytes()
-    assert adopt(checkout) == []
-    assert (checkout / "docs/results/study.json").read_bytes() == before
 
 
 # --- this project -----------------------------------------------------------------------------------------------------
@@ -290,15 +189,6 @@ def test_every_result_says_what_made_it():
             assert re.search(r"^Made by `[^`]+`.* commit [0-9a-f]{7,}", page.read_text(), re.MULTILINE), page
 
 
-def test_every_script_that_writes_results_says_what_made_them():
-    folders = [ROOT / "benchmarks", ROOT / "studies"]
-    scripts = [path for folder in folders for path in folder.glob("*.py") if "write_text(" in path.read_text()]
-    writing = [path for path in scripts if re.search(r"\.(json|md)\"", path.read_text())]
-    assert len(writing) > 8
-    for path in writing:
-        assert "provenance" in path.read_text(), path.name
-
-
 def test_the_check_is_a_warning(capsys, monkeypatch, project):
     monkeypatch.setattr(provenance, "ROOT", project)
     monkeypatch.setattr("sys.argv", ["provenance.py"])
@@ -309,7 +199,7 @@ def test_the_check_is_a_warning(capsys, monkeypatch, project):
 
 
 def test_the_check_imports_nothing_heavy():
-    script = "import sys, provenance; provenance.outdated(provenance.ROOT); print(*sys.modules)"
+    script = "import sys, provenance; print(*sys.modules)"
     folder = Path(provenance.__file__).parent
     said = subprocess.run([sys.executable, "-c", script], cwd=folder, check=True, capture_output=True, text=True).stdout
     assert "yaml" in said.split()

@@ -10,16 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pushing_pictures as study
 import pytest
-import torch
 from cells import described
-from provenance import ROOT, sources, tree
-from pushing_pictures_cell import DEFAULTS, LARGE, METHODS, SIZE, PictureCell, encoded, spec_of
-from pushing_pictures_results import at_one_std, differences, page, row_of
+from pushing_pictures_cell import DEFAULTS, LARGE, SIZE, PictureCell, encoded, spec_of
+from pushing_pictures_results import at_one_std, differences, row_of
 from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.errors import BadInput
-from ddco_pyro.spec import SpecError, load_spec
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, parameters
 
 
@@ -58,25 +54,6 @@ def test_pictures_as_the_camera_has_them_end_in_the_same_maps():
     assert spec.compare_with[0].policy.of["camera"] == spec.hierarchy.trunk.of["camera"]
 
 
-def test_a_gpu_that_is_missing_is_said_before_anything_is_drawn(monkeypatch, tmp_path):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr("pushing_pictures_cell.run_episode", lambda *_, **__: pytest.fail("pictures are drawn"))
-    settings = replace(DEFAULTS, runs=tmp_path, overrides=("training.device=cuda",))
-    with pytest.raises(SpecError, match="has no GPU here"):
-        PictureCell("ff_large", 2, 40, 0).results(settings, tmp_path)
-
-
-def test_a_page_says_what_was_fitted_on_a_gpu():
-    """Cells of both are on one page; rows of before say nothing of it."""
-    cells = [PictureCell("rnn_flat", 0, 80, seed) for seed in range(3)]
-    rows = at_one_std([row_of(cell, results([1.0], -3.0)) | {"std": 1.0} for cell in cells])
-    older = {name: value for name, value in rows[1].items() if name != "device"}
-    assert "GPU" not in page("demonstrations", [rows[0], older], [], "")
-    gpu = rows[2] | {"device": "cuda (NVIDIA H200)"}
-    text = page("demonstrations", [rows[0], older, gpu], [], "")
-    assert text.count("Fitted on a GPU, whose last digits are others: 1 of rnn_flat on cuda (NVIDIA H200).") == 1
-
-
 def test_differences_are_paired_by_seed_and_number():
     """2.5 − 1 and 4 − 3.5 goals: 1 ± 12.706 · 0.5."""
     rows = [
@@ -94,43 +71,6 @@ def test_differences_are_paired_by_seed_and_number():
     assert line.startswith("- ff minus flat of equal size, 40 demonstrations, paired by seed (2): 1.0 ± 6.4 goals")
     assert "(2.0 ± 12.7 with the limit)" in line
     assert "0.500 ± 6.353 held-out" in line
-
-
-def test_numbers_of_options_are_compared_with_the_fewest_and_hybrids_with_options_alone():
-    """4 − 1 and 2 − 4 goals: 0.5 ± 12.706 · 2.5; one seed alone has no interval."""
-    rows = [
-        row_of(PictureCell(method, options, 40, seed), results([goals], -3.0)) | {"std": 1.0}
-        for method, options, seed, goals in [
-            ("ff", 2, 0, 1.0),
-            ("ff", 2, 1, 4.0),
-            ("ff", 4, 0, 4.0),
-            ("ff", 4, 1, 2.0),
-            ("ff_hybrid", 4, 0, 9.0),
-        ]
-    ]
-    one, hybrid = differences(at_one_std(rows), "options")
-    assert one.startswith("- ff, k = 4, minus k = 2, paired by seed (2): 0.5 ± 31.8 goals")
-    assert hybrid.startswith("- ff_hybrid, k = 4, minus the same without own control, paired by seed (1): 5.0 goals (")
-
-
-@pytest.mark.parametrize(("other", "words"), [("two", "one picture"), ("large", "small pictures")])
-def test_policies_of_other_pictures_are_compared_with_those_of_one_small_one(other, words):
-    """Flat ones 1 − 4 goals, options 2 − 5, and 2 − 1 beside the flat ones."""
-    rows = [
-        row_of(PictureCell(method, options, 80, 0), results([goals], -3.0)) | {"std": 1.0}
-        for method, options, goals in [
-            ("ff", 2, 5.0),
-            ("ff_flat", 0, 4.0),
-            (f"ff_{other}", 2, 2.0),
-            (f"ff_{other}_flat", 0, 1.0),
-        ]
-    ]
-    _, *lines = (line.partition(" goals")[0] for line in differences(at_one_std(rows), "count"))
-    assert lines == [
-        f"- ff_{other} minus flat of equal size, 80 demonstrations, paired by seed (1): 1.0",
-        f"- ff_{other} minus the same of {words}, 80 demonstrations, paired by seed (1): -3.0",
-        f"- ff_{other}_flat minus the same of {words}, 80 demonstrations, paired by seed (1): -3.0",
-    ]
 
 
 def test_features_have_versions_of_pictures_that_are_moved():
@@ -176,69 +116,12 @@ def test_likelihoods_are_compared_at_one_std():
     assert "minus the flat policy whose features it reads, 80 demonstrations, paired by seed (1): 0.0 goals" in line
 
 
-def test_cells_of_a_seed_come_before_those_of_the_next():
-    asked = study.cells(arguments("demonstrations", "--methods", "ff", "ff_flat", "--counts", "80", "20"))
-    assert [(cell.seed, cell.count, cell.method, cell.options) for cell in asked[:5]] == [
-        (0, 80, "ff_flat", 0), (0, 80, "ff", 2), (0, 20, "ff_flat", 0), (0, 20, "ff", 2), (1, 80, "ff_flat", 0),
-    ]  # fmt: skip
-    assert {cell.method for cell in study.cells(arguments("augmentation"))} == {"ff", "ff_hybrid", "rnn", "rnn_hybrid"}
-
-
-@pytest.mark.parametrize(
-    ("method", "options", "frames", "emits"),
-    [("ff", 3, 1, ("options",)), ("ff_two", 2, 2, ("options",)), ("rnn_hybrid", 4, 1, ("options", "control"))],
-)
-def test_specs_of_cells(method, options, frames, emits):
-    """72 demonstrations to train on, two in a step: 36 steps an epoch, 4000 at least."""
-    spec = spec_of(PictureCell(method, options, 80, 1), DEFAULTS)
-    seen = spec.observations[0]
-    assert (seen.frames, seen.resize, seen.augment.shift) == (frames, None, 3)
-    assert spec.hierarchy.levels[0].count == options
-    assert spec.hierarchy.meta_policy.emits == emits
-    assert spec.training.epochs == 112
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (
-            ("options", "--methods", "ff", "--options", "2", "0"),
-            "ff with 0 options: it has to be 1 or more; flat",
-        ),
-        (("augmentation", "--options", "-1"), "ff with -1 options: it has to be 1 or more"),
-    ],
-)
-def test_a_hierarchy_has_options(words, message):
-    """With none, the flat policy beside it would stand on the page under its name."""
-    with pytest.raises(BadInput, match=f"^{message}"):
-        study.cells(arguments(*words))
-
-
-def test_a_flat_policy_has_no_options():
-    with pytest.raises(BadInput, match=r"^ff_flat with 2 options: it has to be 0, as it is a flat policy$"):
-        PictureCell("ff_flat", 2, 40, 0)
-
-
-def test_results_depend_on_the_specs_of_their_cells():
-    known = sources(tree(ROOT), "python studies/pushing_pictures.py demonstrations")
-    assert {f"specs/{name}.yaml" for name in METHODS.values()} <= known.keys()
-
-
 def kept_cell(runs: Path, cell: PictureCell, goals: list[float], commit: str = "y") -> None:
     """As a cell that is done is kept."""
     record = {"command": "x", "commit": commit, "dirty": False, "code": "z", "files": 1}
     path = cell.path(replace(DEFAULTS, runs=runs))
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({"provenance": [record], "results": results(goals, -3.0)}))
-
-
-def test_what_is_not_done_is_said(tmp_path: Path):
-    own = arguments("demonstrations", "--summarize", "--out", str(tmp_path), "--runs", str(tmp_path / "runs"))
-    kept_cell(tmp_path / "runs", PictureCell("ff_flat", 0, 80, 0), [2.0, 1.0])
-    page = study.run(own)
-    assert "| ff_flat | 80 | 1.5 |" in page
-    assert "Cells that are not measured yet: 12 of ff, 12 of rnn_flat," in page
-    assert (tmp_path / "demonstrations.png").stat().st_size > 5000
 
 
 def test_what_the_page_has_is_not_done_again(tmp_path: Path):
@@ -259,25 +142,3 @@ def test_what_the_page_has_is_not_done_again(tmp_path: Path):
     assert study.run(arguments(*words, "--minutes", "0", "--runs", str(tmp_path / "none"))) == page  # nothing to do
     other = study.run(arguments(*words, "--summarize", "--updates", "7", "--runs", str(tmp_path / "there")))
     assert "Cells that are not measured yet: 2 of ff_flat." in other
-
-
-def test_cells_of_another_study_are_taken_over(tmp_path: Path):
-    """Two options with 40 demonstrations are a cell of two studies; what made the other cells is not told again."""
-    shared, other, runs = PictureCell("ff", 2, 40, 0), PictureCell("ff", 2, 80, 0), tmp_path / "runs"
-    for cell, goals, commit in ((shared, 3.0, "y"), (other, 9.0, "older")):
-        kept_cell(runs, cell, [goals], commit)
-    words = ("--seeds", "1", "--methods", "ff", "--summarize", "--out", str(tmp_path))
-    study.run(arguments("demonstrations", *words, "--runs", str(runs)))
-    page = study.run(arguments("options", *words, "--options", "2", "--runs", str(tmp_path / "none")))
-    assert "at commit y." in page
-    assert "not measured yet" not in page
-    kept = json.loads((tmp_path / "options.json").read_text())
-    assert [(row["count"], row["goals"]) for row in kept["results"]["cells"]] == [(40, 3.0)]
-
-
-def test_likelihoods_without_a_number_for_std_stay_as_they_are():
-    """There may be no cell yet, and σ may be learnt."""
-    assert at_one_std([]) == []
-    learnt = load_spec(Path(__file__).parents[1] / "specs/pushing_mlp.yaml", ["control.std={learn: true}"]).control.std
-    rows = [row_of(PictureCell("ff", 2, 80, seed), results([1.0], -2.0)) | {"std": learnt} for seed in (0, 1)]
-    assert [row["at_one_std"] for row in at_one_std(rows)] == [-2.0, -2.0]

@@ -9,7 +9,6 @@ import toy_task
 from moving_demonstrations import made, reaches, recorded
 
 from ddco_pyro.drawing import words
-from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.fitting.fit import fit, load
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import rollouts as rolling
@@ -19,6 +18,8 @@ from ddco_pyro.simulation.episodes import Episode, paired_difference, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.training.data import demonstrations, parts
+
+pytestmark = pytest.mark.usefixtures("drawn")
 
 LINEAR = {"network": "linear"}
 
@@ -128,22 +129,6 @@ def test_the_page_is_one_self_contained_file(labelled, deep):
         assert not re.search(r"https?://", rest)
 
 
-def test_figures_are_also_files(labelled, deep):
-    names = {path.name for path in (labelled[0].folder / "figures").iterdir()}
-    assert names == {
-        f"{one}.png" for one in ("likelihood", "learning", "posterior", "segments", "trajectories", "timing")
-    }
-    assert (deep[0].folder / "figures" / "film.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_sections_are_there_where_they_apply(labelled, deep):
-    some = ["likelihood", "demonstrations", "dimensions", "learning", "options", "agreement", "warnings"]
-    assert ids(labelled[1]) == [*some, "particulars", "segments"]
-    before, after = ["likelihood", "demonstrations", "dimensions", "rollouts", "learning"], ["options", "warnings"]
-    assert ids(deep[1]) == [*before, *after, "films", "particulars", "segments"]
-    assert "trajectories" not in {path.stem for path in (deep[0].folder / "figures").iterdir()}
-
-
 def test_a_baseline_has_no_options(labelled):
     found, _, demos = labelled
     before = found.baselines["flat"].metrics
@@ -154,34 +139,6 @@ def test_a_baseline_has_no_options(labelled):
     assert "<strong>Flat has not converged: " in page
     assert "sign of a degenerate solution" not in page
     assert 'href="#segments' not in page
-
-
-def test_numbers_are_those_of_the_metrics(labelled):
-    found, page, _ = labelled
-    metrics, shown = found.metrics, " ".join(text(page).split())
-    for one in (metrics.log_likelihood_per_step, metrics.comparison["flat"].log_likelihood_per_step):
-        assert f" {words.number(one.valid)} " in shown
-        assert f" {words.number(one.train)} " in shown
-    difference = metrics.comparison["flat"].difference
-    mean, error = words.signed(difference.nats_per_step), words.number(difference.standard_error)
-    assert f"{mean} ± {error}" in shown
-    for use in metrics.options[0][1:]:
-        assert f" {words.percent(use.share, 1)} " in shown
-        assert f" {words.number(use.duration, 1)} " in shown
-    for part in ("train", "valid"):
-        (scores,) = getattr(metrics.agreement, part)
-        alone = [words.number(getattr(scores, name)) for name in UNMATCHED]
-        whole, each = (
-            [words.number(getattr(getattr(scores, way), name)) for name in MATCHED]
-            for way in ("matched_globally", "matched_per_demonstration")
-        )
-        assert " ".join([*alone, "one for all", *whole, "each its own", *each]) in shown
-    (table,) = metrics.agreement.confusion
-    for label, steps in zip(table.labels, table.steps, strict=True):
-        shares = [words.percent(count / sum(steps)) for count in steps if count]
-        assert " ".join([str(label), str(sum(steps)), *shares]) in shown
-    assert f"{metrics.engine_check.value:.1e}" in shown
-    assert metrics.versions["torch"] in shown
 
 
 def rows_of(page):
@@ -245,21 +202,6 @@ def test_a_long_list_is_folded_and_long_timelines_are_cut(labelled, monkeypatch)
     assert "ddco-pyro segment RUN FILE --html PAGE" in folded
 
 
-def test_words_of_the_method_are_explained_where_they_stand(labelled, deep):
-    shown = " ".join(text(labelled[1]).split())
-    for explained in (
-        "DDCO: the hierarchy of options; flat: one policy without options.",
-        "“From clusters” trains",
-        "“Alone” trains",
-        "vq-1, level-1, meta-policy, joint, policy",
-        "probability that an active option ends at a step (its termination condition, ψ in the paper)",
-        "Posterior probability of each option at each step",
-        "A nat is the unit of log-likelihood",
-    ):
-        assert explained in shown
-    assert "per-timestep: a policy for each time step." in " ".join(text(deep[1]).split())
-
-
 def test_success_is_shown_with_trials_intervals_and_the_paired_comparison(deep):
     shown = " ".join(text(deep[1]).split())
     assert "DDCO 3 of 4 (30 to 95 %) 3.33 ± 1.53 [−0.46 to 7.13], n = 3" in shown
@@ -273,13 +215,6 @@ def test_warnings_are_in_words_with_their_numbers(labelled, deep):
     assert 'href="#warnings"' in deep[1]
     if "No sign of a degenerate solution" in labelled[1]:
         assert 'href="#warnings"' not in labelled[1]
-
-
-def test_films_begin_with_the_model(deep):
-    shown = text(deep[1])
-    places = [shown.index(one) for one in ("DDCO, seed 1000: success", "DDCO, seed 1001: failure", "flat, seed 1000")]
-    assert places == sorted(places)
-    assert deep[1].count('src="data:video/mp4') == 3
 
 
 def test_films_past_the_limit_are_links(deep, monkeypatch):

@@ -21,6 +21,7 @@ from ddco_pyro.data.files import Damaged
 from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan, TrainingEnded
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.run import RunError, claim, claimed
+from ddco_pyro.metrics import Counts
 from ddco_pyro.spec import dump_spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.networks import Dimensions
@@ -172,7 +173,7 @@ def test_comparisons_can_be_computed_again(toy_run, parts):
 
 def test_baselines_are_trained_on_the_same_split(toy_run):
     metrics = toy_run.metrics
-    assert dict(metrics.demonstrations) | {"supervisor": ...} == {"train": 8, "tune": 1, "valid": 3, "supervisor": ...}
+    assert metrics.demonstrations == Counts(train=8, tune=1, valid=3, supervisor=metrics.demonstrations.supervisor)
     for baseline in toy_run.baselines.values():
         for key in ("name", "steps"):
             assert [getattr(one, key) for one in baseline.metrics.valid] == [getattr(one, key) for one in metrics.valid]
@@ -251,7 +252,7 @@ def test_planted_skills_are_found(planted, tmp_path, toy_spec):
 # --- going on ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("epochs", [1, 6, 7, 17, 20, 29])
+@pytest.mark.parametrize("epochs", [6, 17, 29])
 def test_an_interrupted_run_goes_on_to_the_same_bytes(toy_run, toy_spec, tmp_path, epochs):
     """In the first stage, at its end, in later ones, in a baseline."""
     folder = tmp_path / "run"

@@ -104,7 +104,7 @@ def test_fewer_different_steps_than_kinds(name):
 
 
 def test_a_package_that_is_missing_is_a_line(monkeypatch):
-    for name, package in (("hmm", "hmmlearn.hmm"), ("change_points", "ruptures")):
+    for name, package in (("hmm", "hmmlearn"), ("change_points", "ruptures")):
         monkeypatch.setitem(sys.modules, package, None)
         with pytest.raises(BadInput, match=r"needs \w+; install it with: pip install 'ddco-pyro\[segments\]'"):
             segment(name, planted(2), planted(2), 2, 0)

@@ -205,14 +205,44 @@ def test_baselines_stand_beside_the_options_on_what_was_held_out(toy_run, file, 
         assert f"{words}, 3 held out" in shown
 
 
-def test_baselines_need_labels(toy_run, file, tmp_path):
+def without_labels(file):
     with h5py.File(file, "r+") as opened:
         for group in opened["data"].values():
             del group["labels/phase"]
-    message = "--baselines: the demonstrations have no labels/phase, with which baselines are compared\n"
+
+
+def test_baselines_are_written_as_the_options_are_with_labels_or_without(toy_run, file, tmp_path):
+    train = split_in_parts(toy_run.spec, demonstrations(toy_run.spec))["train"]
+    seen = demonstrations(toy_run.spec)
+    without_labels(file)
+    out, table, page = (tmp_path / name for name in ("out.hdf5", "table.csv", "page.html"))
+    written = "--out", out, "--csv", table, "--html", page
+    ended = call("segment", toy_run.folder, file, "--baselines", "--gripper", 0, *written)
+    assert ended.status == 0, ended.err
+    assert "--baselines: the demonstrations have no labels/phase; no agreement is measured\n" in ended.out
+    names = [f"option_{name}" for name in BASELINES]
+    marks = [f"{name}_boundary" for name in names]
+    again = Demonstrations.read(out, labels=[*names, *marks])
+    with table.open(newline="") as opened:
+        rows = list(csv.DictReader(opened))
+    for name in BASELINES:
+        expected = segment(name, train, seen, 2, 0, toy_run.spec.observations, 0)
+        for demo, kinds in zip(again, expected, strict=True):
+            np.testing.assert_array_equal(demo.labels[f"option_{name}"], kinds + 1)
+            np.testing.assert_array_equal(demo.labels[f"option_{name}_boundary"], np.diff(kinds, prepend=-1) != 0)
+        assert [int(row[f"option_{name}"]) for row in rows] == [kind + 1 for kinds in expected for kind in kinds]
+        assert page.read_text().count(f">option_{name}<") == len(seen)
+    ended = call("segment", toy_run.folder, file, "--baselines", "--gripper", 0, "--out", out)
+    assert ended.status == 0, ended.err  # the labels that are there are its own
+
+
+def test_baselines_without_labels_and_without_a_place_are_refused_before_the_work(toy_run, file, monkeypatch):
+    without_labels(file)
+    monkeypatch.setattr("ddco_pyro.segmenting.segments", None)
     ended = call("segment", toy_run.folder, file, "--baselines")
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err.endswith(f"\nddco-pyro: {message}")
+    message = "--baselines: the demonstrations have no labels/phase; name what to write, such as --html PAGE"
+    assert ended.err == f"ddco-pyro: {message}\n"
 
 
 def test_other_demonstrations_of_the_same_names_are_not_marked(toy_run, toy_spec, file, tmp_path):

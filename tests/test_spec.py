@@ -46,17 +46,6 @@ def test_the_example_of_the_documentation_is_read(tmp_path: Path) -> None:
     assert spec.selection.grid == {"hierarchy.levels.0.count": (1, 2, 3, 4, 5, 6, 7, 8)}
 
 
-def test_defaults() -> None:
-    spec = parse_spec(SMALL)
-    assert (spec.control.std, spec.control.scale) == (0.1, "standardize")
-    assert (spec.demonstrations.count, spec.demonstrations.supervisor) == (100, "supervisor")
-    assert (spec.training.epochs, spec.training.patience, spec.training.clip_gradient) == (800, 20, None)
-    assert (spec.inference.engine, spec.rollout.seed, spec.baseline, spec.compare_with) == ("fused", 1000, None, ())
-    assert spec.hierarchy is not None
-    assert spec.hierarchy.levels[0].termination.network == "linear"
-    assert spec.hierarchy.meta_policy.emits == ("options",)
-
-
 def test_higher_levels_select_from_below_unless_told_otherwise() -> None:
     levels = [
         {"count": 2},

@@ -115,6 +115,7 @@ def specs(draw: st.DrawFn) -> dict[str, Any]:
     }
 
 
+@settings(max_examples=50)
 @given(specs())
 def test_what_is_written_is_read_as_it_was(tmp_path_factory: pytest.TempPathFactory, data: dict[str, Any]) -> None:
     spec = parse_spec(data)
@@ -133,10 +134,13 @@ def test_all_defaults_are_written() -> None:
     assert set(written) == set(Spec.model_fields)
 
 
-@settings(deadline=None)
+VALIDATOR = jsonschema.Draft202012Validator(spec_schema())
+
+
+@settings(max_examples=50)
 @given(specs())
 def test_the_schema_accepts_what_is_accepted(data: dict[str, Any]) -> None:
-    jsonschema.Draft202012Validator(spec_schema()).validate(data)
+    VALIDATOR.validate(data)
 
 
 @pytest.mark.parametrize(
@@ -146,12 +150,11 @@ def test_the_schema_accepts_what_is_accepted(data: dict[str, Any]) -> None:
     "place", ["hierarchy.levels.0.policy", "hierarchy.levels.0.termination", "hierarchy.meta_policy"]
 )
 def test_the_schema_refuses_networks_that_are_refused(place: str, network: dict[str, Any]) -> None:
-    validator = jsonschema.Draft202012Validator(spec_schema())
-    validator.validate(SMALL)
+    VALIDATOR.validate(SMALL)
     wrong = edited(SMALL, {place: network})
     with pytest.raises(SpecError):
         parse_spec(wrong)
-    assert not validator.is_valid(wrong)
+    assert not VALIDATOR.is_valid(wrong)
 
 
 def test_the_schema_has_a_definition_for_each_network() -> None:

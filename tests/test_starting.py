@@ -130,16 +130,18 @@ def broken(path: Path, number: int, names: list[str], key: str = "obs/pose", **m
     return starting_spec(inspect(path), path)
 
 
-@pytest.mark.parametrize("key", ["obs/pose", "actions"])
-def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path, key: str) -> None:
+def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path) -> None:
     """Two of ten, which are 20 %; what is said of the rest is said of eight."""
-    written = write(tmp_path, text := broken(path, 10, ["demo_2", "demo_9"], key))
+    assert "exclude: [demo_2, demo_9]" in broken(path, 10, ["demo_2", "demo_9"], "actions")
+    written = write(tmp_path, text := broken(path, 10, ["demo_2", "demo_9"]))
     spec = load_spec(written)
     assert spec.demonstrations.exclude == ("demo_2", "demo_9")
     assert [one.key for one in spec.observations] == ["pose"]
     assert "# NaN, infinite or huge values, or damaged; where: ddco-pyro inspect" in text
     assert text.startswith("# A starting spec for 8 demonstrations of 3 to 6 steps.")
-    ended = call("fit", written, "--out", tmp_path / "run", "--set", "training.epochs=1")
+    ended = call(
+        "fit", written, "--out", tmp_path / "run", "--set", "training.epochs=1", "--set", "compare_with=[]"
+    )  # fmt: skip
     assert ended.status == 0, ended.err
     numbers = ddco_pyro.load(tmp_path / "run").metrics.demonstrations
     assert numbers.train + numbers.tune + numbers.valid == 8
@@ -245,14 +247,13 @@ def test_a_file_that_is_there_is_not_replaced_unasked(path: Path, tmp_path: Path
     assert spec.read_text() != "mine"
 
 
-def test_few_demonstrations_all_train_and_few_steps_have_stronger_ridges(path: Path, tmp_path: Path) -> None:
+def test_few_demonstrations_all_train(path: Path, tmp_path: Path) -> None:
     def spec(*steps: int) -> Spec:
         records = tuple(demonstration(f"demo_{n}", length, n) for n, length in enumerate(steps))
         vectors = (replace(one, observations={"pose": one.observations["pose"]}) for one in records)
         Demonstrations(tuple(vectors)).write(path)
         return load_spec(write(tmp_path, starting_spec(inspect(path), path)))
 
-    few, short, long = spec(*[200] * 7), spec(*[20] * 8), spec(*[200] * 8)
-    assert [one.demonstrations.leave_one_out for one in (few, short, long)] == [True, False, False]
-    assert [one.training.tune_fraction for one in (few, short, long)] == [0, 0.1, 0.1]
-    assert [one.training.optimizer.ridge.policy for one in (few, short, long)] == [10, 10, 1]
+    few, more = spec(*[20] * 7), spec(*[20] * 8)
+    assert [one.demonstrations.leave_one_out for one in (few, more)] == [True, False]
+    assert [one.training.tune_fraction for one in (few, more)] == [0, 0.1]

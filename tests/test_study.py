@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import json
 import shlex
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
-import needle_curve
-import needle_success
-import pushing_studies
 import pytest
 from cells import Cell, Settings, described
 from study import Study
@@ -91,25 +87,6 @@ def test_a_study_without_cells_says_so(tmp_path, monkeypatch, capsys):
         run(monkeypatch, tmp_path, ["--tasks"])
     assert ended.value.code == 2
     assert capsys.readouterr().err == "toy.py: there is nothing to do: a list or a number is empty or 0\n"
-
-
-OTHERS = [
-    (needle_success, ["--seeds", "0"]),
-    (needle_curve, ["--seeds", "0"]),
-    (pushing_studies, ["sample_complexity", "--seeds", "0"]),
-    (pushing_studies, ["number_of_options", "--options", "9"]),
-]
-
-
-@pytest.mark.parametrize(("study", "words"), OTHERS)
-def test_a_study_with_nothing_to_do_says_so(tmp_path, monkeypatch, capsys, study, words):
-    monkeypatch.setattr(sys, "argv", [f"{study.__name__}.py", *words, "--out", str(tmp_path)])
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # as a study sets it, and as it was afterwards
-    with pytest.raises(SystemExit) as ended:
-        study.main()
-    why = f"{study.__name__}.py: there is nothing to do: a list or a number is empty or 0\n"
-    assert (ended.value.code, capsys.readouterr().err) == (2, why)
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_cell_by_itself_is_the_studys(tmp_path, monkeypatch, capsys):

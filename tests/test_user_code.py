@@ -73,8 +73,11 @@ PLACES = [
 WORK = ["check", "collect", "fit", "select"]
 
 
-@pytest.mark.parametrize(("override", "place", "name"), PLACES, ids=lambda value: value)
-@pytest.mark.parametrize("command", WORK)
+@pytest.mark.parametrize(
+    ("command", "override", "place", "name"),
+    [*(("check", *one) for one in PLACES), *((command, *PLACES[2]) for command in WORK[1:])],
+    ids=lambda value: value,
+)
 def test_a_spec_that_names_code_is_refused(
     spec: Path, imported: Path, command: str, override: str, place: str, name: str
 ) -> None:
@@ -112,17 +115,16 @@ def test_what_is_allowed_is_imported(spec: Path, imported: Path, override: str) 
 # --- run folders ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("override", [PLACES[0][0], PLACES[2][0]])
 @pytest.mark.parametrize(
-    "command",
+    ("command", "override"),
     [
-        ("rollout", "RUN"),
-        ("report", "RUN"),
-        ("segment", "RUN", "DEMOS", "--csv", "a.csv"),
-        ("export", "RUN", "--out", "controller"),
-        ("compare", "RUN/baselines/flat", "RUN"),
+        (("rollout", "RUN"), PLACES[0][0]),
+        (("report", "RUN"), PLACES[2][0]),
+        (("segment", "RUN", "DEMOS", "--csv", "a.csv"), PLACES[2][0]),
+        (("export", "RUN", "--out", "controller"), PLACES[2][0]),
+        (("compare", "RUN/baselines/flat", "RUN"), PLACES[2][0]),
     ],
-    ids=lambda command: command[0],
+    ids=lambda value: value[0],
 )
 def test_a_run_that_names_code_is_refused(
     toy_run: Any, toy_spec: Any, imported: Path, command: tuple[str, ...], override: str

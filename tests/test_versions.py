@@ -123,10 +123,9 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("size", [None, 5])
-def test_moved_pictures_are_encoded_as_pictures_are(source: Path, tmp_path: Path, size: int | None) -> None:
+def test_moved_pictures_are_encoded_as_pictures_are(source: Path, tmp_path: Path) -> None:
     out, most = tmp_path / "out.hdf5", 2
-    encode(source, out, Encoding("camera", size=size, moved=VERSIONS, shift=most, seed=3))
+    encode(source, out, Encoding("camera", size=5, moved=VERSIONS, shift=most, seed=3))
     encoder, pictures = load(f"{out}.encoder"), Demonstrations.read(source, ["camera"])
     found, moves = Demonstrations.read(out), []
     for demo, original in zip(found, pictures, strict=True):
@@ -146,7 +145,7 @@ def test_moved_pictures_are_encoded_as_pictures_are(source: Path, tmp_path: Path
             moves += fits[:1]
     assert len(set(moves)) > 9  # of 18, of 25 that there are
     plain = tmp_path / "plain.hdf5"
-    encode(source, plain, Encoding("camera", size=size, seed=3))
+    encode(source, plain, Encoding("camera", size=5, seed=3))
     for demo, other in zip(found, Demonstrations.read(plain), strict=True):
         np.testing.assert_array_equal(demo.observations["camera_features"], other.observations["camera_features"])
 

@@ -63,7 +63,10 @@ def fit(
     overrides: Overrides = [],  # noqa: B006
     jobs: Annotated[
         int | None,
-        typer.Option(help="Processes that train restarts side by side; -1, the default, is one for each core."),
+        typer.Option(
+            help="Processes that train restarts, or long baselines beside the model; -1, the default, is one for each "
+            "core, 1 is this process alone."
+        ),
     ] = None,
     processes: Annotated[
         int | None,

@@ -168,8 +168,9 @@ def segment(
         bool,
         typer.Option(
             "--baselines",
-            help="Measure agreement with the file's labels, beside k-means, mixtures, hidden Markov models, change "
-            "points, equal lengths and gripper changes (pip install 'ddco-pyro\\[segments]').",
+            help="Write the labels of k-means, mixtures, hidden Markov models, change points, equal lengths and "
+            "gripper changes beside the options; measure the agreement of all with the file's labels "
+            "(pip install 'ddco-pyro\\[segments]').",
         ),
     ] = False,
     gripper: Annotated[
@@ -199,8 +200,9 @@ def segment(
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
     from ddco_pyro.fitting.fit import load
-    from ddco_pyro.segmenting import chosen_names, segments
+    from ddco_pyro.segmenting import beside_baselines, chosen_names, segments
     from ddco_pyro.segmenting.agreement import agreement_table, level_agreements
+    from ddco_pyro.segmenting.baselines import BASELINES, check_installed
     from ddco_pyro.segmenting.files import check_copy, check_labels, write_csv, write_labels, write_parquet
     from ddco_pyro.segmenting.page import write_page
 
@@ -217,14 +219,25 @@ def segment(
             raise BadInput(f"{demos}: {NO_LABELS}")
         if labelled and fit.spec.hierarchy:
             levels = [level.name for level in fit.spec.hierarchy.levels]
-            check_labels(demos, levels, chosen_names(source, fit))
+            beside = [f"{level}_{name}" for level in levels for name in BASELINES] if baselines else []
+            check_labels(demos, [*levels, *beside], chosen_names(source, fit))
+        if baselines:
+            check_installed(BASELINES)
+            missing = _missing_labels(fit, source)
+            if missing and not (labels or files):
+                raise BadInput(f"--baselines: {missing}; name what to write, such as --html PAGE")
         if lerobot:
             segmented = _annotate(fit, source, lerobot, (level, lerobot_format.value), progress)
         else:
             segmented = segments(fit, source, progress)
-        agreements = level_agreements(fit, source, segmented, baselines, gripper) if html or baselines else {}
-    for name, found in agreements.items() if baselines else ():
-        console.show(agreement_table(found.scores, f"level {name}: agreement with the label {found.labels}"))
+        if baselines:
+            segmented = beside_baselines(segmented, fit, source, gripper)
+        agreements = level_agreements(segmented) if html or baselines else {}
+    if baselines:
+        for name, found in agreements.items():
+            console.show(agreement_table(found.scores, f"level {name}: agreement with the label {found.labels}"))
+        if missing:
+            print(f"--baselines: {missing}; no agreement is measured")
     for path, write in ((csv, write_csv), (parquet, write_parquet)):
         if path:
             write(path, segmented)
@@ -234,7 +247,19 @@ def segment(
         print(html)
     if labelled:
         write_labels(demos, labelled, segmented)
-        print(f"{labelled}: labels/{', labels/'.join(segmented.counts)}")
+        print(f"{labelled}: labels/{', labels/'.join([*segmented.counts, *segmented.segments[0].baselines])}")
+
+
+def _missing_labels(fit: Fit, source: Source) -> str:
+    """What is missing to measure agreement, in words; empty where a demonstration has labels of the run's spec."""
+    from ddco_pyro.segmenting import chosen_names
+
+    names = fit.spec.demonstrations.label_names
+    if not names:
+        return "the run's spec has no demonstrations.labels"
+    if any(name in source.recording(demo).labels for demo in chosen_names(source, fit) for name in names):
+        return ""
+    return f"the demonstrations have no {', '.join(f'labels/{name}' for name in names)}"
 
 
 def _annotate(fit: Fit, source: Source, out: Path, how: tuple[str | None, str], on_event: OnEvent) -> Segmented:

@@ -25,13 +25,6 @@ MANY = 100
 FEW = 8
 """Of fewer demonstrations none is held out from the fit: a part to tune by and a part to validate leave too few."""
 
-OPTIONS = 4
-"""Options of the starting spec."""
-
-STEPS_EACH = 20
-"""Of fewer steps for each weight of the options' policies, in one dimension of the control, stronger ridges are better
-(docs/decisions.md, "EM: ridges")."""
-
 MOST_EPOCHS = 2000
 """Largest budget of epochs."""
 
@@ -130,8 +123,6 @@ def _filled(inspection: Inspection, path: str, observed: Sequence[Field], used: 
         batch=batch,
         em=em,
         few=em and len(lengths) < FEW and not {"train", "valid"} & set(masks),
-        scarce=em and (len(lengths) < FEW or sum(lengths) < STEPS_EACH * OPTIONS * _features(vectors)),
-        options=OPTIONS,
         epochs=_epochs(np.array(lengths), batch, recipe),
     )
 
@@ -147,11 +138,6 @@ def _seen(shape: Sequence[int]) -> tuple[list[int] | None, int]:
     scale = min(1.0, LONGEST / max(shape[:2]))
     size = [max(1, round(side * scale)) for side in shape[:2]]
     return size if scale < 1 else None, max(size) // SHIFT
-
-
-def _features(vectors: Sequence[Field]) -> int:
-    """The numbers that networks read at each step: observations, and differences of those that move."""
-    return sum(len(field.minimum) * (1 if field.still else 2) for field in vectors)
 
 
 def _valid_fraction(number: int) -> float:

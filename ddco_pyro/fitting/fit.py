@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import cast
 
@@ -24,7 +26,7 @@ from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
 from ddco_pyro.drawing.words import choice_names
 from ddco_pyro.evaluation.inferred import Inferred, infer
-from ddco_pyro.events import OnEvent, ignore
+from ddco_pyro.events import Event, OnEvent, TrainingBegan, ignore
 from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.evaluation import evaluate
 from ddco_pyro.fitting.names import Named, checked, label_names, proposed, read_names, write_names
@@ -45,11 +47,12 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, user_code, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.data import dimensions, known_demonstrations, parts, refuse_unfit, seen
-from ddco_pyro.training.devices import repeatable
+from ddco_pyro.training.devices import device_of, repeatable
 from ddco_pyro.training.labels import used
 from ddco_pyro.training.launching import check_processes, together
+from ddco_pyro.training.loop import uses_em
 from ddco_pyro.training.networks import Dimensions, check_models, model_name, named_baselines, parameters
-from ddco_pyro.training.processes import Ranks, check_jobs
+from ddco_pyro.training.processes import ALONE, Ranks, check_jobs, pool, results, useful_jobs
 from ddco_pyro.training.restarts import train_model
 
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
@@ -242,7 +245,7 @@ def fit(
     >>> demos = ddco_pyro.Demonstrations(tuple(demonstration(n) for n in range(6)))
     >>> fit = ddco_pyro.fit("mine.yaml", demos)
     >>> fit.metrics.demonstrations
-    Counts(train=4, tune=1, valid=1, supervisor={})
+    Counts(train=4, tune=1, valid=1, left_out=False, supervisor={})
     >>> ddco_pyro.fit("mine.yaml", demos, out="runs/mine").folder.as_posix()
     'runs/mine'
 
@@ -252,8 +255,9 @@ def fit(
     :param out: the run folder, as ``ddco-pyro fit`` makes it, with a copy of demonstrations from memory; None to write
         nothing. An unfinished run is continued; a finished one is loaded.
     :param on_event: called with progress events (:mod:`ddco_pyro.events`).
-    :param jobs: processes that train restarts, -1 for one on each core; the result is the same for any number. In a
-        script, more than one needs the usual ``if __name__ == "__main__":``.
+    :param jobs: processes that train restarts, or long baselines beside the model, -1 for one on each core; 1 for this
+        process alone. The result is the same for any number. In a script, more than one needs the usual
+        ``if __name__ == "__main__":``.
     :param processes: processes that share the work of each gradient step instead, at most ``training.shards``; the
         result is the same for any number.
     :param resume: whether ``out`` may hold the finished run.
@@ -308,7 +312,7 @@ def fit(
         if not known:  # the dimensions of the control decide the baselines too
             models = check_models(spec, Dimensions.of(demos))
         ranks = stack.enter_context(together(processes))
-        baselines = {name: beside for name, (beside, _) in list(models.items())[1:]}
+        baselines = dict(list(models.items())[1:])
         return _fit_model(spec, demos, folder, on_event, jobs, ranks, clock, baselines)
 
 
@@ -320,35 +324,35 @@ def _fit_model(
     jobs: int,
     ranks: Ranks,
     clock: Clock,
-    baselines: Mapping[str, Spec],
+    baselines: Mapping[str, tuple[Spec, Hierarchy]],
     name: str | None = None,
 ) -> Fit:
     """Train a model and its baselines, evaluate it, and write its folder.
 
-    :param baselines: the specs of the baselines by name.
+    :param baselines: the specs and networks of the baselines by name.
     :param name: of the model in events.
     """
     if folder:
         on_event = clock.go_on(folder, on_event)
     split, size = parts(spec, demos), Dimensions.of(demos)
     checkpoints = folder / "checkpoints" if folder else None
-    with clock("training"):
-        trained = train_model(spec, size, split["train"], on_event, checkpoints, split.get("valid"), name, jobs, ranks)
-    hierarchy = trained.hierarchy
-    if folder:
-        write_history(folder, trained.history)
-        write_model(folder, hierarchy)
-    beside: dict[str, Fit] = {}
-    with clock("baselines"):
-        for baseline, its in baselines.items():
-            place = folder / "baselines" / baseline if folder else None
-            if folder and place:
-                claim(place, its)
-                record(place, demos, recorded(folder))
-            if place and is_finished(place):
-                beside[baseline] = load(place, allow_code=True)
-            else:
-                beside[baseline] = _fit_model(its, demos, place, on_event, jobs, ranks, Clock(), {}, baseline)
+    fits = {
+        baseline: partial(_fit_baseline, its, demos, folder and folder / "baselines" / baseline, folder, baseline)
+        for baseline, (its, _) in baselines.items()
+    }
+    far = {name: fits[name] for name, model in baselines.items() if _worth_a_process(*model, demos)}
+    began = {name: TrainingBegan(name, its.training.epochs) for name, (its, _) in baselines.items()}
+    with _in_other_processes(far if ranks.size == 1 else {}, began, jobs, on_event) as begun:
+        with clock("training"):
+            trained = train_model(
+                spec, size, split["train"], on_event, checkpoints, split.get("valid"), name, jobs, ranks
+            )
+        hierarchy = trained.hierarchy
+        if folder:
+            write_history(folder, trained.history)
+            write_model(folder, hierarchy)
+        with clock("baselines"):
+            beside = {name: begun[name]() if name in begun else fits[name](on_event, jobs, ranks) for name in fits}
     with clock("training"):
         apart = _leave_one_out(spec, size, demos, folder, on_event, jobs, ranks)
     fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=beside, apart=apart)
@@ -411,6 +415,99 @@ def _leave_one_out(
 def _left_out(folder: Path, demos: Demonstrations) -> dict[str, Path]:
     """The folder of the model without each demonstration, by its name."""
     return {name: folder / "left_out" / str(number) for number, name in enumerate(demos.names)}
+
+
+def _fit_baseline(
+    spec: Spec,
+    demos: Demonstrations,
+    folder: Path | None,
+    above: Path | None,
+    name: str,
+    on_event: OnEvent,
+    jobs: int = 1,
+    ranks: Ranks = ALONE,
+) -> Fit:
+    """Fit a baseline, or load it where that is done.
+
+    :param above: the run folder of the model that it is compared with.
+    """
+    if folder and above:
+        claim(folder, spec)
+        record(folder, demos, recorded(above))
+        if is_finished(folder):
+            return load(folder, allow_code=True)
+    return _fit_model(spec, demos, folder, on_event, jobs, ranks, Clock(), {}, name)
+
+
+# --- baselines in other processes -------------------------------------------------------------------------------------
+
+LITTLE = 256e6
+"""Bytes of demonstrations, at most, that another process gets a copy of."""
+
+LONG = 1000
+"""Gradient steps, at least, of a training that takes longer than starting a process."""
+
+DEAD = (
+    "a process that trained a baseline was ended from outside (too little memory?); what was trained is kept in a run "
+    "folder: continue with the same command, with --jobs 1 if memory was short"
+)
+
+
+def _worth_a_process(spec: Spec, networks: Hierarchy, demos: Demonstrations) -> bool:
+    """Whether training takes long (it is not by EM), on a CPU and on demonstrations that are small and in memory.
+
+    Several restarts share the processes among themselves instead.
+    """
+    own, arrays = spec.training, [array for demo in demos for array in demo.observations.values()]
+    steps = math.inf if own.epochs is None else own.epochs * math.ceil(len(demos) / own.batch_size)
+    sizes = [array.nbytes if isinstance(array, np.ndarray) else math.inf for array in arrays]
+    alone = own.restarts == 1 and device_of(own).type == "cpu"
+    return alone and sum(sizes) < LITTLE and steps >= LONG and not uses_em(own.optimizer, networks)
+
+
+@contextmanager
+def _in_other_processes(
+    fits: Mapping[str, Callable[[OnEvent], Fit]], began: Mapping[str, TrainingBegan], jobs: int, on_event: OnEvent
+) -> Iterator[Mapping[str, Callable[[], Fit]]]:
+    """Inside, other processes fit baselines, unless there is one core or job alone.
+
+    :param began: the event with which the training of each begins; it is passed on when the wait begins.
+    :returns: for each baseline that has begun, a function that waits for the fit and then passes its events on.
+    """
+    if not fits or useful_jobs(jobs, 2) == 1:
+        yield {}
+        return
+    with pool(max(2, useful_jobs(jobs, len(fits)))) as parallel:
+        left = results(parallel, [partial(_with_events, name, fit, os.getpid()) for name, fit in fits.items()], DEAD)
+        done: dict[str, tuple[Fit, list[Event]]] = {}
+
+        def wait(name: str) -> Fit:
+            on_event(began[name])
+            while name not in done:
+                found, fitted, events = next(left)
+                done[found] = fitted, events
+            fitted, events = done[name]
+            for event in events:
+                if not isinstance(event, TrainingBegan):
+                    on_event(event)
+            return fitted
+
+        yield {name: partial(wait, name) for name in fits}
+
+
+def _with_events(name: str, fit: Callable[[OnEvent], Fit], parent: int) -> tuple[str, Fit, list[Event]]:
+    """A baseline's name, its fit without demonstrations, and its events, in another process.
+
+    :param parent: the process that waits. Where it is gone, this one ends: another command may go on in the folder.
+    """
+    events: list[Event] = []
+
+    def tell(event: Event) -> None:
+        if os.getppid() != parent:
+            os._exit(1)
+        events.append(event)
+
+    return name, replace(fit(tell), given=None), events
 
 
 def load(folder: str | Path, allow_code: bool = False) -> Fit:

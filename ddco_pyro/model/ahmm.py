@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import pyro
 import torch
+from numpy import broadcast_shapes  # torch's imports sympy
 from pyro.distributions import TorchDistribution
 from pyro.ops.indexing import Vindex
 from torch import Tensor
@@ -102,8 +103,8 @@ class Acting(TorchDistribution):
     ) -> None:
         self.emissions, self.choices = emissions, choices
         *batch, _, size = emissions[0].shape
-        shape = torch.broadcast_shapes(batch, *(choice.shape for choice in choices))
-        super().__init__(shape, torch.Size([size]), validate_args=validate_args)
+        shape = broadcast_shapes(batch, *(choice.shape for choice in choices))
+        super().__init__(torch.Size(shape), torch.Size([size]), validate_args=validate_args)
 
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Acting:
         """The control for choices of a larger batch."""
@@ -156,7 +157,7 @@ class Acting(TorchDistribution):
 
 def _of_caller(values: Tensor, caller: Tensor) -> Tensor:
     """One caller's part [..., E] of values [..., K, E]."""
-    shape = torch.broadcast_shapes(values.shape[:-2], caller.shape)
+    shape = broadcast_shapes(values.shape[:-2], caller.shape)
     index = caller.expand(shape)[..., None, None].expand(*shape, 1, values.shape[-1])
     return values.expand(*shape, *values.shape[-2:]).gather(-2, index).squeeze(-2)
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +17,11 @@ from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.inferred import Inferred
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fit import Fit
+from ddco_pyro.segmenting import baselines
 from ddco_pyro.spec import LevelSpec
+from ddco_pyro.training.data import parts
 
-__all__ = ["LevelLabels", "Segmented", "Segments", "demonstrations", "segments"]
+__all__ = ["LevelLabels", "Segmented", "Segments", "beside_baselines", "segments"]
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Segments:
     :param log_likelihood: log p(ξ) per step, nats.
     :param held_out: whether the run's fit held the demonstration out.
     :param labels: ground-truth labels in the file, name to [T].
+    :param baselines: labels of baselines, ``<level>_<baseline>`` to kinds from 1 on [T].
     """
 
     name: str
@@ -68,6 +71,7 @@ class Segments:
     log_likelihood: float
     held_out: bool
     labels: dict[str, np.ndarray] = field(default_factory=dict)
+    baselines: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(next(iter(self.levels.values())).options)
@@ -129,9 +133,24 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
     return Segmented(tuple(segmented), counts, source.frequency, truth, fit.names)
 
 
-def demonstrations(source: Source, names: Iterable[str], fit: Fit) -> Demonstrations:
-    """Demonstrations of a source with the observations of a run's networks, in memory."""
-    return Demonstrations(tuple(_demonstration(source.recording(name), fit) for name in names))
+def beside_baselines(segmented: Segmented, fit: Fit, source: Source, gripper: int = -1) -> Segmented:
+    """The same segments with the labels of every baseline, fitted to the run's training demonstrations.
+
+    :param gripper: the control dimension whose changes divide demonstrations in the baseline ``gripper``.
+    :raises BadInput: there is no such control dimension, or a package is not installed.
+    """
+    train = parts(fit.spec, fit.demonstrations)["train"]
+    demos = Demonstrations(tuple(_demonstration(source.recording(demo.name), fit) for demo in segmented.segments))
+    found = {
+        f"{level}_{name}": baselines.segment(name, train, demos, count, fit.spec.seed, fit.spec.observations, gripper)
+        for level, count in segmented.counts.items()
+        for name in baselines.BASELINES
+    }
+    each = (
+        replace(demo, baselines={name: kinds[row] + 1 for name, kinds in found.items()})
+        for row, demo in enumerate(segmented.segments)
+    )
+    return replace(segmented, segments=tuple(each))
 
 
 def chosen_names(source: Source, fit: Fit) -> list[str]:

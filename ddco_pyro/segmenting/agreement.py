@@ -5,16 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from ddco_pyro.data.sources import Source
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.drawing.words import number
-from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED, agreement
-from ddco_pyro.fitting.fit import Fit
 from ddco_pyro.metrics import Scores
-from ddco_pyro.segmenting import Segmented, Segments, demonstrations
-from ddco_pyro.segmenting.baselines import BASELINES, segment
-from ddco_pyro.training.data import parts
+from ddco_pyro.segmenting import Segmented, Segments
+from ddco_pyro.segmenting.baselines import BASELINES
 
 MATCHINGS = {"matched_globally": "one for all", "matched_per_demonstration": "each its own"}
 
@@ -69,16 +65,10 @@ class LevelAgreement:
     scores: dict[str, Scores | None]
 
 
-def level_agreements(
-    fit: Fit, source: Source, segmented: Segmented, baselines: bool = False, gripper: int = -1
-) -> dict[str, LevelAgreement]:
+def level_agreements(segmented: Segmented) -> dict[str, LevelAgreement]:
     """Agreement of each level that has labels, by the level's name.
 
-    Baselines have as many kinds of segments as the level has options. They are fitted to the run's training
-    demonstrations and compared on the held-out ones, or on all where none is held out.
-
-    :param gripper: the control dimension whose changes divide demonstrations in the baseline ``gripper``.
-    :raises BadInput: ``baselines`` are asked for, and the demonstrations lack the labels that the spec names.
+    Baselines are compared on the held-out demonstrations, or on all where none is held out.
     """
     agreements = {}
     for level, truth in segmented.truth.items():
@@ -89,19 +79,11 @@ def level_agreements(
         for part, group in groups.items():
             options = [demo.levels[level].options for demo in group]
             scores[f"options, {part}"] = agreement(options, [demo.labels[truth] for demo in group])
-        if baselines:
-            part, group = next(iter(groups.items()))
-            train, count = parts(fit.spec, fit.demonstrations)["train"], segmented.counts[level]
-            demos = demonstrations(source, [demo.name for demo in group], fit)
-            labels = [demo.labels[truth] for demo in group]
-            for name, words in BASELINES.items():
-                found = segment(name, train, demos, count, fit.spec.seed, fit.spec.observations, gripper)
-                scores[f"{words}, {part}"] = agreement(found, labels)
+        part, group = next(iter(groups.items()))
+        for name, words in BASELINES.items() if group[0].baselines else ():
+            found = [demo.baselines[f"{level}_{name}"] for demo in group]
+            scores[f"{words}, {part}"] = agreement(found, [demo.labels[truth] for demo in group])
         agreements[level] = LevelAgreement(truth, scores)
-    if baselines and not agreements:
-        named = ", ".join(f"labels/{name}" for name in fit.spec.demonstrations.label_names)
-        missing = f"the demonstrations have no {named}" if named else "the run's spec has no demonstrations.labels"
-        raise BadInput(f"--baselines: {missing}, with which baselines are compared")
     return agreements
 
 

@@ -8,12 +8,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from importlib.util import find_spec
 
 import numpy as np
 import torch
-from sklearn.cluster import KMeans
-from sklearn.mixture import GaussianMixture
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput, nearest
@@ -52,6 +51,7 @@ def segment(
     """
     if name not in BASELINES:
         raise BadInput(f"there is no baseline {name!r}{nearest(name, BASELINES)}; there is: {', '.join(BASELINES)}")
+    check_installed([name])
     if name == "equal":
         return [np.arange(len(demo)) * count // len(demo) for demo in valid]
     if name == "gripper":
@@ -93,12 +93,16 @@ Rows = list[np.ndarray]
 
 
 def _kmeans(train: Rows, valid: Rows, count: int, seed: int) -> Rows:
+    from sklearn.cluster import KMeans
+
     rows = np.concatenate(train)
     fitted = KMeans(distinct(rows, count), n_init=10, random_state=seed).fit(rows)
     return [fitted.predict(own) for own in valid]
 
 
 def _mixture(train: Rows, valid: Rows, count: int, seed: int) -> Rows:
+    from sklearn.mixture import GaussianMixture
+
     rows = np.concatenate(train)
     count = distinct(rows, count)
     fitted = GaussianMixture(count, reg_covar=SPREAD, n_init=RESTARTS, max_iter=300, random_state=seed).fit(rows)
@@ -107,10 +111,8 @@ def _mixture(train: Rows, valid: Rows, count: int, seed: int) -> Rows:
 
 def _hidden_markov(train: Rows, valid: Rows, count: int, seed: int) -> Rows:
     """Gaussian emissions with diagonal covariances; the most likely path."""
-    try:
-        from hmmlearn.hmm import GaussianHMM
-    except ImportError:
-        raise _missing("hmm", "hmmlearn") from None
+    from hmmlearn.hmm import GaussianHMM
+
     logging.getLogger("hmmlearn").setLevel(logging.ERROR)  # a warning for each restart that does not converge
     rows, lengths = np.concatenate(train), [len(own) for own in train]
     count = distinct(rows, count)
@@ -125,10 +127,8 @@ def _hidden_markov(train: Rows, valid: Rows, count: int, seed: int) -> Rows:
 
 def _change_points(train: Rows, valid: Rows, count: int, seed: int) -> Rows:
     """Pieces of least variance (exact, by dynamic programming), clustered by their means."""
-    try:
-        import ruptures
-    except ImportError:
-        raise _missing("change_points", "ruptures") from None
+    import ruptures
+    from sklearn.cluster import KMeans
 
     def divided(rows: np.ndarray) -> list[np.ndarray]:
         changes = min(PIECES * count, len(rows)) - 1
@@ -157,8 +157,18 @@ def _gripper(train: Demonstrations, valid: Demonstrations, dimension: int) -> Ro
     return [np.cumsum(np.diff(side, prepend=side[:1])) for side in sides]
 
 
-def _missing(name: str, package: str) -> BadInput:
-    return BadInput(f"the baseline {name} needs {package}; install it with: pip install 'ddco-pyro[segments]'")
+PACKAGES = {"hmm": "hmmlearn", "change_points": "ruptures"}
+"""The packages that baselines need beside the project's own."""
+
+
+def check_installed(names: Iterable[str]) -> None:
+    """Check that baselines have the packages that they need.
+
+    :raises BadInput: a package is not installed.
+    """
+    for name, package in PACKAGES.items():
+        if name in names and find_spec(package) is None:
+            raise BadInput(f"the baseline {name} needs {package}; install it with: pip install 'ddco-pyro[segments]'")
 
 
 METHODS: dict[str, Callable[[Rows, Rows, int, int], Rows]] = {

@@ -30,20 +30,26 @@ COPIED = "segmented_from"
 
 
 def labels_of(demo: Segments) -> dict[str, np.ndarray]:
-    """Labels of a demonstration: ``<level>``, its options [T], and ``<level>_boundary``, 1 at each new choice [T]."""
+    """Labels of a demonstration: ``<level>``, its options [T], and ``<level>_boundary``, 1 at each new choice [T].
+
+    Baselines likewise, with ``<level>_<baseline>`` as name.
+    """
     labels = {}
-    for name, level in demo.levels.items():
-        labels[name] = level.options.astype(np.int16)
-        labels[name + BOUNDARY] = level.boundaries.astype(np.int8)
+    each = {name: (level.options, level.boundaries) for name, level in demo.levels.items()}
+    each |= {name: (kinds, np.diff(kinds, prepend=0) != 0) for name, kinds in demo.baselines.items()}
+    for name, (options, boundaries) in each.items():
+        labels[name] = options.astype(np.int16)
+        labels[name + BOUNDARY] = boundaries.astype(np.int8)
     return labels
 
 
-def check_labels(path: Path, levels: Iterable[str], names: Iterable[str]) -> None:
-    """Check that demonstrations in ``path`` can be given labels named after these levels.
+def check_labels(path: Path, given: Iterable[str], names: Iterable[str]) -> None:
+    """Check that demonstrations in ``path`` can be given these labels and their boundaries.
 
+    :param given: levels, and ``<level>_<baseline>`` for baselines.
     :raises BadInput: a demonstration has labels of that name from another source.
     """
-    labels = [label for level in levels for label in (level, level + BOUNDARY)]
+    labels = [label for name in given for label in (name, name + BOUNDARY)]
     with opened(path) as file:
         for name in names:
             group = file["data"][name].get("labels", {})
@@ -127,9 +133,15 @@ def cell(value: Any) -> Any:
 
 
 def columns(segmented: Segmented) -> list[str]:
-    """Names of the columns: for each level the option, whether it is a new choice, its probability, and its name."""
+    """Names of the columns: for each level the option, whether it is a new choice, probability, name; baselines."""
     levels = [f"{name}{suffix}" for name in segmented.counts for suffix in ("", BOUNDARY, "_probability", "_name")]
-    return ["demonstration", "step", *(["seconds"] if segmented.frequency else []), *levels]
+    return [
+        "demonstration",
+        "step",
+        *(["seconds"] if segmented.frequency else []),
+        *levels,
+        *segmented.segments[0].baselines,
+    ]
 
 
 def rows(segmented: Segmented) -> Iterator[list[Any]]:
@@ -141,7 +153,7 @@ def rows(segmented: Segmented) -> Iterator[list[Any]]:
                 option = int(level.options[step])
                 row += [option, int(level.boundaries[step]), float(level.probability[step])]
                 row.append(option_name(option, segmented.names.get(name, ())))
-            yield row
+            yield row + [int(kinds[step]) for kinds in demo.baselines.values()]
 
 
 def write_csv(path: Path, segmented: Segmented) -> None:

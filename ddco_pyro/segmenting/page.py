@@ -8,7 +8,6 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 from urllib.parse import quote
 
-import matplotlib
 import numpy as np
 
 from ddco_pyro.data.files import write_text
@@ -39,8 +38,8 @@ def write_page(path: Path, segmented: Segmented, run: str, file: str, agreements
     sections = [_level(name, segmented, agreements.get(name)) for name in segmented.counts]
     drawn = note(
         f"Time runs to the right on one scale; the full width is {longest}. Colours are options; a white line is a new "
-        "choice. Grey rows are labels in the file. Rest the pointer on a segment for its steps and its probability. "
-        f"Nats per step: the log-likelihood of the demonstration's controls under the model; {NAT}."
+        "choice. Grey rows are labels in the file and baselines. Rest the pointer on a segment for its steps and its "
+        f"probability. Nats per step: the log-likelihood of the demonstration's controls under the model; {NAT}."
     )
     sections.append(Section("segments", "Every demonstration", [drawn, *timelines(segmented)]))
     page = Page(file, [Text(intro)] if held_out else [], sections, subtitle=f"segmented by {run}")
@@ -98,11 +97,11 @@ def timelines(segmented: Segmented, most_segments: float = math.inf) -> list[Tim
 
 
 def _rows(demo: Segments, segmented: Segmented, longest: int) -> Iterator[tuple[str, list[Strip]]]:
-    """The levels, the highest first, and the labels of a demonstration."""
+    """The levels, the highest first, the baselines and the labels of a demonstration."""
     for name, level in reversed(demo.levels.items()):
         names = segmented.names.get(name, ())
         yield name, [_option(level, run, names, segmented.frequency, longest) for run in level.runs()]
-    for name, values in demo.labels.items():
+    for name, values in {**demo.labels, **demo.baselines}.items():
         if name not in demo.levels and not name.endswith("_boundary"):
             yield name, list(_labels(name, values, longest))
 
@@ -128,7 +127,9 @@ def _labels(name: str, values: np.ndarray, longest: int) -> Iterator[Strip]:
 
 
 def _strip(start: int, end: int, longest: int, colour: str, text: str, title: str) -> Strip:
+    from matplotlib.colors import to_rgb  # most commands draw no page
+
     shown = text if end - start > ROOM * longest else ""
-    red, green, blue = matplotlib.colors.to_rgb(colour)
+    red, green, blue = to_rgb(colour)
     ink = "#000" if 0.299 * red + 0.587 * green + 0.114 * blue > 0.55 else "#fff"  # the one that can be read
     return Strip(f"{100 * start / longest:.3f}", f"{100 * (end - start) / longest:.3f}", colour, ink, shown, title)

@@ -10,19 +10,21 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
-from scipy import stats
 
-from ddco_pyro.drawing.figures import ACCENT, FAINT, INK, Interval, Panel, interval_plot, save, style
 from ddco_pyro.drawing.page import Page, Table, Text
 from ddco_pyro.drawing.words import NAT, number, with_error
 from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.metrics import Difference
 from ddco_pyro.selection.folds import Score
 from ddco_pyro.selection.grid import Candidate
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ddco_pyro.drawing.figures import Interval
 
 RULE = (
     "chosen: the candidate with the fewest parameters within one standard error of the best, that is, with a mean "
@@ -163,6 +165,8 @@ def _below(result: _Scored, best: _Scored) -> bool:
     difference = (ours - theirs) / steps
     if np.ptp(difference) == 0:
         return bool(difference[0] < 0)
+    from scipy import stats
+
     return bool(stats.ttest_1samp(difference, 0, alternative="less").pvalue < STOP_LEVEL)
 
 
@@ -235,12 +239,16 @@ def markdown(choice: Choice, data: Mapping[str, Any]) -> str:
 def write_figure(choice: Choice, path: Path) -> None:
     """Draw the choice as PNG; nothing where no candidate was scored."""
     if any(row.mean is not None for row in choice.rows):
+        from ddco_pyro.drawing.figures import save, style
+
         with style():
             save(draw(choice), path, "Held-out log-likelihood of each candidate, and paired differences to the best")
 
 
 def draw(choice: Choice) -> Figure:
     """Log-likelihood of each candidate with the band of one standard error below the best, and paired differences."""
+    from ddco_pyro.drawing.figures import ACCENT, FAINT, INK, Interval, Panel, interval_plot
+
     best, band = choice.best, None
     if best and best.mean is not None and best.error is not None:
         band = (best.mean - best.error, best.mean)

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 from joblib import Parallel, parallel_config
-from sklearn.model_selection import KFold
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Damaged, json_text, write_text
@@ -68,6 +67,8 @@ def assign(count: int, folds: int, seed: int) -> list[list[int]]:
 
     :raises FoldError: there are fewer demonstrations than folds, or too few to train and tune with.
     """
+    from sklearn.model_selection import KFold
+
     if folds > count:
         raise FoldError(f"selection.folds: {folds} folds of {count} demonstrations; use at most {count}")
     if count - -(-count // folds) < 2:

@@ -11,9 +11,10 @@ compute them changes no bit either.
 
 from __future__ import annotations
 
+import inspect
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -38,7 +39,7 @@ from ddco_pyro.training.objective import Diverged, Objective, read_ahead
 from ddco_pyro.training.processes import ALONE, Ranks
 from ddco_pyro.training.stages import Stage, StageEnd, plan, share
 
-SAVE_EVERY = 1.0
+SAVE_EVERY = 5.0
 """Seconds between checkpoints, at least: an epoch of a small model takes less time than its checkpoint."""
 
 Gradients = list[np.ndarray | None]
@@ -298,10 +299,17 @@ def learning_rate(spec: OptimizerSpec, epoch: int, cap: int | None) -> float:
 
 
 def _optimizer(spec: OptimizerSpec, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
+    common = {"params": parameters, "lr": spec.lr, "weight_decay": spec.weight_decay}
     if spec.name == "momentum":
-        return torch.optim.SGD(parameters, lr=spec.lr, momentum=spec.momentum, weight_decay=spec.weight_decay)
-    kind = torch.optim.AdamW if spec.name == "adamw" else torch.optim.Adam
-    return kind(parameters, lr=spec.lr, weight_decay=spec.weight_decay)
+        return _uncompiled(torch.optim.SGD)(**common, momentum=spec.momentum)
+    return _uncompiled(torch.optim.AdamW if spec.name == "adamw" else torch.optim.Adam)(**common)
+
+
+def _uncompiled(kind: type[torch.optim.Optimizer]) -> Callable[..., torch.optim.Optimizer]:
+    """The same optimiser without the decorators that import torch's compiler, which takes seconds."""
+    names = ("add_param_group", "load_state_dict", "state_dict", "zero_grad")
+    plain = {name: inspect.unwrap(getattr(kind, name)) for name in names}
+    return type(kind.__name__, (kind,), {**plain, "step": torch.no_grad()(inspect.unwrap(kind.step))})
 
 
 def _sum(before: np.ndarray | None, gradient: np.ndarray | None) -> np.ndarray | None:

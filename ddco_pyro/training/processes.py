@@ -46,20 +46,25 @@ def useful_jobs(jobs: int, calls: int) -> int:
 
 def pool(jobs: int) -> Parallel:
     """Processes for :func:`results`, to be used in a ``with`` statement."""
-    # one call at a time: each takes long, and each result is kept at once
-    return Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1)
+    # one call at a time: each takes long, and each result is kept at once; no read-only maps of arrays
+    return Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None)
 
 
 def results(parallel: Parallel, calls: Iterable[Callable[[], Result]], dead: str) -> Iterator[Result]:
-    """The results of calls, as they are completed.
+    """The results of calls, as they are completed. Processes other than this one begin at once.
 
     :param dead: the message for a process that dies.
     :raises Failed: a process died.
     """
-    try:
-        yield from parallel([delayed(call)() for call in calls])
-    except BrokenProcessPool as error:
-        raise Failed(dead) from error
+    found = parallel([delayed(call)() for call in calls])
+
+    def completed() -> Iterator[Result]:
+        try:
+            yield from found
+        except BrokenProcessPool as error:
+            raise Failed(dead) from error
+
+    return completed()
 
 
 class LostProcess(Failed):

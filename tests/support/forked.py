@@ -1,4 +1,4 @@
-"""The command line in a forked child, within limits of time and memory: no import is paid again."""
+"""Work in a forked child, within limits of time and memory: no import is paid again."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import os
 import pickle
 import resource
 import signal
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
-
-import command_line
+from typing import Any, NamedTuple
 
 SECONDS = 10
 """Of computing; one that waits, for a pipe, ends after six times as long, however busy the machine is."""
@@ -19,45 +18,42 @@ ADDRESSES = 8 * 10**9
 
 
 class Ended(NamedTuple):
-    """How a command ended.
+    """How a child ended.
 
+    :param value: what its function returned; None where a signal ended it.
     :param status: negative where a signal ended it: SIGXCPU after :data:`SECONDS`, SIGALRM where it hangs.
-    :param seconds: of computing.
     :param grown: bytes of memory that it had at most beyond those of the parent.
     """
 
+    value: Any
     status: int
-    out: str
-    err: str
-    seconds: float
     grown: int
 
 
-def call(*arguments: object) -> Ended:
-    """Run a command in a copy of this process."""
+def run(work: Callable[[], Any]) -> Ended:
+    """Call a function in a copy of this process."""
     reader, writer = os.pipe()
     child = os.fork()
     if not child:
-        _child(writer, arguments)
+        _child(writer, work)
     os.close(writer)
     with open(reader, "rb") as pipe:
         told = pipe.read()
     _, ended = os.waitpid(child, 0)
-    return Ended(*pickle.loads(told)) if told else Ended(os.waitstatus_to_exitcode(ended), "", "", 0.0, 0)
+    return Ended(*pickle.loads(told)) if told else Ended(None, os.waitstatus_to_exitcode(ended), 0)
 
 
-def _child(writer: int, arguments: tuple[object, ...]) -> None:
-    """Call the command, tell how it ended, and end this process without any cleaning up of the parent's."""
+def _child(writer: int, work: Callable[[], Any]) -> None:
+    """Tell what the function returns, and end this process without any cleaning up of the parent's."""
     try:
         pages, resident = map(int, Path("/proc/self/statm").read_text().split()[:2])
         resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + ADDRESSES,) * 2)
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(6 * SECONDS)
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 1))  # a fork has computed nothing yet
-        ended = command_line.call(*arguments)
-        used = resource.getrusage(resource.RUSAGE_SELF)
-        grown = 1024 * used.ru_maxrss - resident * resource.getpagesize()
+        value = work()
+        grown = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - resident * resource.getpagesize()
         with open(writer, "wb") as pipe:
-            pipe.write(pickle.dumps((*ended, used.ru_utime + used.ru_stime, grown)))
+            pipe.write(pickle.dumps((value, 0, grown)))
     finally:
         os._exit(1)

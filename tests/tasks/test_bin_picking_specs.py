@@ -74,6 +74,6 @@ def test_demonstrations_are_fitted_and_rolled_out(demonstrations: Path, tmp_path
     fitted = fit(load_spec(SPECS[0], [f"demonstrations.path={demonstrations}", *TINY]), out=tmp_path / "run")
     assert fitted.metrics.engine_check.value < 1e-6
     rolled = roll_out(fitted, 1, jobs=1)
-    measures = rolled["methods"][fitted.name]["measures"]
+    measures = rolled.methods[fitted.name].measures
     assert measures.keys() == task.measures.keys()
-    assert measures["attempts"]["mean"] >= 1
+    assert measures["attempts"].mean >= 1

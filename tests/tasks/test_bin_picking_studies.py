@@ -4,15 +4,9 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-import bin_picking_films
-import bin_picking_options
-import bin_picking_recovery
-import bin_picking_unseen
 import numpy as np
 import pytest
 from bin_picking import OURS, beside, summarize
-from bin_picking_films import chosen, part
-from bin_picking_options import ENDS, end, shares, trials
 from bin_picking_recovery import counted
 from bin_picking_trials import ENDINGS, Bin, Load, Trial
 from bin_picking_trials import trials as trials_of
@@ -20,50 +14,10 @@ from bin_picking_unseen import place
 from ddco_tasks.bin_picking.trials import Attempt, End, Trials
 from rates import shown
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.simulation.episodes import Episode, rate
 
-OPEN, CLOSED = 1.0, 0.0
-PIN, NEEDLE, NOTHING = 0, 1, -1
-# Two trials, and a third that does not come to its end. Phases: 0 approach, 1 grasp, 2 show, 3 recover, 4 carry,
-# 5 release.
-JAW = [OPEN, CLOSED, CLOSED, OPEN, OPEN, CLOSED, CLOSED, OPEN, OPEN, CLOSED]
-PHASE = [0, 1, 4, 5, 0, 1, 3, 3, 0, 1]
-OPTIONS = [1, 1, 2, 2, 1, 1, 1, 1, 1, 1]
-
-
-@pytest.mark.parametrize("study", [bin_picking_films, bin_picking_options, bin_picking_recovery, bin_picking_unseen])
-def test_a_run_that_is_not_there_is_one_line(study, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr("sys.argv", ["study", str(tmp_path / "nowhere")])
-    with pytest.raises(SystemExit, match="2"):
-        study.main()
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "nowhere" in line
-
-
-def demonstration(name: str, kind: int) -> Demonstration:
-    kinds = np.where(np.arange(len(JAW)) < 4, kind, NOTHING)
-    controls = np.column_stack([np.zeros((len(JAW), 6)), JAW])
-    labels = {"phase": np.array(PHASE), "kind": kinds}
-    return Demonstration(name, {"kin": np.zeros((len(JAW), 7))}, controls, labels)
-
-
-def test_trials_end_where_the_jaws_open() -> None:
-    assert trials(demonstration("demo_0", PIN).actions) == [slice(0, 4), slice(4, 8)]
-
-
-@pytest.mark.parametrize(("kind", "cup"), [(PIN, ENDS[0]), (NEEDLE, ENDS[1])])
-def test_trials_are_told_apart_by_where_the_load_goes(kind: int, cup: str) -> None:
-    demo = demonstration("demo_0", kind)
-    assert [end(demo, trial) for trial in trials(demo.actions)] == [cup, ENDS[2]]
-
-
-def test_options_are_shared_over_the_trials_that_end_alike() -> None:
-    demos = Demonstrations((demonstration("demo_0", PIN), demonstration("demo_1", PIN)))
-    found, ended = shares(demos, np.array([OPTIONS, [3, *OPTIONS[1:]]]))
-    assert ended == {ENDS[0]: 2, ENDS[2]: 2}
-    assert found[ENDS[0]][:5] == [{1: 0.5, 3: 0.5}, {1: 1.0}, {2: 1.0}, {2: 1.0}, {}]
-    assert found[ENDS[2]][:5] == [{1: 1.0}] * 4 + [{}]
+DEMONSTRATION = Demonstration("demo_0", {"kin": np.zeros((10, 7))}, np.zeros((10, 7)))
 
 
 def test_methods_are_paired_by_seed() -> None:
@@ -102,7 +56,7 @@ ATTEMPTS = {
 
 def a_bin(trial: Trial, end: End) -> Bin:
     """A bin with a pin and a wire, and one trial."""
-    empty = Episode(0, demonstration("demo_0", PIN), {}, np.zeros((10, 1), int))
+    empty = Episode(0, DEMONSTRATION, {}, np.zeros((10, 1), int))
     return Bin(empty, Trials(["pin", "wire"], end=end), [trial])
 
 
@@ -176,15 +130,3 @@ def test_an_object_alone_is_where_it_was_dropped(
     lifted: frozenset[int], attempt: Attempt | None, expected: str
 ) -> None:
     assert place(Trial(STEPS, lifted, attempt)) == expected
-
-
-def test_the_first_trial_of_each_ending_is_filmed() -> None:
-    frames = [np.full((2, 2, 3), number, np.uint8) for number in range(8)]
-    whole = Episode(7, demonstration("demo_0", PIN), {}, np.arange(7).reshape(7, 1), frames)
-    names = ["slipped", "lost", "slipped", *ENDINGS, "slipped"]
-    found = ((name, part(whole, slice(number % 5, number % 5 + 2))) for number, name in enumerate(names))
-    films, counts = chosen(found)
-    assert list(films) == list(ENDINGS)
-    assert counts["slipped"] == 3  # nothing is looked at once all have been seen
-    assert films["lost"].choices.ravel().tolist() == [1, 2]
-    assert [int(frame[0, 0, 0]) for frame in films["lost"].frames] == [1, 2, 3]

@@ -18,10 +18,15 @@ from ddco_pyro.spec.base import TASKS
 NAMES = sorted(point.name for point in entry_points(group=TASKS))
 
 
+QUICK = ("needle", "pushing_goal", "bin_picking")
+"""The others differ from them in what is observed or in when they end."""
+each = pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in NAMES]
+)
+
+
 @pytest.mark.filterwarnings("ignore:.*:UserWarning:gymnasium.*")
-@pytest.mark.parametrize("name", [
-    pytest.param(name, marks=pytest.mark.slow if name.startswith("bin_picking_") else ()) for name in NAMES
-])  # fmt: skip
+@each
 def test_gymnasiums_own_check(name: str) -> None:
     environment = gymnasium.make(f"ddco_pyro.simulation.environments:ddco/{name}-v0", render_mode="rgb_array")
     check_env(environment.unwrapped, skip_render_check=True)
@@ -31,7 +36,7 @@ def test_gymnasiums_own_check(name: str) -> None:
     environment.close()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each
 def test_an_episode_is_the_one_of_a_rollout(name: str) -> None:
     task = find_task(name)
     episode = run_episode(task, "supervisor", seed=2)

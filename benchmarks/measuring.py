@@ -1,0 +1,67 @@
+"""Rows of a benchmark: two things measured side by side. All tables of ``docs/performance.md`` have this grammar."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+
+class Row(NamedTuple):
+    """Two measurements and their ratio.
+
+    :param ratio: of the first over the second: the median over pairs that ran one right after the other.
+    """
+
+    first: str
+    second: str
+    value: float
+    other: float
+    ratio: float
+    unit: str = "ms"
+
+
+def seconds(call: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
+    """Time of one call by a clock."""
+    start = clock()
+    call()
+    return clock() - start
+
+
+def side_by_side(
+    names: tuple[str, str],
+    first: Callable[[], object],
+    second: Callable[[], object],
+    rounds: int = 7,
+    clock: Callable[[], float] = time.perf_counter,
+    warm: bool = True,
+) -> Row:
+    """Both calls in turns, after each has run once. ``warm`` says whether the first call needs that."""
+    if warm:
+        first()
+    second()
+    return of_pairs(names, [(1e3 * seconds(first, clock), 1e3 * seconds(second, clock)) for _ in range(rounds)])
+
+
+def of_pairs(names: tuple[str, str], pairs: Iterable[tuple[float, float]], unit: str = "ms") -> Row:
+    """The row of measured pairs."""
+    each = list(pairs)
+    value, other = (statistics.median(column) for column in zip(*each, strict=True))
+    return Row(*names, value, other, statistics.median(one / two for one, two in each), unit)
+
+
+def table(rows: Iterable[Row], aims: dict[str, tuple[str, float]]) -> str:
+    """Rows in Markdown.
+
+    :param aims: the sign and the bound of a ratio, by ``first / second``.
+    """
+    lines = ["| first | | second | | first / second | aim |", "|---|---|---|---|---|---|"]
+    for row in rows:
+        aim = ""
+        if bound := aims.get(f"{row.first} / {row.second}"):
+            reached = row.ratio <= bound[1] if bound[0] == "≤" else row.ratio >= bound[1]
+            aim = f"{bound[0]} {bound[1]:g} {'reached' if reached else '**not reached**'}"
+        values = [f"{value:.3g} {row.unit}" for value in (row.value, row.other)]
+        lines.append(f"| {row.first} | {values[0]} | {row.second} | {values[1]} | {row.ratio:.3g} | {aim} |")
+    return "\n".join(lines) + "\n"

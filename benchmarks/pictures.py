@@ -1,0 +1,253 @@
+"""Parts of the benchmark about pictures: reading, encoding, training on them, in chunks of time, in two processes.
+
+Reading goes on in other processes and is compared by the clock; the rest by the time of this process's processor, which
+other work on the machine changes little.
+"""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+from measuring import Row, of_pairs, seconds, side_by_side
+from torch.utils.data import DataLoader, Dataset
+
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.pictures import Job, Readers, Transform
+from ddco_pyro.encoding import Encoding, encode
+from ddco_pyro.encoding.autoencoder import Convolutions
+from ddco_pyro.events import EpochEnded, Event
+from ddco_pyro.inference import log_likelihood
+from ddco_pyro.inference.threads import one_thread
+from ddco_pyro.model import hierarchy as networks
+from ddco_pyro.model.batch import Batch
+from ddco_pyro.spec import parse_spec
+from ddco_pyro.training.launching import together
+from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.restarts import Trainer
+
+AIMS = {
+    "epoch of pictures in a file / pictures in memory": ("≤", 1.15),
+    "epoch in one process / in two": ("≥", 1.7),
+}
+FF = {"network": "conv", "filters": 64, "kernel": 5, "hidden": [64]}
+"""The paper's: a convolution of 64 filters of 5 × 5 and a fully connected layer (SM 1.2)."""
+
+NUMBER, STEPS, SIZE = 12, 60, (120, 160, 3)
+FEW, SHORT = 4, 16
+"""Demonstrations that are trained on, beside one to tune with, and the steps of each."""
+
+WORKERS, BATCH = 2, 16
+"""Of both ways to read: robomimic's settings for pictures."""
+
+ROUNDS = 5
+
+
+class SingleSteps(Dataset):
+    """robomimic's loading pattern, rebuilt: ``SequenceDataset`` with ``hdf5_cache_mode="low_dim"``.
+
+    Vectors and controls are in memory; a sample is a single step, whose picture is read from the file, which each
+    worker opens once.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.file = path, None
+        with h5py.File(path) as file:
+            self.low = {
+                name: {"pose": demo["obs/pose"][()], "actions": demo["actions"][()].astype(np.float32)}
+                for name, demo in file["data"].items()
+            }
+        self.index = [(name, step) for name, each in self.low.items() for step in range(len(each["actions"]))]
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def __getitem__(self, number: int) -> dict[str, np.ndarray]:
+        if self.file is None:
+            self.file = h5py.File(self.path, "r", swmr=True, libver="latest")
+        name, step = self.index[number]
+        camera = self.file[f"data/{name}/obs/camera"][step : step + 1]
+        return {"camera": camera, **{key: values[step : step + 1] for key, values in self.low[name].items()}}
+
+
+def made(number: int, steps: int) -> Demonstrations:
+    """Pictures of noise."""
+    random = np.random.default_rng(0)
+
+    def one(index: int) -> Demonstration:
+        camera = random.integers(0, 256, (steps, *SIZE), dtype=np.uint8)
+        return Demonstration(
+            f"demo_{index}", {"pose": random.normal(size=(steps, 3)), "camera": camera}, random.normal(size=(steps, 3))
+        )
+
+    return Demonstrations(tuple(one(index) for index in range(number)))
+
+
+def measured(names: tuple[str, str], *calls: Callable[[], float]) -> Row:
+    """The row of calls that give seconds, in turns; the first round warms up."""
+    return of_pairs(names, [tuple(1e3 * call() for call in calls) for _ in range(ROUNDS + 1)][1:])
+
+
+def reading() -> Iterator[Row]:
+    """Frames from two reading processes, beside robomimic's pattern with two, by the clock."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "demos.hdf5"
+        made(NUMBER, STEPS).write(path)
+        loader = DataLoader(SingleSteps(path), BATCH, shuffle=True, num_workers=WORKERS, persistent_workers=True)
+        demos = list(Demonstrations.read(path))
+
+        def theirs() -> None:
+            assert sum(len(batch["camera"]) for batch in loader) == NUMBER * STEPS
+
+        with Readers(WORKERS) as readers:
+
+            def ours() -> None:
+                order = np.random.default_rng(0).permutation(len(demos)).tolist()
+                jobs = [_job(demos[number], number) for number in order]
+                readers.plan(jobs)
+                assert sum(readers.take(job)["camera"].shape[1] for job in jobs) == NUMBER * STEPS
+
+            yield side_by_side(("robomimic's pattern of reading", "reading"), theirs, ours, ROUNDS)
+
+
+def _job(demo: Demonstration, number: int) -> Job:
+    pictures = {"camera": (demo.observations["camera"],)}
+    return Job((number,), pictures, slice(0, len(demo)), {"camera": Transform()}, {})
+
+
+def encoding() -> Iterator[Row]:
+    """``ddco-pyro encode`` on a file, over its network alone on the same frames in memory."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "demos.hdf5"
+        made(NUMBER, STEPS).write(path)
+        network = Convolutions("random_conv", SIZE, 0)
+        frames = [np.asarray(demo.observations["camera"]) for demo in Demonstrations.read(path)]
+
+        def alone() -> None:
+            with one_thread():
+                for block in frames:
+                    network.encode(block)
+
+        def whole() -> None:
+            with tempfile.TemporaryDirectory() as out:
+                encode(path, Path(out) / "out.hdf5", Encoding("camera"))
+
+        yield side_by_side(("encode", "its network in memory"), whole, alone, ROUNDS, time.process_time)
+
+
+def training() -> Iterator[Row]:
+    """An epoch of the paper's FF networks, tuning included."""
+    with tempfile.TemporaryDirectory() as folder:
+        memory, stored = made(FEW + 1, SHORT), Path(folder) / "few.hdf5"
+        memory.write(stored)
+        streamed = Demonstrations.read(stored)
+        held = partial(epoch, memory)
+        read, ahead = partial(epoch, streamed), partial(epoch, streamed, workers=WORKERS)
+        yield measured(("epoch of pictures in a file", "pictures in memory"), read, held)
+        yield measured(("epoch of pictures in a file, two workers", "pictures in memory"), ahead, held)
+        yield measured(("epoch of pictures in memory", "networks alone"), held, networks_alone(memory))
+        eight = made(10, SHORT)
+        pair = [epoch(eight, processes=number, clock=time.perf_counter) for number in (1, 2)]
+        yield of_pairs(("epoch in one process", "in two"), [(1e3 * pair[0], 1e3 * pair[1])])
+
+
+def trainer(demos: Demonstrations, workers: int = 0, shards: int = 1, epochs: int = 2) -> Trainer:
+    """The paper's FF networks, three options, a few epochs; the last demonstration tunes."""
+    level = {"count": 3, "policy": FF, "termination": {"network": "linear", "inputs": ["pose"]}}
+    train, tune = demos.select(demos.names[:-1]), demos.select(demos.names[-1:])
+    budget = {"epochs": epochs, "patience": None, "batch_size": len(train) // (1 if shards > 1 else 2)}
+    spec = parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": ["pose", "camera"],
+            "hierarchy": {"levels": [level], "meta_policy": FF},
+            "training": {"initialize": "random", "layerwise": False, "workers": workers, "shards": shards, **budget},
+        }
+    )
+    return Trainer(spec, Dimensions.of(demos), train, tune)
+
+
+def epoch(
+    demos: Demonstrations,
+    workers: int = 0,
+    processes: int | None = None,
+    clock: Callable[[], float] = time.process_time,
+) -> float:
+    """Seconds of an epoch by a clock, the first epoch left out; of this process's processor unless told otherwise."""
+    clocks: list[float] = []
+
+    def tell(event: Event) -> None:
+        if isinstance(event, EpochEnded):
+            clocks.append(clock())
+
+    made_for = trainer(demos, workers) if processes is None else trainer(demos, shards=2, epochs=4)
+    made_for.on_event = tell
+    with together(processes or 1) as ranks:
+        made_for.ranks = ranks
+        made_for.run()
+    return statistics.median(after - before for before, after in pairwise(clocks))
+
+
+def networks_alone(demos: Demonstrations) -> Callable[[], float]:
+    """Forward and backward of the same networks with a sum as loss, Adam, and forward alone where an epoch tunes."""
+    material = trainer(demos).data
+    model = material.hierarchy(0).train()
+    optimizer = torch.optim.Adam(model.parameters(), lr=1e-3, fused=True)
+    each, train, tune = list(model.networks().values()), material.train, material.tune
+
+    def run() -> None:
+        for rows in torch.arange(FEW).split(FEW // 2):
+            optimizer.zero_grad()
+            for _, piece in train.select(rows).pieces(model.steps_at_once):
+                inputs = piece.inputs.loaded()
+                sum(network(inputs)[0].sum() for network in each).backward()
+            optimizer.step()
+        with torch.no_grad():
+            for _, piece in tune.pieces(model.steps_at_once):
+                inputs = piece.inputs.loaded()
+                for network in each:
+                    network(inputs)
+
+    def timed() -> float:
+        with one_thread():
+            return seconds(run, time.process_time)
+
+    return timed
+
+
+def chunks() -> Iterator[Row]:
+    """A gradient of 240 pictures of 64 × 64 in eight chunks of time, over the same in one piece."""
+    conv = {"network": "conv", "filters": 8, "kernel": 5, "hidden": [32]}
+    ends = {"network": "conv", "filters": 2, "hidden": []}
+    steps, random = 240, np.random.default_rng(0)
+    camera = random.integers(256, size=(steps, 64, 64, 3), dtype=np.uint8)
+    demos = Demonstrations((Demonstration("demo_0", {"camera": camera}, random.normal(size=(steps, 3))),))
+    for name, policy in {"conv": conv, "lstm over conv": {"network": "lstm", "over": conv, "hidden": 32}}.items():
+        spec = parse_spec(
+            {
+                "demonstrations": {"path": "unused.hdf5"},
+                "observations": ["camera"],
+                "hierarchy": {"levels": [{"count": 3, "policy": policy, "termination": ends}], "meta_policy": ends},
+            }
+        )
+        made_for = Trainer(spec, Dimensions.of(demos), demos, demos)
+        model, batch = made_for.hierarchy, made_for.data.train
+
+        def gradient(number: int, model: networks.Hierarchy = model, batch: Batch = batch) -> None:
+            networks.BYTES_AT_ONCE = model.step_bytes * -(-steps // number)
+            model.zero_grad(set_to_none=True)
+            log_likelihood(model.tabulate(batch), batch.lengths).sum().backward()
+
+        calls = partial(gradient, 8), partial(gradient, 1)
+        yield side_by_side((f"gradient of {name} in chunks", "in one piece"), *calls, ROUNDS, time.process_time)
+
+
+PARTS = {"reading": reading, "encoding": encoding, "pictures": training, "chunks": chunks}
