@@ -495,9 +495,3 @@ class Metrics(Record, frozen=False):
     def trainings(self) -> dict[str, Training]:
         """The training of the model and of each baseline, by name."""
         return {name: method.training for name, method in self.methods.items()}
-
-    @property
-    def option_labels(self) -> dict[str, dict[int, int]]:
-        """The label that each option stands for, by level; empty for a run that was not trained from labels."""
-        trained = self.trained_labels
-        return {trained.level: dict(enumerate(trained.values, start=1))} if trained else {}

@@ -162,10 +162,10 @@ def read_all(fit: Fit, metrics: Metrics) -> None:
 def _read_all(fit: Fit, metrics: Metrics) -> None:
     words.verdict(metrics), words.success(metrics)
     again = replace(fit, metrics=metrics)
-    training.degeneracies(fit.spec, metrics), header(fit, metrics), training.particulars(again)
+    training.degeneracies(again), header(fit, metrics), training.particulars(again)
     agreement.section(again)
     likelihood.table(metrics)
-    options.use_table(["option"], metrics.options, metrics.demonstrations.train)
+    options.use_table(again)
     found = metrics.rollouts
     if found:
         rollouts.measures_table(found.methods), rollouts.paired_table(found.methods, metrics.model)

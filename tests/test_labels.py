@@ -317,9 +317,10 @@ def test_a_run_says_for_which_labels_its_options_stand(files):
     call("segment", files / "run", files / "demos.hdf5", "--html", files / "page.html")
     for page in (files / "page.html", files / "run" / "report.html"):
         text = page.read_text()
-        assert "option 2 (label 2)" in text
+        assert "phase 2 (option 2)" in text
         assert "option 3" in text
         assert "option 3 (" not in text
+        assert "(option 3)" not in text
 
 
 def test_labels_that_do_not_fit_are_refused_before_anything_is_written(files):

@@ -178,13 +178,15 @@ def test_the_segments_are_those_of_the_most_likely_path(labelled):
     for name, link, *_ in rows_of(page):
         after = page.partition(f'id="{link}"')[2].partition('class="demonstration"')[0]
         drawn = [
-            (int(option), int(start), int(end))
-            for option, start, end in re.findall(r'title="option (\d), steps (\d+) to (\d+), probability', after)
+            (found.names["option"].index(name), int(start), int(end))
+            for name, start, end in re.findall(r'title="([^"]+), steps (\d+) to (\d+), probability', after)
         ]
         steps = np.concatenate([np.full(end + 1 - start, option) for option, start, end in drawn])
         row = demos.names.index(name)
         np.testing.assert_array_equal(steps, path[row, : len(demos[row])])
-        labels = [(int(label), int(start)) for label, start in re.findall(r'title="phase (\d), steps (\d+) to', after)]
+        labels = [
+            (int(label), int(start)) for label, start in re.findall(r'title="phase (\d), steps (\d+) to \d+"', after)
+        ]
         assert labels == [(0, 0), (1, len(steps) // 2)]
 
 

@@ -71,7 +71,7 @@ FILES = {
 def test_the_folder_holds_what_it_promises(toy_run):
     files = {str(path.relative_to(toy_run.folder)) for path in toy_run.folder.rglob("*") if path.is_file()}
     beside = {f"baselines/{kind}/{name}" for kind in ("flat", "per_timestep") for name in FILES}
-    assert files == FILES | beside
+    assert files == FILES | beside | {"names.yaml"}
 
 
 def test_the_spec_in_the_folder_is_the_whole_spec(toy_run, toy_spec):

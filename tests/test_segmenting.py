@@ -130,7 +130,15 @@ def test_tables_have_a_row_for_each_step(toy_run, file, tmp_path):
     assert call("segment", toy_run.folder, file, "--csv", table, "--parquet", binary).status == 0
     found = look(toy_run.folder, file)
     rows = list(csv.DictReader(table.open()))
-    assert list(rows[0]) == ["demonstration", "step", "seconds", "option", "option_boundary", "option_probability"]
+    assert list(rows[0]) == [
+        "demonstration",
+        "step",
+        "seconds",
+        "option",
+        "option_boundary",
+        "option_probability",
+        "option_name",
+    ]
     assert len(rows) == sum(len(one) for one in found.segments)
     at = 0
     for one in found.segments:
@@ -153,9 +161,10 @@ def test_the_page_shows_every_segment(toy_run, file, tmp_path):
     assert call("segment", toy_run.folder, file, "--html", page).status == 0
     text, found = page.read_text(), look(toy_run.folder, file)
     assert len(re.findall('class="demonstration"', text)) == len(found)
-    titles = re.findall(r'title="option (\d), steps (\d+) to (\d+), probability', text)
+    number = {name: option for option, name in enumerate(toy_run.names["option"])}
+    titles = re.findall(r'title="([^"]+), steps (\d+) to (\d+), probability', text)
     runs = [run for one in found.segments for run in one.levels["option"].runs()]
-    assert [(int(o), int(a), int(b) + 1) for o, a, b in titles] == runs
+    assert [(number[o], int(a), int(b) + 1) for o, a, b in titles] == runs
     assert "http" not in text
     assert "<script" not in text
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -11,6 +12,7 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from ddco_pyro.acting.window import Window
+from ddco_pyro.drawing.words import option_name
 from ddco_pyro.inference.logspace import arrive
 from ddco_pyro.model.ahmm import Acting, Tabulated, choose
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -36,6 +38,7 @@ class Controller:
     :param options: ``sample`` terminations and selections; take the ``most_likely`` of each; or take the choices with
         the largest ``marginal`` p(h_t | s_0, ..., s_t), which accumulates the probability that options have ended.
     :param seed: of the first episode.
+    :param names: the names of the choices of each level, lowest first, such as ``fit.names``.
     """
 
     def __init__(
@@ -44,15 +47,22 @@ class Controller:
         control: Literal["mean", "sample"] = "mean",
         options: OptionExecution = "sample",
         seed: int = 0,
+        names: Mapping[str, Sequence[str]] = MappingProxyType({}),
     ) -> None:
-        self.hierarchy = hierarchy.eval()
+        self.hierarchy, self.names = hierarchy.eval(), names
         self.control, self.options = control, options
         self.reset(seed)
 
     @classmethod
-    def from_spec(cls, hierarchy: Hierarchy, spec: RolloutSpec, seed: int = 0) -> Controller:
+    def from_spec(
+        cls,
+        hierarchy: Hierarchy,
+        spec: RolloutSpec,
+        seed: int = 0,
+        names: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    ) -> Controller:
         """The controller of a spec's ``rollout`` settings."""
-        return cls(hierarchy, spec.control, spec.options, seed)
+        return cls(hierarchy, spec.control, spec.options, seed, names)
 
     def reset(self, seed: int = 0) -> None:
         """Begin an episode. Equal seeds and observations give equal controls."""
@@ -71,6 +81,12 @@ class Controller:
     def choices(self) -> tuple[int, ...]:
         """The active choice of each level, lowest first: 1 to k_d, or 0 for control by the caller."""
         return tuple(self.all_choices[0].tolist())
+
+    @property
+    def active(self) -> dict[str, str]:
+        """The name of the active choice of each level that ``names`` has."""
+        levels = zip(self.names.items(), self.choices, strict=False)
+        return {level: option_name(choice, own) for (level, own), choice in levels}
 
     @property
     def terminations(self) -> tuple[float, ...]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -26,10 +27,12 @@ class Monitor:
     ...     belief = monitor.step({"place": demo.observations["place"][t]}, demo.actions[t - 1])
     >>> belief.choices[0].shape, round(float(belief.choices[0].sum()), 6)  # control and two options
     (torch.Size([1, 3]), 1.0)
+
+    :param names: the names of the choices of each level, lowest first, such as ``fit.names``.
     """
 
-    def __init__(self, hierarchy: Hierarchy) -> None:
-        self.hierarchy = hierarchy.eval()
+    def __init__(self, hierarchy: Hierarchy, names: Mapping[str, Sequence[str]] = MappingProxyType({})) -> None:
+        self.hierarchy, self.names = hierarchy.eval(), names
         self.reset()
 
     def reset(self) -> None:
@@ -42,6 +45,11 @@ class Monitor:
     def log_likelihood(self) -> float:
         """log p of the controls so far, nats."""
         return float(self._filter.log_likelihood)
+
+    def by_name(self, belief: Belief) -> dict[str, dict[str, float]]:
+        """The probability of each choice of each level that ``names`` has, by name."""
+        levels = zip(self.names.items(), belief.choices, strict=False)
+        return {level: dict(zip(own, each[0].tolist(), strict=True)) for (level, own), each in levels}
 
     def step(self, observation: Mapping[str, np.ndarray], control: np.ndarray | None = None) -> Belief:
         """p(h_t, b_t | s_0..t, a_0..t-1) of every level.

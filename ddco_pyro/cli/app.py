@@ -37,6 +37,7 @@ EXAMPLES: dict[Callable[..., None], str] = {
     runs.compare: "compare runs/needle runs/needle/baselines/flat runs/other",
     runs.rollout: "rollout runs/needle --episodes 200 --video",
     runs.report: "report runs/needle",
+    runs.name: "name runs/mine --level option reach,grasp,lift,place",
     demos.inspect: "inspect mine.hdf5",
     demos.init: "init mine.hdf5 --out mine.yaml",
     demos.import_: "import pusht --out demos.hdf5",

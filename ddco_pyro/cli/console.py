@@ -242,11 +242,12 @@ def seeds(metrics: Metrics) -> None:
     say(words.over_seeds(found, words.method(metrics.model), len(metrics.valid)))
 
 
-def merged(pair: Pair, before: Metrics, after: Metrics) -> None:
+def merged(pair: Pair, before: Fit, after: Fit) -> None:
     """The merged options and the change of held-out log-likelihood."""
-    first, second = pair.options
+    names = list(before.names.values())[pair.level]
+    first, second = (words.numbered_name(option, names).removeprefix("option ") for option in pair.options)
     apart = "" if pair.divergence is None else f" ({pair.divergence:.2f} nats/step apart)"
-    values = [words.number(metrics.log_likelihood_per_step.valid) for metrics in (before, after)]
+    values = [words.number(fit.metrics.log_likelihood_per_step.valid) for fit in (before, after)]
     say(f"Merged options {first} and {second}{apart}: held-out {values[0]} → {values[1]} nats/step.")
 
 
@@ -254,7 +255,7 @@ def warnings(fit: Fit) -> None:
     """Warnings of too short a training and of a degenerate solution, each with the usual remedy."""
     from ddco_pyro.report.training import degeneracies
 
-    for what, advice in (*words.unconverged(fit.metrics), *degeneracies(fit.spec, fit.metrics)):
+    for what, advice in (*words.unconverged(fit.metrics), *degeneracies(fit)):
         say(f"warning: {what} {advice}")
 
 

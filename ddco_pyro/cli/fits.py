@@ -128,6 +128,9 @@ def _fit(
     console.log_likelihoods(fitted.metrics)
     console.seeds(fitted.metrics)
     console.warnings(fitted)
+    if fitted.named:
+        every = "; ".join(", ".join(names) for names in fitted.named.values())
+        print(f"names: {folder / 'names.yaml'}: {every}")
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
     if loaded.hierarchy and loaded.demonstrations.path:
         file = loaded.demonstrations.path
@@ -210,7 +213,7 @@ def merge(
     with console.Progress() as progress:
         fitted = merging.merge(before, pair, folder, progress, jobs)
     console.log_likelihoods(fitted.metrics)
-    console.merged(pair, before.metrics, fitted.metrics)
+    console.merged(pair, before, fitted)
     console.warnings(fitted)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
     print(f"next: {command('compare', run, folder, *_allowed(fitted.spec))}")

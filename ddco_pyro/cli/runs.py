@@ -90,6 +90,32 @@ def report(run: RunPath, allow_code: AllowCode = False) -> None:
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
 
 
+def name(
+    run: RunPath,
+    names: Annotated[
+        str | None,
+        typer.Argument(metavar="[NAMES]", help="The names of options 1 to k, with commas between.", show_default=False),
+    ] = None,
+    level: Annotated[str | None, typer.Option(help="Name of their level; by default the lowest.")] = None,
+    allow_code: AllowCode = False,
+) -> None:
+    """Name the options of a level in RUN/names.yaml; without NAMES, show the options with their shares and lengths."""
+    from ddco_pyro.cli import console
+    from ddco_pyro.fitting.fitted import load
+    from ddco_pyro.report.options import use_table
+
+    fitted = load(run, allow_code)
+    if names is not None:
+        check_outputs([Output("RUN", run / "names.yaml", "file")])
+        fitted.name_options(level or next(iter(fitted.names), ""), names.split(","))
+    elif not fitted.names or (level and level not in fitted.names):
+        raise BadInput(f"{run}: has no {f'level {level!r}' if fitted.names else 'options'}; name another")
+    console.show(use_table(fitted, [level] if level else None))
+    if names is not None:
+        allowed = ["--allow-code"] if allow_code else []
+        print(f"{run / 'names.yaml'}: show them with: {command('report', run, *allowed)}")
+
+
 def _check_run(run: Path, *names: str) -> None:
     """Check that the report of a run, and these files of the run, may be written."""
     files = [Output("RUN", run / name, "file") for name in ("report.html", *names)]
@@ -246,15 +272,15 @@ def _annotate(fit: Fit, source: Source, out: Path, how: tuple[str | None, str], 
     if source.format != "lerobot":
         raise BadInput(f"{source.files[0]}: is no LeRobot dataset; --lerobot annotates a copy of one")
     from ddco_pyro.data.sources.lerobot import LeRobot
-    from ddco_pyro.segmenting.lerobot import FORMS, annotate, check_target, subtask_names
+    from ddco_pyro.segmenting.lerobot import FORMS, annotate, check_target, subtasks
 
     assert isinstance(source, LeRobot)
     level, form = how[0], FORMS[how[1]]
-    counts = {options.name: options.count for options in fit.spec.hierarchy.levels} if fit.spec.hierarchy else {}
-    if level is not None and level not in counts:
-        raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(counts)})")
-    chosen = level or next(iter(counts), "")
-    check_target(source, out, subtask_names(chosen, counts.get(chosen, 0)), form)
+    if level is not None and level not in fit.names:
+        raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(fit.names)})")
+    chosen = level or next(iter(fit.names), "")
+    names = fit.names.get(chosen, ())
+    check_target(source, out, subtasks(chosen, len(names) - 1, names), form)
     segmented = segments(fit, source, on_event)
     annotate(source, out, segmented, chosen, form)
     print(out)

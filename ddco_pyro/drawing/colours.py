@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +20,9 @@ OPTIONS = (
 )  # fmt: skip
 """Any two of the first five and the grey of control are more than 23 apart in CIELAB, for normal sight and for readers
 without red, green or blue cones. All ten are more than 18 apart."""
+
+ROW = 132
+"""Characters in a row of a legend, about: eleven options without names."""
 
 HEIGHT = 240
 """Rows of a picture with heat; pixels stay squares."""
@@ -42,17 +45,24 @@ def option_rgb(choice: int) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def legend(choices: Iterable[int]) -> list[Patch]:
-    """Legend handles that name the colours of choices."""
+def legend(choices: Iterable[int], names: Sequence[str] = ()) -> list[Patch]:
+    """Legend handles that name the colours of choices.
+
+    :param names: of each choice, control first.
+    """
     from matplotlib.patches import Patch
 
-    return [Patch(color=option_colour(choice), label=option_name(choice)) for choice in choices]
+    return [Patch(color=option_colour(choice), label=option_name(choice, names)) for choice in choices]
 
 
-def add_legend(figure: Figure, choices: Iterable[int], place: str = "outside lower center") -> None:
-    """Name the colours of these choices below a figure."""
-    handles = legend(sorted(set(choices)))
-    figure.legend(handles=handles, loc=place, ncols=min(len(handles), 11), handlelength=1)  # type: ignore[call-overload]
+def add_legend(
+    figure: Figure, choices: Iterable[int], names: Sequence[str] = (), place: str = "outside lower center"
+) -> None:
+    """Name the colours of these choices below a figure, in rows that it has room for."""
+    handles = legend(sorted(set(choices)), names)
+    longest = max((len(handle.get_label()) for handle in handles), default=0)  # type: ignore[arg-type]
+    columns = max(1, min(len(handles), ROW // (longest + 4)))
+    figure.legend(handles=handles, loc=place, ncols=columns, handlelength=1)  # type: ignore[call-overload]
 
 
 def with_heat(picture: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -68,10 +68,32 @@ def method(name: str) -> str:
     return METHODS.get(name, name.replace("_", " "))
 
 
-def option_name(option: int, labels: Mapping[int, int] | None = None) -> str:
-    """``control``, ``option h``, or ``option h (label l)`` where ``labels`` has the option."""
-    stands = f" (label {labels[option]})" if labels and option in labels else ""
-    return f"option {option}{stands}" if option else "control"
+def option_name(option: int, names: Sequence[str] = ()) -> str:
+    """The name of a choice: ``control``, the option's name, or ``option h`` where it has none.
+
+    :param names: of each choice, control first, as in ``fit.names[level]``.
+    """
+    return names[option] if option < len(names) else f"option {option}" if option else "control"
+
+
+def numbered_name(option: int, names: Sequence[str] = ()) -> str:
+    """``grasp (option 2)``, or ``option 2`` where it has no name."""
+    name, number = option_name(option, names), option_name(option)
+    return name if name == number else f"{name} ({number})"
+
+
+def name_in_level(option: int, level: str, names: Sequence[str] = ()) -> str:
+    """``grasp``, or ``skill 2`` where option 2 of the level ``skill`` has no name."""
+    name = option_name(option, names)
+    return f"{level} {option}" if option and name == option_name(option) else name
+
+
+def choice_names(count: int, named: Sequence[str] = ()) -> tuple[str, ...]:
+    """The name of each choice of a level with ``count`` options, control first.
+
+    :param named: the names of the options; empty where they have none.
+    """
+    return option_name(0), *(named or map(option_name, range(1, 1 + count)))
 
 
 def number(value: float | None, digits: int = 2) -> str:
@@ -114,10 +136,10 @@ def measure(name: str) -> str:
     base, _, unit = name.rpartition("_")
     units = {"mm", "cm", "m", "s", "rad", "deg", "steps"}
     text = f"{base} ({unit})" if base and unit in units else name
-    return text.replace("_", " ").capitalize() if "(" not in text else _capital(text.replace("_", " "))
+    return text.replace("_", " ").capitalize() if "(" not in text else capital(text.replace("_", " "))
 
 
-def _capital(text: str) -> str:
+def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
@@ -141,7 +163,7 @@ def rising(names: Iterable[str]) -> str:
 
 def _explained(metrics: Metrics) -> str:
     ours, held_out, per_step = method(metrics.model), len(metrics.valid), metrics.log_likelihood_per_step
-    name = _capital(ours)
+    name = capital(ours)
     if not held_out:
         value = number(per_step.train)
         return f"{name} was fitted to all demonstrations ({value} nats per step); none was held out to evaluate it."
@@ -379,7 +401,7 @@ def unconverged(metrics: Metrics) -> list[tuple[str, str]]:
         stages = [_too_short(stage) for stage in training.stages if not stage.converged]
         if stages:
             who = method(name)
-            verdict = f"Earlier stages of {who} had" if training.converged else f"{_capital(who)} has"
+            verdict = f"Earlier stages of {who} had" if training.converged else f"{capital(who)} has"
             verdicts.append((f"{verdict} not converged: the budget ended {listed(stages)}.", RAISE))
     return verdicts
 

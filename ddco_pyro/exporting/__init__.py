@@ -76,6 +76,7 @@ def write_numpy(fit: Fit, folder: Path) -> bool:
     """
     hierarchy = fit.hierarchy.place(HOST).eval()
     about, weights = describe(hierarchy, fit.spec.rollout, StepProgram(hierarchy).eval())
+    about["names"] = fit.names
     if about["numpy"]:
         np.savez(folder / "weights.npz", **weights)  # type: ignore[arg-type]
     shutil.copyfile(runner.__file__, folder / "runner.py")

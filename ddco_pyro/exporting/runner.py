@@ -6,6 +6,7 @@
     controller.reset(seed=0)
     control = controller.act({"state": state})    # [A], in the control's own units
     controller.choices, controller.terminations   # active options, lowest level first, and their ψ
+    controller.active                             # their names, by level
 
 ``python runner.py [FOLDER] [numpy|torch|onnx]`` replays the episodes in ``check.npz`` and prints the largest difference
 from the original. A user's networks may need ``Runner(".", networks="torch")`` and torch, or
@@ -65,6 +66,12 @@ class Runner:
         self._pictures: dict[str, list[np.ndarray]] = {}
         self._marginal: np.ndarray | None = None
         self._state = [np.array(part["values"], part["kind"]).reshape(part["shape"]) for part in self.about["state"]]
+
+    @property
+    def active(self) -> dict[str, str]:
+        """The name of the active choice of each level."""
+        levels = zip(self.about["names"].items(), self.choices, strict=False)
+        return {level: own[choice] for (level, own), choice in levels}
 
     def act(self, observation: Mapping[str, Any]) -> np.ndarray:
         """The control [A], in the control's own units.

@@ -23,6 +23,7 @@ from ddco_pyro.events import Event, OnEvent, TrainingBegan, ignore
 from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.evaluation import evaluate
 from ddco_pyro.fitting.fitted import Fit, left_out, load
+from ddco_pyro.fitting.names import label_names, proposed, read_names, write_names
 from ddco_pyro.fitting.run import (
     Clock,
     claim,
@@ -113,9 +114,11 @@ def fit(
         if demos is not None:
             refuse_unfit(spec, demos)
             used(spec, demos)
+            label_names(demos)
     with ExitStack() as stack:  # all checks are done: from here on files are written
         if folder is not None:
             stack.enter_context(claimed(folder, spec, resume))
+            read_names(folder, spec)  # or they are refused
         finished = folder is not None and is_finished(folder)
         with clock("demonstrations"):
             if demos is None and not finished:
@@ -195,10 +198,15 @@ def _fit_model(
             seconds={},
             versions={package: importlib.metadata.version(package) for package in PACKAGES},
         )
+        named = read_names(folder, spec) if folder else None
+        if named is None and spec.hierarchy and name is None:
+            named = proposed(spec, split["train"], fitted.segment(split["train"]), metrics.trained_labels)
+            if folder and named:
+                write_names(folder, named)
     metrics.seconds = clock.end()
     if folder:
         metrics.write(folder)
-    return replace(fitted, metrics=metrics)
+    return replace(fitted, metrics=metrics, named=named or {})
 
 
 def _leave_one_out(

@@ -15,8 +15,10 @@ from torch import Tensor
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.drawing.words import choice_names
 from ddco_pyro.evaluation.inferred import Inferred, infer
 from ddco_pyro.fitting.digest import record, recorded
+from ddco_pyro.fitting.names import Named, checked, read_names, write_names
 from ddco_pyro.fitting.run import RunError, is_finished, read_model
 from ddco_pyro.inference import Posterior
 from ddco_pyro.metrics import Metrics
@@ -42,6 +44,7 @@ class Fit:
     :param beside: the fitted baselines, by name; None for those in the run folder.
     :param apart: models that were trained without a demonstration, by its name (``demonstrations.leave_one_out``); None
         for those in the run folder.
+    :param named: the names of the options of each level that has names; :meth:`name_options` changes them.
     """
 
     spec: Spec
@@ -51,6 +54,7 @@ class Fit:
     given: Demonstrations | None = field(default=None, repr=False)
     beside: Mapping[str, Fit] | None = field(default=None, repr=False)
     apart: Mapping[str, Hierarchy] | None = field(default=None, repr=False)
+    named: Named = field(default_factory=dict, repr=False)
 
     def __str__(self) -> str:
         return str(self.folder or "this fit")
@@ -69,6 +73,25 @@ class Fit:
     def name(self) -> str:
         """The name of the model in tables."""
         return model_name(self.spec)
+
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """The name of each choice of each level, lowest first: ``control``, then the options 1 to k."""
+        levels = self.spec.hierarchy.levels if self.spec.hierarchy else ()
+        return {level.name: choice_names(level.count, self.named.get(level.name, ())) for level in levels}
+
+    def name_options(self, level: str, names: Sequence[str]) -> None:
+        """Name the options 1 to k of a level, in ``names.yaml`` of the run folder too.
+
+        >>> fit.name_options("option", ["go there", "go back"])
+        >>> fit.names["option"]
+        ('control', 'go there', 'go back')
+
+        :raises BadInput: there is no such level, or the names are not k different texts.
+        """
+        self.named.update(checked(self.spec, {**self.named, level: names}))
+        if self.folder is not None:
+            write_names(self.folder, self.named)
 
     @cached_property
     def demonstrations(self) -> Demonstrations:
@@ -158,11 +181,11 @@ class Fit:
 
     def controller(self, seed: int = 0) -> Controller:
         """The model as a policy that acts, as the spec's ``rollout`` says."""
-        return Controller.from_spec(self.hierarchy, self.spec.rollout, seed)
+        return Controller.from_spec(self.hierarchy, self.spec.rollout, seed, self.names)
 
     def monitor(self) -> Monitor:
         """A live monitor of the active options while another policy, or a person, acts."""
-        return Monitor(self.hierarchy)
+        return Monitor(self.hierarchy, self.names)
 
 
 def _stacked(parts: Sequence[Tensor], padding: float) -> Tensor:
@@ -188,6 +211,7 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
     :raises RunError: the folder has no finished fit, or its model is of another spec.
     :raises OtherVersion: the folder was written in another format.
     :raises Damaged: the model or ``metrics.json`` is damaged.
+    :raises BadInput: ``names.yaml`` does not fit the spec.
     :raises SpecError: its spec names user code, and that is not allowed.
     """
     folder = Path(folder)
@@ -201,4 +225,4 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
     recorded(folder)  # or the format is another
     hierarchy = read_model(folder, spec)
     counts = [level.count for level in spec.hierarchy.levels] if spec.hierarchy else []
-    return Fit(spec, hierarchy, Metrics.read(folder, counts), folder)
+    return Fit(spec, hierarchy, Metrics.read(folder, counts), folder, named=read_names(folder, spec) or {})

@@ -16,6 +16,7 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.fitting.names import LABEL_NAMES, label_names
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.spec.base import nearest
 from ddco_pyro.training.checkpoint import copy_of
@@ -58,8 +59,19 @@ def merge(run: Fit, pair: Pair, out: str | Path | None = None, on_event: OnEvent
     if out is not None:
         _check_same(Path(out), json.loads(json.dumps(origin)))
     demos = merged_labels(run, pair)
-    demos = replace(demos, attributes={**demos.attributes, LABELS: json.dumps(origin)})
+    names = label_names(demos) | {LABELS: _merged_names(run, pair)}
+    about = {LABELS: json.dumps(origin), LABEL_NAMES: json.dumps(names)}
+    demos = replace(demos, attributes={**demos.attributes, **about})
     return fit(changed, demos, out=out, on_event=on_event, jobs=jobs)
+
+
+def _merged_names(run: Fit, pair: Pair) -> list[str]:
+    """The names of the merged labels; none where the level has none."""
+    level, (first, second) = [*run.names][pair.level], pair.options
+    names = list(run.named.get(level, ()))
+    if names:
+        names[first - 1] += f" + {names.pop(second - 1)}"
+    return names
 
 
 def _check_same(folder: Path, origin: Mapping[str, Any]) -> None:

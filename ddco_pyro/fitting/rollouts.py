@@ -80,7 +80,7 @@ def roll_out(
             outcomes.append(episode.outcome)
             if episode.frames:
                 _film_looks(fit, name, policy, episode.seed)
-                write_film(_film(fit, name, episode.seed), episode)
+                write_film(_film(fit, name, episode.seed), episode, _names(policy))
             on_event(EpisodeEnded(name, total))
         rolled.outcomes[name] = outcomes
         write_text(unfinished, json_text(rolled.model_dump()))
@@ -112,7 +112,13 @@ def _film_looks(fit: Fit, name: str, policy: Policy | str, seed: int) -> None:
     if isinstance(policy, Controller) and policy.hierarchy.encoder.images:
         looking = Looking(policy)
         again = run_episode(find_task(str(fit.spec.task)), looking, seed, observed=fit.spec.observed, keep=())
-        write_film(fit.run_folder / "videos" / "saliency" / f"{name}-{seed}.mp4", replace(again, frames=looking.frames))
+        path = fit.run_folder / "videos" / "saliency" / f"{name}-{seed}.mp4"
+        write_film(path, replace(again, frames=looking.frames), _names(policy))
+
+
+def _names(policy: Policy | str) -> list[Sequence[str]]:
+    """The names of a controller's choices, lowest level first."""
+    return list(policy.names.values()) if isinstance(policy, Controller) else []
 
 
 def _film(fit: Fit, name: str, seed: int) -> Path:

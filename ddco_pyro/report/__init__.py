@@ -66,7 +66,7 @@ def header(fit: Fit, metrics: Metrics) -> list[Block]:
     blocks: list[Block] = [Text(words.verdict(metrics), "verdict")]
     if success := words.success(metrics):
         blocks.append(Text(success))
-    if found := degeneracies(fit.spec, metrics):
+    if found := degeneracies(fit):
         signs = "1 sign" if len(found) == 1 else f"{len(found)} signs"
         link = Markup('<a href="#warnings">Warnings</a>')
         blocks.append(Text(Markup("{} of a degenerate solution: see {}.").format(signs, link)))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.drawing.words import option_name
 from ddco_pyro.evaluation.inferred import Inferred
 from ddco_pyro.fitting.fitted import Fit
 
@@ -22,6 +24,7 @@ class LevelActivity:
     :param ended: whether the path makes a new choice at this step: 1, 0, or -1 past the end [N, T].
     :param termination: ψ_h(s_t) of the k options [N, T, k].
     :param lasts: whether options can be active for more than one step.
+    :param names: the name of each choice, control first.
     """
 
     name: str
@@ -30,6 +33,7 @@ class LevelActivity:
     ended: np.ndarray
     termination: np.ndarray
     lasts: bool = field(default=True, kw_only=True)
+    names: Sequence[str] = field(default=(), kw_only=True)
 
     @property
     def choices(self) -> list[int]:
@@ -49,6 +53,15 @@ class Activity:
         """The choices that can occur at any level."""
         return {choice for level in self.levels for choice in level.choices}
 
+    @property
+    def names(self) -> list[str]:
+        """The name of each choice, control first: those of all levels, the highest level first."""
+        each: dict[int, list[str]] = {}
+        for level in reversed(self.levels):
+            for choice in range(level.active.shape[2]):
+                each.setdefault(choice, []).append(option_name(choice, level.names))
+        return [" / ".join(dict.fromkeys(each[choice])) for choice in sorted(each)]
+
 
 def activity(fit: Fit, demos: Demonstrations) -> Activity:
     """The activity of a fit with at least one level."""
@@ -57,7 +70,7 @@ def activity(fit: Fit, demos: Demonstrations) -> Activity:
     levels = []
     for number, level in enumerate(fit.spec.hierarchy.levels):
         arrays = (np.concatenate([part[what][number] for part in parts]) for what in range(4))
-        levels.append(LevelActivity(level.name, *arrays, lasts=level.lasts))
+        levels.append(LevelActivity(level.name, *arrays, lasts=level.lasts, names=fit.names[level.name]))
     return Activity(tuple(levels), np.array(demos.lengths))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from ddco_pyro.drawing.page import Block, Section, Table, Text, note
 from ddco_pyro.drawing.words import option_name, percent
 from ddco_pyro.fitting.fitted import Fit
@@ -27,7 +29,7 @@ def section(fit: Fit) -> Section | None:
     blocks: list[Block] = [Text(f"Options and the ground-truth {labels}."), agreement_table(scores), note(EXPLAINED)]
     for level, label, own in zip(names, record.labels, record.confusion, strict=True):
         title = f"Where each label’s steps lie: level “{level}”, label “{label}”"
-        blocks += [Text(title, "heading"), confusion_table(own)]
+        blocks += [Text(title, "heading"), confusion_table(own, fit.names[level])]
     part = "training" if record.valid is None else "held-out"
     blocks.append(
         note(
@@ -39,11 +41,15 @@ def section(fit: Fit) -> Section | None:
     return Section("agreement", "Agreement with ground truth", blocks)
 
 
-def confusion_table(record: Confusion) -> Table:
-    """Share of each label's steps in each option, and the label of each option."""
+def confusion_table(record: Confusion, names: Sequence[str] = ()) -> Table:
+    """Share of each label's steps in each option, and the label of each option.
+
+    :param names: of each choice, control first.
+    """
     rows = [
         [str(label), str(sum(steps)), *(percent(count / sum(steps)) if count else "" for count in steps)]
         for label, steps in zip(record.labels, record.steps, strict=True)
     ]
     matched = ["–" if label is None else str(label) for label in record.matched]
-    return Table(["Label", "Steps", *map(option_name, record.options)], [*rows, ["stands for", "", *matched]])
+    options = [option_name(option, names) for option in record.options]
+    return Table(["Label", "Steps", *options], [*rows, ["stands for", "", *matched]])

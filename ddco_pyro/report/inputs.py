@@ -13,7 +13,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.colours import option_colour, with_heat
 from ddco_pyro.drawing.figures import FAINT, WIDTH, blank, save
 from ddco_pyro.drawing.page import Section, Table, note
-from ddco_pyro.drawing.words import number
+from ddco_pyro.drawing.words import name_in_level, number, option_name
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import BranchUse
 from ddco_pyro.training.data import parts
@@ -32,7 +32,7 @@ def saliency(fit: Fit, demos: Demonstrations) -> Section | None:
     split = parts(fit.spec, demos)
     part = "valid" if "valid" in split and not fit.without else "train"
     chosen = split[part].select(split[part].names[:1])
-    paths = [level[0] for level in fit.segment(chosen)]
+    paths, names = [level[0] for level in fit.segment(chosen)], next(iter(fit.names.values()), ())
     demo, gradients = chosen[0], Saliency(fit.hierarchy)
     shown = np.unique(np.linspace(0, len(demo) - 1, COLUMNS * ROWS).round().astype(int))
     panels = []
@@ -40,7 +40,7 @@ def saliency(fit: Fit, demos: Demonstrations) -> Section | None:
         choices = [int(path[step]) for path in paths]
         looks = gradients.step({key: values[step] for key, values in demo.observations.items()}, choices)
         if step in shown:
-            title = f"step {step}" + (f", option {choices[0]}" if choices else "")
+            title = f"step {step}" + (f", {option_name(choices[0], names)}" if choices else "")
             panels.append(
                 (title, choices[0] if choices else 0, np.hstack([with_heat(*look) for look in looks.values()]))
             )
@@ -73,9 +73,9 @@ def branches(fit: Fit) -> Section | None:
     uses = fit.metrics.branches
     if not uses:
         return None
-    levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
+    levels = [*fit.names.items()]
     names = [
-        [f"{levels[use.level].name} {number + 1}" for number in range(len(use.loss))]
+        [name_in_level(1 + option, *levels[use.level]) for option in range(len(use.loss))]
         if use.level < len(levels)
         else ["meta-policy" if levels else "policy"]
         for use in uses

@@ -17,9 +17,8 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.colours import add_legend, option_colour
 from ddco_pyro.drawing.figures import FAINT, GRID, blank, hide_frame, save
 from ddco_pyro.drawing.page import Block, Cell, Picture, Section, Table, Text, Timeline, note
-from ddco_pyro.drawing.words import number, option_name, percent
+from ddco_pyro.drawing.words import number, numbered_name, percent
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.metrics import Use
 from ddco_pyro.report import trajectories
 from ddco_pyro.report.activity import Activity, Bins, LevelActivity, bins
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
@@ -53,37 +52,33 @@ def section(fit: Fit, demos: Demonstrations, activity: Activity) -> Section:
         trajectories.picture(fit, demos, activity),
         _timing_picture(fit, activity),
     )
-    names = [level.name for level in fit.spec.hierarchy.levels]
-    counts = fit.metrics.demonstrations
-    count = counts.train + counts.tune + (0 if counts.left_out else counts.valid)
     used = note(
         "Over all demonstrations. Expected steps: from one selection of the option to the next selection of any option."
     )
     blocks: list[Block] = [picture for picture in pictures if picture is not None]
-    if len(names) > 1:
-        blocks.insert(0, Text("Each level numbers its own options: equal colours in two levels mean nothing."))
+    if len(fit.names) > 1:
+        named = " Legends give the names of the highest level first." if fit.named else ""
+        apart = f"Each level numbers its own options: equal colours in two levels mean nothing.{named}"
+        blocks.insert(0, Text(apart))
     blocks.append(Text("Use of the options", "heading"))
-    blocks.append(use_table(names, fit.metrics.options, count, fit.metrics.option_labels))
+    blocks.append(use_table(fit))
     link = Markup('<a href="#segments">segments of every demonstration</a>')
     blocks += [used, Text(Markup("Step by step: {}.").format(link))]
     return Section("options", "Which option is active when", blocks)
 
 
-def use_table(
-    levels: Sequence[str],
-    options: Sequence[Sequence[Use]],
-    demonstrations: int,
-    labels: Mapping[str, Mapping[int, int]] | None = None,
-) -> Table:
+def use_table(fit: Fit, levels: Sequence[str] | None = None) -> Table:
     """The use of each choice of each level, the highest level first; control only where it is chosen.
 
-    :param labels: the label of each option, by level, where the run was trained from labels.
+    :param levels: the levels to show; None for all.
     """
+    counts = fit.metrics.demonstrations
+    demonstrations = counts.train + counts.tune + (0 if counts.left_out else counts.valid)
     rows = []
-    for level, use in reversed(list(zip(levels, options, strict=True))):
-        for row in use:
+    for (level, names), use in reversed(list(zip(fit.names.items(), fit.metrics.options, strict=True))):
+        for row in use if levels is None or level in levels else ():
             if row.choice or row.share > 0:
-                named = option_name(row.choice, (labels or {}).get(level))
+                named = numbered_name(row.choice, names)
                 each = number(row.selected / demonstrations)
                 numbers = [percent(row.share, 1), number(row.selected, 1), each, number(row.duration, 1)]
                 rows.append([level, Cell(named, colour=option_colour(row.choice)), *numbers])
@@ -130,7 +125,7 @@ def draw_posteriors(
     for part, (name, row) in zip(figure.subfigures(rows, 2, squeeze=False).flat, examples.items(), strict=False):
         _example(part, activity, row, labels[row])
         part.axes[0].set_title(name)
-    add_legend(figure, activity.choices)
+    add_legend(figure, activity.choices, activity.names)
     return figure
 
 
@@ -220,7 +215,7 @@ def draw_rows(activity: Activity, labels: Mapping[str, Sequence[np.ndarray]]) ->
         axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
     panels[0].set_ylabel("demonstration")
-    add_legend(figure, activity.choices)
+    add_legend(figure, activity.choices, activity.names)
     return figure
 
 
@@ -270,7 +265,7 @@ def draw_timing(activity: Activity) -> Figure:
         right.grid(axis="y", color=GRID)
     for axes in panels[-1]:
         axes.set_xlabel(gathered.axis)
-    add_legend(figure, activity.choices)
+    add_legend(figure, activity.choices, activity.names)
     return figure
 
 
@@ -317,7 +312,7 @@ def segmented(fit: Fit, demos: Demonstrations, activity: Activity) -> Segmented:
             value = entry.log_likelihood_per_step[fit.name]
             segments.append(Segments(name, levels, value, entry.part == "valid", labels))
     counts = {level.name: level.active.shape[2] - 1 for level in activity.levels}
-    return Segmented(tuple(segments), counts, None, option_labels=fit.metrics.option_labels)
+    return Segmented(tuple(segments), counts, None, names=fit.names)
 
 
 def segments(timelines: Sequence[Timeline], demonstrations: int) -> Section:

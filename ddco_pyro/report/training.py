@@ -18,8 +18,8 @@ from ddco_pyro.drawing.page import Block, Code, Columns, Facts, Folded, Section,
 from ddco_pyro.drawing.words import number, percent
 from ddco_pyro.evaluation.options import Finding, diagnose
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.metrics import Metrics, read_table, refit
-from ddco_pyro.spec import Spec, dump_spec
+from ddco_pyro.metrics import read_table, refit
+from ddco_pyro.spec import dump_spec
 
 COLUMNS = 4
 TUNE = "#c2410c"
@@ -135,7 +135,7 @@ def warnings(fit: Fit) -> Section | None:
     blocks: list[Block] = [Warned(*sign) for sign in words.unconverged(fit.metrics)]
     if fit.spec.hierarchy is None:
         return Section("warnings", "Warnings", blocks) if blocks else None
-    signs = degeneracies(fit.spec, fit.metrics)
+    signs = degeneracies(fit)
     blocks += [Warned(*sign) for sign in signs]
     if not signs:
         blocks.append(
@@ -149,26 +149,27 @@ def warnings(fit: Fit) -> Section | None:
     return Section("warnings", "Warnings", blocks)
 
 
-def degeneracies(spec: Spec, metrics: Metrics) -> list[tuple[str, str]]:
+def degeneracies(fit: Fit) -> list[tuple[str, str]]:
     """Signs of a degenerate solution in ``metrics.json``, each in words with its number, and the usual remedy."""
-    if spec.hierarchy is None:
+    if fit.spec.hierarchy is None:
         return []
-    levels = spec.hierarchy.levels
+    levels = fit.spec.hierarchy.levels
     return [
-        (_sign(finding, levels[finding.level - 1].name), finding.advice)
-        for finding in diagnose(metrics.options, metrics.divergences)
+        (_sign(finding, levels[finding.level - 1].name, fit.names), finding.advice)
+        for finding in diagnose(fit.metrics.options, fit.metrics.divergences)
         if finding.kind != "never_persisting" or levels[finding.level - 1].lasts
     ]
 
 
-def _sign(finding: Finding, level: str) -> str:
+def _sign(finding: Finding, level: str, names: Mapping[str, Sequence[str]]) -> str:
     """A sign of a degenerate solution in words."""
-    option = f"Option {finding.choice} of level “{level}”"
+    option = f"{words.capital(words.numbered_name(finding.choice, names[level]))} of level “{level}”"
+    other = words.numbered_name(finding.other or 0, names[level])
     share = percent(finding.value, 1)
     return {
         "unused": f"{option} is unused: it is active in {share} of all steps.",
         "dominating": f"{option} dominates: it is active in {share} of all steps.",
-        "redundant": f"{option} acts like option {finding.other}: they differ by {number(finding.value, 3)} nats per "
+        "redundant": f"{option} acts like {other}: they differ by {number(finding.value, 3)} nats per "
         "step while either is active.",
         "never_persisting": f"{option} never persists: it lasts {number(finding.value)} steps on average and is "
         f"selected {number(finding.selections, 1)} times in each demonstration that has it.",

@@ -90,7 +90,7 @@ def draw(activity: Activity, positions: Sequence[np.ndarray], key: str) -> Figur
         axes = figure.add_axes(place, projection="3d", proj_type="ortho")
         panel(axes, level, positions, key, turn)
         axes.set_title(f"level “{level.name}”" + (f", turned by {turn:.0f}°" if turn else ""))
-    add_legend(figure, activity.choices, "lower center")
+    add_legend(figure, activity.choices, activity.names, "lower center")
     return figure
 
 

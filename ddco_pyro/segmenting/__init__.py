@@ -84,14 +84,14 @@ class Segmented:
     :param counts: the number of options of each level, by name.
     :param frequency: steps per second (Hz); None where unknown.
     :param truth: for each level, the name of the labels that the run's spec compares with it.
-    :param option_labels: for each level of a run trained from labels, the label of each option.
+    :param names: for each level, the name of each choice, control first.
     """
 
     segments: tuple[Segments, ...]
     counts: dict[str, int]
     frequency: float | None
     truth: Mapping[str, str] = field(default_factory=dict)
-    option_labels: Mapping[str, Mapping[int, int]] = field(default_factory=dict)
+    names: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.segments)
@@ -130,7 +130,7 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
         on_event(DemonstrationsDone(len(segmented), len(chosen)))
     names = fit.spec.demonstrations.labels_by_level(len(counts))
     truth = dict(zip(counts, names, strict=bool(names)))
-    return Segmented(tuple(segmented), counts, source.frequency, truth, fit.metrics.option_labels)
+    return Segmented(tuple(segmented), counts, source.frequency, truth, fit.names)
 
 
 def beside_baselines(segmented: Segmented, fit: Fit, source: Source, gripper: int = -1) -> Segmented:

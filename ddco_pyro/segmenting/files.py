@@ -15,6 +15,7 @@ import numpy as np
 
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.hdf5 import DemonstrationsError, opened, written
+from ddco_pyro.drawing.words import option_name
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting import Segmented, Segments
 
@@ -132,8 +133,8 @@ def cell(value: Any) -> Any:
 
 
 def columns(segmented: Segmented) -> list[str]:
-    """Names of the columns: for each level the option, whether it is a new choice, and its probability; baselines."""
-    levels = [f"{name}{suffix}" for name in segmented.counts for suffix in ("", "_boundary", "_probability")]
+    """Names of the columns: for each level the option, whether it is a new choice, probability, name; baselines."""
+    levels = [f"{name}{suffix}" for name in segmented.counts for suffix in ("", BOUNDARY, "_probability", "_name")]
     return [
         "demonstration",
         "step",
@@ -148,8 +149,10 @@ def rows(segmented: Segmented) -> Iterator[list[Any]]:
     for demo in segmented.segments:
         for step in range(len(demo)):
             row: list[Any] = [demo.name, step, *([step / segmented.frequency] if segmented.frequency else [])]
-            for level in demo.levels.values():
-                row += [int(level.options[step]), int(level.boundaries[step]), float(level.probability[step])]
+            for name, level in demo.levels.items():
+                option = int(level.options[step])
+                row += [option, int(level.boundaries[step]), float(level.probability[step])]
+                row.append(option_name(option, segmented.names.get(name, ())))
             yield row + [int(kinds[step]) for kinds in demo.baselines.values()]
 
 

@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,15 +18,16 @@ from pyarrow import parquet
 from ddco_pyro.data.files import whole_folder, write_text
 from ddco_pyro.data.sources.lerobot import SUBTASK, LeRobot
 from ddco_pyro.data.sources.metadata import inside
+from ddco_pyro.drawing.words import name_in_level
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting import Segmented
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
 
 
-def subtask_names(level: str, count: int) -> list[str]:
-    """The name of each choice of a level, control (0) first."""
-    return ["control", *(f"{level} {option}" for option in range(1, 1 + count))]
+def subtasks(level: str, count: int, names: Sequence[str]) -> list[str]:
+    """The subtask of each choice of a level, control (0) first."""
+    return [name_in_level(option, level, names) for option in range(1 + count)]
 
 
 class Form(ABC):
@@ -126,7 +127,7 @@ def annotate(source: LeRobot, out: Path, segmented: Segmented, level: str, form:
 
     :raises BadInput: ``out`` is something else, the dataset has subtasks already, or it has rows of unknown episodes.
     """
-    names = subtask_names(level, segmented.counts[level])
+    names = subtasks(level, segmented.counts[level], segmented.names.get(level, ()))
     check_target(source, out, names, form)
     options = {demo.name.removeprefix("demo_"): demo.levels[level].options for demo in segmented.segments}
     if out.exists():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import accumulate, pairwise
 from pathlib import Path
 from urllib.parse import quote
@@ -13,7 +13,7 @@ import numpy as np
 from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Strip, Table, Text, Timeline, note
-from ddco_pyro.drawing.words import NAT, number, option_name
+from ddco_pyro.drawing.words import NAT, number, numbered_name, option_name
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
 from ddco_pyro.segmenting.agreement import EXPLAINED, LevelAgreement, agreement_table
 
@@ -21,7 +21,10 @@ SHADES = ("#f2f2f2", "#d4d4d4")
 """Shades of ground-truth segments, in turn: colours belong to options."""
 
 ROOM = 0.03
-"""A segment carries text if it is longer than this share of the longest demonstration."""
+"""A segment carries its number if it is longer than this share of the longest demonstration."""
+
+LETTER = 0.011
+"""The share of the longest demonstration that a letter of a name takes."""
 
 
 def write_page(path: Path, segmented: Segmented, run: str, file: str, agreements: Mapping[str, LevelAgreement]) -> None:
@@ -52,7 +55,7 @@ def _level(name: str, segmented: Segmented, agreement: LevelAgreement | None) ->
     for option in range(segmented.counts[name] + 1):
         lengths = [end - start for choice, start, end in runs if choice == option]
         if option or lengths:
-            named = Cell(option_name(option, segmented.option_labels.get(name)), colour=option_colour(option))
+            named = Cell(numbered_name(option, segmented.names.get(name, ())), colour=option_colour(option))
             median = duration(float(np.median(lengths)), segmented.frequency) if lengths else "–"
             there = sum(any(choice == option for choice, _, _ in each) for each in per_demo)
             used = [f"{sum(lengths) / total:.1%}", str(len(lengths)), median]
@@ -96,21 +99,24 @@ def timelines(segmented: Segmented, most_segments: float = math.inf) -> list[Tim
 def _rows(demo: Segments, segmented: Segmented, longest: int) -> Iterator[tuple[str, list[Strip]]]:
     """The levels, the highest first, the baselines and the labels of a demonstration."""
     for name, level in reversed(demo.levels.items()):
-        labels = segmented.option_labels.get(name, {})
-        yield name, [_option(level, run, labels, segmented.frequency, longest) for run in level.runs()]
+        names = segmented.names.get(name, ())
+        yield name, [_option(level, run, names, segmented.frequency, longest) for run in level.runs()]
     for name, values in {**demo.labels, **demo.baselines}.items():
         if name not in demo.levels and not name.endswith("_boundary"):
             yield name, list(_labels(name, values, longest))
 
 
 def _option(
-    level: LevelLabels, run: tuple[int, int, int], labels: Mapping[int, int], frequency: float | None, longest: int
+    level: LevelLabels, run: tuple[int, int, int], names: Sequence[str], frequency: float | None, longest: int
 ) -> Strip:
     option, start, end = run
     seconds = f" ({start / frequency:.3g} to {end / frequency:.3g} s)" if frequency else ""
     probability = float(level.probability[start:end].mean())
-    title = f"{option_name(option, labels)}, steps {start} to {end - 1}{seconds}, probability {probability:.2f}"
-    return _strip(start, end, longest, option_colour(option), str(option) if option else "", title)
+    name = option_name(option, names)
+    title = f"{name}, steps {start} to {end - 1}{seconds}, probability {probability:.2f}"
+    short = name == option_name(option) or end - start < LETTER * len(name) * longest
+    text = (str(option) if short else name) if option else ""
+    return _strip(start, end, longest, option_colour(option), text, title)
 
 
 def _labels(name: str, values: np.ndarray, longest: int) -> Iterator[Strip]:

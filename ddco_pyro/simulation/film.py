@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.drawing.colours import option_rgb
+from ddco_pyro.drawing.words import option_name
 from ddco_pyro.simulation.episodes import Episode
 
 FRAMES_PER_SECOND = 3
@@ -16,11 +18,14 @@ QUALITY = "25"
 """x264's constant rate factor: 0 is lossless, 51 the coarsest."""
 
 
-def write_film(path: Path, episode: Episode) -> None:
-    """Write the episode's frames as an mp4 (H.264)."""
+def write_film(path: Path, episode: Episode, names: Sequence[Sequence[str]] = ()) -> None:
+    """Write the episode's frames as an mp4 (H.264).
+
+    :param names: the name of each choice of each level, lowest first.
+    """
     import av
 
-    frames = [_even(captioned(episode, t)) for t in range(len(episode.frames))]
+    frames = [_even(captioned(episode, t, names)) for t in range(len(episode.frames))]
     with whole_file(path) as temporary, av.open(temporary, "w", format="mp4") as film:
         stream = film.add_stream("libx264", FRAMES_PER_SECOND, options={"crf": QUALITY})
         stream.height, stream.width = frames[0].shape[:2]
@@ -29,7 +34,7 @@ def write_film(path: Path, episode: Episode) -> None:
         film.mux(stream.encode())
 
 
-def captioned(episode: Episode, t: int) -> np.ndarray:
+def captioned(episode: Episode, t: int, names: Sequence[Sequence[str]] = ()) -> np.ndarray:
     """Frame t with a border in the active option's colour, and its name; uint8 [H, W, 3].
 
     The last frame shows the end of the episode, without an active option.
@@ -40,7 +45,8 @@ def captioned(episode: Episode, t: int) -> np.ndarray:
     active = episode.choices[t] if t < len(episode.choices) else episode.choices[:0].reshape(-1)
     if len(active):
         cv2.rectangle(frame, (0, 0), (frame.shape[1] - 1, frame.shape[0] - 1), option_rgb(active[0]), 2 * BORDER)
-    text = "end" if t >= len(episode.choices) else f"t={t}" + "".join(f"  h{d}={h}" for d, h in enumerate(active, 1))
+    said = [name.removeprefix("option ") for name in map(option_name, active, names)] if names else active
+    text = "end" if t >= len(episode.choices) else f"t={t}" + "".join(f"  h{d}={h}" for d, h in enumerate(said, 1))
     white, black = (255, 255, 255), (20, 20, 20)
     for right, down, colour in ((-1, 0, white), (1, 0, white), (0, -1, white), (0, 1, white), (0, 0, black)):
         cv2.putText(frame, text, (12 + right, 26 + down), cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, 1, cv2.LINE_AA)

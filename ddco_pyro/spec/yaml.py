@@ -93,9 +93,12 @@ def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool 
 
 def dump_spec(spec: Spec) -> str:
     """The spec as YAML with all defaults written out; reading the YAML gives an equal spec."""
-    return yaml.dump(
-        spec.model_dump(), Dumper=_Dumper, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120
-    )
+    return dump_yaml(spec.model_dump())
+
+
+def dump_yaml(data: Any) -> str:
+    """Plain data as YAML that :func:`read_yaml` reads back."""
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)
 
 
 def spec_schema() -> dict[str, Any]:

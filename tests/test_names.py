@@ -1,0 +1,188 @@
+"""Names of options: where they come from, where they are shown, and which are refused."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+
+import h5py
+import numpy as np
+import pytest
+from command_line import call
+
+import ddco_pyro
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.errors import BadInput
+from ddco_pyro.fitting.names import proposed
+from ddco_pyro.spec import parse_spec
+
+SPEC = {
+    "demonstrations": {"path": "demos.hdf5", "labels": "phase"},
+    "observations": ["place"],
+    "hierarchy": {
+        "levels": [{"name": "skill", "count": 3, "policy": {"network": "linear"}}],
+        "meta_policy": {"network": "linear"},
+    },
+}
+PHASES = np.repeat([0, 1, 2], [6, 4, 5])
+
+
+def labelled(phases=PHASES, number=4, names=None):
+    """Demonstrations with a gain of their own in each phase; ``names`` goes into the file."""
+    random = np.random.default_rng(0)
+    places = [random.normal(size=(len(phases), 2)) for _ in range(number)]
+    gains = np.array([[-3.0], [0.5], [3.0]])[np.maximum(phases, 0)]
+    demos = tuple(
+        Demonstration(f"demo_{n}", {"place": place}, gains * place, {"phase": phases}) for n, place in enumerate(places)
+    )
+    return Demonstrations(demos, attributes={} if names is None else {"label_names": json.dumps({"phase": names})})
+
+
+def propose(choices, demos):
+    return proposed(parse_spec(SPEC), demos, (np.tile(choices, (len(demos), 1)),))
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations([1, 2, 3])))
+def test_names_follow_the_labels_in_any_order_of_options(order):
+    choices = np.array(order)[PHASES]
+    found = propose(choices, labelled(names=["reach", "grasp", "lift"]))["skill"]
+    assert [found[order[phase] - 1] for phase in range(3)] == ["reach", "grasp", "lift"]
+    found = propose(choices, labelled())["skill"]
+    assert [found[order[phase] - 1] for phase in range(3)] == ["phase 0", "phase 1", "phase 2"]
+
+
+def test_only_a_clear_match_gives_a_name():
+    demos = labelled()
+    thirds = np.array([1, 1, 2, 2, 3, 3, 2, 2, 2, 2, 3, 3, 3, 3, 3])  # label 0 lies in all three
+    assert propose(thirds, demos) == {"skill": ("option 1", "phase 1", "phase 2")}
+    assert propose(np.ones(15, int), demos) == {}  # label 0 has 6 of its 15 steps
+    unknown = labelled(np.where(PHASES == 1, -1, PHASES))
+    assert propose(np.array([3, 2, 1])[PHASES], unknown) == {"skill": ("phase 2", "option 2", "phase 0")}
+    control = np.array([1, 2, 0])[PHASES]
+    assert propose(control, demos) == {"skill": ("phase 0", "phase 1", "option 3")}
+    twice = labelled(names=["reach", "grasp", "reach"])
+    assert propose(np.array([1, 2, 3])[PHASES], twice) == {"skill": ("reach", "grasp", "option 3")}
+    assert propose(np.array([1, 2, 3])[PHASES], labelled(names=["control", "", "lift"])) == {
+        "skill": ("option 1", "option 2", "lift")
+    }
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A run that is trained from labels: option h + 1 is label h. The file names the labels."""
+    folder = tmp_path_factory.mktemp("names")
+    labelled(number=8, names=["reach", "grasp", "lift"]).write(folder / "demos.hdf5")
+    (folder / "mine.yaml").write_text(
+        f"""
+demonstrations: {{path: {folder / "demos.hdf5"}}}
+observations: [place]
+control: {{std: 0.3}}
+hierarchy:
+  levels: [{{name: skill, count: 3, policy: {{network: linear}}, termination: {{network: linear}}}}]
+  meta_policy: {{network: linear}}
+compare_with: [{{kind: mixture}}]
+training: {{epochs: 60, optimizer: {{lr: 0.1}}, labels: {{level: skill, from: phase, count: null, hold: false}}}}
+"""
+    )
+    ended = call("fit", folder / "mine.yaml", "--out", folder / "run", "--jobs", 1)
+    assert f"names: {folder / 'run' / 'names.yaml'}: reach, grasp, lift\n" in ended.out
+    return folder
+
+
+def test_a_fit_proposes_the_names_of_its_labels(files):
+    fit = ddco_pyro.load(files / "run")
+    assert fit.names == {"skill": ("control", "reach", "grasp", "lift")}
+    assert fit.baselines["mixture"].named == {}
+    own = ddco_pyro.fit(fit.spec, labelled(number=8))
+    assert own.names == {"skill": ("control", "phase 0", "phase 1", "phase 2")}
+
+
+def test_names_are_shown_wherever_options_are(files):
+    run, demos = files / "run", files / "demos.hdf5"
+    (run / "names.yaml").write_text("skill: [<go>, pick & place, 'on']\n")
+    assert call("report", run).status == 0
+    outputs = {option: files / option for option in ("--html", "--csv", "--parquet")}
+    written = [part for pair in outputs.items() for part in pair]
+    assert call("segment", run, demos, *written).status == 0
+    for page in (run / "report.html", outputs["--html"]):
+        text = page.read_text()
+        assert "&lt;go&gt; (option 1)" in text
+        assert 'title="pick &amp; place, steps ' in text
+        assert "<go>" not in text
+    fit = ddco_pyro.load(run)
+    truth = [fit.names["skill"][option] for row in fit.segment(fit.demonstrations)[0] for option in row]
+    rows = list(csv.DictReader(outputs["--csv"].open()))
+    assert [row["skill_name"] for row in rows] == truth
+    assert all(fit.names["skill"][int(row["skill"])] == row["skill_name"] for row in rows)
+    shown = call("name", run).out
+    assert "pick & place (option 2)" in shown
+    assert f"{100 * fit.metrics.options[0][2].share:.1f} %" in shown
+    with h5py.File(demos) as file:
+        place = file["data/demo_0/obs/place"][0]
+    controller, monitor = fit.controller(), fit.monitor()
+    controller.act({"place": place})
+    assert controller.active == {"skill": fit.names["skill"][controller.choices[0]]}
+    belief = monitor.step({"place": place})
+    assert monitor.by_name(belief)["skill"]["pick & place"] == pytest.approx(float(belief.choices[0][0, 2]))
+    ddco_pyro.export(fit, files / "controller")
+    about = json.loads((files / "controller" / "controller.json").read_text())
+    assert about["names"] == {"skill": ["control", "<go>", "pick & place", "on"]}
+
+
+def test_the_command_writes_names_that_are_read_again(files):
+    ended = call("name", files / "run", "--level", "skill", "a, b ,c d")
+    assert ended.status == 0
+    assert "c d (option 3)" in ended.out
+    fit = ddco_pyro.load(files / "run")
+    assert fit.names == {"skill": ("control", "a", "b", "c d")}
+    fit.name_options("skill", ["é", "010", "yes"])
+    assert ddco_pyro.load(files / "run").names == fit.names == {"skill": ("control", "é", "010", "yes")}
+    merged = call("merge", files / "run", "--options", 1, 2, "--out", files / "merged", "--jobs", 1)
+    assert "Merged options é (option 1) and 010 (option 2)" in merged.out
+    assert set(ddco_pyro.load(files / "merged").names["skill"]) <= {"control", "é + 010", "yes", "option 1", "option 2"}
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("skil: [a, b, c]", "there is no level 'skil' (did you mean 'skill'?); there is: skill"),
+        ("skill: [a, b]", "level 'skill': 2 names for 3 options; name each, in the order of options 1 to 3"),
+        ("skill: [a, b, a]", "level 'skill': 'a' names two choices; give each a name of its own"),
+        ("skill: [a, b, control]", "level 'skill': 'control' names two choices; give each a name of its own"),
+        ("skill: [a, ' ', c]", "level 'skill': the name of option 2 is empty or has a line break"),
+        ('skill: [a, b, "c\\nd"]', "level 'skill': the name of option 3 is empty or has a line break"),
+        ("skill: [a, b, 3]", "level 'skill': give a list of texts; quote a number"),
+        ("skill: abc", "level 'skill': give a list of texts; quote a number"),
+        ("- a", "is no mapping; write a line for each level, such as: option: [reach, grasp]"),
+        ("skill: [a", "not valid YAML"),
+        ("\xffa", "not valid YAML"),
+    ],
+)
+def test_names_that_do_not_fit_are_refused(files, text, problem):
+    path = files / "run" / "names.yaml"
+    path.write_bytes(text.encode("latin-1"))
+    for command in (["report"], ["name"], ["segment", files / "demos.hdf5", "--csv", files / "none.csv"]):
+        ended = call(command[0], files / "run", *command[1:])
+        assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
+        assert problem in ended.err
+        assert str(path) in ended.err
+    assert not (files / "none.csv").exists()
+    path.unlink()
+
+
+def test_the_command_refuses_names_that_do_not_fit(files):
+    (files / "run" / "names.yaml").unlink(missing_ok=True)
+    for arguments in (["a,b"], ["--level", "arm", "a,b,c"], ["a,,c"], ["--level", "arm"]):
+        ended = call("name", files / "run", *arguments)
+        assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
+    assert not (files / "run" / "names.yaml").exists()
+    assert ddco_pyro.load(files / "run").names == {"skill": ("control", "option 1", "option 2", "option 3")}
+
+
+def test_label_names_that_are_none_are_refused_before_anything_is_written(tmp_path):
+    demos = labelled()
+    wrong = Demonstrations(demos.demonstrations, attributes={"label_names": "phase"})
+    with pytest.raises(BadInput, match="attribute 'label_names': is no JSON"):
+        ddco_pyro.fit(parse_spec(SPEC), wrong, out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
