@@ -354,16 +354,20 @@ def _direction(difference: Difference, held_out: int) -> int:
 
 
 def effort(training: Training) -> str:
-    """The gradient or EM steps of training for tables, marked where training had not converged."""
-    by_em, not_converged = " (EM)" * training.by_em, ", not converged" * (not training.converged)
-    return f"{training.spent.gradient_steps}{by_em}{not_converged}"
+    """The steps of training for tables, with EM or L-BFGS named, marked where training had not converged."""
+    name = WHOLE.get(training.optimizer)
+    return f"{training.spent.gradient_steps}{f' ({name})' * bool(name)}{', not converged' * (not training.converged)}"
+
+
+WHOLE = {"em": "EM", "lbfgs": "L-BFGS"}
+"""The names of optimisers whose steps are over all demonstrations."""
 
 
 def spent(training: Training) -> str:
     """Epochs and gradient steps, the budget, and the effort of restarts."""
     took, allowed, beside = training.spent, training.budget, restarts(training)
     of = "" if allowed.epochs is None else f" of at most {allowed.epochs} ({allowed.gradient_steps})"
-    steps = "EM" if training.by_em else "gradient"
+    steps = WHOLE.get(training.optimizer, "gradient")
     return f"{took.epochs} epochs ({took.gradient_steps} {steps} steps){of}{'; ' * bool(beside)}{beside}"
 
 

@@ -25,7 +25,8 @@ class OptimizerSpec(Model):
 
     name: Literal["adam", "adamw", "momentum", "em"] = "adam"
     """``adam``, ``adamw``, ``momentum`` for gradient descent with momentum, or ``em``: expectation-maximisation where
-    every network of a model is linear, ``adam`` for other models."""
+    every network of a model is linear, L-BFGS for a policy without options whose network is a perceptron without
+    dropout, ``adam`` for other models."""
     ridge: RidgeSpec = RidgeSpec()
     """Ridges (``em`` only)."""
     lr: Positive = 1e-3

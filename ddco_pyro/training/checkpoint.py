@@ -158,23 +158,3 @@ class Restart:
 def copy_of(model: nn.Module) -> State:
     """A copy of a model's tensors, on the host."""
     return {name: value.detach().cpu().clone() for name, value in model.state_dict().items()}
-
-
-def optimizer_state(optimizer: torch.optim.Optimizer) -> State:
-    """A copy of the optimiser's tensors by ``<parameter>.<name>``, on the host."""
-    state = optimizer.state_dict()["state"]
-    return {
-        f"{index}.{name}": torch.as_tensor(value).cpu().clone()
-        for index, values in state.items()
-        for name, value in values.items()
-        if value is not None
-    }
-
-
-def restore_optimizer(optimizer: torch.optim.Optimizer, state: State) -> None:
-    """Give an optimiser the tensors of :func:`optimizer_state`."""
-    nested: dict[int, State] = {}
-    for key, value in state.items():
-        index, _, name = key.partition(".")
-        nested.setdefault(int(index), {})[name] = value
-    optimizer.load_state_dict({**optimizer.state_dict(), "state": nested})

@@ -28,7 +28,7 @@ from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.perceptrons import Mlp, StackedLinear
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import Tables
-from ddco_pyro.spec import OptimizerSpec, RidgeSpec
+from ddco_pyro.spec import RidgeSpec
 
 LARGEST = 3.0
 """The most that a weight of a logit changes in a step: Fisher scoring overshoots where a logistic curve is flat."""
@@ -53,11 +53,6 @@ def is_linear(model: Hierarchy) -> bool:
         isinstance(network, Mlp) and network.trunk_size is None and len(network.layers) == 1
         for network in model.networks().values()
     )
-
-
-def uses_em(spec: OptimizerSpec, model: Hierarchy) -> bool:
-    """Whether a model is trained by EM: where the spec asks for it, and every network is linear."""
-    return spec.name == "em" and is_linear(model)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
@@ -41,11 +40,11 @@ from ddco_pyro.spec import Spec
 from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData
 from ddco_pyro.training.data import tuning_split
 from ddco_pyro.training.devices import described, device_of
-from ddco_pyro.training.em import uses_em
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
+from ddco_pyro.training.optimizers import optimizer_of
 from ddco_pyro.training.processes import ALONE, Ranks, pool, results, useful_jobs
 from ddco_pyro.training.stages import StageEnd, plan
 
@@ -189,6 +188,8 @@ class Trainer:
             self.ranks.share(None)  # no further model
             raise TrainingError(why)
         if len(self.restarts) > 1 and self.hierarchy.depth:
+            from sklearn.metrics import normalized_mutual_info_score
+
             found = {n: self._segments(n) for n, restart in enumerate(self.restarts) if "best" in restart.states}
             own = found.pop(self.best)
             self.agreement = {n: float(normalized_mutual_info_score(own, other)) for n, other in found.items()}
@@ -210,8 +211,9 @@ class Trainer:
     @property
     def summary(self) -> dict[str, Any]:
         """``training`` of ``metrics.json``: the budget, the best restart's stages, and the epochs of all restarts."""
-        by_em = uses_em(self.spec.training.optimizer, self.hierarchy)
-        best, updates = self.best, 1 if by_em else math.ceil(len(self.data.train) / self.spec.training.batch_size)
+        optimizer = optimizer_of(self.spec.training.optimizer, self.hierarchy)
+        whole = optimizer in ("em", "lbfgs")
+        best, updates = self.best, 1 if whole else math.ceil(len(self.data.train) / self.spec.training.batch_size)
         ends = [StageEnd(**end) for end in self.restarts[best].progress.ended]
         each = [
             {
@@ -234,7 +236,8 @@ class Trainer:
             "converged": ends[-1].converged,  # the last stage trains what acts in the end
             "restarts": {"best": best, "spent": effort(len(self.history)), "each": each},
             "device": self.restarts[best].progress.device,
-            "by_em": by_em,
+            "by_em": optimizer == "em",
+            "optimizer": optimizer,
         }
 
     def _segments(self, number: int) -> np.ndarray:
