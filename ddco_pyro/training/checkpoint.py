@@ -136,10 +136,12 @@ class Restart:
     progress: Progress
     states: dict[str, State] = field(default_factory=dict)
 
-    def write(self, path: Path) -> None:
-        """Write a checkpoint, whole or not at all."""
-        tensors = {f"{part}/{name}": value for part, state in self.states.items() for name, value in state.items()}
-        write_tensors(path, tensors, {"progress": json.dumps(asdict(self.progress))})
+    def written(self, path: Path | None) -> Restart:
+        """This restart, written as a checkpoint where there is a path: whole or not at all."""
+        if path is not None:
+            tensors = {f"{part}/{name}": value for part, state in self.states.items() for name, value in state.items()}
+            write_tensors(path, tensors, {"progress": json.dumps(asdict(self.progress))})
+        return self
 
     @classmethod
     def read(cls, path: Path) -> Restart:

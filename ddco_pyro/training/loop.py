@@ -65,8 +65,9 @@ def train(
 
     :param until: epochs of the last stage after which training pauses; None to train until patience or budget end it.
     :param seconds: training also pauses after about this time, at the end of an epoch.
-    :param checkpoint: the file that the restart is written to at the end of epochs.
-    :param ranks: the processes that train this restart together, none of them with a limit of ``seconds``.
+    :param checkpoint: the file that the restart is written to at the end of epochs and of the training.
+    :param ranks: the processes that train this restart together, none of them with a limit of ``seconds``; the first
+        writes the file.
     """
     now, states, spec = restart.progress, restart.states, data.spec.training
     device, deadline, saved = device_of(spec), time.monotonic() + seconds, -math.inf
@@ -83,18 +84,18 @@ def train(
                     overdue = now.epoch > begun and time.monotonic() > deadline
                     if overdue or (last and until is not None and now.epoch >= until):
                         states |= stage.states()
-                        return restart
+                        return restart.written(checkpoint)
                     on_event(stage.epoch(cap))
-                    if checkpoint is not None and time.monotonic() - saved > SAVE_EVERY:
+                    if checkpoint and time.monotonic() - saved > SAVE_EVERY:
                         states |= stage.states()
-                        restart.write(checkpoint)
+                        restart.written(checkpoint)
                         saved = time.monotonic()
                 stage.end(cap)
                 now.stage, now.epoch, now.done = (now.stage, now.epoch, True) if last else (now.stage + 1, 0, False)
             restart.states = {"best": states["best"]}
         except Diverged as error:
             now.done, now.diverged, now.best, restart.states = True, str(error), -math.inf, {}
-    return restart
+    return restart.written(checkpoint)
 
 
 class StageTraining:

@@ -168,6 +168,6 @@ class QuasiNewton:
         nn.utils.vector_to_parameters(states["weights"], self._parameters)
         self.gain = float(states["gain"])
         own = self._optimizer.state[self._parameters[0]]
-        for name in states.keys() - {"weights", "gain"}:
-            own[name] = list(states[name]) if name in _LISTS else states[name].clone()
+        own |= {name: list(states.get(name, ())) for name in _LISTS}
+        own |= {name: states[name].clone() for name in _KEPT if name in states}
         own["n_iter"] = int(own["n_iter"])

@@ -10,6 +10,8 @@ changes the result.
 from __future__ import annotations
 
 import math
+import os
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -45,11 +47,11 @@ from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
 from ddco_pyro.training.optimizers import optimizer_of
-from ddco_pyro.training.processes import ALONE, Ranks, pool, results, useful_jobs
+from ddco_pyro.training.processes import ALONE, Ranks, end_with, pool, results, useful_jobs
 from ddco_pyro.training.stages import StageEnd, plan
 
-SLICE = 10.0
-"""Seconds that a job trains a restart before it returns, so that progress is shown and a checkpoint written."""
+SHORT = 10.0
+"""Seconds of training here before other processes start, which takes seconds itself."""
 
 DEAD = (
     "a process that trained a restart was ended from outside (too little memory?); what was trained is kept in a run "
@@ -104,8 +106,8 @@ class Trainer:
         them: of the training demonstrations, at the lowest level.
 
     :param checkpoints: the folder for a checkpoint of each restart; None for nowhere.
-    :param jobs: processes that train restarts side by side; -1 is one for each core. The result is the same for any
-        number.
+    :param jobs: processes that train restarts side by side, each a whole one; -1 is one for each core. The result is
+        the same for any number.
     :param ranks: processes that train each restart together instead, of which this is the first (:func:`follow`).
     :raises DemonstrationsError: a number is too large for networks.
     :raises SpecError: the demonstrations lack the labels that the spec names, or have more labels than options.
@@ -294,45 +296,44 @@ class Trainer:
                     self.on_event(RestartStopped(number, progress.epoch))
 
     def _train(self, numbers: Sequence[int], until: int | None) -> None:
-        """Train restarts until so many epochs of the last stage, None for to the end; jobs train slice after slice.
+        """Train restarts until so many epochs of the last stage, None for to the end; jobs share what takes long.
 
         :raises OtherDevice: a restart was begun on another kind of device; nothing is trained then.
         """
         left = [number for number in numbers if not self.restarts[number].progress.done]
         for number in left:
             self._refuse_other_device(self.restarts[number].progress, until)
-        if self.jobs == 1 or len(left) < 2:
-            for number in left:
-                self.ranks.share((self.restarts[number], until))
-                self._keep(
-                    train(
-                        self.data,
-                        self.restarts[number],
-                        until,
-                        checkpoint=self._path(number),
-                        on_event=self.on_event,
-                        ranks=self.ranks,
-                    )
-                )
+        deadline = time.monotonic() + (math.inf if self.jobs == 1 else SHORT)
+        while left and (len(left) == 1 or time.monotonic() < deadline):
+            own, seconds = self.restarts[left[0]], math.inf if len(left) == 1 else deadline - time.monotonic()
+            self.ranks.share((own, until))
+            self._keep(train(self.data, own, until, seconds, self._path(left[0]), self.on_event, self.ranks))
+            if seconds == math.inf or time.monotonic() < deadline:  # or it has paused
+                del left[0]
+        if not left:
             return
-        with pool(self.jobs) as parallel:
-            while left:
-                calls = [partial(train, self.data, self.restarts[number], until, SLICE) for number in left]
-                for restart in results(parallel, calls, DEAD):
-                    before = self.restarts[restart.progress.restart].progress
-                    self._keep(restart)
-                    for row in restart.progress.history[len(before.history) :]:
-                        self.on_event(EpochEnded(**row))
-                left = [n for n in left if not self.restarts[n].progress.reached(self._last(n), until)]
+        with pool(min(self.jobs, len(left))) as parallel:
+            calls = [
+                partial(_train_apart, self.data, self.restarts[n], until, self._path(n), os.getpid()) for n in left
+            ]
+            for restart in results(parallel, calls, DEAD):
+                before = self.restarts[restart.progress.restart].progress
+                self._keep(restart)
+                for row in restart.progress.history[len(before.history) :]:
+                    self.on_event(EpochEnded(**row))
 
     def _keep(self, restart: Restart) -> None:
         number, why = restart.progress.restart, restart.progress.diverged
         self.restarts[number] = restart
-        path = self._path(number)
-        if path is not None:
-            restart.write(path)
         if why is not None and len(self.restarts) > 1:
             self.on_event(RestartDiverged(number, why))
+
+
+def _train_apart(
+    data: TrainingData, restart: Restart, until: int | None, checkpoint: Path | None, parent: int
+) -> Restart:
+    """Train a restart in a process of its own, which ends with the process that waits for it."""
+    return train(data, restart, until, math.inf, checkpoint, lambda event: end_with(parent))
 
 
 def follow(ranks: Ranks) -> None:
