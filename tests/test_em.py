@@ -267,7 +267,7 @@ def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
     trained = fit.metrics.trainings
     assert {name: one.by_em for name, one in trained.items()} == {"ddco": True, "mixture": True, "flat": False}
     assert trained["ddco"].spent.gradient_steps == trained["ddco"].spent.epochs
-    assert {name: one.optimizer for name, one in trained.items()} == {"ddco": "em", "mixture": "em", "flat": "lbfgs"}
+    assert {name: one.by_lbfgs for name, one in trained.items()} == {"ddco": False, "mixture": False, "flat": True}
     assert trained["flat"].spent.gradient_steps == trained["flat"].spent.epochs
     assert "(EM)" in words.effort(trained["ddco"])
     assert "(L-BFGS)" in words.effort(trained["flat"])
@@ -286,7 +286,7 @@ def test_a_flat_policy_for_each_time_step_is_least_squares_at_that_step():
     trainer = make_trainer(spec, demos, None)
     trainer.run()
     batch = trainer.data.train
-    assert trainer.summary["optimizer"] == "lbfgs"
+    assert trainer.summary["by_lbfgs"]
     last = trainer.history[-1]["train"]
     residual = 0.0
     for t in range(int(batch.lengths.max())):
@@ -325,6 +325,29 @@ def test_a_spec_that_em_would_not_follow_is_refused():
     for key, value in (("training.average", 0.9), ("training.clip_gradient", 1.0), ("training.optimizer.warmup", 2)):
         with pytest.raises(SpecError, match=f"{key}: em"):
             with_overrides(small_spec(), {key: value})
+
+
+def test_linear_networks_are_trained_by_em_unless_the_spec_asks_for_gradient_steps():
+    linear, data = {"network": "linear"}, {"demonstrations": {"path": "unused.hdf5"}, "observations": ["pose"]}
+    own = {"levels": [{"count": 2, "policy": linear}], "meta_policy": linear}
+    flat = {"baseline": {"kind": "flat", "policy": linear}}
+
+    def chosen(model=None, **rest):
+        return parse_spec({**data, **(model or {"hierarchy": own}), **rest}).training.optimizer.name
+
+    assert chosen() == chosen(flat) == chosen(training={"optimizer": {"ridge": {"policy": 2}}}) == "em"
+    for asked in ({"optimizer": {"lr": 0.1}}, {"optimizer": {"name": "adam"}}, {"average": 0.9}, {"clip_gradient": 1}):
+        assert chosen(training=asked) == "adam"
+    for changed in (
+        {"meta_policy": {"network": "mlp"}},
+        {"trunk": {"network": "mlp", "hidden": [4]}},
+        {"levels": [{"count": 2, "policy": linear, "trunk": {"network": "mlp", "hidden": [4]}}]},
+        {"levels": [{"count": 2, "policy": linear, "termination": {"network": "mlp"}}]},
+    ):
+        assert chosen({"hierarchy": own | changed}) == "adam"
+    assert chosen({"baseline": {"kind": "per_timestep", "policy": linear}}) == "adam"
+    assert chosen(observations=[{"key": "pose", "augment": {"versions": "others"}}]) == "adam"
+    assert chosen(training={"optimizer": {"name": "em"}}, hierarchy=own | {"meta_policy": {"network": "mlp"}}) == "em"
 
 
 def test_tuning_demonstrations_decide_nothing_before_the_last_stage():

@@ -355,19 +355,20 @@ def _direction(difference: Difference, held_out: int) -> int:
 
 def effort(training: Training) -> str:
     """The steps of training for tables, with EM or L-BFGS named, marked where training had not converged."""
-    name = WHOLE.get(training.optimizer)
+    name = _over_all(training)
     return f"{training.spent.gradient_steps}{f' ({name})' * bool(name)}{', not converged' * (not training.converged)}"
 
 
-WHOLE = {"em": "EM", "lbfgs": "L-BFGS"}
-"""The names of optimisers whose steps are over all demonstrations."""
+def _over_all(training: Training) -> str:
+    """The name of an optimiser whose steps are over all demonstrations."""
+    return "EM" if training.by_em else "L-BFGS" if training.by_lbfgs else ""
 
 
 def spent(training: Training) -> str:
     """Epochs and gradient steps, the budget, and the effort of restarts."""
     took, allowed, beside = training.spent, training.budget, restarts(training)
     of = "" if allowed.epochs is None else f" of at most {allowed.epochs} ({allowed.gradient_steps})"
-    steps = WHOLE.get(training.optimizer, "gradient")
+    steps = _over_all(training) or "gradient"
     return f"{took.epochs} epochs ({took.gradient_steps} {steps} steps){of}{'; ' * bool(beside)}{beside}"
 
 

@@ -239,7 +239,7 @@ class Trainer:
             "restarts": {"best": best, "spent": effort(len(self.history)), "each": each},
             "device": self.restarts[best].progress.device,
             "by_em": optimizer == "em",
-            "optimizer": optimizer,
+            "by_lbfgs": optimizer == "lbfgs",
         }
 
     def _segments(self, number: int) -> np.ndarray:

@@ -18,7 +18,7 @@ TRAINING = {
     },
     "device": "cpu",
     "by_em": False,
-    "optimizer": "adam",
+    "by_lbfgs": False,
 }
 
 
