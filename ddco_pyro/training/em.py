@@ -332,10 +332,10 @@ class Expectation:
             if name not in sums or of[name] is None:
                 continue
             caller, groups = self._callers[name], list[Information]()
-            choices, logits = selection.get(name), slice(0, caller.sizes[0])
+            choices, columns = selection.get(name), slice(0, caller.sizes[0])
             if caller.sizes[0] and choices is not None:
-                probabilities = said[name].detach()[..., logits].softmax(-1)
-                groups.append(Information(logits, choices.sum(-1).double(), probabilities))
+                probabilities = said[name].detach()[..., columns].softmax(-1)
+                groups.append(Information(columns, choices.sum(-1).double(), probabilities))
             acting = acted[place]
             if caller.std is not None and acting is not None:
                 emitted = _emitted(
