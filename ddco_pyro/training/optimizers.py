@@ -101,7 +101,7 @@ _KEPT = ("n_iter", "func_evals", "d", "t", "H_diag", "prev_flat_grad", "prev_los
 class QuasiNewton:
     """L-BFGS (Liu and Nocedal 1989) with a line search for the strong Wolfe conditions, over all demonstrations.
 
-    It works on a copy of the model in float64: differences of gradients in float32 are too inexact.
+    It works on a copy of the model in float64.
 
     :param backward: adds the gradient of minus the log-likelihood per step; the log-likelihood, nats.
     :param decay: L2 penalty.
