@@ -16,22 +16,19 @@
 # An arm of three joints pushes a box to one goal after another, and sees nothing but the pictures of a camera (§5.1,
 # SM 1.2). Can policies be learned that read box, arm and goal from them, and do options help?
 #
-# This page draws a demonstration; all else shows what `studies/pushing_pictures*.py` measured, each by the command
-# above its table.
+# This page draws a demonstration; all else is what `studies/pushing_pictures.py` measured.
 
 # %%
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-from IPython.display import Image, Markdown, display
+from IPython.display import Image, Markdown
 
 from ddco_pyro.data.pictures import Transform
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.simulation.task import find_task
 
-FOLDER = "../docs/results/pushing_pictures"
-pages = {path.stem: path.read_text().partition("![")[0] for path in Path(FOLDER).glob("*.md")}
-drawn = {path.stem: Image(str(path)) for path in Path(FOLDER).glob("*.png")}
+RESULTS = Path("../docs/results")
 
 # %% [markdown]
 # ## What is seen
@@ -55,47 +52,14 @@ plt.show()
 # %% [markdown]
 # ## What policies reach
 #
-# Goals in 2000 steps, from the same initial states for all. Policies that see the state itself, on the same
-# demonstrations and episodes, are in `docs/results/pushing`.
+# Goals in 2000 steps, from the same initial states for all, beside full-size pictures, numbers of options, a meta-policy
+# that may act itself, and options over what a flat policy sees.
 
 # %%
-display(Markdown(pages["demonstrations"]), drawn["demonstrations"])
-
-# %% [markdown]
-# ## Finer pictures
-#
-# All that the camera sees, 480 × 640, reduced by two convolutions before the others, beside 48 × 64, after as many
-# gradient steps; fitted on a GPU, where that takes three minutes.
+Markdown((RESULTS / "pushing_pictures.md").read_text().replace("](", "](../docs/results/"))
 
 # %%
-display(Markdown(pages["large"]))
-
-# %% [markdown]
-# ## How many options
-#
-# With 40 demonstrations. The paper's text has four feed-forward options and two recurrent ones, its supplement two and
-# four.
-
-# %%
-display(Markdown(pages["options"]), drawn["options"])
-
-# %% [markdown]
-# ## A meta-policy that may act itself
-#
-# How often it does: *steps under own control* (SM 1.5).
-
-# %%
-display(Markdown(pages["augmentation"]), drawn["augmentation"])
-
-# %% [markdown]
-# ## Options over what a flat policy sees
-#
-# A flat policy learns to see more easily than options with layers of their own. Here its convolutions are kept
-# (`ddco-pyro encode --encoder RUN`), and perceptrons are fitted to what they give of each picture: two options, and a
-# flat one with as many parameters.
-
-# %%
-display(Markdown(pages["encoded"]), drawn["encoded"])
+Image(str(RESULTS / "pushing_pictures.png"))
 
 # %% [markdown]
 # ## What a policy looks at
@@ -103,4 +67,4 @@ display(Markdown(pages["encoded"]), drawn["encoded"])
 # How much the control of the active option changes with each pixel, in the first episode of the evaluation.
 
 # %%
-display(Markdown(pages["looks"]), drawn["looks"])
+Image(str(RESULTS / "pushing_pictures_looks.png"))

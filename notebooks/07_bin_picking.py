@@ -17,21 +17,18 @@
 # (Physical Experiment 2, SM 1.4). It sees masks of the objects, the shape of what it holds in them, a grasp candidate
 # and what its encoders read. Do options learned from 60 demonstrations clear the bin, and what are they?
 #
-# This page draws one demonstration; all else shows what `studies/bin_picking*.py` measured, each by the command above
-# its table.
+# This page draws one demonstration; all else is what `studies/bin_picking.py` measured.
 
 # %%
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-from IPython.display import Image, Markdown, display
+from IPython.display import Image, Markdown
 
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.simulation.task import find_task
 
-FOLDER = "../docs/results/bin_picking"
-pages = {path.stem: path.read_text().replace("](", f"]({FOLDER}/") for path in Path(FOLDER).glob("*.md")}
-pictures = {path.stem: Image(str(path)) for path in Path(FOLDER).glob("*.png")}
+RESULTS = Path("../docs/results")
 
 # %% [markdown]
 # ## A demonstration
@@ -53,25 +50,12 @@ for step, (above, below) in zip(steps, axes.T, strict=True):
 plt.show()
 
 # %% [markdown]
-# How often the demonstrator's grasps took something, and what became of its bins:
-
-# %%
-Markdown(pages["supervisor"])
-
-# %% [markdown]
 # ## Policies
 #
-# The paper's four criteria, beside flat policies with the same branches and gradient steps.
+# The paper's four criteria beside flat policies with the same branches and gradient steps, and what else was measured.
 
 # %%
-Markdown(pages["summary"])
-
-# %% [markdown]
-# Recovery counts what is held when the jaws open, and so what slipped on the way to a cup, which the demonstrator, who
-# does not look again, does not take back either. By what is held where it is shown, when it is decided where to go:
-
-# %%
-Markdown(pages.get("recovery", "Not measured yet."))
+Markdown((RESULTS / "bin_picking.md").read_text().replace("](", "](../docs/results/"))
 
 # %% [markdown]
 # ## What the options are
@@ -79,7 +63,7 @@ Markdown(pages.get("recovery", "Not measured yet."))
 # Which option is active in each step of a demonstrated trial, and which inputs move it.
 
 # %%
-display(Markdown(pages["options"].partition("![")[0]), pictures["options"])
+Image(str(RESULTS / "bin_picking_options.png"))
 
 # %% [markdown]
 # ## How trials end
@@ -87,28 +71,4 @@ display(Markdown(pages["options"].partition("![")[0]), pictures["options"])
 # The first trial of each ending, every picture framed in the colour of the active option.
 
 # %%
-display(Markdown(pages.get("films", "Not measured yet.").partition("![")[0]), *filter(None, [pictures.get("films")]))
-
-# %% [markdown]
-# ## What matters
-#
-# Other numbers of options, fewer demonstrations, coarser pictures, and the gripper's pose for the control, as a
-# rotation vector and as a matrix. Of eight objects, the paper's robot took singly 7 with joint angles, 3 with tooltip
-# poses and 2 with rotation matrices.
-
-# %%
-Markdown(pages.get("variants", "Not measured yet."))
-
-# %% [markdown]
-# With ten, twenty and forty demonstrations again, four and three training seeds:
-
-# %%
-Markdown(pages.get("fewer", "Not measured yet."))
-
-# %% [markdown]
-# ## Objects that no demonstration has shown
-#
-# Each alone in the bin, and the known ones for comparison.
-
-# %%
-Markdown(pages.get("unseen", "Not measured yet."))
+Image(str(RESULTS / "bin_picking_films.png"))
