@@ -52,8 +52,8 @@ plt.show()
 # %% [markdown]
 # ## What policies reach
 #
-# Goals in 2000 steps, from the same initial states for all, beside full-size pictures, numbers of options, a meta-policy
-# that may act itself, and options over what a flat policy sees.
+# Goals in 2000 steps, from the same initial states for all, beside full-size pictures, numbers of options, a
+# meta-policy that may act itself, and options over what a flat policy sees.
 
 # %%
 Markdown((RESULTS / "pushing_pictures.md").read_text().replace("](", "](../docs/results/"))
