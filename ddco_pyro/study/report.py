@@ -18,9 +18,11 @@ from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.figures import GRID, WIDTH, Interval, Panel, interval_plot, save, style
 from ddco_pyro.drawing.page import Block, Page, Picture, Section, Table, Text, note
 from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.metrics import write_table
+from ddco_pyro.segmenting.agreement import measure_names
 from ddco_pyro.study.cells import COLUMNS, Folder, Row, State, read_tidy, tidy
-from ddco_pyro.study.declaration import ContrastSpec, Study
+from ddco_pyro.study.declaration import NATS, ContrastSpec, Study
 from ddco_pyro.study.statistics import LEVEL, BySeed, Estimate, bootstrap, estimate, holm, p_value, paired
 
 FILES = ("table.csv", "page.md", "page.html", "contrasts.png", "methods.png")
@@ -127,33 +129,28 @@ def _plural(name: str, count: int) -> str:
 
 
 def _contrasts(found: Sequence[Tested], to: Path) -> list[Block]:
-    head = ["contrast", "measure", "demonstrations", "exceeds", "difference", "95 % t", "95 % bootstrap", "units",
-            "p", "p (Holm)", "verdict"]  # fmt: skip
+    head = ["contrast", "measure", "demos", "has to exceed", "difference [95 % t]", "bootstrap", "p (Holm)", "verdict"]
     table = []
     for one in found:
-        first = [one.spec.contrast, one.spec.measure, str(one.demonstrations), words.signed(one.spec.bound)]
-        if one.found is None:
-            table.append([*first, *["–"] * 6, one.verdict])
-            continue
-        units = f"{one.found.tasks} tasks" if one.found.tasks > 1 else f"{one.found.values} seeds"
-        numbers = [words.signed(one.found.value), _interval(one.found.interval), _interval(bootstrap(one.differences))]
-        p_values = [words.p_value(p) if p == p else "–" for p in (one.p, one.adjusted)]
-        table.append([*first, *numbers, units, *p_values, one.verdict])
+        first = [one.spec.contrast, name_of(one.spec.measure), str(one.demonstrations), words.signed(one.spec.bound)]
+        ends, p = bootstrap(one.differences) if one.found else (math.nan, math.nan), words.p_value(one.adjusted)
+        numbers = [shown(one.found, "+.2f"), words.interval(ends), p] if one.found else ["–"] * 3
+        table.append([*first, *numbers, one.verdict])
     text = (
         "Differences are paired by task and training seed. The test of each contrast is one-sided, at 2.5 %. For "
         "superiority the difference has to exceed the margin, for non-inferiority minus the margin. Holm's correction "
         "is over these contrasts; intervals are not corrected. With several tasks the units are tasks, so an interval "
         "speaks of further tasks. The bootstrap draws tasks, and seeds within each."
     )
-    shown = [one for one in found if one.found]
-    measures = dict.fromkeys(one.spec.measure for one in shown)
+    known = [one for one in found if one.found]
+    measures = dict.fromkeys(one.spec.measure for one in known)
     panels = [
         Panel(
-            measure,
-            f"difference in {words.measure(measure)}",
+            name_of(measure),
+            "difference",
             [
                 _drawn(one.found, one.differences, one.spec.bound) if one.spec.measure == measure else None
-                for one in shown
+                for one in known
             ],
             line=0,
         )
@@ -164,9 +161,9 @@ def _contrasts(found: Sequence[Tested], to: Path) -> list[Block]:
         "bound that the difference has to exceed."
     )
     with style():
-        figure = interval_plot([one.name for one in shown], panels)
+        figure = interval_plot([one.name for one in known], panels)
         picture = _saved(figure, to / "contrasts.png", verdict(found), caption)
-    return [Table(head, table, {0, 1, 10}), picture, note(text)]
+    return [Table(head, table, {0, 1, 7}), picture, note(text)]
 
 
 def _drawn(found: Estimate | None, by_seed: BySeed, bound: float | None = None) -> Interval | None:
@@ -187,13 +184,13 @@ def _methods(study: Study, rows: Sequence[Row], to: Path) -> list[Block]:
             cells = [_estimated(values(rows, label, measure, count)) for count in counts]
             if any(cells):
                 table.append([label, *(shown(cell) if cell else "–" for cell in cells)])
-        head = [words.measure(measure), *(f"{count} demonstrations" for count in counts)]
+        head = [name_of(measure), *(f"{count} demonstrations" for count in counts)]
         blocks.append(Table(head, table))
     picture = _saved(
         draw(study, rows), to / "methods.png", f"{', '.join(study.declared.measures)} of {', '.join(labels)}",
         "Means with 95 % t intervals, over tasks where there are several, else over training seeds.",
     )  # fmt: skip
-    return [*blocks, picture, note("Means with 95 % t intervals: over tasks where there are several, else over seeds.")]
+    return [*blocks, picture]
 
 
 def _saved(figure: Figure, path: Path, alt: str, caption: str) -> Picture:
@@ -209,7 +206,7 @@ def draw(study: Study, rows: Sequence[Row]) -> Figure:
     if len(counts) == 1:
         by_method = {(m, label): values(rows, label, m, counts[0]) for m in measures for label in labels}
         panels = [
-            Panel(m, words.measure(m), [_drawn(_estimated(by_method[m, one]), by_method[m, one]) for one in labels])
+            Panel("", name_of(m), [_drawn(_estimated(by_method[m, one]), by_method[m, one]) for one in labels])
             for m in measures
         ]
         with style():
@@ -232,7 +229,7 @@ def draw(study: Study, rows: Sequence[Row]) -> Figure:
                     [n * 1.02 ** (number - 1) for n, _ in known], middle, np.nan_to_num(ends), marker="o",
                     markersize=3.5, capsize=2, linewidth=1.2, color=option_colour(number), label=label,
                 )  # fmt: skip
-            axes.set(xscale="log", title=task or (f"{measure}, mean of tasks" if several else measure))
+            axes.set(xscale="log", title=task or name_of(measure) + (", mean of tasks" if several else ""))
             axes.set_xticks(counts, map(str, counts))
             axes.set_xticks([], minor=True)
             axes.grid(axis="y", color=GRID)
@@ -253,7 +250,7 @@ def design(study: Study, rows: Sequence[Row], state: State) -> list[str]:
     declared, data = study.declared, study.declared.demonstrations
     several = f"{len(study.tasks)} tasks: {', '.join(study.tasks)}. " if study.tasks[0] else ""
     if study.source is None:
-        drawn = "Every training seed has demonstrations of its own."
+        drawn = "Each training seed has its own demonstrations."
     else:
         drawn = (
             f"Every training seed draws its demonstrations from {declared.demonstrations.path}, so seeds share some."
@@ -278,8 +275,11 @@ def design(study: Study, rows: Sequence[Row], state: State) -> list[str]:
     return lines
 
 
-def _interval(ends: tuple[float, float]) -> str:
-    return words.interval(None if math.isnan(ends[0]) else ends)
+def name_of(measure: str) -> str:
+    """The name of a measure in tables and figures."""
+    if measure == NATS:
+        return "held-out nats/step"
+    return measure_names([measure])[0] if measure in (*UNMATCHED, *MATCHED) else words.measure(measure)
 
 
 def shown(found: Estimate, form: str = ".2f") -> str:
