@@ -297,7 +297,7 @@ def test_the_best_point_on_development_seeds_is_tested(made):
 
 def test_cells_of_an_earlier_table_are_not_done(made, done, tmp_path):
     write(done, done.state(), tmp_path)
-    folder = made(kept="table.csv", seeds={"test": {"count": 2}})
+    folder = made(kept=[{"table": "table.csv"}])
     assert not folder.state().missing
     with (tmp_path / "table.csv").open() as table:
         rows = [row for row in csv.DictReader(table) if (row["method"], row["seed"]) != ("flat", "1")]
@@ -305,25 +305,27 @@ def test_cells_of_an_earlier_table_are_not_done(made, done, tmp_path):
         writer = csv.DictWriter(table, rows[0])
         writer.writeheader()
         writer.writerows(rows)
-    folder = made(kept="table.csv")
+    folder = made(kept=[{"table": "table.csv"}])
     assert {(cell.method, cell.seed) for cell in folder.state().missing} == {("flat", 1)}
 
 
-def test_pages_quote_the_table(done, tmp_path):
-    write(done, done.state(), tmp_path / "study")
-    rows = read_tidy(tmp_path / "study" / "table.csv")
+def test_pages_quote_the_tables_by_the_names_of_the_study(made, done, tmp_path):
+    write(done, done.state(), tmp_path)
+    rows = read_tidy(tmp_path / "table.csv")
     own = values(rows, "options", "nats", 6)[""]
-    mean = (own[0] + own[1]) / 2
-    quoted = "It is <!-- study study: options; nats; 6; form=.3f -->?<!-- / -->."
+    methods = {"mine": {}, "flat": {"baseline": "flat"}}
+    kept = [{"table": "table.csv", "study": "study", "methods": {"mine": "options"}, "measures": {"nats/step": "nats"}}]
+    made(kept=kept, methods=methods, contrasts=[])
+    quoted = "It is <!-- study study: mine; nats/step; 6; form=.3f -->?<!-- / -->."
     now = render(quoted, tmp_path)
-    assert f"-->{mean:.3f} [".replace("-->-", "-->−") in now
+    assert f"-->{(own[0] + own[1]) / 2:.3f} [".replace("-->-", "-->−") in now
     assert render(now, tmp_path) == now
     assert render("nothing", tmp_path) == "nothing"
-    for wrong, said in (("options; nats", "write a method"), ("option; nats; 6", "has no"), ("options; nats; 5", "no")):
+    for wrong, said in (("mine; nats", "write a method"), ("flat; nats/step; 6", "no"), ("mine; nats; 5", "no")):
         with pytest.raises(BadInput, match=said):
             render(f"<!-- study study: {wrong} --><!-- / -->", tmp_path)
-    with pytest.raises(BadInput, match="cannot be read"):
-        render("<!-- study other: options; nats; 6 --><!-- / -->", tmp_path)
+    with pytest.raises(SpecError, match="cannot be read"):
+        render("<!-- study other: mine; nats; 6 --><!-- / -->", tmp_path)
 
 
 def test_the_command_says_what_is_left(made, tmp_path, monkeypatch):
@@ -339,4 +341,4 @@ def test_the_command_says_what_is_left(made, tmp_path, monkeypatch):
 def test_pages_of_the_project_agree_with_the_tables():
     for page in ("README.md", "docs/results/README.md"):
         text = (ROOT / page).read_text()
-        assert render(text, ROOT / "docs" / "results") == text
+        assert render(text, ROOT / "studies") == text

@@ -36,9 +36,7 @@ def study(
     to: Annotated[
         Path | None, written(out_folder, "The folder of table, page and figures; by default that of the results.")
     ] = None,
-    tables: Annotated[Path, typer.Option(help="The folder in which render reads NAME/table.csv.")] = Path(
-        "docs/results"
-    ),
+    studies: Annotated[Path, typer.Option(help="The folder of the studies that render quotes.")] = Path("studies"),
     jobs: Annotated[int, typer.Option(help="Processes that do cells; -1 is one for each core.")] = -1,
     backend: Annotated[Backend, typer.Option(help="Where cells are done: loky (here) or dask.")] = Backend.LOKY,
     scheduler: Annotated[str | None, typer.Option(help="Address of the dask scheduler, tcp://HOST:PORT.")] = None,
@@ -53,7 +51,7 @@ def study(
     table, the page and the figures. render brings the numbers that pages quote up to date with the tables.
     """
     if action is Action.RENDER:
-        _render(files, tables, check)
+        _render(files, studies, check)
         return
     if len(files) > 1:
         raise BadInput(f"{files[1]}: one study at a time")
@@ -100,7 +98,7 @@ def study(
         raise Failed(f"{len(state.failed)} of {total} cells failed; the same command tries them again")
 
 
-def _render(pages: list[Path], tables: Path, check: bool) -> None:
+def _render(pages: list[Path], studies: Path, check: bool) -> None:
     """Bring the quoted numbers of pages up to date.
 
     :raises Failed: with ``check``, a page differs.
@@ -112,7 +110,7 @@ def _render(pages: list[Path], tables: Path, check: bool) -> None:
             text = page.read_text(encoding="utf-8")
         except OSError as error:
             raise BadInput(f"{page}: cannot be read: {error.strerror}; check the path") from error
-        now = render(text, tables)
+        now = render(text, studies)
         if now != text and check:
             raise Failed(f"{page}: differs from the tables; write it with: {command('study', 'render', page)}")
         if now != text:

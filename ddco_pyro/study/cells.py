@@ -206,10 +206,9 @@ class Folder:
 
     @cached_property
     def _earlier(self) -> dict[tuple[str, str, int, int], dict[str, float | None]]:
-        """The cells of the table ``kept`` that have every measure that some cell of their method has."""
-        kept = self.study.declared.kept
+        """The values of the declaration's tables ``kept``, by cell and measure."""
         found: dict[tuple[str, str, int, int], dict[str, float | None]] = defaultdict(dict)
-        for row in read_tidy(self.study.path.parent / kept) if kept else ():
+        for row in earlier(self.study):
             found[row.cell][row.measure] = row.value
         return dict(found)
 
@@ -400,13 +399,9 @@ class Folder:
     def _placed(self, cell: Cell, path: str) -> dict[str, Any]:
         """What a spec says of a cell's data, by key path. The path is relative: the study's folder may move."""
         task = cell.task if self.study.declared.world is None else None
-        changes: dict[str, Any] = {
-            "demonstrations.path": path,
-            "demonstrations.exclude": [],
-            "training.seed": None,
-            "seed": cell.seed,
-        }
-        return changes | ({"task": task} if task else {})
+        own = {"path": path, "exclude": [], "count": max(2, cell.demonstrations), "seed": 0}
+        changes: dict[str, Any] = {f"demonstrations.{key}": value for key, value in own.items()}
+        return changes | {"training.seed": None, "seed": cell.seed} | ({"task": task} if task else {})
 
     def _recorded(self, cell: Cell, world: World | None) -> Path:
         """The recorded demonstrations of a task and training seed, the same for all methods and numbers."""
@@ -414,8 +409,10 @@ class Folder:
         seeds, count = getattr(own, cell.part).of(cell.place), own.held_out + max(own.counts)
         path = self.path / "demonstrations" / f"{cell.task.replace(':', '-')}-{seeds.start}-{count}.hdf5"
         if world is None:
-            spec = DemonstrationsSpec(count=count, seed=seeds.start, supervisor=own.supervisor)
-            return collect(cell.task, spec, path, observed=self.study.base.observed if self.study.base else ())
+            base = self.study.base
+            wanted, observed = (base.demonstrations, base.observed) if base else (DemonstrationsSpec(), [])
+            how = {"count": count, "seed": seeds.start, "supervisor": own.supervisor or wanted.supervisor}
+            return collect(wanted.task or cell.task, wanted.model_copy(update=how), path, observed=observed)
         with only_one(self.path / "work" / path.stem, wait=True):
             if not path.exists():
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -466,19 +463,38 @@ class Row:
 
 
 def read_tidy(path: Path) -> list[Row]:
-    """The rows of a tidy table.
+    """The rows of a tidy table that have a number of demonstrations and a training seed.
 
     :raises BadInput: the file cannot be read.
     """
 
-    def row(fields: Mapping[str, str]) -> Row:
-        count, seed, value = int(fields["demonstrations"]), int(fields["seed"]), float(fields["value"])
-        return Row(fields["study"], fields["task"], fields["method"], count, seed, fields["measure"], value)
+    def row(fields: Mapping[str, str]) -> Row | None:
+        count, seed, value = fields["demonstrations"], fields["seed"], float(fields["value"])
+        if not (count.isdecimal() and seed.isdecimal()):
+            return None
+        return Row(fields["study"], fields["task"], fields["method"], int(count), int(seed), fields["measure"], value)
 
+    remedy = "write it with: ddco-pyro study report"
     try:
-        return read_table(path, row, "write it again: ddco-pyro study report")
+        return [one for one in read_table(path, row, remedy) if one is not None]
     except OSError as error:
-        raise BadInput(f"{path}: cannot be read: {error.strerror}; write it with: ddco-pyro study report") from error
+        raise BadInput(f"{path}: cannot be read: {error.strerror}; {remedy}") from error
+
+
+def earlier(study: Study) -> list[Row]:
+    """The rows of a declaration's tables ``kept``, by the names of the declaration."""
+    found: dict[tuple[Any, ...], Row] = {}
+    for kept in study.declared.kept:
+        tasks, methods, measures = (
+            {there: here for here, there in names.items()} for names in (kept.tasks, kept.methods, kept.measures)
+        )
+        for row in read_tidy(study.path.parent / kept.table):
+            if kept.study in (None, row.study) and (not methods or row.method in methods):
+                task, method = tasks.get(row.task, row.task), methods.get(row.method, row.method)
+                measure = measures.get(row.measure, row.measure)
+                own = replace(row, study=study.name, task=task, method=method, measure=measure)
+                found.setdefault((*own.cell, measure), own)
+    return list(found.values())
 
 
 def tidy(folder: Folder, state: State) -> Iterator[Row]:

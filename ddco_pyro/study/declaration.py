@@ -73,8 +73,8 @@ class DataSpec(Model):
     """Numbers of demonstrations to train on."""
     held_out: Count = 10
     """Further demonstrations, which score the fits."""
-    supervisor: Text = "supervisor"
-    """Which of a task's scripted policies is recorded."""
+    supervisor: Text | None = None
+    """Which of a task's scripted policies is recorded; null: that of the spec."""
     test: Block | None = None
     """Seeds of recorded episodes for each training seed. With ``path``: places in the file, from which every training
     seed draws; null: the whole file."""
@@ -119,6 +119,21 @@ class ContrastSpec(Model):
         return self.margin if self.kind == "superiority" else -self.margin
 
 
+class KeptSpec(Model):
+    """A tidy table of earlier results, whose cells are not done again. Names that are left out are equal in both."""
+
+    table: Text
+    """The table, relative to the declaration."""
+    study: Text | None = None
+    """The study in the table; null: all."""
+    tasks: dict[Text, Text] = Field(default={})
+    """The name of a task here to its name in the table."""
+    methods: dict[Text, Text] = Field(default={})
+    """The name of a method here to its name in the table; others of the table are not taken."""
+    measures: dict[Text, Text] = Field(default={})
+    """The name of a measure here to its name in the table."""
+
+
 class Declaration(Model):
     """The contents of a declaration's file."""
 
@@ -149,8 +164,8 @@ class Declaration(Model):
     """Measures of the tables: ``nats``, ``nmi`` and others of ``ddco_pyro.metrics.Scores``, or a task's."""
     contrasts: Items[ContrastSpec] = ()
     """The primary contrasts, whose p-values are corrected for their number."""
-    kept: Text | None = None
-    """Table of an earlier run, relative to the declaration, whose cells are not done again; null: none."""
+    kept: Items[KeptSpec] = ()
+    """Tables of earlier results, the first of which decides where several have a value."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Declaration:

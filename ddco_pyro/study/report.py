@@ -21,7 +21,7 @@ from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.metrics import write_table
 from ddco_pyro.segmenting.agreement import measure_names
-from ddco_pyro.study.cells import COLUMNS, Folder, Row, State, read_tidy, tidy
+from ddco_pyro.study.cells import COLUMNS, Folder, Row, State, earlier, tidy
 from ddco_pyro.study.declaration import NATS, ContrastSpec, Study
 from ddco_pyro.study.statistics import LEVEL, BySeed, Estimate, bootstrap, estimate, holm, p_value, paired
 
@@ -133,8 +133,10 @@ def _contrasts(found: Sequence[Tested], to: Path) -> list[Block]:
     table = []
     for one in found:
         first = [one.spec.contrast, name_of(one.spec.measure), str(one.demonstrations), words.signed(one.spec.bound)]
-        ends, p = bootstrap(one.differences) if one.found else (math.nan, math.nan), words.p_value(one.adjusted)
-        numbers = [shown(one.found, "+.2f"), words.interval(ends), p] if one.found else ["–"] * 3
+        numbers = ["–"] * 3
+        if one.found:
+            p = "–" if math.isnan(one.p) else words.p_value(one.adjusted)
+            numbers = [shown(one.found, "+.2f"), words.interval(bootstrap(one.differences)), p]
         table.append([*first, *numbers, one.verdict])
     text = (
         "Differences are paired by task and training seed. The test of each contrast is one-sided, at 2.5 %. For "
@@ -248,7 +250,7 @@ def _estimated(by_seed: BySeed) -> Estimate | None:
 def design(study: Study, rows: Sequence[Row], state: State) -> list[str]:
     """The data and seeds of a study, missing cells, and fits that have not converged, a line each."""
     declared, data = study.declared, study.declared.demonstrations
-    several = f"{len(study.tasks)} tasks: {', '.join(study.tasks)}. " if study.tasks[0] else ""
+    several = f"Tasks: {', '.join(study.tasks)}. " if study.tasks[0] else ""
     if study.source is None:
         drawn = "Each training seed has its own demonstrations."
     else:
@@ -258,7 +260,7 @@ def design(study: Study, rows: Sequence[Row], state: State) -> list[str]:
     seeds = declared.seeds.test
     lines = [
         f"{several}{', '.join(map(str, data.counts))} demonstrations to train on, {data.held_out} held out. {drawn}",
-        f"Training seeds {seeds.first} to {seeds.first + seeds.count - 1}. Spec: {declared.spec}.",
+        f"{seeds.count} training seeds from {seeds.first} on. Spec: {declared.spec}.",
     ]
     if declared.starts is not None:
         lines.append(f"Every method acts from the same {declared.starts.test.count} starts, others for every seed.")
@@ -293,22 +295,23 @@ def shown(found: Estimate, form: str = ".2f") -> str:
 _QUOTED = re.compile(r"<!-- study (?P<study>[\w-]+): (?P<what>.*?) -->(?P<text>.*?)<!-- / -->", re.DOTALL)
 
 
-def render(text: str, tables: Path) -> str:
+def render(text: str, studies: Path) -> str:
     """A page's text with every quoted number as the tables of the studies have it.
 
     A quotation is ``<!-- study NAME: options - flat; success; 50 -->…<!-- / -->``: a method or a contrast, a measure,
     and a number of demonstrations. ``task=NAME`` takes one task, and ``form=+.0%`` formats as Python does. A difference
     is bold where its interval excludes 0.
 
-    :param tables: the folder that holds ``NAME/table.csv``.
-    :raises BadInput: a quotation is wrong, or its table has no such value.
+    :param studies: the folder of the declarations, whose tables ``kept`` have the numbers.
+    :raises BadInput: a quotation is wrong, or its study keeps no such value.
     """
     known: dict[str, list[Row]] = {}
 
     def quoted(match: re.Match[str]) -> str:
         name, what = match["study"], match["what"]
-        rows = known.setdefault(name, read_tidy(tables / name / "table.csv")) if name not in known else known[name]
-        return f"<!-- study {name}: {what} -->{_quoted(rows, name, what)}<!-- / -->"
+        if name not in known:  # nothing of a study is imported for its numbers
+            known[name] = earlier(Study.load(studies / f"{name}.yaml", allow_code=True))
+        return f"<!-- study {name}: {what} -->{_quoted(known[name], name, what)}<!-- / -->"
 
     return _QUOTED.sub(quoted, text)
 
@@ -325,8 +328,8 @@ def _quoted(rows: Sequence[Row], name: str, quotation: str) -> str:
     what, measure, count = plain
     found = _estimated(values(rows, what, measure, int(count), named.get("task")))
     if found is None:
-        raise BadInput(f"study {name}: its table has no {quotation!r}; check names, or write the table again")
+        raise BadInput(f"study {name}: its tables have no {quotation!r}; check its names, and kept in the study")
     difference = " - " in what
     percent = measure == "success"
-    text = shown(found, named.get("form", ("+" if difference else "") + (".0%" if percent else ".2f")))
+    text = shown(found, named.get("form", ("+z" if difference else "z") + (".0%" if percent else ".2f")))
     return f"**{text}**" if difference and found.interval[0] * found.interval[1] > 0 else text
