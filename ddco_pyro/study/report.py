@@ -188,10 +188,10 @@ def _methods(study: Study, rows: Sequence[Row], to: Path) -> list[Block]:
                 table.append([label, *(shown(cell) if cell else "–" for cell in cells)])
         head = [name_of(measure), *(f"{count} demonstrations" for count in counts)]
         blocks.append(Table(head, table))
-    picture = _saved(
-        draw(study, rows), to / "methods.png", f"{', '.join(study.declared.measures)} of {', '.join(labels)}",
-        "Means with 95 % t intervals, over tasks where there are several, else over training seeds.",
-    )  # fmt: skip
+    single = "Single tasks: means and ranges over training seeds." if len(study.tasks) > 1 and len(counts) > 1 else ""
+    caption = "Means with 95 % t intervals, over tasks where there are several, else over training seeds."
+    alt = f"{', '.join(study.declared.measures)} of {', '.join(labels)}"
+    picture = _saved(draw(study, rows), to / "methods.png", alt, f"{caption} {single}".rstrip())
     return [*blocks, picture]
 
 
@@ -226,7 +226,8 @@ def draw(study: Study, rows: Sequence[Row]) -> Figure:
                 points = [(n, _estimated(values(rows, label, measure, n, task))) for n in counts]
                 known = [(n, one) for n, one in points if one]
                 middle = [one.value for _, one in known]
-                ends = np.abs(np.array([one.interval for _, one in known]).reshape(-1, 2).T - middle)
+                both = [one.interval if task is None else one.range for _, one in known]
+                ends = np.abs(np.array(both).reshape(-1, 2).T - middle)
                 axes.errorbar(
                     [n * 1.02 ** (number - 1) for n, _ in known], middle, np.nan_to_num(ends), marker="o",
                     markersize=3.5, capsize=2, linewidth=1.2, color=option_colour(number), label=label,
@@ -264,6 +265,9 @@ def design(study: Study, rows: Sequence[Row], state: State) -> list[str]:
     ]
     if declared.starts is not None:
         lines.append(f"Every method acts from the same {declared.starts.test.count} starts, others for every seed.")
+    if declared.kept:
+        tables = dict.fromkeys(one.table for one in declared.kept)
+        lines.append(f"Kept results may be older than the contrasts: {', '.join(tables)}.")
     if declared.choose is not None:
         lines.append(f"Each method's point of the grid has the highest {declared.choose} on the development seeds.")
     test = [number for number, cell in enumerate(state.cells) if cell.part == "test"]

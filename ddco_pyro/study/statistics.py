@@ -27,6 +27,7 @@ class Estimate:
     :param error: the standard error; NaN for a single unit, as the interval is.
     :param freedom: degrees of freedom of the t interval: tasks − 1, or seeds − 1 for a single task.
     :param interval: the 95 % t interval.
+    :param range: the least and the greatest unit.
     :param tasks: the number of tasks, and of ``values`` in all.
     """
 
@@ -34,6 +35,7 @@ class Estimate:
     error: float
     freedom: int
     interval: tuple[float, float]
+    range: tuple[float, float]
     tasks: int
     values: int
 
@@ -69,7 +71,8 @@ def estimate(values: BySeed) -> Estimate:
     value, freedom = float(means.mean()), len(units) - 1
     error = float(units.std(ddof=1) / math.sqrt(len(units))) if freedom else math.nan
     half = error * float(stdtrit(freedom, 1 - LEVEL)) if freedom else math.nan
-    return Estimate(value, error, freedom, (value - half, value + half), len(means), sum(map(len, by_task)))
+    ends, values_in_all = (float(units.min()), float(units.max())), sum(map(len, by_task))
+    return Estimate(value, error, freedom, (value - half, value + half), ends, len(means), values_in_all)
 
 
 def bootstrap(values: BySeed, draws: int = 4000, seed: int = 0) -> tuple[float, float]:
