@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import csv
+import doctest
 import json
 import re
 import shutil
 import signal
 from pathlib import Path
 
+import arena_playing
 import numpy as np
 import pytest
+import sawyer
 import yaml
 from command_line import call
 from killing import struck
@@ -20,7 +23,7 @@ from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import BadInput
 from ddco_pyro.selection import Workers
 from ddco_pyro.spec import SpecError
-from ddco_pyro.study import cells, report
+from ddco_pyro.study import cells, declaration, report, statistics
 from ddco_pyro.study.cells import Folder, read_tidy
 from ddco_pyro.study.declaration import Study
 from ddco_pyro.study.report import render, values, write
@@ -68,13 +71,13 @@ def file(tmp_path_factory):
 def made(file, tmp_path):
     """Makes a folder's ``study.yaml``, with other values at some keys, and gives the study and its folder."""
     shutil.copy(file, tmp_path)
-    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(SPEC))
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(SPEC, sort_keys=False))
 
     def make(spec=None, **changes):
         if spec:
-            (tmp_path / "spec.yaml").write_text(yaml.safe_dump({**SPEC, **spec}))
+            (tmp_path / "spec.yaml").write_text(yaml.safe_dump({**SPEC, **spec}, sort_keys=False))
         path = tmp_path / "study.yaml"
-        path.write_text(yaml.safe_dump({**STUDY, **changes}))
+        path.write_text(yaml.safe_dump({**STUDY, **changes}, sort_keys=False))
         return Folder(Study.load(path), tmp_path / "out")
 
     return make
@@ -85,8 +88,8 @@ def done(file, tmp_path_factory):
     """The folder of a finished study."""
     place = tmp_path_factory.mktemp("done")
     shutil.copy(file, place)
-    (place / "spec.yaml").write_text(yaml.safe_dump(SPEC))
-    (place / "study.yaml").write_text(yaml.safe_dump(STUDY))
+    (place / "spec.yaml").write_text(yaml.safe_dump(SPEC, sort_keys=False))
+    (place / "study.yaml").write_text(yaml.safe_dump(STUDY, sort_keys=False))
     folder = Folder(Study.load(place / "study.yaml"), place / "out")
     folder.run(HERE)
     return folder
@@ -126,6 +129,21 @@ def test_a_declaration_that_cannot_be_meant_is_refused_in_words(made, changes, s
     with pytest.raises(SpecError) as refused:
         made(**changes)
     assert said in str(refused.value)
+
+
+def test_the_examples_of_the_docstrings_run(done, monkeypatch):
+    monkeypatch.chdir(done.study.path.parent)
+    for module in (declaration, statistics, sawyer):
+        found = doctest.testmod(module)
+        assert (found.failed, found.attempted > 0) == (0, True)
+
+
+def test_the_page_names_every_key():
+    page = (ROOT / "docs" / "studies.md").read_text()
+    models = [one for one in vars(declaration).values() if getattr(one, "__module__", "") == declaration.__name__]
+    keys = {key for one in models for key in getattr(one, "model_fields", {})}
+    assert "margin" in keys
+    assert not {key for key in keys if f"`{key}`" not in page}
 
 
 def test_every_declaration_of_the_project_is_valid():
@@ -326,6 +344,27 @@ def test_pages_quote_the_tables_by_the_names_of_the_study(made, done, tmp_path):
             render(f"<!-- study study: {wrong} --><!-- / -->", tmp_path)
     with pytest.raises(SpecError, match="cannot be read"):
         render("<!-- study other: mine; nats; 6 --><!-- / -->", tmp_path)
+
+
+class Told:
+    """A controller of chunks of three: at time t it gives 10 t, 10 t + 1 and 10 t + 2 for three steps."""
+
+    def reset(self, seed):
+        self.time = -1
+
+    def act(self, observation):
+        self.time += 1
+        return 10.0 * self.time + np.arange(3.0)
+
+
+def test_chunks_of_actions_are_averaged_over_what_was_given_for_a_step():
+    """By hand: step 2 was given 2 at time 0, 11 at time 1 and 20 at time 2; the oldest has the largest weight."""
+    chunks, weights = arena_playing.Chunks(Told(), 3), np.exp([0, -0.01, -0.02])
+    given = [[0.0], [1.0, 10.0], [2.0, 11.0, 20.0], [12.0, 21.0, 30.0]]
+    for _ in range(2):  # nothing is left of an episode
+        chunks.reset(0)
+        acted = [float(chunks.act({})[0]) for _ in given]
+        assert acted == pytest.approx([np.average(one, weights=weights[: len(one)]) for one in given])
 
 
 def test_the_command_says_what_is_left(made, tmp_path, monkeypatch):

@@ -308,11 +308,12 @@ class Folder:
         """
         self.path.mkdir(parents=True, exist_ok=True)
         cells, state = self.cells(self.first), None
+        there = Folder(replace(self.study, path=self.study.path.resolve()), self.path.resolve())  # wherever workers are
         with workers.pool() as pool:
             while state is None or len(cells) > len(state.cells):
                 before = self._state(cells)
                 on_event(StudyBegan(len(cells), len(before.done)))
-                calls = [partial(self.do, cell) for number, cell in enumerate(cells) if number not in before.done]
+                calls = [partial(there.do, cell) for number, cell in enumerate(cells) if number not in before.done]
                 for cell, failed in processes.results(pool, calls, DEAD) if calls else ():
                     on_event(CellDone(str(cell), failed))
                 state = self._state(cells)
