@@ -122,6 +122,8 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
         ({"overrides": {"training.epoch": 3}}, "training.epoch: unknown key; did you mean training.epochs?"),
         ({"methods": {"options": {}, "mine": {"by": "mine"}}}, "methods.mine.by: names a method of an adapter"),
         ({"choose": "nats"}, "choose: and seeds.development go together"),
+        ({"starts": {"test": {"count": 3}}}, "tasks: missing; name the task in which methods act"),
+        ({"tasks": ["needle", "pushing"]}, "tasks: are several, but demonstrations.path names one file"),
         ({"world": "os:system", "tasks": ["a"], "demonstrations": RECORDED, "contrasts": []}, "would import user code"),
     ],
 )
@@ -144,6 +146,84 @@ def test_the_page_names_every_key():
     keys = {key for one in models for key in getattr(one, "model_fields", {})}
     assert "margin" in keys
     assert not {key for key in keys if f"`{key}`" not in page}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"demonstrations": {**STUDY["demonstrations"], "path": "other.hdf5"}}, "other.hdf5"),
+        (
+            {"demonstrations": {**STUDY["demonstrations"], "held_out": 7}},
+            "has 12 demonstrations for test, but",
+        ),
+        ({"kept": [{"table": "none.csv"}]}, "none.csv: cannot be read"),
+        ({"kept": [{"table": "spec.yaml"}]}, "spec.yaml: is damaged"),
+        ({"starts": {"test": {"count": 3}}, "tasks": ["nedle"]}, "no task is registered as 'nedle'"),
+    ],
+)
+def test_data_and_tasks_that_cannot_be_used_are_refused_before_any_work(made, changes, said):
+    folder = made(**changes)
+    with pytest.raises(BadInput, match=re.escape(said)):
+        folder.run(HERE)
+    assert not (folder.path / "cells").exists()
+
+
+def test_an_adapter_collects_plays_and_has_methods_of_its_own(made, file, tmp_path):
+    (tmp_path / "world_of_tests.py").write_text(ADAPTER)
+    study = {
+        "spec": "init",
+        "world": "world_of_tests:WORLD",
+        "tasks": ["there", "back"],
+        "overrides": {"training.epochs": 3},
+        "methods": {"options": {}, "own": {"by": "own"}},
+        "demonstrations": {"counts": [5], "held_out": 2, "test": {"first": 100, "count": 7}},
+        "starts": {"test": {"first": 500, "count": 4}},
+        "seeds": {"test": {"count": 2}},
+        "measures": ["success", "nats"],
+        "contrasts": [{"contrast": "options - own", "measure": "success"}],
+    }
+    path = tmp_path / "study.yaml"
+    path.write_text(yaml.safe_dump({**STUDY, **study}))
+    folder = Folder(Study.load(path, allow_code=True), tmp_path / "out")
+    state = folder.run(HERE)
+    assert not state.failed
+    found = {cell.row: state.done[number].values for number, cell in enumerate(state.cells)}
+    for (task, method, _, seed), own in found.items():
+        first, start = 100 + 7 * seed, 500 + 4 * seed
+        assert own["success"] == {"there": 1, "back": 0}[task] if method == "options" else start / 1000
+        assert method == "options" or own["demonstrations"] == first
+    write(folder, state, tmp_path / "report")  # of two tasks
+    path.write_text(yaml.safe_dump({**STUDY, **study, "methods": {"on": {"by": "on"}}, "contrasts": []}))
+    wrong = Folder(Study.load(path, allow_code=True), tmp_path / "out")
+    with pytest.raises(BadInput, match=r"has no method 'on' \(did you mean 'own'\?\)"):
+        wrong.run(HERE)
+
+
+ADAPTER = """
+import numpy as np
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+
+class World:
+    def __init__(self):
+        self.methods = {"own": self.own}
+
+    def collect(self, task, seeds, count, path):
+        places = [np.random.default_rng(seed).normal(size=(10, 2)) for seed in seeds]
+        turn = np.repeat([[-2.0], [2.0]], 5, 0)
+        demos = (Demonstration(f"demo_{n}", {"place": x}, turn * x, attributes={"seed": seed})
+                 for n, (seed, x) in enumerate(zip(seeds, places)))
+        Demonstrations(tuple(demos)[:count]).write(path)
+
+    def play(self, task, fitted, starts, folder):
+        return [{"success": float(task == "there")} for _ in starts]
+
+    def own(self, job):
+        assert set(job.demos.masks["train"]) | set(job.demos.masks["valid"]) == set(job.demos.names)
+        first = min(demo.attributes["seed"] for demo in job.demos)
+        return {"success": job.starts[0] / 1000, "demonstrations": float(first)}
+
+WORLD = World()
+"""
 
 
 def test_every_declaration_of_the_project_is_valid():

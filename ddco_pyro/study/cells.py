@@ -304,8 +304,10 @@ class Folder:
     def run(self, workers: Workers, on_event: OnEvent = ignore) -> State:
         """Do all cells that are not done; failed ones are tried again. Returns the state afterwards.
 
+        :raises BadInput: the file of demonstrations, the adapter or a task cannot be used.
         :raises Failed: a process died.
         """
+        self.study.world()  # or something is wrong with it
         self.path.mkdir(parents=True, exist_ok=True)
         cells, state = self.cells(self.first), None
         there = Folder(replace(self.study, path=self.study.path.resolve()), self.path.resolve())  # wherever workers are
@@ -353,8 +355,6 @@ class Folder:
         spec, demos = self._prepared(cell, world)
         starts = self._starts(cell)
         if method.by is not None:
-            if method.by not in world.methods:
-                raise BadInput(f"{self.study.declared.world}: has no method {method.by!r}: {', '.join(world.methods)}")
             return {"values": dict(world.methods[method.by](Job(cell, spec, demos, starts, folder)))}
         fitted = fit(spec, demos, out=folder / "fit", keep=False)
         found = fitted.metrics.agreement

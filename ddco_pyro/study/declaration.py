@@ -20,6 +20,7 @@ from pydantic import Field, ValidationError, model_validator
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.selection.grid import point_name
+from ddco_pyro.simulation.task import find_task
 from ddco_pyro.spec import Spec, SpecError, load_spec, parse_spec, user_code
 from ddco_pyro.spec.base import Count, Importable, Items, Model, Seed, TaskName, Text, invalid, lines
 from ddco_pyro.spec.model import Baseline
@@ -207,9 +208,8 @@ class Declaration(Model):
                 yield f"{at}.count", f"must be at least {needed}, the most to train on and those held out"
             if self.starts is not None and getattr(self.starts, part) is None:
                 yield f"starts.{part}", "missing; give first and count"
-        for key in ("tasks", "world"):
-            if data.path is not None and getattr(self, key):
-                yield key, "records demonstrations, but demonstrations.path names a file; leave one of them out"
+        if data.path is not None and len(self.tasks) > 1:
+            yield "tasks", "are several, but demonstrations.path names one file; name one task"
         if self.world is not None and not self.tasks:
             yield "tasks", "missing; name tasks of the world"
 
@@ -301,8 +301,9 @@ class Study:
                 *(f"{path}: {place}: would import user code ({name}); pass --allow-code if you trust it"
                   for place, name in code.items())
             )  # fmt: skip
-        if own is not None and declared.demonstrations.path is None and not study.tasks[0]:
-            raise SpecError(f"{path}: tasks: missing; name tasks, or a file in demonstrations.path")
+        if not study.tasks[0] and (declared.starts or declared.demonstrations.path is None):
+            where = "the task in which methods act" if declared.starts else "tasks, or a file in demonstrations.path"
+            raise SpecError(f"{path}: tasks: missing; name {where}")
         study.check_overrides()
         return study
 
@@ -343,15 +344,23 @@ class Study:
     def world(self) -> Any:
         """The adapter of the simulator (:class:`ddco_pyro.study.cells.World`); None for the registered tasks.
 
-        :raises BadInput: it cannot be imported.
+        :raises BadInput: the adapter or a task cannot be imported, or the adapter lacks a method.
         """
         if self.declared.world is None:
+            for task in self.tasks if self.declared.starts or self.source is None else ():
+                find_task(task)
             return None
         folder = str(self.path.parent.resolve())
         if folder not in sys.path:
             sys.path.append(folder)
         module, _, name = self.declared.world.partition(":")
         try:
-            return getattr(importlib.import_module(module), name)
+            found = getattr(importlib.import_module(module), name)
         except Exception as error:  # whatever the adapter's code raises
             raise BadInput(f"{self.path}: world: {self.declared.world} cannot be loaded: {error}") from error
+        for method in self.declared.methods.values():
+            if method.by is not None and method.by not in found.methods:
+                known = ", ".join(found.methods)
+                text = f"{self.declared.world} has no method {method.by!r}{nearest(method.by, found.methods)}"
+                raise BadInput(f"{self.path}: {text}; it has: {known}")
+        return found
