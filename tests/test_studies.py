@@ -14,6 +14,7 @@ import arena_playing
 import numpy as np
 import pytest
 import sawyer
+import toy_task
 import yaml
 from command_line import call
 from killing import struck
@@ -21,7 +22,9 @@ from killing import struck
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import BadInput
+from ddco_pyro.fitting.fitted import load
 from ddco_pyro.selection import Workers
+from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import SpecError
 from ddco_pyro.study import cells, declaration, report, statistics
 from ddco_pyro.study.cells import Folder, read_tidy
@@ -168,6 +171,30 @@ def test_data_and_tasks_that_cannot_be_used_are_refused_before_any_work(made, ch
     assert not (folder.path / "cells").exists()
 
 
+def test_in_a_registered_task_every_training_seed_has_its_own_episodes(tmp_path):
+    spec = yaml.safe_load(toy_task.SPEC) | {"compare_with": [], "training": {"epochs": 1}}
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(spec))
+    study = {
+        "methods": {"options": {}},
+        "demonstrations": {"counts": [4], "held_out": 2, "test": {"first": 10, "count": 8}},
+        "starts": {"test": {"first": 500, "count": 5}},
+        "measures": ["error", "success", "nats"],
+        "contrasts": [],
+    }
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump({**STUDY, **study}))
+    folder = Folder(Study.load(tmp_path / "study.yaml"), tmp_path / "out")
+    state = folder.run(HERE)
+    assert not state.failed
+    for seed, cell in enumerate(folder.cells("test")):
+        recorded = Demonstrations.read(folder.path / "demonstrations" / f"toy-{10 + 8 * seed}-6.hdf5")
+        assert recorded.names == tuple(f"demo_{n}" for n in range(10 + 8 * seed, 16 + 8 * seed))
+        controller = load(folder.path / "work" / folder.key(cell) / "fit").controller()
+        outcomes = [run_episode(toy_task.task, controller, 500 + 5 * seed + n).outcome for n in range(5)]
+        assert state.done[seed].values["success"] == np.mean([one["success"] for one in outcomes])
+        errors = [one["error"] for one in outcomes if not np.isnan(one["error"])]
+        assert state.done[seed].values["error"] == (pytest.approx(np.mean(errors)) if errors else None)
+
+
 def test_an_adapter_collects_plays_and_has_methods_of_its_own(made, file, tmp_path):
     (tmp_path / "world_of_tests.py").write_text(ADAPTER)
     study = {
@@ -260,7 +287,7 @@ def test_a_training_seed_draws_its_own_demonstrations(done):
     assert divided[0, 4][1] == divided[0, 6][1] != divided[1, 6][1]
 
 
-def test_planted_options_win_in_the_table_and_the_contrast(done, tmp_path):
+def test_planted_options_win_in_the_table_and_the_contrast(done, tmp_path, drawn_here):
     state = done.state()
     assert not state.failed
     assert not state.missing
@@ -391,6 +418,23 @@ def test_the_best_point_on_development_seeds_is_tested(made):
     }
     train, valid = folder._divided(folder.cells("development")[0])
     assert {*train, *valid} <= {f"demo_{n}" for n in range(6, 12)}
+
+
+def test_a_measure_of_nothing_is_better_than_less(made):
+    """Means over development cells: −1 and 0 at the first point, −0.4 at the second; the best is the second."""
+    folder = made(
+        grid={"control.std": [0.5, 1.0]}, choose="nats", contrasts=[], methods={"options": {}},
+        seeds={"test": {"count": 1}, "development": {"first": 7, "count": 2}},
+        demonstrations={"path": "mine.hdf5", "counts": [3], "held_out": 2, "test": {"count": 6},
+                        "development": {"first": 6, "count": 6}},
+    )  # fmt: skip
+    values = {(7, 0.5): -1.0, (8, 0.5): 0.0, (7, 1.0): -0.4, (8, 1.0): -0.4}
+    places = folder.cells("development")
+    results = [cells.Done(depends={}, values={"nats": values[one.seed, one.point["control.std"]]}) for one in places]
+    state = cells.State(places, dict(enumerate(results)), {})
+    assert folder.chosen(state) == {"options": {"control.std": 1.0}}
+    results[0] = cells.Done(depends={}, values={"nats": -0.7})
+    assert folder.chosen(cells.State(places, dict(enumerate(results)), {})) == {"options": {"control.std": 0.5}}
 
 
 def test_cells_of_an_earlier_table_are_not_done(made, done, tmp_path):

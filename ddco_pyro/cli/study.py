@@ -25,7 +25,9 @@ class Action(StrEnum):
 
 
 def study(
-    action: Annotated[Action, typer.Argument(metavar="run|status|report|render", show_default=False)],
+    action: Annotated[
+        Action, typer.Argument(metavar="ACTION", help="run, status, report or render.", show_default=False)
+    ],
     files: Annotated[
         list[Path],
         typer.Argument(metavar="STUDY", help="The study, a YAML file; for render the pages.", show_default=False),

@@ -187,8 +187,8 @@ class Folder:
         for number, done in state.done.items():
             cell = state.cells[number]
             if cell.part == "development":
-                point = json.dumps(cell.point)
-                scores[cell.of].setdefault(point, []).append(done.values.get(measure) or -math.inf)
+                value = done.values.get(measure)
+                scores[cell.of].setdefault(json.dumps(cell.point), []).append(-math.inf if value is None else value)
         return {
             method: json.loads(max(points, key=lambda point: float(np.mean(points[point]))))
             for method, points in scores.items()
@@ -236,13 +236,13 @@ class Folder:
         facts |= {"seed": cell.seed, "starts": [*self._starts(cell)[:1], len(self._starts(cell))]}
         changes = self.study.changes(cell.of, dict(cell.point))
         if self.study.base is None:
-            return {**facts, "given": changes, "spec": {}}
+            return _as_json({**facts, "given": changes, "spec": {}})
         spec = with_overrides(self.study.base, {**changes, **self._placed(cell, "demonstrations.hdf5")})
         shown = {"report", "selection", "compare_with"}  # what a result does not depend on
         if method.baseline is not None and (own := named_baselines(spec).get(method.baseline.name)):
             facts["baseline"] = own.model_dump(exclude_unset=True, mode="json")
         whole = [spec.model_dump(mode="json", exclude=shown, exclude_defaults=bare) for bare in (True, False)]
-        return json.loads(json.dumps({**facts, "given": whole[0], "spec": whole[1]}))  # type: ignore[no-any-return]
+        return _as_json({**facts, "given": whole[0], "spec": whole[1]})
 
     def _starts(self, cell: Cell) -> range:
         starts = self.study.declared.starts
@@ -431,6 +431,11 @@ def _mean(values: Sequence[float]) -> float | None:
     """The mean over episodes of a measure that does not apply (NaN) to some."""
     known = [value for value in values if not math.isnan(value)]
     return float(np.mean(known)) if known else None
+
+
+def _as_json(data: dict[str, Any]) -> dict[str, Any]:
+    """Plain data as they are read back from a file."""
+    return dict(json.loads(json.dumps(data)))
 
 
 def _agrees(kept: Any, now: Any) -> bool:
