@@ -16,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, Self
 
-from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.errors import BadInput, Failed, nearest
 from ddco_pyro.events import EpochEnded, Event, TrainingBegan
 
 
@@ -35,7 +35,7 @@ MakeLog = Callable[[Path, Mapping[str, Any]], Log]
 
 
 class Logged:
-    """The events of a fit as numbers in a log, which is made at the first event: the run folder exists from then on.
+    """The events of a fit as numbers in a log, which is made when training begins: the run folder exists from then on.
 
     Log-likelihoods are in nats per step. ``<model>/<stage>/train`` and ``tune`` have a value for each epoch of a stage;
     restarts after the first are ``<model>/<stage>/restart <n>/train``.
@@ -55,16 +55,24 @@ class Logged:
         """Log an event."""
         if isinstance(event, TrainingBegan):
             self._model = event.model
+            self.scalars({})
         if isinstance(event, EpochEnded):
             restart = (f"restart {event.restart}",) if event.restart else ()
             place = "/".join((self._model, event.stage, *restart))
             self.scalars({f"{place}/train": event.train, f"{place}/tune": event.tune}, event.epoch)
 
     def scalars(self, values: Mapping[str, float], step: int = 0) -> None:
-        """Log the finite ones of these numbers."""
+        """Log the finite ones of these numbers.
+
+        :raises Failed: the log cannot be made.
+        """
         if self._log is None:
-            self._log = self._make(*self._of)
-        self._log.scalars({name: value for name, value in values.items() if math.isfinite(value)}, step)
+            try:
+                self._log = self._make(*self._of)
+            except Exception as error:  # whatever the other program or the user's code raises
+                raise Failed(f"--log: the log cannot be made: {' '.join(str(error).split())}") from error
+        if values := {name: value for name, value in values.items() if math.isfinite(value)}:
+            self._log.scalars(values, step)
 
     def __enter__(self) -> Self:
         return self

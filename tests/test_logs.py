@@ -14,7 +14,7 @@ from random_demonstrations import demonstrations
 
 import ddco_pyro
 from ddco_pyro.errors import BadInput
-from ddco_pyro.events import EpochEnded, TrainingBegan
+from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan
 from ddco_pyro.logs import LOGS, Logged, find_log
 
 SPEC = {
@@ -87,8 +87,9 @@ def test_restarts_have_names_of_their_own_and_numbers_are_finite(tmp_path: Path)
             got.append("closed")
 
     with Logged(Kept, tmp_path / "run", {"seed": 3}) as log:
-        log(TrainingBegan("DDCO", 5))
+        log(DemonstrationsDone(1, 2))
         assert got == []  # the run folder is not there yet
+        log(TrainingBegan("DDCO", 5))
         log(EpochEnded(0, "joint", 2, -1.0, float("nan")))
         log(EpochEnded(1, "joint", 3, -2.0, -3.0))
     assert got == [
@@ -130,6 +131,10 @@ def test_tensorboards_own_reader_reads_the_history(spec: Path, tmp_path: Path) -
 def test_mlflow_has_the_history_and_the_spec(spec: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mlflow")
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"file://{tmp_path / 'mlruns'}")
+    monkeypatch.delenv("MLFLOW_ALLOW_FILE_STORE", raising=False)
+    ended = call("fit", spec, "--out", tmp_path / "refused", "--log", "mlflow")
+    assert (ended.status, "--log: the log cannot be made: " in ended.err) == (1, True)
+    monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
     from mlflow import MlflowClient
 
     run = tmp_path / "run"
