@@ -11,12 +11,14 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import style
 from ddco_pyro.drawing.page import Block, Facts, Page, Text, note
+from ddco_pyro.drawing.timeline import Timelines
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Metrics, Rate
-from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, training, worth
+from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, skills, training, worth
 from ddco_pyro.report.activity import activity
 from ddco_pyro.report.training import degeneracies
-from ddco_pyro.segmenting.page import timelines
+from ddco_pyro.segmenting import Segmented
+from ddco_pyro.segmenting.page import followed, timelines
 
 
 def write_report(fit: Fit, demos: Demonstrations) -> Path:
@@ -29,12 +31,14 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
     path, metrics = fit.run_folder / "report.html", fit.metrics
     active = activity(fit, demos) if fit.spec.hierarchy else None
     segmented = options.segmented(fit, demos, active) if active else None
-    drawn = timelines(segmented, options.MOST_SEGMENTS) if segmented else []
+    drawn = _timelines(fit, demos, segmented) if segmented else None
     with style():
         sections = [
+            skills.section(fit, demos, segmented) if segmented else None,
+            options.segments(drawn, len(metrics.demonstrations_by_likelihood)) if drawn else None,
             worth.section(metrics),
             likelihood.section(fit),
-            likelihood.demonstrations(metrics, {timeline.anchor for timeline in drawn}),
+            likelihood.demonstrations(metrics, {track.anchor for track in drawn.tracks} if drawn else ()),
             likelihood.dimensions(fit),
             rollouts.success(fit),
             training.learning(fit),
@@ -45,11 +49,16 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             training.warnings(fit),
             rollouts.films(fit),
             training.particulars(fit),
-            options.segments(drawn, len(metrics.demonstrations_by_likelihood)) if drawn else None,
         ]
     name = fit.run_folder.resolve().name
     write_text(path, Page(words.method(fit.name), header(fit, metrics), sections, subtitle=name).html())
     return path
+
+
+def _timelines(fit: Fit, demos: Demonstrations, segmented: Segmented) -> Timelines:
+    by_name = dict(zip(demos.names, demos, strict=True))
+    ordered = [by_name[demo.name] for demo in segmented.segments]
+    return timelines(segmented, followed(ordered, segmented, fit, options.MOST_STEPS), options.MOST_STEPS)
 
 
 def header(fit: Fit, metrics: Metrics) -> list[Block]:
