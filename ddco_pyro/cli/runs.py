@@ -199,6 +199,7 @@ def segment(
         raise BadInput(f"{demos}: labels go into whole files only; first: {again}")
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
+    from ddco_pyro.drawing.shown import stored_pictures
     from ddco_pyro.fitting.fitted import load
     from ddco_pyro.segmenting import beside_baselines, chosen_names, recorded, segments
     from ddco_pyro.segmenting.agreement import agreement_table, level_agreements
@@ -233,7 +234,9 @@ def segment(
         if baselines:
             segmented = beside_baselines(segmented, fit, source, gripper)
         agreements = level_agreements(segmented) if html or baselines else {}
-        follows = list(followed(recorded(segmented, fit, source), segmented, fit)) if html else []
+        if html:
+            pictures = stored_pictures(source, {demo.name: len(demo) for demo in segmented.segments})
+            follows = list(followed(recorded(segmented, fit, source), pictures, segmented, fit))
     if baselines:
         for name, found in agreements.items():
             console.show(agreement_table(found.scores, f"level {name}: agreement with the label {found.labels}"))

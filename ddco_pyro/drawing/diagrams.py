@@ -114,7 +114,7 @@ def _edge(start: float, end: float, y: float, gap: float, share: float, title: s
 
 
 def dendrogram(merges: np.ndarray, choices: Sequence[int], names: Sequence[str]) -> Markup:
-    """Options joined at their distance, from left (alike) to right.
+    """Options joined at their distance, from left (alike) to right, on a square-root scale.
 
     :param merges: the result of :func:`scipy.cluster.hierarchy.linkage` for the options ``choices``.
     """
@@ -125,7 +125,7 @@ def dendrogram(merges: np.ndarray, choices: Sequence[int], names: Sequence[str])
     height = row * len(choices) + 34
 
     def right(distance: float) -> float:
-        return left + (WIDTH - left - 60) * distance / most
+        return left + (WIDTH - left - 60) * float(np.sqrt(distance / most))
 
     parts: list[str] = []
     for distances, rows in zip(found["dcoord"], found["icoord"], strict=True):

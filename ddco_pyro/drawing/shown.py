@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.pictures import PICTURE_DIMENSIONS
+from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed
+from ddco_pyro.data.sources import Source
 
 LEAST_OBLIQUE = 15.0
 """Degrees between the view and an axis, at least; a view along an axis hides the axis' scale."""
@@ -88,19 +89,43 @@ def projection(points: np.ndarray) -> np.ndarray:
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def picture_key(demo: Demonstration) -> str | None:
-    """The first observation that is a picture; None where there is none."""
-    shapes = {key: array.shape[1:] for key, array in demo.observations.items()}
-    return next((key for key, shape in shapes.items() if len(shape) == PICTURE_DIMENSIONS), None)
+def pictures(demos: Sequence[Demonstration]) -> list[Observed]:
+    """The first observation of each demonstration that is a picture; empty where one has none."""
+    found = (
+        next((array for array in demo.observations.values() if len(array.shape) == 1 + PICTURE_DIMENSIONS), None)
+        for demo in demos
+    )
+    return _every(found)
 
 
-def frames(demo: Demonstration, key: str, steps: Sequence[int] | np.ndarray, height: int) -> np.ndarray:
-    """The pictures of these steps in ascending order, uint8 [F, height, W, 3] in red, green and blue."""
+def stored_pictures(source: Source, lengths: Mapping[str, int]) -> list[Observed]:
+    """The first pictures of each recording, which are read when shown, observed by a fit or not.
+
+    :param lengths: steps of each recording by name.
+    :returns: pictures in this order; empty where a recording has none or has other steps.
+    """
+    if not set(lengths) <= set(source.names):
+        return []
+    columns = (source.recording(name).observations.values() for name in lengths)
+    lazy = (
+        next((column.kept for column in each if column.image and len(column.kept or ()) == steps), None)
+        for each, steps in zip(columns, lengths.values(), strict=True)
+    )
+    return _every(lazy)
+
+
+def _every(found: Iterable[Observed | None]) -> list[Observed]:
+    listed = list(found)
+    there = [array for array in listed if array is not None]
+    return there if len(there) == len(listed) else []
+
+
+def frames(observed: Observed, steps: Sequence[int] | np.ndarray, height: int) -> np.ndarray:
+    """The pictures of these steps, uint8 [F, height, W, 3] in red, green and blue."""
     import cv2  # one's own vectors need none of it
 
     chosen = np.unique(steps)
     first, last = int(chosen[0]), int(chosen[-1])
-    observed = demo.observations[key]
     if last - first < MOST_SKIPPED * len(chosen):
         read = np.asarray(observed[first : last + 1])[chosen - first]
     else:

@@ -9,12 +9,14 @@ import base64
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration
-from ddco_pyro.drawing.shown import frames, jpeg, picture_key, projection
+from ddco_pyro.data.pictures import Observed
+from ddco_pyro.drawing.shown import frames, jpeg, projection
 
 MOST_NUMBERS = 12
 """Observed numbers that follow the cursor."""
@@ -123,14 +125,17 @@ def text(values: np.ndarray) -> str:
     return base64.b64encode(values.astype(np.uint8).tobytes()).decode("ascii")
 
 
-def following(demos: Iterable[Demonstration], steps: int, position: str | None) -> Iterator[dict[str, Any]]:
+def following(
+    demos: Iterable[Demonstration], pictures: Sequence[Observed], steps: int, position: str | None
+) -> Iterator[dict[str, Any]]:
     """What follows the cursor along each demonstration: numbers, a trajectory, pictures.
 
+    :param pictures: of each demonstration; empty for none.
     :param steps: of all demonstrations together.
     :param position: the observation whose first three numbers are a trajectory.
     """
-    pictures, view = MOST_PICTURES, None
-    for demo in demos:
+    left, view = MOST_PICTURES, None
+    for demo, observed in zip_longest(demos, pictures):
         values = _numbers(demo, position)
         every = -(-len(values) * steps // MOST_BYTES) or 1
         low = np.array([array.min() for array in values.values()])
@@ -144,12 +149,11 @@ def following(demos: Iterable[Demonstration], steps: int, position: str | None) 
         if position is not None:
             view = projection(demo.observations[position][:, :3]) if view is None else view
             found["view"] = np.round(view, 5).tolist()
-        key = picture_key(demo)
-        if key is not None and pictures >= FEWEST_PICTURES:
-            count = min(len(demo), max(FEWEST_PICTURES, MOST_PICTURES * len(demo) // steps), pictures)
+        if observed is not None and left >= FEWEST_PICTURES:
+            count = min(len(demo), max(FEWEST_PICTURES, MOST_PICTURES * len(demo) // steps), left)
             chosen = np.unique(np.linspace(0, len(demo) - 1, count).round().astype(int))
-            pictures -= len(chosen)
-            strip = np.hstack(list(frames(demo, key, chosen, PICTURE_HEIGHT)))
+            left -= len(chosen)
+            strip = np.hstack(list(frames(observed, chosen, PICTURE_HEIGHT)))
             content = base64.b64encode(jpeg(strip)).decode("ascii")
             found["k"] = {"steps": chosen.tolist(), "strip": f"data:image/jpeg;base64,{content}"}
         yield found

@@ -135,8 +135,8 @@ def _shares(
 
 
 def _largest(values: Mapping[str, float | None], words: Callable[[float | None], str]) -> str:
-    """The three largest values in words."""
-    first = sorted(values, key=lambda key: -(values[key] or 0.0))[:3]
+    """The three largest values in words, without those that round to nothing."""
+    first = [key for key in sorted(values, key=lambda key: -(values[key] or 0.0))[:3] if (values[key] or 0.0) >= 0.005]
     return ", ".join(f"{key} {words(values[key])}" for key in first)
 
 

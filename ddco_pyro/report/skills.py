@@ -8,12 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.pictures import Observed
 from ddco_pyro.drawing.colours import option_colour, option_rgb
 from ddco_pyro.drawing.diagrams import curves, dendrogram, path_film, transition_graph, typical_paths
 from ddco_pyro.drawing.figures import data_uri
 from ddco_pyro.drawing.page import Block, Card, Cell, Code, Drawing, Facts, Film, Films, Picture, Section, Text, note
-from ddco_pyro.drawing.shown import frames, jpeg, picture_key, position_key, projection
+from ddco_pyro.drawing.shown import frames, jpeg, position_key, projection
 from ddco_pyro.drawing.words import number, numbered_name, percent
 from ddco_pyro.errors import command
 from ddco_pyro.evaluation.options import SMALLEST_DIVERGENCE
@@ -109,9 +110,13 @@ def aligned(chosen: Sequence[Instance], most: int = FRAMES) -> np.ndarray:
     return steps
 
 
-def section(fit: Fit, demos: Demonstrations, segmented: Segmented) -> Section:
-    """Every option of every level, the highest level first, then the order and the likeness of the options."""
-    shown = _Shown(fit, demos, segmented)
+def section(fit: Fit, demos: Demonstrations, pictures: Sequence[Observed], segmented: Segmented) -> Section:
+    """Every option of every level, the highest level first, then the order and the likeness of the options.
+
+    :param demos: in the order of their segments.
+    :param pictures: of each demonstration; empty for none.
+    """
+    shown = _Shown(fit, demos, pictures)
     reads = deciding(fit, demos)
     blocks: list[Block] = [note(shown.explained())]
     for place, (level, names) in reversed(list(enumerate(fit.names.items()))):
@@ -137,8 +142,9 @@ def section(fit: Fit, demos: Demonstrations, segmented: Segmented) -> Section:
         order = sorted(present, key=onset.__getitem__)
         caption = (
             "Order of the options: numbers count transitions between segments; the width of an arc is the share of its "
-            "start's transitions. Arcs above lead to the right, arcs below back. The area of a circle is the share of "
-            f"steps. From left to right, by mean onset: {', '.join(names[choice] for choice in order)}."
+            "start's transitions. Arcs above lead to the right, arcs below back. Transitions below 1 % of all are left "
+            "out. The area of a circle is the share of steps. From left to right, by mean onset: "
+            f"{', '.join(names[choice] for choice in order)}."
         )
         blocks.append(Drawing(transition_graph(counts, steps / steps.sum(), names, order), caption))
         blocks += _alike(fit, place, level, names)
@@ -178,7 +184,7 @@ def _alike(fit: Fit, place: int, level: str, names: Sequence[str]) -> list[Block
         merges = linkage([known[pair] for pair in pairs], "average")
         caption = (
             "How alike options act: the divergence of their policies, the mean of both Kullback–Leibler divergences in "
-            "nats per step, averaged over the pairs of two groups."
+            "nats per step, averaged over the pairs of two groups; square-root scale."
         )
         blocks.append(Drawing(dendrogram(merges, used, names), caption))
     held = fit.spec.training.labels is not None and fit.spec.training.labels.hold
@@ -194,11 +200,9 @@ def _alike(fit: Fit, place: int, level: str, names: Sequence[str]) -> list[Block
 class _Shown:
     """Pictures and films of the segments of one fit, from what its demonstrations have."""
 
-    def __init__(self, fit: Fit, demos: Demonstrations, segmented: Segmented) -> None:
-        by_name = dict(zip(demos.names, demos, strict=True))
-        self.demos: list[Demonstration] = [by_name[demo.name] for demo in segmented.segments]
-        self.picture = picture_key(self.demos[0])
-        self.position = None if self.picture else fit.spec.report.trajectory or position_key(demos)
+    def __init__(self, fit: Fit, demos: Demonstrations, pictures: Sequence[Observed]) -> None:
+        self.demos, self.pictures = demos, pictures
+        self.position = None if pictures else fit.spec.report.trajectory or position_key(demos)
         self.films = 0
         self.paths: list[np.ndarray] = []
         if self.position is not None:
@@ -212,7 +216,7 @@ class _Shown:
             "Typical segments have the largest mean posterior probability; different demonstrations come first. "
             "Instances in a film are aligned at their onset; one that has ended rests."
         )
-        if self.picture:
+        if self.pictures:
             return f"Contact sheet: first, middle and last picture of a segment, a row each. {typical}"
         if self.position is None:
             return f"Lines: controls from the onset of each segment on. {typical}"
@@ -226,10 +230,10 @@ class _Shown:
         chosen, colour = found[:INSTANCES], option_colour(choice)
         caption = f"{len(chosen)} instances from their onset on"
         where = ", ".join(f"{self.demos[one.row].name} {one.start}–{one.end - 1}" for one in chosen[:SHOWN])
-        if self.picture:
+        if self.pictures:
             self.films += 1
-            film = [Films([_film(self.demos, self.picture, chosen, choice)])] if self.films <= MOST_FILMS else []
-            return [_sheet(self.demos, self.picture, chosen[:SHOWN], where), *film]
+            film = [Films([_film(self.pictures, chosen, choice)])] if self.films <= MOST_FILMS else []
+            return [_sheet(self.pictures, chosen[:SHOWN], where), *film]
         if self.position is not None:
             shown = list(dict.fromkeys([*(one.row for one in chosen[:SHOWN]), *range(len(self.demos))]))[:MOST_PATHS]
             segments = [(shown.index(one.row), one.start, one.end) for one in chosen[:SHOWN]]
@@ -247,27 +251,24 @@ class _Shown:
         return [Drawing(curves(dict(list(each.items())[:6]), colour), caption)]
 
 
-def _sheet(demos: Sequence[Demonstration], key: str, chosen: Sequence[Instance], where: str) -> Picture:
+def _sheet(pictures: Sequence[Observed], chosen: Sequence[Instance], where: str) -> Picture:
     """First, middle and last picture of each instance, a row each."""
-    rows = [
-        np.hstack(
-            list(frames(demos[one.row], key, [one.start, (one.start + one.end - 1) // 2, one.end - 1], SHEET_HEIGHT))
-        )
-        for one in chosen
-    ]
+    steps = [(one.start, (one.start + one.end - 1) // 2, one.end - 1) for one in chosen]
+    strips = [frames(pictures[one.row], three, SHEET_HEIGHT) for one, three in zip(chosen, steps, strict=True)]
+    rows = [np.hstack(list(strip)) for strip in strips]
     return Picture(data_uri(jpeg(np.vstack(rows)), "image/jpeg"), f"First, middle and last pictures of {where}", where)
 
 
-def _film(demos: Sequence[Demonstration], key: str, chosen: Sequence[Instance], choice: int) -> Film:
+def _film(pictures: Sequence[Observed], chosen: Sequence[Instance], choice: int) -> Film:
     """A grid of instances aligned at their onset, in H.264; an instance that has ended is paler."""
     steps = aligned(chosen)
-    cells = [frames(demos[one.row], key, steps[:, cell], FILM_HEIGHT) for cell, one in enumerate(chosen)]
+    cells = [frames(pictures[one.row], steps[:, cell], FILM_HEIGHT) for cell, one in enumerate(chosen)]
     columns = int(np.ceil(np.sqrt(len(cells))))
     height, width = cells[0].shape[1:3]
     film = np.full((len(steps), -(-len(cells) // columns) * height, columns * width, 3), 255, np.uint8)
-    for cell, pictures in enumerate(cells):
+    for cell, seen in enumerate(cells):
         ended = np.diff(steps[:, cell], prepend=-1) == 0
-        shown = np.where(ended[:, None, None, None], 128 + pictures // 2, pictures)
+        shown = np.where(ended[:, None, None, None], 128 + seen // 2, seen)
         shown[:, :3] = option_rgb(choice)
         top, left = height * (cell // columns), width * (cell % columns)
         film[:, top : top + height, left : left + width] = shown

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import accumulate, chain, islice, zip_longest
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import write_text
+from ddco_pyro.data.pictures import Observed
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, note
 from ddco_pyro.drawing.shown import position_key
@@ -116,17 +117,22 @@ def timelines(
 
 
 def followed(
-    demos: Iterable[Demonstration], segmented: Segmented, fit: Fit, most_steps: float = math.inf
+    demos: Iterable[Demonstration],
+    pictures: Sequence[Observed],
+    segmented: Segmented,
+    fit: Fit,
+    most_steps: float = math.inf,
 ) -> Iterator[Mapping[str, Any]]:
     """What follows the cursor along demonstrations in the order of their segments.
 
+    :param pictures: of each demonstration; empty for none.
     :param most_steps: as in :func:`timelines`.
     """
     steps = min(sum(map(len, segmented.segments)), most_steps / len(segmented.counts))
     ordered = iter(demos)
     first = list(islice(ordered, FIRST))
     position = fit.spec.report.trajectory or position_key(Demonstrations(tuple(first)))
-    return following(chain(first, ordered), int(steps), position)
+    return following(chain(first, ordered), pictures, int(steps), position)
 
 
 def _level_lane(name: str, segmented: Segmented) -> Lane:
