@@ -10,6 +10,9 @@ from typing import Any, Self
 import jinja2
 import rich.table
 import rich.text
+from markupsafe import Markup
+
+from ddco_pyro.drawing.timeline import Timelines
 
 
 class Cell(str):
@@ -151,33 +154,22 @@ class Films:
 
 
 @dataclass(frozen=True)
-class Strip:
-    """One segment of a :class:`Timeline`: its place in percent of the longest demonstration, colours and text."""
+class Drawing:
+    """A drawing in SVG inside the page, and its caption."""
 
-    left: str
-    width: str
-    colour: str
-    ink: str
-    text: str
-    title: str
+    svg: Markup
+    caption: str
 
 
 @dataclass(frozen=True)
-class Timeline:
-    """The segments of one demonstration: a row of strips for each name.
+class Card:
+    """Blocks side by side under a title, such as all about one option."""
 
-    :param anchor: the ``id`` by which links lead here.
-    :param facts: a line on the demonstration, such as its length.
-    """
-
-    name: str
-    anchor: str
-    facts: str
-    held_out: bool
-    rows: Sequence[tuple[str, Sequence[Strip]]]
+    title: str
+    blocks: Sequence[Block]
 
 
-Block = Text | Table | Picture | Facts | Folded | Columns | Code | Warned | Films | Timeline
+Block = Text | Table | Picture | Facts | Folded | Columns | Code | Warned | Films | Drawing | Card | Timelines
 
 
 @dataclass(frozen=True)
@@ -198,6 +190,11 @@ class Page:
     sections: Sequence[Section | None]
     _: KW_ONLY
     subtitle: str = ""
+
+    @property
+    def has_timelines(self) -> bool:
+        """Whether the page needs the script of time lines."""
+        return any(isinstance(block, Timelines) for section in self.sections if section for block in section.blocks)
 
     def html(self) -> str:
         """One self-contained file. Text is escaped unless it is ``markupsafe.Markup``."""
