@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import doctest
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
 import typer
+import yaml
 
 import ddco_pyro
 from ddco_pyro.cli.app import app
@@ -89,3 +91,9 @@ def test_every_make_target_that_is_named_exists() -> None:
     targets = set(re.findall(r"^([.a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     for page in PAGES:
         assert set(re.findall(r"(?:^|`)make ([.a-z-]+)", page.read_text(), re.MULTILINE)) <= targets, page
+
+
+def test_the_citation_has_the_version_of_the_package() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert citation["references"][0]["year"] == 2017

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.planted import pick_and_place
 
 HIDDEN = ("cv2", "dm_control", "dm_env", "gymnasium", "mujoco", "ompl")
 WITHOUT = f"""
@@ -73,6 +74,19 @@ def test_from_a_file_to_an_export(folder, said):
     assert (folder / "segments.html").exists()
     assert (folder / "run" / "report.html").exists()
     assert (folder / "controller" / "weights.npz").exists()
+
+
+@pytest.mark.slow
+def test_the_demo_has_generated_demonstrations(folder):
+    """A spec that is there already, here one with a small budget, is kept."""
+    out, small = folder / "demo", "\ntraining: {epochs: 2}\n"
+    pick_and_place(8).write(out / "pick_and_place.hdf5")
+    known = "demonstrations: {path: demo/pick_and_place.hdf5}\nobservations: [gripper, jaw]\n"
+    levels = "hierarchy: {levels: [{count: 2, policy: {network: linear}}], meta_policy: {network: linear}}"
+    (out / "spec.yaml").write_text(known + levels + small)
+    said = call(folder, ("demo", "--out", "demo"))
+    assert said[-1] == "status 0", said
+    assert (out / "segments.html").exists()
 
 
 def test_a_task_names_the_missing_package(said):
