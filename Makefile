@@ -29,7 +29,7 @@ demo: opengl $(DEMO)
 test: lint
 	$(BIN)/pytest -n 2 --dist worksteal -q
 
-# About an hour: planted recoveries, kills, several processes, every notebook, dynamax, and the site besides.
+# About an hour: planted recoveries, many kills, more processes, every notebook, dynamax, and the site besides.
 test-all: lint
 	$(PIP) -e '.[bench,docs]'
 	$(BIN)/pytest -n 2 --dist worksteal -q -m ''

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ddco_pyro.cli import demos, fits, runs, starting
+from ddco_pyro.cli import demos, fits, runs, starting, study
 from ddco_pyro.errors import BadInput, Failed
 
 app = typer.Typer(
@@ -46,6 +46,7 @@ EXAMPLES: dict[Callable[..., None], str] = {
     demos.encode: "encode demos.hdf5 --observation camera --encoder random_conv --out encoded.hdf5",
     runs.segment: "segment runs/mine mine.hdf5 --html segments.html",
     runs.export: "export runs/mine --out controller --onnx",
+    study.study: "study run studies/mine.yaml --jobs 2",
 }
 """Every command, in the order of ``--help``."""
 
