@@ -63,7 +63,7 @@ def rows_of(folder):
 def test_subtasks_are_written_as_lerobot_writes_them(tmp_path):
     """Beside what LeRobot's own annotation writer made of the same subtasks (``fixtures/write_lerobot_language.py``).
 
-    ``fixtures/read_lerobot.py`` has LeRobot read what is written here; 0.6.1 did.
+    ``fixtures/read_formats.py`` has LeRobot read what is written here; 0.6.1 did.
     """
     options = {int(key): np.array(value) for key, value in json.loads((LANGUAGE / "options.json").read_text()).items()}
     level = {key: LevelLabels(value, np.ones(len(value), bool), np.ones(len(value))) for key, value in options.items()}
