@@ -88,7 +88,13 @@ def test_what_to_write_has_to_be_said(toy_run, file, monkeypatch, options, messa
     monkeypatch.chdir(file.parent)
     before = file.read_bytes()
     named = [option.replace("FILE", str(file)) for option in options]
-    assert call("segment", toy_run.folder, file, *named) == (2, "", message.replace("FILE", str(file)).replace(f"{file} (a copy)", "FILE (a copy)").replace("--csv " + str(file), "--csv FILE"))
+    assert call("segment", toy_run.folder, file, *named) == (
+        2,
+        "",
+        message.replace("FILE", str(file))
+        .replace(f"{file} (a copy)", "FILE (a copy)")
+        .replace("--csv " + str(file), "--csv FILE"),
+    )
     assert [path.name for path in file.parent.iterdir()] == ["demos.hdf5"]
     assert file.read_bytes() == before
 

@@ -6,6 +6,7 @@ import inspect
 import shlex
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from enum import StrEnum
 from functools import wraps
 from importlib import import_module
@@ -228,7 +229,7 @@ def segment(
         float | None,
         typer.Option(
             min=0.001,
-            help="Steps per second of a new LeRobot dataset; by default the control frequency of DEMOS, else 10.",
+            help="Steps per second; by default the control frequency that DEMOS says.",
             show_default=False,
         ),
     ] = None,
@@ -287,7 +288,6 @@ def segment(
             level or next(iter(fit.names), ""),
             beside,
             overwrite,
-            fps,
             lerobot_format,
             same_order,
         )
@@ -301,6 +301,7 @@ def segment(
             if missing and not writers:
                 raise BadInput(f"--baselines: {missing}; name what to write, such as --html PAGE")
         segmented = segments(fit, source, progress)
+        segmented = replace(segmented, frequency=fps or segmented.frequency)
         if baselines:
             segmented = beside_baselines(segmented, fit, source, gripper)
             for name, found in level_agreements(segmented).items():

@@ -27,7 +27,6 @@ class Asked:
     :param demos: the path of the demonstrations; ``source`` is the same, open.
     :param level: the level whose options are subtasks.
     :param baselines: names of further labels, ``<level>_<baseline>``.
-    :param frequency: steps per second (Hz) of a new LeRobot dataset.
     :param lerobot_format: the first version of LeRobot that reads its subtasks.
     :param same_order: leave out demonstrations whose options follow another order than most.
     """
@@ -39,7 +38,6 @@ class Asked:
     level: str
     baselines: tuple[str, ...] = ()
     overwrite: bool = False
-    frequency: float | None = None
     lerobot_format: str = "0.6"
     same_order: bool = False
 

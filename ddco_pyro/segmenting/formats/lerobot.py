@@ -249,7 +249,7 @@ class Annotated(Writer):
                     source.folder, temporary, dirs_exist_ok=True, copy_function=_link, ignore_dangling_symlinks=True
                 )
             else:
-                write_dataset(temporary, self.asked, [demo.name for demo in segmented.segments])
+                write_dataset(temporary, self.asked, segmented)
             dataset = LeRobot(temporary)
             # A LeRobot dataset has numbers for names; the episodes of a new one are in the order of the segments.
             kept = isinstance(source, LeRobot)

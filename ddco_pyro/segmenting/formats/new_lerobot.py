@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from pyarrow import parquet
 
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.sources import Column, Recording, Source
+from ddco_pyro.segmenting import Segmented
 from ddco_pyro.segmenting.formats import Asked
 
 FREQUENCY = 10.0
@@ -29,19 +30,20 @@ FRAMES, PIXELS = 4, 8
 """Statistics use so many pictures of an episode, and every eighth pixel of a row and of a column."""
 
 
-def write_dataset(folder: Path, asked: Asked, names: Sequence[str]) -> None:
-    """Write the recordings ``names`` of a source as episodes 0, 1, ...
+def write_dataset(folder: Path, asked: Asked, segmented: Segmented) -> None:
+    """Write the segmented demonstrations as episodes 0, 1, ...
 
     An observation ``arm`` is ``observation.arm``: a picture as PNG in the parquet files, other arrays as vectors of
     float32. ``observation.state`` has all vectors one after another, unless the source has a ``state``.
     """
-    source = asked.source
-    frequency = asked.frequency or source.frequency or FREQUENCY
+    source, names = asked.source, [demo.name for demo in segmented.segments]
+    frequency = segmented.frequency or FREQUENCY
     writer, statistics, tasks = _Rows(folder), _Statistics(), dict[str, int]()
     episodes, features, start = list[dict[str, Any]](), dict[str, Any](), 0
     for episode, name in enumerate(names):
         recording = source.recording(name)
-        task = str(recording.attributes.get("task") or _environment(source) or asked.demos.stem)
+        task = recording.attributes.get("task") or source.attributes.get("task") or _environment(source)
+        task = str(task or asked.demos.stem)
         columns, features = _columns(recording, statistics)
         steps = recording.actions.shape[0]
         frame = np.arange(steps)
