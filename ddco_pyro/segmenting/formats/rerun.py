@@ -40,7 +40,7 @@ class Rerun(Writer):
         from rerun import blueprint
 
         recording, steps = self.asked.source.recording(demo.name), np.arange(len(demo))
-        stream = rerun.RecordingStream(str(self.asked.run), recording_id=demo.name)
+        stream = rerun.RecordingStream("ddco-pyro", recording_id=demo.name)
         lanes = blueprint.StateTimelineView(origin="segments", name="segments")
         stream.save(path, default_blueprint=blueprint.Blueprint(blueprint.Vertical(lanes, blueprint.TimeSeriesView())))
 
