@@ -337,7 +337,11 @@ def _missing_labels(fit: Fit, source: Source) -> str:
 
 def export(
     run: RunPath,
-    out: Annotated[Path, written(out_folder, "The folder to write.", show_default=False)],
+    out: Annotated[Path | None, written(out_folder, "The folder to write.", show_default=False)] = None,
+    lerobot: Annotated[
+        Path | None,
+        written(out_folder, "The folder of a LeRobot policy, for lerobot_policy_ddco.", show_default=False),
+    ] = None,
     onnx: Annotated[bool, typer.Option("--onnx", help="Write ONNX too (pip install 'ddco-pyro\\[export]').")] = False,
     allow_code: AllowCode = False,
 ) -> None:
@@ -353,8 +357,19 @@ def export(
     from ddco_pyro.exporting import export as write
     from ddco_pyro.fitting.fitted import load
 
-    check_outputs([Output("--out", out, "folder")], [run])
-    exported = write(load(run, allow_code), out, onnx)
+    if not (out or lerobot):
+        raise BadInput("name what to write: --out FOLDER or --lerobot FOLDER")
+    places = {"--out": out, "--lerobot": lerobot}
+    check_outputs([Output(option, path, "folder") for option, path in places.items() if path], [run])
+    fit = load(run, allow_code)
+    if lerobot:
+        from ddco_pyro.exporting.lerobot import export_policy
+
+        export_policy(fit, lerobot)
+        print(f"{lerobot}: use it with: lerobot-eval --policy.path={lerobot} --env.type=...")
+    if out is None:
+        return
+    exported = write(fit, out, onnx)
     for form, (difference, seconds) in exported.items():
         print(f"{form}: largest difference {difference:.1e}, a step takes {1e3 * seconds:.3f} ms")
     form = next(iter(exported))
