@@ -15,6 +15,8 @@ import h5py
 import numpy as np
 import pyarrow.parquet as parquet
 import pytest
+from command_line import call
+from safetensors.numpy import load_file
 
 from ddco_pyro.cli.runs import FORMATS
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
@@ -381,8 +383,40 @@ def test_the_tool_reads_what_was_planted(tmp_path, form, kind, plan):
     module, _, name = kind.partition(":")
     out = planted.write(getattr(import_module(f"ddco_pyro.segmenting.formats.{module}"), name), "out")
     table = planted.write(CSV, "table.csv")
-    arguments = [str(TOOLS), str(HERE / "fixtures" / "read_formats.py"), form, str(out), str(table), "skill"]
+    in_tools("read_formats.py", form, out, table, "skill")
+
+
+def in_tools(script, *arguments):
+    command = [str(TOOLS), str(HERE / "fixtures" / script), *map(str, arguments)]
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    ended = subprocess.run(arguments, capture_output=True, text=True, env=environment)
+    ended = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert ended.returncode == 0, ended.stderr
     print(ended.stdout)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not TOOLS.exists(), reason="the tools are not installed: make tools")
+def test_lerobot_acts_as_the_run_does(toy_run, tmp_path):
+    ended = call("export", toy_run.folder, "--lerobot", tmp_path / "policy", "--out", tmp_path / "export")
+    assert ended.status == 0
+    in_tools("act_lerobot.py", tmp_path / "policy", tmp_path / "export")
+
+
+def test_a_policy_for_lerobot_has_the_weights_of_the_export(toy_run, tmp_path):
+    """Its ``runner.py`` acts with them alone, as the export's does."""
+    assert call("export", toy_run.folder, "--lerobot", tmp_path / "policy").status == 0
+    assert call("export", toy_run.folder, "--out", tmp_path / "export").status == 0
+    config = json.loads((tmp_path / "policy" / "config.json").read_text())
+    assert config["type"] == "ddco"
+    assert config["input_features"]["observation.offsets"] == {"type": "STATE", "shape": [4]}
+    assert config["output_features"] == {"action": {"type": "ACTION", "shape": [2]}}
+    assert json.loads(config["controller"]) == json.loads((tmp_path / "export" / "controller.json").read_text())
+    weights = load_file(tmp_path / "policy" / "model.safetensors")
+    shapes = {name: [list(array.shape), str(array.dtype)] for name, array in weights.items()}
+    assert json.loads(config["weights"]) == shapes
+    with np.load(tmp_path / "export" / "weights.npz") as file:
+        assert {name.replace(".", "/") for name in file.files} == weights.keys()
+        assert all(np.array_equal(file[name.replace("/", ".")], array) for name, array in weights.items())
+    (tmp_path / "policy" / "mine.txt").touch()
+    ended = call("export", toy_run.folder, "--lerobot", tmp_path / "policy")
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
