@@ -4,6 +4,7 @@
 #   make test-all lint, all tests, all notebooks, and the documentation site
 #   make bench    what exact inference costs, beside other tools
 #   make tools    LeRobot and other tools that tests of segments' formats read back with, where they can be installed
+#   make release-check  build the sdist and the wheel, and use each in an environment of its own, without a clone
 #   make docs     the documentation site, in build/site; the commands of its tutorial are run meanwhile
 #   make .venv    the environment alone: what the demo needs
 #   make dev      the environment with what tests and lint need besides
@@ -19,7 +20,7 @@ TORCH_CPU := https://download.pytorch.org/whl/cpu/torch/
 SIZE := 1.9 GB (0.6 GB to download)
 
 .NOTPARALLEL:
-.PHONY: demo test test-all bench docs tools lint format clean dev .venv python opengl
+.PHONY: demo test test-all bench release-check tools docs lint format clean dev .venv python opengl
 
 # --resume: an interrupted demo goes on where it stopped, a finished one shows its result again.
 demo: opengl $(DEMO)
@@ -29,7 +30,7 @@ demo: opengl $(DEMO)
 test: lint
 	$(BIN)/pytest -n 2 --dist worksteal -q
 
-# About an hour: planted recoveries, kills, several processes, every notebook, dynamax, and the site besides.
+# About an hour: planted recoveries, many kills, more processes, every notebook, dynamax, and the site besides.
 test-all: lint
 	$(PIP) -e '.[bench,docs]'
 	$(BIN)/pytest -n 2 --dist worksteal -q -m ''
@@ -47,6 +48,13 @@ tools:
 	test -x .venv-tools/bin/python || python3.12 -m venv .venv-tools
 	.venv-tools/bin/pip install -q 'lerobot[dataset]>=0.6' label-studio-sdk 'rerun-sdk>=0.41' pympi-ling ./lerobot_policy_ddco
 	$(PIP) -e '.[rerun]'
+
+# CHECK='--packages FOLDER': dependencies that are installed already, instead of those that pip finds.
+release-check: $(DEV)
+	$(PIP) build
+	rm -rf dist
+	$(BIN)/python -m build
+	$(BIN)/python tests/release_check.py $(CHECK) dist/*
 
 docs: $(DEMO)
 	$(PIP) -e '.[docs,export]'

@@ -192,7 +192,7 @@ def with_formats(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def with_outputs(**arguments: Any) -> None:
-        paths = {form.option: arguments.pop(name) for name, form in added.items()}
+        paths = {form.option: arguments.pop(name, None) for name, form in added.items()}
         command(**arguments, outputs={option: path for option, path in paths.items() if path})
 
     parameters = [parameter.replace(kind=keyword) for parameter in own if parameter.name != "outputs"]
