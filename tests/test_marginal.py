@@ -8,7 +8,7 @@ import pyro.distributions as dist
 import pytest
 import torch
 from hierarchies import make_batch, make_hierarchy
-from pyro.infer import SVI, Trace_ELBO, TraceEnum_ELBO
+from pyro.infer import MCMC, NUTS, SVI, Trace_ELBO, TraceEnum_ELBO
 from pyro.infer.autoguide import AutoDelta, AutoNormal
 from torch.func import functional_call
 
@@ -29,6 +29,7 @@ def bayesian(hierarchy, batch, eliminated):
             name: pyro.sample(name.replace(".", "_"), dist.Normal(0.0, PRIOR).expand(shape).to_event())
             for name, shape in shapes.items()
         }
+        weights = {name: weight.float() for name, weight in weights.items()}  # NUTS has float64 weights
         outputs = functional_call(hierarchy, weights, (batch.inputs,))
         if eliminated:
             with pyro.plate("demonstrations", len(batch), dim=-1):
@@ -83,6 +84,18 @@ def test_svi_reaches_the_posterior_mode():
     pull = torch.autograd.grad(likelihood, list(found.values()))
     for value, gradient in zip(found.values(), pull, strict=True):
         torch.testing.assert_close(gradient, value.detach() / PRIOR**2, atol=2e-2, rtol=1e-2)
+
+
+def test_nuts_moves_with_weights_in_double_precision():
+    pyro.clear_param_store()
+    pyro.set_rng_seed(0)
+    hierarchy, batch = make_hierarchy((2,), network="linear"), make_batch()
+    kernel = NUTS(bayesian(hierarchy, batch, True), max_tree_depth=3)
+    chain = MCMC(kernel, num_samples=4, warmup_steps=4, disable_progbar=True)
+    chain.run()
+    for drawn in chain.get_samples().values():
+        assert drawn.dtype == torch.float64
+        assert (drawn.diff(dim=0) != 0).any()
 
 
 def test_draws_follow_the_model():

@@ -24,6 +24,7 @@ class EliminatedAHMM(TorchDistribution):
     In a plate over demonstrations it replaces the enumerated model :func:`ddco_pyro.model.ahmm.ahmm`:
     ``pyro.sample("controls", EliminatedAHMM(hierarchy(batch.inputs), batch.lengths), obs=batch.actions)``.
     Its gradient is the posterior; second derivatives raise an error. The batch shape is [N], the event shape [T, A].
+    ``log_prob`` is float64, which NUTS makes the type of all weights: give networks ``weight.float()``.
 
     >>> from ddco_pyro.model.batch import encode
     >>> batch = encode(demos, fit.hierarchy.encoder, fit.hierarchy.scaling)
