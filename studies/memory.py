@@ -12,8 +12,8 @@ A mixture is the hierarchy of that study's spec whose options end after every st
 demonstrations, training seeds, starts and gradient steps. ``--check`` fits options of so many seeds again, to see
 whether this code gives what the study's table has. ``--em`` fits them by expectation-maximisation, with its
 ridges and without. Each cell is a few rows of ``docs/results/memory.csv`` as soon as it is done, and is not done again.
-``page`` pairs mixtures by seed with the tables of those studies, and writes ``memory.md``, ``memory.png``, and the
-table and figure of the README.
+``page`` pairs mixtures by seed with the tables of those studies, and writes ``memory.md``, ``memory.png`` and the
+figure of the README.
 """
 
 from __future__ import annotations
@@ -52,9 +52,7 @@ from memory_results import (
     numbers,
     of_pages,
     page,
-    short,
     shortest,
-    with_table,
 )
 from table import RESULTS, ROOT, Row, add, read
 from threadpoolctl import threadpool_limits
@@ -269,14 +267,12 @@ def command(study: str, asked: Asked) -> str:
 
 
 def write_page(out: Path) -> str:
-    """``memory.md`` and ``memory.png`` beside the table, README's table and its figure; the page."""
+    """``memory.md`` and ``memory.png`` beside the table, and README's figure; the page."""
     found, again = compared(out)
     shown = page(found, again, missing(done_in(out)))
     write_text(out.with_suffix(".md"), shown)
     draw(everything(found), out.with_suffix(".png"))
     draw(shortest(found), ROOT / "docs" / "images" / "worth.png", columns=1)
-    readme = ROOT / "README.md"
-    write_text(readme, with_table(readme.read_text(encoding="utf-8"), short(found)))
     return shown
 
 

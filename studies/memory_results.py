@@ -296,7 +296,7 @@ def page(found: Sequence[Numbers], again: Sequence[Numbers], missing: Sequence[s
 
 
 ACTED = (("needle", "success"), ("pushing", "goals"), ("arena", "success"), ("arena", "NMI"), ("bins", "success"))
-"""The measures of acting, and of segments, in the table and the figure of README."""
+"""The measures of acting, and of segments, in the figure of README."""
 
 
 def shortest(found: Sequence[Numbers]) -> list[Numbers]:
@@ -315,31 +315,6 @@ def shortest(found: Sequence[Numbers]) -> list[Numbers]:
         both = {f"{MIXTURE} - {FLAT}": one["difference"][f"{MIXTURE} - {FLAT}"], f"{OPTIONS} - {MIXTURE}": lasting}
         chosen.append(one | {"acting": "", "difference": both})
     return chosen
-
-
-def short(found: Sequence[Numbers]) -> str:
-    """The table of README: the two differences of each row of :func:`shortest`."""
-    lines = [
-        "| task | demonstrations | measure | several policies (mixture − flat) | lasting (options − mixture) | seeds |",
-        "|---|---|---|---|---|---|",
-    ]
-    for one in shortest(found):
-        name = NAMED[one["study"]] + (f", {one['task']}" if one["task"] != one["study"] else "")
-        differences = [_difference(one, MIXTURE, FLAT), _difference(one, OPTIONS, MIXTURE)]
-        lines.append(f"| {' | '.join([name, str(one['demonstrations']), one['measure'], *differences, _seeds(one)])} |")
-    return "\n".join(lines)
-
-
-BEGIN, END = "<!-- begin: python studies/memory.py page -->", "<!-- end -->"
-
-
-def with_table(text: str, table: str) -> str:
-    """A text whose table between :data:`BEGIN` and :data:`END` is this one.
-
-    :raises ValueError: the text has no such place.
-    """
-    first = text.index(BEGIN) + len(BEGIN)
-    return f"{text[:first]}\n{table}\n{text[text.index(END, first) :]}"
 
 
 # --- the figure -------------------------------------------------------------------------------------------------------

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import memory
 import pytest
-from memory import Asked, Cell, Measured, cells_of, compared, missing, work
-from memory_results import ACTED, checks, comparisons, draw, everything, of_pages, over_tasks, page, short, with_table
-from table import RESULTS, ROOT, read
+from memory import Asked, Cell, Measured, cells_of, missing, work
+from memory_results import checks, comparisons, draw, everything, of_pages, over_tasks, page
+from table import RESULTS, read
 
 
 def rows(method, values, study="needle", measure="success", acting="marginal", task=None, count=20):
@@ -118,14 +118,3 @@ def test_the_page_and_the_figure_have_every_study(tmp_path):
     assert text.endswith("- `a command`: 3 of mixture\n")
     draw(everything(found), tmp_path / "memory.png")
     assert (tmp_path / "memory.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_table_of_readme_is_that_of_the_page():
-    found, _ = compared()
-    readme = (ROOT / "README.md").read_text()
-    assert with_table(readme, short(found)) == readme
-    assert short(found).count("\n") == 1 + len(ACTED)
-    other = with_table(readme, "other")
-    assert other == readme.replace(short(found), "other") != readme  # what stands around the table stays
-    with pytest.raises(ValueError, match="substring not found"):
-        with_table("no table", "other")

@@ -335,5 +335,5 @@ def _quoted(rows: Sequence[Row], name: str, quotation: str) -> str:
         raise BadInput(f"study {name}: its tables have no {quotation!r}; check its names, and kept in the study")
     difference = " - " in what
     percent = measure == "success"
-    text = shown(found, named.get("form", ("+z" if difference else "z") + (".0%" if percent else ".2f")))
+    text = shown(found, named.get("form", ("+" if difference else "") + (".0%" if percent else ".2f")))
     return f"**{text}**" if difference and found.interval[0] * found.interval[1] > 0 else text
