@@ -125,7 +125,7 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
         ({"contrasts": [{"contrast": "options - flat", "measure": "ari", "demonstrations": 6}]}, "not among measures"),
         ({"overrides": {"training.epoch": 3}}, "training.epoch: unknown key; did you mean training.epochs?"),
         ({"methods": {"options": {}, "mine": {"by": "mine"}}}, "methods.mine.by: names a method of an adapter"),
-        ({"choose": "nats"}, "choose: and seeds.development go together"),
+        ({"choose": "nats"}, "choose: goes together with seeds.development"),
         ({"starts": {"test": {"count": 3}}}, "tasks: missing; name the task in which methods act"),
         ({"tasks": ["needle", "pushing"]}, "tasks: are several, but demonstrations.path names one file"),
         ({"world": "os:system", "tasks": ["a"], "demonstrations": RECORDED, "contrasts": []}, "would import user code"),

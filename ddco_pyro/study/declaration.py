@@ -243,7 +243,7 @@ class Declaration(Model):
 
     def _chosen(self) -> Iterator[tuple[str, str]]:
         if (self.choose is None) != (self.seeds.development is None):
-            yield "choose", "and seeds.development go together; give both or neither"
+            yield "choose", "goes together with seeds.development; give both or neither"
         if self.choose is not None and not self.grid:
             yield "grid", "is empty; name what to choose from"
 
