@@ -128,6 +128,10 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
         ({"choose": "nats"}, "choose: goes together with seeds.development"),
         ({"starts": {"test": {"count": 3}}}, "tasks: missing; name the task in which methods act"),
         ({"tasks": ["needle", "pushing"]}, "tasks: are several, but demonstrations.path names one file"),
+        (
+            {"overrides": {"hierarchy.levels.0.policy.network": "os:system"}},
+            "options: would import user code (os:system)",
+        ),
         ({"world": "os:system", "tasks": ["a"], "demonstrations": RECORDED, "contrasts": []}, "would import user code"),
     ],
 )
