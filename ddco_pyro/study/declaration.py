@@ -326,7 +326,7 @@ class Study:
         :raises SpecError: the overrides of a method do not fit the spec.
         """
         given: Any = SKELETON if self.base is None else self.base.model_dump(exclude_unset=True)
-        found = {}
+        found: dict[str, str] = {}
         for method, point in itertools.product(self.declared.methods, self.declared.points):
             where = self.declared.label(method, point)
             try:
