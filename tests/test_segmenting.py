@@ -13,12 +13,13 @@ import pyarrow.parquet as parquet
 import pytest
 from command_line import call
 from sklearn.metrics import normalized_mutual_info_score
+from time_lines import embedded, tracks, unpacked
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.evaluation.agreement import agreement
-from ddco_pyro.segmenting import Segmented, segments
+from ddco_pyro.segmenting import Segmented, boundary_intervals, segments
 from ddco_pyro.segmenting.baselines import BASELINES, segment
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.data import parts as split_in_parts
@@ -65,9 +66,8 @@ def test_a_page_or_a_table_leaves_the_file_alone(toy_run, file, tmp_path, option
 
 
 NOTHING = (
-    "ddco-pyro: name what to write: --html PAGE, --csv FILE or --parquet FILE; labels for each step go to --out FILE "
-    "(a copy) or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset; --baselines "
-    "measures agreement with labels\n"
+    "ddco-pyro: name what to write, such as --html PAGE, --csv FILE or --lerobot FOLDER; labels for each step go to "
+    "--out FILE (a copy) or with --in-place into DEMOS; --baselines measures agreement with labels\n"
 )
 
 
@@ -78,14 +78,24 @@ NOTHING = (
         (["--level", "option"], NOTHING),
         (["--in-place", "--out", "copy.hdf5"], "ddco-pyro: --out and --in-place exclude each other; keep one\n"),
         (["--out", "FILE"], "ddco-pyro: --out FILE: is what this command reads; choose another place\n"),
-        (["--lerobot", "folder"], "ddco-pyro: FILE: is no LeRobot dataset; --lerobot annotates a copy of one\n"),
+        (
+            ["--mimicgen", "copy.hdf5"],
+            "ddco-pyro: FILE: demo_0: has no datagen_info/eef_pose, so the file is not prepared for --mimicgen; first: "
+            "python mimicgen/scripts/prepare_src_dataset.py --dataset FILE\n",
+        ),
     ],
 )
 def test_what_to_write_has_to_be_said(toy_run, file, monkeypatch, options, message):
     monkeypatch.chdir(file.parent)
     before = file.read_bytes()
     named = [option.replace("FILE", str(file)) for option in options]
-    assert call("segment", toy_run.folder, file, *named) == (2, "", message.replace(" FILE: ", f" {file}: "))
+    assert call("segment", toy_run.folder, file, *named) == (
+        2,
+        "",
+        message.replace("FILE", str(file))
+        .replace(f"{file} (a copy)", "FILE (a copy)")
+        .replace("--csv " + str(file), "--csv FILE"),
+    )
     assert [path.name for path in file.parent.iterdir()] == ["demos.hdf5"]
     assert file.read_bytes() == before
 
@@ -160,19 +170,57 @@ def test_the_page_shows_every_segment(toy_run, file, tmp_path):
     page = tmp_path / "segments.html"
     assert call("segment", toy_run.folder, file, "--html", page).status == 0
     text, found = page.read_text(), look(toy_run.folder, file)
-    assert len(re.findall('class="demonstration"', text)) == len(found)
-    number = {name: option for option, name in enumerate(toy_run.names["option"])}
-    titles = re.findall(r'title="([^"]+), steps (\d+) to (\d+), probability', text)
-    runs = [run for one in found.segments for run in one.levels["option"].runs()]
-    assert [(number[o], int(a), int(b) + 1) for o, a, b in titles] == runs
+    drawn, data = tracks(text), embedded(text)
+    assert list(drawn) == [one.name for one in found.segments]
+    (posterior,) = toy_run.posterior(demonstrations(toy_run.spec)).u
+    (path,) = toy_run.segment(demonstrations(toy_run.spec))
+    for row, (one, track) in enumerate(zip(found.segments, data["tracks"], strict=True)):
+        runs = drawn[one.name][2]["option"]
+        assert runs == one.levels["option"].runs()
+        steps = np.repeat([value for value, _, _ in runs], [end - start for _, start, end in runs])
+        np.testing.assert_array_equal(steps, path[row, : len(one)])
+        lane = track["lanes"][[lane["name"] for lane in data["lanes"]].index("option")]
+        heights = np.array(unpacked(lane["p"])) / 255
+        np.testing.assert_allclose(heights, posterior[row, np.arange(len(one)), steps], atol=0.5001 / 255)
+    assert data["lanes"][0]["names"] == list(toy_run.names["option"])
     assert "http" not in text
-    assert "<script" not in text
+    assert not re.search(r"<(link|iframe|img)|src=|@import|url\(\"?http", text)
+
+
+def test_numbers_follow_the_cursor(toy_run, file, tmp_path):
+    page = tmp_path / "segments.html"
+    assert call("segment", toy_run.folder, file, "--html", page).status == 0
+    for demo, track in zip(demonstrations(toy_run.spec), embedded(page.read_text())["tracks"], strict=True):
+        numbers = track["n"]
+        values = np.array(unpacked(numbers["bytes"])).reshape(len(numbers["names"]), len(demo))
+        decoded = np.array(numbers["low"])[:, None] + np.array(numbers["span"])[:, None] * values / 255
+        known = {**demo.observations, "control": demo.actions}
+        for name, row, span in zip(numbers["names"], decoded, numbers["span"], strict=True):
+            key, _, place = name.removesuffix("]").partition("[")
+            np.testing.assert_allclose(
+                row, known[key].reshape(len(demo), -1)[:, int(place or 0)], atol=span / 255 + 1e-5
+            )
+
+
+def test_the_interval_of_a_boundary_is_that_of_enumerated_paths():
+    """A chain that goes from option 1 to option 2 once: p(first step of 2 = t) is known for every t."""
+    step = np.array([0.0, 0.02, 0.04, 0.2, 0.5, 0.2, 0.03, 0.01])  # p(boundary at t)
+    second = np.cumsum(step)
+    active = np.stack([np.zeros(8), 1 - second, second], axis=1)
+    options = np.where(np.arange(8) < 4, 1, 2)
+    begun = np.isin(np.arange(8), [0, 4])
+    (first, (low, high)) = boundary_intervals(options, begun, active).tolist()
+    assert first == [0, 0]
+    assert (low, high) == (3, 5)  # windows reach from step 3 to step 6
+    assert step[:low].sum() < 0.07
+    assert step[high + 1 :].sum() <= 0.05
+    again = boundary_intervals(np.ones(8, int), begun, active).tolist()
+    assert again == [[0, 0], [4, 4]]  # the same option again: u says nothing of the step
 
 
 def marked(page):
     """Names on the page that are marked as held out."""
-    shown = re.findall(r'<div class="who">(\S+)\s*(<span class="held-out">held out</span>)?', page)
-    return {name for name, mark in shown if mark}
+    return {name for name, (_, held_out, _) in tracks(page).items() if held_out}
 
 
 def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy_spec, file, tmp_path):
@@ -231,7 +279,9 @@ def test_baselines_are_written_as_the_options_are_with_labels_or_without(toy_run
             np.testing.assert_array_equal(demo.labels[f"option_{name}"], kinds + 1)
             np.testing.assert_array_equal(demo.labels[f"option_{name}_boundary"], np.diff(kinds, prepend=-1) != 0)
         assert [int(row[f"option_{name}"]) for row in rows] == [kind + 1 for kinds in expected for kind in kinds]
-        assert page.read_text().count(f">option_{name}<") == len(seen)
+        for row, (_, _, lanes) in enumerate(tracks(page.read_text()).values()):
+            steps = [value for value, start, end in lanes[f"option_{name}"] for _ in range(start, end)]
+            assert steps == (expected[row] + 1).tolist()
     ended = call("segment", toy_run.folder, file, "--baselines", "--gripper", 0, "--out", out)
     assert ended.status == 0, ended.err  # the labels that are there are its own
 
@@ -279,8 +329,10 @@ def test_the_page_escapes_what_it_shows(toy_run, tmp_path, toy_spec):
     assert call("segment", toy_run.folder, path, "--html", page).status == 0
     text = page.read_text()
     assert "&lt;script&gt;alert(1)&lt;%script&gt;" in text
-    assert "&lt;b&gt;phase" in text
-    assert not re.search("<script|<img|<b>", text)
+    assert [lane["name"] for lane in embedded(text)["lanes"]] == ["option", "<b>phase"]
+    without_code = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)  # the page's own, without data
+    assert without_code.count("<script") == 1
+    assert not re.search("<img|<b>", without_code)
 
 
 # --- what cannot be segmented -----------------------------------------------------------------------------------------

@@ -232,8 +232,8 @@ class _Shown:
         where = ", ".join(f"{self.demos[one.row].name} {one.start}–{one.end - 1}" for one in chosen[:SHOWN])
         if self.pictures:
             self.films += 1
-            film = [Films([_film(self.pictures, chosen, choice)])] if self.films <= MOST_FILMS else []
-            return [_sheet(self.pictures, chosen[:SHOWN], where), *film]
+            film = [Films([film_of(self.pictures, chosen, choice)])] if self.films <= MOST_FILMS else []
+            return [sheet_of(self.pictures, chosen[:SHOWN], where), *film]
         if self.position is not None:
             shown = list(dict.fromkeys([*(one.row for one in chosen[:SHOWN]), *range(len(self.demos))]))[:MOST_PATHS]
             segments = [(shown.index(one.row), one.start, one.end) for one in chosen[:SHOWN]]
@@ -251,7 +251,7 @@ class _Shown:
         return [Drawing(curves(dict(list(each.items())[:6]), colour), caption)]
 
 
-def _sheet(pictures: Sequence[Observed], chosen: Sequence[Instance], where: str) -> Picture:
+def sheet_of(pictures: Sequence[Observed], chosen: Sequence[Instance], where: str) -> Picture:
     """First, middle and last picture of each instance, a row each."""
     steps = [(one.start, (one.start + one.end - 1) // 2, one.end - 1) for one in chosen]
     strips = [frames(pictures[one.row], three, SHEET_HEIGHT) for one, three in zip(chosen, steps, strict=True)]
@@ -259,7 +259,7 @@ def _sheet(pictures: Sequence[Observed], chosen: Sequence[Instance], where: str)
     return Picture(data_uri(jpeg(np.vstack(rows)), "image/jpeg"), f"First, middle and last pictures of {where}", where)
 
 
-def _film(pictures: Sequence[Observed], chosen: Sequence[Instance], choice: int) -> Film:
+def film_of(pictures: Sequence[Observed], chosen: Sequence[Instance], choice: int) -> Film:
     """A grid of instances aligned at their onset, in H.264; an instance that has ended is paler."""
     steps = aligned(chosen)
     cells = [frames(pictures[one.row], steps[:, cell], FILM_HEIGHT) for cell, one in enumerate(chosen)]

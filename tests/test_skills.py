@@ -1,0 +1,116 @@
+"""Skills of the report beside segments written by hand: transitions, instances, contact sheets, films, drawings."""
+
+import base64
+import io
+import re
+
+import av
+import cv2
+import numpy as np
+import pytest
+from scipy.cluster.hierarchy import linkage
+
+from ddco_pyro.drawing.diagrams import dendrogram, path_film, transition_graph
+from ddco_pyro.drawing.shown import projection
+from ddco_pyro.report.skills import Instance, aligned, film_of, instances, sheet_of, transitions
+from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
+
+PATHS = ["1112233", "112222", "2211"]
+"""The options of three demonstrations of 7, 6 and 4 steps."""
+
+
+def segmented(paths=PATHS, sure=0.9):
+    found = []
+    for number, path in enumerate(paths):
+        options = np.array([int(step) for step in path])
+        begun = np.diff(options, prepend=-1) != 0
+        level = LevelLabels(options, begun, np.full(len(path), sure))
+        found.append(Segments(f"demo_{number}", {"option": level}, 0.0, False))
+    return Segmented(tuple(found), {"option": 3}, None)
+
+
+def test_transitions_are_those_counted_by_hand():
+    counts = transitions(segmented(), "option")
+    expected = np.zeros((5, 5), int)  # 1 to 3 are options, 4 is the start (row) and the end (column)
+    expected[4, 1], expected[4, 2] = 2, 1
+    expected[1, 2], expected[2, 3], expected[2, 1] = 2, 1, 1
+    expected[3, 4], expected[2, 4], expected[1, 4] = 1, 1, 1
+    np.testing.assert_array_equal(counts, expected)
+    drawn = transition_graph(counts, [0, 7 / 17, 8 / 17, 2 / 17], ["control", "a<b", "place", "go"], [1, 2, 3])
+    titles = re.findall(r"<title>([^<]*): (\d+) of (\d+)</title>", drawn)
+    assert {(name, int(a), int(b)) for name, a, b in titles} == {
+        ("start → a&lt;b", 2, 3), ("start → place", 1, 3), ("a&lt;b → place", 2, 3), ("place → go", 1, 3),
+        ("place → a&lt;b", 1, 3), ("go → end", 1, 1), ("place → end", 1, 3), ("a&lt;b → end", 1, 3),
+    }  # fmt: skip
+
+
+def test_the_most_typical_segments_come_first_and_of_different_demonstrations():
+    found = segmented(["1121122", "11112"])
+    found.segments[0].levels["option"].probability[3:5] = 1.0
+    assert instances(found, "option", 1) == [
+        Instance(0, 3, 5, 1.0),  # the surest
+        Instance(1, 0, 4, 0.9),  # of another demonstration
+        Instance(0, 0, 2, 0.9),
+    ]
+    assert instances(found, "option", 3) == []
+
+
+def test_instances_in_a_film_begin_at_their_onsets_and_rest_at_their_ends():
+    chosen = [Instance(0, 4, 14, 1.0), Instance(1, 2, 5, 1.0)]
+    np.testing.assert_array_equal(aligned(chosen, most=5), [[4, 2], [6, 4], [8, 4], [10, 4], [12, 4]])
+    np.testing.assert_array_equal(aligned([Instance(0, 7, 8, 1.0)]), [[7]])
+
+
+@pytest.fixture
+def shades():
+    """Pictures of two demonstrations whose shade is 10 times the step, plus 100 in the second one."""
+    steps = 10 * np.arange(12, dtype=np.uint8)[:, None, None, None]
+    return [np.broadcast_to(steps + np.uint8(first), (12, 30, 40, 1)) for first in (0, 100)]
+
+
+CHOSEN = [Instance(0, 4, 10, 1.0), Instance(1, 2, 5, 1.0)]
+
+
+def test_a_contact_sheet_has_the_first_middle_and_last_picture(shades):
+    content = sheet_of(shades, CHOSEN, "").uri.partition(",")[2]
+    sheet = cv2.imdecode(np.frombuffer(base64.b64decode(content), np.uint8), cv2.IMREAD_COLOR)
+    cells = sheet.reshape(2, sheet.shape[0] // 2, 3, sheet.shape[1] // 3, 3).mean((1, 3, 4))
+    np.testing.assert_allclose(cells, [[40, 60, 90], [120, 130, 140]], atol=3)
+
+
+def test_a_film_of_pictures_begins_at_onsets(shades):
+    content = base64.b64decode(film_of(shades, CHOSEN, 1).uri.partition(",")[2])
+    assert len(content) < 300_000
+    with av.open(io.BytesIO(content)) as film:
+        frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    assert len(frames) == 6
+    for step, frame in enumerate(frames):
+        left, right = np.hsplit(frame[10:100].astype(float), 2)
+        assert left[:, 10:-10].mean() == pytest.approx(10 * (4 + step), abs=8)
+        if step < 3:
+            assert right[:, 10:-10].mean() == pytest.approx(100 + 10 * (2 + step), abs=8)
+        else:
+            assert right[:, 10:-10].mean() == pytest.approx(128 + 140 / 2, abs=8)  # ended: paler
+
+
+def test_a_film_of_trajectories_moves_a_point_along_each_instance():
+    path = np.stack([np.arange(10.0), np.zeros(10)], axis=1)
+    drawn = path_film([path], np.array([[2], [4], [6]]), 1.5, "#123456")
+    (across,) = re.findall(r'attributeName="cx" values="([^"]*)"', drawn)
+    places = np.array([float(value) for value in across.split(";")])
+    assert np.diff(places) == pytest.approx(2 * (110 - 16) / 9, abs=0.11)
+
+
+def test_a_projection_keeps_distances_in_the_plane_that_it_looks_at():
+    """An orthographic view scales every length by the same factor and shortens depth alone."""
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    turn = projection(points) * np.ptp(points, axis=0).max()
+    np.testing.assert_allclose(turn @ turn.T, np.eye(2), atol=1e-12)
+
+
+def test_a_dendrogram_joins_the_alike_first():
+    merges = linkage([1.0, 9.0, 16.0], "average")  # pairs (1, 2), (1, 3), (2, 3)
+    drawn = dendrogram(merges, [1, 2, 3], ["control", "reach", "grasp", "lift"])
+    assert re.findall(r">(\d+\.\d\d)<", drawn) == ["1.00", "12.50"]
+    names = re.findall(r">(reach|grasp|lift)<", drawn)
+    assert abs(names.index("reach") - names.index("grasp")) == 1
