@@ -3,6 +3,7 @@
 #   make test     lint, then the tests that take seconds
 #   make test-all lint, all tests, all notebooks, and the documentation site
 #   make bench    what exact inference costs, beside other tools
+#   make tools    LeRobot and other tools that tests of segments' formats read back with, where they can be installed
 #   make release-check  build the sdist and the wheel, and use each in an environment of its own, without a clone
 #   make docs     the documentation site, in build/site; the commands of its tutorial are run meanwhile
 #   make .venv    the environment alone: what the demo needs
@@ -19,7 +20,7 @@ TORCH_CPU := https://download.pytorch.org/whl/cpu/torch/
 SIZE := 1.9 GB (0.6 GB to download)
 
 .NOTPARALLEL:
-.PHONY: demo test test-all bench release-check docs lint format clean dev .venv python opengl
+.PHONY: demo test test-all bench release-check tools docs lint format clean dev .venv python opengl
 
 # --resume: an interrupted demo goes on where it stopped, a finished one shows its result again.
 demo: opengl $(DEMO)
@@ -41,6 +42,12 @@ test-all: lint
 bench: $(DEMO)
 	$(PIP) -e '.[bench,segments]'
 	$(BIN)/python benchmarks/performance.py
+
+# What reads the formats of segments, in an environment of its own: LeRobot needs Python 3.12. About 6 GB with CUDA.
+tools:
+	test -x .venv-tools/bin/python || python3.12 -m venv .venv-tools
+	.venv-tools/bin/pip install -q 'lerobot[dataset]>=0.6' label-studio-sdk 'rerun-sdk>=0.41' pympi-ling ./lerobot_policy_ddco
+	$(PIP) -e '.[rerun]'
 
 # CHECK='--packages FOLDER': dependencies that are installed already, instead of those that pip finds.
 release-check: $(DEV)

@@ -175,6 +175,8 @@ class Training(Record):
     device: str
     by_em: bool
     """Whether the gradient steps are EM steps over all training demonstrations."""
+    by_lbfgs: bool = False
+    """Whether they are steps of L-BFGS over all training demonstrations."""
 
 
 class Compared(Record):

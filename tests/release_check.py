@@ -43,7 +43,7 @@ def check(file: Path, packages: Path | None) -> None:
         if packages:
             (site,) = (folder / "venv" / "lib").glob("python*/site-packages")
             (site / "dependencies.pth").write_text(f"{packages.resolve()}\n")
-            run("pip", "install", "-q", "--no-deps", "--no-build-isolation", file.resolve())
+            run("pip", "install", "-q", "--no-deps", file.resolve())
         else:
             run("pip", "install", "-q", "--find-links", TORCH_CPU, "-c", ROOT / "constraints.txt", file.resolve())
         run("python", "-c", INSTALLED)

@@ -267,12 +267,42 @@ def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
     trained = fit.metrics.trainings
     assert {name: one.by_em for name, one in trained.items()} == {"ddco": True, "mixture": True, "flat": False}
     assert trained["ddco"].spent.gradient_steps == trained["ddco"].spent.epochs
+    assert {name: one.by_lbfgs for name, one in trained.items()} == {"ddco": False, "mixture": False, "flat": True}
+    assert trained["flat"].spent.gradient_steps == trained["flat"].spent.epochs
     assert "(EM)" in words.effort(trained["ddco"])
+    assert "(L-BFGS)" in words.effort(trained["flat"])
 
 
-@pytest.mark.parametrize("initialize", ["vq", "cuts", "mixture"])
-def test_a_fit_by_em_that_is_interrupted_has_the_same_bits(tmp_path, initialize):
-    spec, demos = small_spec(initialize=initialize), demonstrations(12)
+def flat_spec(kind="flat", **control):
+    network = {"network": "mlp", "hidden": [4] if kind == "flat" else []}
+    changes = {"hierarchy": None, "compare_with": [], "baseline": {"kind": kind, "policy": network}}
+    return parse_spec({**small_spec().model_dump(exclude_unset=True), **changes, "control": control})
+
+
+def test_a_flat_policy_for_each_time_step_is_least_squares_at_that_step():
+    demos = demonstrations(40)
+    spec = flat_spec("per_timestep", std=1.0, scale="none")
+    spec = with_overrides(spec, {"training.tune_fraction": 0.1, "training.patience": 300, "training.epochs": 300})
+    trainer = make_trainer(spec, demos, None)
+    trainer.run()
+    batch = trainer.data.train
+    assert trainer.summary["by_lbfgs"]
+    last = trainer.history[-1]["train"]
+    residual = 0.0
+    for t in range(int(batch.lengths.max())):
+        rows = batch.lengths > t
+        x = np.column_stack([batch.inputs.vector[rows, t].double(), np.ones(int(rows.sum()))])
+        a = batch.actions[rows, t].double().numpy()
+        residual += float(np.square(a - x @ np.linalg.lstsq(x, a, rcond=None)[0]).sum())
+    dims = batch.actions.shape[-1]
+    truth = -0.5 * residual / batch.steps - 0.5 * dims * np.log(2 * np.pi)
+    assert last == pytest.approx(truth, abs=1e-6)
+
+
+@pytest.mark.parametrize("initialize", ["vq", "cuts", "mixture", "flat"])
+def test_a_fit_that_is_interrupted_has_the_same_bits(tmp_path, initialize):
+    flat = initialize == "flat"
+    spec, demos = flat_spec(std=LEARNED) if flat else small_spec(initialize=initialize), demonstrations(12)
     whole, cut = (make_trainer(spec, demos, tmp_path / name) for name in ("whole", "cut"))
     expected = train(whole.data, Restart(Progress(0)))
     path = tmp_path / "restart.safetensors"
@@ -281,7 +311,7 @@ def test_a_fit_by_em_that_is_interrupted_has_the_same_bits(tmp_path, initialize)
         restart = train(cut.data, restart, seconds=0.0)
         if restart.progress.done:
             break
-        restart.write(path)
+        restart.written(path)
         restart = Restart.read(path)
     assert restart.progress.history == expected.progress.history
     for name, value in expected.states["best"].items():

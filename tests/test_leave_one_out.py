@@ -54,7 +54,7 @@ def test_every_demonstration_trains_and_is_held_out_from_a_fit_without_it(run):
     for method, model in (("ddco", run), *run.baselines.items()):
         spec = with_overrides(model.spec, {"demonstrations.leave_one_out": False})
         each = {row.name: row.log_likelihood for row in model.metrics.valid}
-        for name in demos.names[:2]:
+        for name in demos.names[:1]:
             masked = replace(demos, masks={"valid": (name,)})  # the same held out by a mask instead
             apart = ddco_pyro.fit(with_overrides(spec, {"compare_with": []}), masked)
             assert each[name] == pytest.approx(float(apart.log_likelihood(demos.select([name]))[0])), method

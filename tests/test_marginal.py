@@ -73,7 +73,7 @@ def test_svi_reaches_the_posterior_mode():
     model = bayesian(hierarchy, batch, True)
     guide = AutoDelta(model)
     svi = SVI(model, guide, pyro.optim.Adam({"lr": 0.03}), Trace_ELBO())
-    for _ in range(800):
+    for _ in range(500):
         svi.step()
     found = {
         name: guide()[name.replace(".", "_")].detach().requires_grad_() for name, _ in hierarchy.named_parameters()

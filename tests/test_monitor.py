@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+import yaml
 from hierarchies import make_hierarchy
 
-from ddco_pyro.acting.monitor import Monitor
+import ddco_pyro
+from ddco_pyro.acting.monitor import Monitor, run_lengths
 from ddco_pyro.acting.window import ObservationError
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood, posterior
 from ddco_pyro.model.batch import encode
+from ddco_pyro.spec import parse_spec
 
 
 def demonstration(steps):
@@ -65,3 +68,75 @@ def test_the_control_comes_with_every_observation_but_the_first():
         monitor.step(state)
     with pytest.raises(ObservationError, match=r"got one of shape \(3,\)"):
         monitor.step(state, np.zeros(3))
+
+
+PLANTED = [(1, 6), (2, 3), (3, 4)]
+"""Phases, each with its number of steps."""
+SPEC = """
+demonstrations: {path: unused.hdf5}
+observations: [state]
+control: {std: 0.3}
+hierarchy:
+  levels: [{name: skill, count: 3, policy: {network: linear}, termination: {network: linear}}]
+  meta_policy: {network: linear}
+compare_with: []
+training: {epochs: 200, optimizer: {name: em}}
+"""
+
+
+@pytest.fixture(scope="module")
+def phases():
+    """Demonstrations of three phases, and a fit that finds them; the state says the phase, with noise."""
+    rng, phase = np.random.default_rng(0), np.repeat(*zip(*PLANTED, strict=True))
+    means = np.array([[1.0, 0.0], [-1.0, 1.0], [0.0, -1.0]])
+    demos = []
+    for number in range(12):
+        state = np.eye(3)[phase - 1] + 0.1 * rng.normal(size=(len(phase), 3))
+        action = means[phase - 1] + 0.1 * rng.normal(size=(len(phase), 2))
+        demos.append(Demonstration(f"demo_{number}", {"state": state}, action))
+    demos = Demonstrations(tuple(demos))
+    return ddco_pyro.fit(parse_spec(yaml.safe_load(SPEC)), demos), demos, phase
+
+
+def test_progress_is_the_planted_part_of_each_phase(phases):
+    fit, demos, phase = phases
+    (found,) = fit.segment(demos)
+    order = list(dict.fromkeys(fit.names["skill"][option] for option in found[0]))
+    monitor, demo = fit.monitor(demos), demos[0]
+    expected = [
+        ((k + (step + 1) / steps) / 3, (step + 1) / steps)
+        for k, (_, steps) in enumerate(PLANTED)
+        for step in range(steps)
+    ]
+    for t, (whole, fraction) in enumerate(expected):
+        monitor.step({"state": demo.observations["state"][t]}, demo.actions[t - 1] if t else None)
+        progress = monitor.progress({"skill": order})["skill"]
+        assert progress.name == order[phase[t] - 1]
+        assert (progress.fraction, progress.whole) == (pytest.approx(fraction), pytest.approx(whole))
+    monitor.reset()
+    assert monitor.progress() == {}
+
+
+def test_the_expected_length_grows_with_what_a_run_has_outlasted(phases):
+    """Runs of 4 or 8 steps: 6 expected, and 8 once a fifth step has come; past the longest, all of it."""
+    fit, demos, _ = phases
+    lengths = [np.array([4, 4, 8, 8])] * 4
+    monitor = Monitor(fit.hierarchy, fit.names, {"skill": lengths})
+    fractions = []
+    for t in range(10):
+        state = demos[0].observations["state"][0]
+        monitor.step({"state": state}, demos[0].actions[0] if t else None)
+        fractions.append(monitor.progress()["skill"].fraction)
+    assert fractions == pytest.approx([a / 6 for a in range(1, 5)] + [a / 8 for a in range(5, 9)] + [1.0, 1.0])
+
+
+def test_without_demonstrations_no_fraction_is_known(phases):
+    fit, demos, _ = phases
+    monitor = fit.monitor()
+    monitor.step({"state": demos[0].observations["state"][0]})
+    assert monitor.progress({"skill": fit.names["skill"]})["skill"][2:] == (1, None, None)
+
+
+def test_runs_end_where_the_choice_changes_and_with_the_demonstration():
+    found = run_lengths(np.array([[1, 1, 2, 2, 2, 1], [0, 1, -1, -1, -1, -1]]), 3)
+    assert [lengths.tolist() for lengths in found] == [[1], [1, 1, 2], [3], []]

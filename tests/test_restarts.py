@@ -79,10 +79,13 @@ class Interrupting:
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_same_bits_also_where_one_had_begun(undisturbed, spec, demos, tmp_path, monkeypatch):
-    """Interrupted in the middle of the second rung, continued in slices of a single epoch each by two processes."""
+@pytest.mark.parametrize("here", [0.0, 0.02])
+def test_two_processes_give_the_same_bits_also_where_one_had_begun(
+    undisturbed, spec, demos, tmp_path, monkeypatch, here
+):
+    """Interrupted in the middle of the second rung; continued by two processes, at once or after a moment here."""
     monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
-    monkeypatch.setattr(restarting, "SLICE", 0.0)
+    monkeypatch.setattr(restarting, "SHORT", here)
     with pytest.raises(KeyboardInterrupt):
         make_trainer(spec, demos, tmp_path, Interrupting(5 * 3 + 2)).run()
     kept = [Restart.read(path).progress for path in sorted(tmp_path.iterdir())]
@@ -154,7 +157,7 @@ class Scripted:
     def __init__(self, curves):
         self.curves = curves
 
-    def __call__(self, data, restart, until, checkpoint=None, on_event=None, ranks=None):
+    def __call__(self, data, restart, until, seconds=None, checkpoint=None, on_event=None, ranks=None):
         progress = restart.progress
         curve = self.curves[progress.restart]
         progress.start = curve[0]
@@ -297,7 +300,8 @@ def test_an_interruption_changes_nothing_where_restarts_diverge(with_diverging, 
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_same_bits_where_restarts_diverge(with_diverging, demos, tmp_path):
+def test_two_processes_give_the_same_bits_where_restarts_diverge(with_diverging, demos, tmp_path, monkeypatch):
+    monkeypatch.setattr(restarting, "SHORT", 0.0)
     trainer = make_trainer(with_diverging[0].spec, demos, tmp_path, jobs=2)
     assert_same(trainer, trainer.run().state_dict(), tmp_path, with_diverging)
 

@@ -66,9 +66,8 @@ def test_a_page_or_a_table_leaves_the_file_alone(toy_run, file, tmp_path, option
 
 
 NOTHING = (
-    "ddco-pyro: name what to write: --html PAGE, --csv FILE or --parquet FILE; labels for each step go to --out FILE "
-    "(a copy) or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset; --baselines "
-    "measures agreement with labels\n"
+    "ddco-pyro: name what to write, such as --html PAGE, --csv FILE or --lerobot FOLDER; labels for each step go to "
+    "--out FILE (a copy) or with --in-place into DEMOS; --baselines measures agreement with labels\n"
 )
 
 
@@ -79,14 +78,24 @@ NOTHING = (
         (["--level", "option"], NOTHING),
         (["--in-place", "--out", "copy.hdf5"], "ddco-pyro: --out and --in-place exclude each other; keep one\n"),
         (["--out", "FILE"], "ddco-pyro: --out FILE: is what this command reads; choose another place\n"),
-        (["--lerobot", "folder"], "ddco-pyro: FILE: is no LeRobot dataset; --lerobot annotates a copy of one\n"),
+        (
+            ["--mimicgen", "copy.hdf5"],
+            "ddco-pyro: FILE: demo_0: has no datagen_info/eef_pose, so the file is not prepared for --mimicgen; first: "
+            "python mimicgen/scripts/prepare_src_dataset.py --dataset FILE\n",
+        ),
     ],
 )
 def test_what_to_write_has_to_be_said(toy_run, file, monkeypatch, options, message):
     monkeypatch.chdir(file.parent)
     before = file.read_bytes()
     named = [option.replace("FILE", str(file)) for option in options]
-    assert call("segment", toy_run.folder, file, *named) == (2, "", message.replace(" FILE: ", f" {file}: "))
+    assert call("segment", toy_run.folder, file, *named) == (
+        2,
+        "",
+        message.replace("FILE", str(file))
+        .replace(f"{file} (a copy)", "FILE (a copy)")
+        .replace("--csv " + str(file), "--csv FILE"),
+    )
     assert [path.name for path in file.parent.iterdir()] == ["demos.hdf5"]
     assert file.read_bytes() == before
 

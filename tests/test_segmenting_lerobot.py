@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow
@@ -18,7 +19,8 @@ from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
-from ddco_pyro.segmenting.lerobot import FORMS, annotate
+from ddco_pyro.segmenting.formats import Asked
+from ddco_pyro.segmenting.formats.lerobot import Annotated
 from ddco_pyro.spec import parse_spec
 
 LEROBOT = Path(__file__).parent / "fixtures" / "lerobot"
@@ -61,7 +63,7 @@ def rows_of(folder):
 def test_subtasks_are_written_as_lerobot_writes_them(tmp_path):
     """Beside what LeRobot's own annotation writer made of the same subtasks (``fixtures/write_lerobot_language.py``).
 
-    ``fixtures/read_lerobot.py`` has LeRobot read what is written here; 0.6.1 did.
+    ``fixtures/read_formats.py`` has LeRobot read what is written here; 0.6.1 did.
     """
     options = {int(key): np.array(value) for key, value in json.loads((LANGUAGE / "options.json").read_text()).items()}
     level = {key: LevelLabels(value, np.ones(len(value), bool), np.ones(len(value))) for key, value in options.items()}
@@ -69,7 +71,9 @@ def test_subtasks_are_written_as_lerobot_writes_them(tmp_path):
         tuple(Segments(f"demo_{key}", {"skill": one}, 0.0, False) for key, one in level.items()), {"skill": 2}, 10.0
     )
     with open_source(LEROBOT) as source:
-        annotate(source, tmp_path / "out", found, "skill", FORMS["0.6"])
+        fit = SimpleNamespace(names={"skill": ("control", "option 1", "option 2")})
+        asked = Asked(fit, tmp_path, LEROBOT, source, "skill")  # type: ignore[arg-type]
+        Annotated("--lerobot", tmp_path / "out", asked).write(found)
     ours, theirs = rows_of(tmp_path / "out"), parquet.read_table(LANGUAGE / "data.parquet")
     assert ours.column_names == theirs.column_names
     assert ours.to_pylist() == theirs.to_pylist()
@@ -121,7 +125,11 @@ def test_the_older_form_of_subtasks(lerobot_run, tmp_path):
 @pytest.mark.parametrize(
     ("form", "features", "more"),
     [
-        ("0.6", {"language_persistent": "language", "language_events": "language"}, set()),
+        (
+            "0.6",
+            {"language_persistent": "language", "language_events": "language"},
+            {Path("meta/lerobot_annotations.json")},
+        ),
         ("0.4", {"subtask_index": "int64"}, {Path("meta/subtasks.parquet")}),
     ],
 )
@@ -162,8 +170,8 @@ def test_a_copy_with_subtasks(lerobot_run, tmp_path, form, features, more):
     [
         (["--lerobot", "OUT", "--level", "skil"], "there is no level 'skil' (there is: skill"),
         (["--lerobot", "OUT", "--lerobot-format", "0.5"], "Invalid value for '--lerobot-format'"),
-        (["--in-place"], "labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot"),
-        (["--html", "OUT", "--out", "OUT"], "labels go into HDF5 files only"),
+        (["--in-place"], "is a folder; name a file"),
+        (["--html", "OUT", "--out", "OUT2"], "labels go into HDF5 files only; name another format, such as --csv"),
     ],
 )
 def test_what_cannot_be_written_of_a_lerobot_dataset(lerobot_run, tmp_path, arguments, message):

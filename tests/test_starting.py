@@ -53,7 +53,9 @@ def two_skills(path: Path, number: int = 12) -> None:
 
 @pytest.mark.slow
 def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Path) -> None:
-    """Held out it is as likely, to 0.1 nats per step, as under the policy that the demonstrations were drawn from."""
+    """Segments are the planted ones. Held out they are as likely as under the policy that they were drawn from, to 0.1
+    nats per step by Adam. EM's ridges take 0.2 more here, of 156 steps.
+    """
     two_skills(path)
     spec = tmp_path / "spec.yaml"
     assert call("init", path, "--out", spec).out == f"{spec}: fit it with: ddco-pyro fit {spec} --out runs/spec\n"
@@ -61,15 +63,17 @@ def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Pa
     assert ended.status == 0, ended.err
     assert ended.out.splitlines()[-1] == f"next: ddco-pyro segment {tmp_path / 'run'} '{path}' --html segments.html"
     looked = call("inspect", path).out.splitlines()[-1]
-    assert looked == f"next: ddco-pyro init '{path}' --out 'my demos: 1'.yaml"
+    assert looked == f"next: ddco-pyro init '{path}' --out 'my demos: 1.yaml'"
     fit = ddco_pyro.load(tmp_path / "run")
     assert fit.spec == load_spec(spec)
     held_out = Demonstrations.read(path, labels=["skill"]).select([one.name for one in fit.metrics.valid])
     side = [np.where(demo.labels["skill"] == 5, 1, -1)[:, None] * demo.observations["place"] for demo in held_out]
     truth = stats.norm.logpdf(np.concatenate([demo.actions for demo in held_out]), np.concatenate(side), NOISE).mean()
-    assert fit.metrics.log_likelihood_per_step.valid > truth - 0.1
-    assert list(fit.baselines) == ["flat", "flat_equal"]
-    assert fit.metrics.agreement  # with the labels in the file
+    assert fit.metrics.log_likelihood_per_step.valid > truth - 0.3
+    adam = ["compare_with=[]", "training.optimizer={name: adam, lr: 3.0e-3}"]
+    assert ddco_pyro.fit(load_spec(spec, adam)).metrics.log_likelihood_per_step.valid > truth - 0.1
+    assert list(fit.baselines) == ["mixture", "flat", "flat_equal"]
+    assert fit.metrics.agreement.valid[0].nmi > 0.95  # with the labels in the file
 
 
 @pytest.mark.slow
@@ -81,8 +85,8 @@ def test_what_it_writes_lets_every_method_converge(tmp_path: Path) -> None:
     assert ended.status == 0, ended.err
     metrics = ddco_pyro.load(tmp_path / "run").metrics
     trainings = metrics.trainings.values()
-    assert [one.converged for one in trainings] == [True, True, True]
-    assert len({one.budget for one in trainings}) == 1
+    assert [one.converged for one in trainings] == [True] * 4  # with a mixture and two flat policies
+    assert len({one.budget.epochs for one in trainings}) == 1
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 import shlex
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from enum import StrEnum
+from functools import wraps
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
@@ -16,9 +21,8 @@ from ddco_pyro.errors import BadInput, command
 
 if TYPE_CHECKING:
     from ddco_pyro.data.sources import Source
-    from ddco_pyro.events import OnEvent
     from ddco_pyro.fitting.fitted import Fit
-    from ddco_pyro.segmenting import Segmented
+    from ddco_pyro.segmenting.formats import Asked, Writer
 
 FILMED = 3
 """Episodes of each method that ``rollout --video`` films."""
@@ -132,37 +136,102 @@ class LeRobotFormat(StrEnum):
     SUBTASK_INDEX = "0.4"
 
 
-NO_LABELS = "labels go into HDF5 files only; name --csv, --parquet, --html or --lerobot"
+class Format(NamedTuple):
+    """A format of segments, an option of ``segment`` that names a file or folder.
+
+    :param writer: its class in :mod:`ddco_pyro.segmenting.formats`, ``module:Class``.
+    """
+
+    option: str
+    kind: Literal["file", "folder", "stream"]
+    writer: str
+    group: str
+    text: str
 
 
+GENERAL, DATASETS, TOOLS = "Pages, tables and labels", "Datasets for training", "Annotation tools"
+FORMATS = (
+    Format("--html", "stream", "html:Page", GENERAL, "A page with the timeline of every demonstration."),
+    Format("--csv", "stream", "tables:CSV", GENERAL, "A table with a row for each step."),
+    Format("--parquet", "stream", "tables:Parquet", GENERAL, "The same table as Parquet."),
+    Format("--out", "file", "labels:Labels", GENERAL, "A copy of the HDF5 file with labels for each step."),
+    Format("--lerobot", "folder", "lerobot:Annotated", DATASETS, "A LeRobot dataset with options as subtasks."),
+    Format("--sarm", "folder", "lerobot:SARM", DATASETS, "A LeRobot dataset with the stages of SARM's reward model."),
+    Format("--rabc", "stream", "rabc:RABC", DATASETS, "Progress of each frame as Parquet, for RA-BC in LeRobot."),
+    Format("--mimicgen", "file", "mimicgen:MimicGen", DATASETS, "A copy of a prepared file, with MimicGen's signals."),
+    Format("--isaac", "file", "mimicgen:Isaac", DATASETS, "The same for Isaac Lab Mimic."),
+    Format("--rlds", "folder", "rlds:RLDS", DATASETS, "Steps in the fields of RLDS, as numpy archives."),
+    Format("--label-studio", "folder", "label_studio:LabelStudio", TOOLS, "Predictions for Label Studio."),
+    Format("--elan", "folder", "elan:ELAN", TOOLS, "ELAN's .eaf of each demonstration."),
+    Format("--rerun", "folder", "rerun:Rerun", TOOLS, "Rerun's .rrd of each demonstration."),
+)
+"""Every format of segments; to add one, write its :class:`Writer` and list it here."""
+
+
+def with_formats(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command an option for each format, between its arguments and its own options.
+
+    The command gets them as ``outputs``, from the option to the path, with the options that were given.
+    """
+    own = list(inspect.signature(command, eval_str=True).parameters.values())
+    parsers = {"file": out_file, "stream": out_file, "folder": out_folder}
+    added = {form.option[2:].replace("-", "_"): form for form in FORMATS}
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    options = [
+        inspect.Parameter(
+            name,
+            keyword,
+            default=None,
+            annotation=Annotated[
+                Path | None,
+                written(parsers[form.kind], form.text, show_default=False, rich_help_panel=form.group),
+            ],
+        )
+        for name, form in added.items()
+    ]
+
+    @wraps(command)
+    def with_outputs(**arguments: Any) -> None:
+        paths = {form.option: arguments.pop(name, None) for name, form in added.items()}
+        command(**arguments, outputs={option: path for option, path in paths.items() if path})
+
+    parameters = [parameter.replace(kind=keyword) for parameter in own if parameter.name != "outputs"]
+    vars(with_outputs)["__signature__"] = inspect.Signature([*parameters[:2], *options, *parameters[2:]])
+    return with_outputs
+
+
+@with_formats
 def segment(
+    outputs: dict[str, Path],
     run: RunPath,
     demos: Annotated[
         Path, typer.Argument(metavar="DEMOS", help="Demonstrations: an HDF5 file, or a Minari or LeRobot dataset.")
     ],
-    out: Annotated[
-        Path | None,
-        written(out_file, "A copy of the HDF5 file with labels for each step.", show_default=False),
-    ] = None,
+    in_place: Annotated[bool, typer.Option("--in-place", help="Write the labels into the HDF5 file itself.")] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Let --out replace a file that is no labelled copy of DEMOS.")
     ] = False,
-    in_place: Annotated[bool, typer.Option("--in-place", help="Write the labels into the HDF5 file itself.")] = False,
-    csv: Annotated[Path | None, written(out_file, "A table with a row for each step.", show_default=False)] = None,
-    parquet: Annotated[Path | None, written(out_file, "The same table as Parquet.", show_default=False)] = None,
-    html: Annotated[
-        Path | None, written(out_file, "A page with the timeline of every demonstration.", show_default=False)
+    level: Annotated[
+        str | None, typer.Option(help="The level that gives the subtasks; the lowest by default.", show_default=False)
     ] = None,
-    lerobot: Annotated[
-        Path | None,
-        written(out_folder, "A copy of the LeRobot dataset with options as subtasks.", show_default=False),
-    ] = None,
+    same_order: Annotated[
+        bool,
+        typer.Option(
+            "--same-order",
+            help="Leave demonstrations out of --mimicgen and --isaac if their options follow another order than most.",
+        ),
+    ] = False,
     lerobot_format: Annotated[
         LeRobotFormat,
         typer.Option("--lerobot-format", help="Subtasks as LeRobot reads them from 0.6 on, or in 0.4 and 0.5."),
     ] = LeRobotFormat.LANGUAGE,
-    level: Annotated[
-        str | None, typer.Option(help="The level that gives the subtasks; the lowest by default.", show_default=False)
+    fps: Annotated[
+        float | None,
+        typer.Option(
+            min=0.001,
+            help="Steps per second; by default the control frequency that DEMOS says.",
+            show_default=False,
+        ),
     ] = None,
     baselines: Annotated[
         bool,
@@ -179,79 +248,79 @@ def segment(
     allow_external: AllowExternal = False,
     allow_code: AllowCode = False,
 ) -> None:
-    """Label every step of demonstrations with a run's options: as a page, a table, labels in HDF5, or subtasks.
+    """Label every step of demonstrations with a run's options, and write them in the formats that you name.
 
     DEMOS is changed with --in-place only.
     """
-    if not (out or in_place or csv or parquet or html or lerobot or baselines):
+    if not (outputs or in_place or baselines):
         raise BadInput(
-            "name what to write: --html PAGE, --csv FILE or --parquet FILE; labels for each step go to --out FILE (a "
-            "copy) or with --in-place into DEMOS; --lerobot FOLDER is an annotated copy of a LeRobot dataset; "
-            "--baselines measures agreement with labels"
+            "name what to write, such as --html PAGE, --csv FILE or --lerobot FOLDER; labels for each step go to --out "
+            "FILE (a copy) or with --in-place into DEMOS; --baselines measures agreement with labels"
         )
-    if out and in_place:
+    if "--out" in outputs and in_place:
         raise BadInput("--out and --in-place exclude each other; keep one")
-    labelled = demos if in_place else out
-    if labelled and demos.is_dir():
-        raise BadInput(f"{demos}: {NO_LABELS}")
+    places = [Output(form.option, outputs[form.option], form.kind) for form in FORMATS if form.option in outputs]
+    if in_place:
+        places.append(Output("--in-place", demos, "file"))
+    labelled = in_place or "--out" in outputs
     if labelled and allow_external:  # a copy lacks the other files, and labels could go into them
         again = command("import", demos, "--allow-external", "--out", "whole.hdf5")
         raise BadInput(f"{demos}: labels go into whole files only; first: {again}")
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
-    from ddco_pyro.drawing.shown import stored_pictures
     from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.segmenting import beside_baselines, chosen_names, recorded, segments
+    from ddco_pyro.segmenting import beside_baselines, segments
     from ddco_pyro.segmenting.agreement import agreement_table, level_agreements
     from ddco_pyro.segmenting.baselines import BASELINES, check_installed
-    from ddco_pyro.segmenting.files import check_copy, check_labels, write_csv, write_labels, write_parquet
-    from ddco_pyro.segmenting.page import followed, write_page
+    from ddco_pyro.segmenting.formats import Asked
 
-    named = {"--csv": csv, "--parquet": parquet, "--html": html}
-    files = [Output(option, path) for option, path in named.items() if path]
-    labels = [Output("--in-place" if in_place else "--out", labelled, "file")] if labelled else []
-    copies = [Output("--lerobot", lerobot, "folder")] if lerobot else []
-    check_outputs([*labels, *files, *copies], [run] if in_place else [run, demos])
-    if out and not overwrite:
-        check_copy(demos, out)
+    check_outputs(places, [run] if in_place else [run, demos])
     fit = load(run, allow_code)
+    if level is not None and fit.names and level not in fit.names:
+        raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(fit.names)})")
     with open_source(demos, external=allow_external) as source, console.Progress("segmenting") as progress:
-        if labelled and source.format != "robomimic":
-            raise BadInput(f"{demos}: {NO_LABELS}")
-        if labelled and fit.spec.hierarchy:
-            levels = [level.name for level in fit.spec.hierarchy.levels]
-            beside = [f"{level}_{name}" for level in levels for name in BASELINES] if baselines else []
-            check_labels(demos, [*levels, *beside], chosen_names(source, fit))
+        beside = tuple(f"{level}_{name}" for level in fit.names for name in BASELINES) if baselines else ()
+        asked = Asked(
+            fit,
+            run,
+            demos,
+            source,
+            level or next(iter(fit.names), ""),
+            beside,
+            overwrite,
+            lerobot_format,
+            same_order,
+        )
+        writers = [_writer(place, asked) for place in places]
+        if fit.names:  # without options, segments() refuses the run
+            for writer in writers:
+                writer.check()
+        missing = _missing_labels(fit, source) if baselines else ""
         if baselines:
             check_installed(BASELINES)
-            missing = _missing_labels(fit, source)
-            if missing and not (labels or files):
+            if missing and not writers:
                 raise BadInput(f"--baselines: {missing}; name what to write, such as --html PAGE")
-        if lerobot:
-            segmented = _annotate(fit, source, lerobot, (level, lerobot_format.value), progress)
-        else:
-            segmented = segments(fit, source, progress)
+        segmented = segments(fit, source, progress)
+        segmented = replace(segmented, frequency=fps or segmented.frequency)
         if baselines:
             segmented = beside_baselines(segmented, fit, source, gripper)
-        agreements = level_agreements(segmented) if html or baselines else {}
-        if html:
-            pictures = stored_pictures(source, {demo.name: len(demo) for demo in segmented.segments})
-            follows = list(followed(recorded(segmented, fit, source), pictures, segmented, fit))
-    if baselines:
-        for name, found in agreements.items():
-            console.show(agreement_table(found.scores, f"level {name}: agreement with the label {found.labels}"))
-        if missing:
-            print(f"--baselines: {missing}; no agreement is measured")
-    for path, write in ((csv, write_csv), (parquet, write_parquet)):
-        if path:
-            write(path, segmented)
-            print(path)
-    if html:
-        write_page(html, segmented, str(run), str(demos), agreements, follows)
-        print(html)
-    if labelled:
-        write_labels(demos, labelled, segmented)
-        print(f"{labelled}: labels/{', labels/'.join([*segmented.counts, *segmented.segments[0].baselines])}")
+            for name, found in level_agreements(segmented).items():
+                console.show(agreement_table(found.scores, f"level {name}: agreement with the label {found.labels}"))
+            if missing:
+                print(f"--baselines: {missing}; no agreement is measured")
+        for writer in writers:
+            print(writer.write(segmented))
+
+
+def _writer(place: Output, asked: Asked) -> Writer:
+    (name,) = {form.writer for form in FORMATS if form.option == place.option.replace("--in-place", "--out")}
+    module, _, kind = name.partition(":")
+    try:
+        found = import_module(f"ddco_pyro.segmenting.formats.{module}")
+    except ModuleNotFoundError as error:
+        raise BadInput(f"{place.option} needs {error.name}; install it with: pip install {error.name}") from None
+    made: Writer = getattr(found, kind)(place.option, place.path, asked)
+    return made
 
 
 def _missing_labels(fit: Fit, source: Source) -> str:
@@ -266,34 +335,13 @@ def _missing_labels(fit: Fit, source: Source) -> str:
     return f"the demonstrations have no {', '.join(f'labels/{name}' for name in names)}"
 
 
-def _annotate(fit: Fit, source: Source, out: Path, how: tuple[str | None, str], on_event: OnEvent) -> Segmented:
-    """Segment a LeRobot dataset and write a copy with a level's options as subtasks.
-
-    :param how: the level (None: the lowest) and the format.
-    """
-    from ddco_pyro.segmenting import segments
-
-    if source.format != "lerobot":
-        raise BadInput(f"{source.files[0]}: is no LeRobot dataset; --lerobot annotates a copy of one")
-    from ddco_pyro.data.sources.lerobot import LeRobot
-    from ddco_pyro.segmenting.lerobot import FORMS, annotate, check_target, subtasks
-
-    assert isinstance(source, LeRobot)
-    level, form = how[0], FORMS[how[1]]
-    if level is not None and level not in fit.names:
-        raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(fit.names)})")
-    chosen = level or next(iter(fit.names), "")
-    names = fit.names.get(chosen, ())
-    check_target(source, out, subtasks(chosen, len(names) - 1, names), form)
-    segmented = segments(fit, source, on_event)
-    annotate(source, out, segmented, chosen, form)
-    print(out)
-    return segmented
-
-
 def export(
     run: RunPath,
-    out: Annotated[Path, written(out_folder, "The folder to write.", show_default=False)],
+    out: Annotated[Path | None, written(out_folder, "The folder to write.", show_default=False)] = None,
+    lerobot: Annotated[
+        Path | None,
+        written(out_folder, "The folder of a LeRobot policy, for lerobot_policy_ddco.", show_default=False),
+    ] = None,
     onnx: Annotated[bool, typer.Option("--onnx", help="Write ONNX too (pip install 'ddco-pyro\\[export]').")] = False,
     allow_code: AllowCode = False,
 ) -> None:
@@ -309,8 +357,19 @@ def export(
     from ddco_pyro.exporting import export as write
     from ddco_pyro.fitting.fitted import load
 
-    check_outputs([Output("--out", out, "folder")], [run])
-    exported = write(load(run, allow_code), out, onnx)
+    if not (out or lerobot):
+        raise BadInput("name what to write: --out FOLDER or --lerobot FOLDER")
+    places = {"--out": out, "--lerobot": lerobot}
+    check_outputs([Output(option, path, "folder") for option, path in places.items() if path], [run])
+    fit = load(run, allow_code)
+    if lerobot:
+        from ddco_pyro.exporting.lerobot import export_policy
+
+        export_policy(fit, lerobot)
+        print(f"{lerobot}: use it with: lerobot-eval --policy.path={lerobot} --env.type=...")
+    if out is None:
+        return
+    exported = write(fit, out, onnx)
     for form, (difference, seconds) in exported.items():
         print(f"{form}: largest difference {difference:.1e}, a step takes {1e3 * seconds:.3f} ms")
     form = next(iter(exported))

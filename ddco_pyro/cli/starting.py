@@ -51,7 +51,7 @@ def new(
     _say("fit", spec, "--out", run)
     fits.fit(spec, run, resume=True)
     _say("segment", run, file, "--html", page)
-    runs.segment(run, file, html=page)
+    runs.segment(run=run, demos=file, html=page)
     if show and sys.stdout.isatty() and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         webbrowser.open(page.resolve().as_uri())
 

@@ -13,6 +13,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ddco_pyro.data.files import whole_file
@@ -69,7 +70,8 @@ def blank(height: float) -> Figure:
 def save(figure: Figure, path: Path, alt: str, caption: str = "") -> Picture:
     """Write a figure as PNG; the same figure for a page."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH, metadata={"Description": alt})
+    figure.set_dpi(DOTS_PER_INCH)
+    FigureCanvasAgg(figure).print_png(buffer, metadata={"Description": alt})  # savefig draws twice
     with whole_file(path) as temporary:
         temporary.write_bytes(buffer.getvalue())
     return Picture(data_uri(buffer.getvalue(), "image/png"), alt, caption)

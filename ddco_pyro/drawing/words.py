@@ -354,16 +354,21 @@ def _direction(difference: Difference, held_out: int) -> int:
 
 
 def effort(training: Training) -> str:
-    """The gradient or EM steps of training for tables, marked where training had not converged."""
-    by_em, not_converged = " (EM)" * training.by_em, ", not converged" * (not training.converged)
-    return f"{training.spent.gradient_steps}{by_em}{not_converged}"
+    """The steps of training for tables, with EM or L-BFGS named, marked where training had not converged."""
+    name = _over_all(training)
+    return f"{training.spent.gradient_steps}{f' ({name})' * bool(name)}{', not converged' * (not training.converged)}"
+
+
+def _over_all(training: Training) -> str:
+    """The name of an optimiser whose steps are over all demonstrations."""
+    return "EM" if training.by_em else "L-BFGS" if training.by_lbfgs else ""
 
 
 def spent(training: Training) -> str:
     """Epochs and gradient steps, the budget, and the effort of restarts."""
     took, allowed, beside = training.spent, training.budget, restarts(training)
     of = "" if allowed.epochs is None else f" of at most {allowed.epochs} ({allowed.gradient_steps})"
-    steps = "EM" if training.by_em else "gradient"
+    steps = _over_all(training) or "gradient"
     return f"{took.epochs} epochs ({took.gradient_steps} {steps} steps){of}{'; ' * bool(beside)}{beside}"
 
 

@@ -17,7 +17,8 @@ from ddco_pyro.model.networks import Inputs, InputShape
 from ddco_pyro.model.networks.conv import SHARPNESS, Conv
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import ConvolutionLayer
-from ddco_pyro.training.checkpoint import copy_of, optimizer_state, restore_optimizer
+from ddco_pyro.training.checkpoint import copy_of
+from ddco_pyro.training.optimizers import optimizer_state, restore_optimizer
 
 _KEY = "picture"
 _FIRST = ConvolutionLayer(filters=16, kernel=5, stride=2, padding=2)

@@ -41,9 +41,9 @@ from ddco_pyro.training.data import dimensions, known_demonstrations, parts, ref
 from ddco_pyro.training.devices import device_of, repeatable
 from ddco_pyro.training.labels import used
 from ddco_pyro.training.launching import check_processes, together
-from ddco_pyro.training.loop import uses_em
 from ddco_pyro.training.networks import Dimensions, check_models, model_name, parameters
-from ddco_pyro.training.processes import ALONE, Ranks, check_jobs, pool, results, useful_jobs
+from ddco_pyro.training.optimizers import optimizer_of
+from ddco_pyro.training.processes import ALONE, Ranks, check_jobs, end_with, pool, results, useful_jobs
 from ddco_pyro.training.restarts import train_model
 
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
@@ -274,7 +274,7 @@ DEAD = (
 
 
 def _worth_a_process(spec: Spec, networks: Hierarchy, demos: Demonstrations) -> bool:
-    """Whether training takes long (it is not by EM), on a CPU and on demonstrations that are small and in memory.
+    """Whether training takes many steps on minibatches, on a CPU and on demonstrations that are small and in memory.
 
     Several restarts share the processes among themselves instead.
     """
@@ -282,7 +282,9 @@ def _worth_a_process(spec: Spec, networks: Hierarchy, demos: Demonstrations) -> 
     steps = math.inf if own.epochs is None else own.epochs * math.ceil(len(demos) / own.batch_size)
     sizes = [array.nbytes if isinstance(array, np.ndarray) else math.inf for array in arrays]
     alone = own.restarts == 1 and device_of(own).type == "cpu"
-    return alone and sum(sizes) < LITTLE and steps >= LONG and not uses_em(own.optimizer, networks)
+    return (
+        alone and sum(sizes) < LITTLE and steps >= LONG and optimizer_of(own.optimizer, networks) not in ("em", "lbfgs")
+    )
 
 
 @contextmanager
@@ -318,13 +320,12 @@ def _in_other_processes(
 def _with_events(name: str, fit: Callable[[OnEvent], Fit], parent: int) -> tuple[str, Fit, list[Event]]:
     """A baseline's name, its fit without demonstrations, and its events, in another process.
 
-    :param parent: the process that waits. Where it is gone, this one ends: another command may go on in the folder.
+    :param parent: the process that waits.
     """
     events: list[Event] = []
 
     def tell(event: Event) -> None:
-        if os.getppid() != parent:
-            os._exit(1)
+        end_with(parent)
         events.append(event)
 
     return name, replace(fit(tell), given=None), events

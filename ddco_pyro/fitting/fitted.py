@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.acting.monitor import Monitor
+from ddco_pyro.acting.monitor import Monitor, run_lengths
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing.words import choice_names
 from ddco_pyro.errors import BadInput
@@ -215,9 +215,15 @@ class Fit:
         """The model as a policy that acts, as the spec's ``rollout`` says."""
         return Controller.from_spec(self.hierarchy, self.spec.rollout, seed, self.names)
 
-    def monitor(self) -> Monitor:
-        """A live monitor of the active options while another policy, or a person, acts."""
-        return Monitor(self.hierarchy, self.names)
+    def monitor(self, demos: Iterable[Demonstration] = ()) -> Monitor:
+        """A live monitor of the active options while another policy, or a person, acts.
+
+        :param demos: demonstrations that tell :meth:`Monitor.progress` how long options last.
+        """
+        demos = list(demos)
+        segments = zip(self.names.items(), self.segment(demos) if demos else (), strict=False)
+        lengths = {level: run_lengths(choices, len(names) - 1) for (level, names), choices in segments}
+        return Monitor(self.hierarchy, self.names, lengths)
 
 
 def _stacked(parts: Sequence[Tensor], padding: float) -> Tensor:

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.sources.recording import LABEL_NAMES
 from ddco_pyro.data.tensors import digest_of
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.fitting.names import LABEL_NAMES, label_names
+from ddco_pyro.fitting.names import label_names
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.spec.base import nearest
 from ddco_pyro.training.checkpoint import copy_of

@@ -12,6 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.hdf5 import DemonstrationsError
+from ddco_pyro.data.sources.recording import LABEL_NAMES
 from ddco_pyro.drawing.words import choice_names
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import confusion
@@ -20,9 +21,6 @@ from ddco_pyro.spec import Spec
 from ddco_pyro.spec.yaml import dump_yaml, read_yaml
 
 FILE = "names.yaml"
-
-LABEL_NAMES = "label_names"
-"""Attribute of a file of demonstrations: JSON, the names of labels 0, 1, ... for each name of labels."""
 
 Named = dict[str, tuple[str, ...]]
 """The names of options 1 to k, by level."""

@@ -24,12 +24,14 @@ def log_sum(values: Tensor) -> Tensor:
 
 def log_likelihood(chain: Chain) -> Tensor:
     """log p(ξ) of each trajectory, [N], differentiable in the chain's tables."""
+    if not chain.selection and chain.emission is not None:
+        return chain.emission.sum(1)  # nothing is latent
     message: Tensor | None = None
     for now in chain.steps():
         assert now.emission is not None  # nothing else can be scored
         message = arrive(message, now).message + now.emission
     assert message is not None  # there is a step
-    return log_sum(message.flatten(1)) if chain.selection else message
+    return log_sum(message.flatten(1))
 
 
 class Arrival(NamedTuple):

@@ -60,8 +60,16 @@ def draw(activity: Activity, positions: Sequence[np.ndarray], key: str) -> Figur
 def panel(axes: Axes3D, level: LevelActivity, positions: Sequence[np.ndarray], key: str, turn: float = 0.0) -> None:
     """One level over the positions [T_n, 3], of at most :data:`MOST_TRAJECTORIES` demonstrations."""
     chosen = np.unique(np.linspace(0, len(positions) - 1, min(len(positions), MOST_TRAJECTORIES)).round().astype(int))
+    lines, colours = [], []
     for row in chosen:
-        _trajectory(axes, positions[row], level.path[row])
+        steps = np.arange(0, len(positions[row]), -(-len(positions[row]) // MOST_POINTS))
+        points = positions[row][steps]
+        lines.append(np.stack([points[:-1], points[1:]], axis=1))
+        colours += [to_rgba(option_colour(int(choice))) for choice in level.path[row][steps[:-1]]]
+    if colours:
+        axes.add_collection3d(Line3DCollection(np.concatenate(lines), colors=colours, linewidths=1.3))
+    first = np.stack([positions[row][0] for row in chosen])
+    axes.scatter(*first.T, color="white", edgecolor=INK, s=12, linewidth=0.7, depthshade=False)
     _frame(axes, np.concatenate([positions[row] for row in chosen]), key, turn)
 
 
@@ -70,17 +78,6 @@ def _places(count: int, height: float) -> list[tuple[float, float, float, float]
     rows = -(-count // 2)
     bottom, each = 0.55 / height, (1 - 0.55 / height) / rows
     return [(0.5 * (n % 2), bottom + (rows - 1 - n // 2) * each, 0.5, 0.93 * each) for n in range(count)]
-
-
-def _trajectory(axes: Axes3D, positions: np.ndarray, path: np.ndarray) -> None:
-    steps = np.arange(0, len(positions), -(-len(positions) // MOST_POINTS))
-    points = positions[steps]
-    colours = [to_rgba(option_colour(int(choice))) for choice in path[steps]]
-    if len(points) > 1:
-        axes.add_collection3d(
-            Line3DCollection(np.stack([points[:-1], points[1:]], axis=1), colors=colours, linewidths=1.3)
-        )
-    axes.scatter(*points[0], color="white", edgecolor=INK, s=12, linewidth=0.7, depthshade=False)
 
 
 def _frame(axes: Axes3D, points: np.ndarray, key: str, turn: float) -> None:

@@ -25,8 +25,9 @@ class OptimizerSpec(Model):
 
     name: Literal["adam", "adamw", "momentum", "em"] = "adam"
     """``adam``, ``adamw``, ``momentum`` for gradient descent with momentum, or ``em``: expectation-maximisation where
-    every network of a model is linear, ``adam`` for other models. A spec whose networks are all linear, and that gives
-    no other setting of gradient steps, has ``em`` if it names none."""
+    every network of a model is linear, L-BFGS for perceptrons without dropout in a policy without options, ``adam`` for
+    other models. A spec whose networks are all linear, and that gives no other setting of gradient steps, has ``em`` if
+    it names none."""
     ridge: RidgeSpec = RidgeSpec()
     """Ridges (``em`` only)."""
     lr: Positive = 1e-3

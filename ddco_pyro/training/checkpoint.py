@@ -136,10 +136,12 @@ class Restart:
     progress: Progress
     states: dict[str, State] = field(default_factory=dict)
 
-    def write(self, path: Path) -> None:
-        """Write a checkpoint, whole or not at all."""
-        tensors = {f"{part}/{name}": value for part, state in self.states.items() for name, value in state.items()}
-        write_tensors(path, tensors, {"progress": json.dumps(asdict(self.progress))})
+    def written(self, path: Path | None) -> Restart:
+        """This restart, written as a checkpoint where there is a path: whole or not at all."""
+        if path is not None:
+            tensors = {f"{part}/{name}": value for part, state in self.states.items() for name, value in state.items()}
+            write_tensors(path, tensors, {"progress": json.dumps(asdict(self.progress))})
+        return self
 
     @classmethod
     def read(cls, path: Path) -> Restart:
@@ -158,23 +160,3 @@ class Restart:
 def copy_of(model: nn.Module) -> State:
     """A copy of a model's tensors, on the host."""
     return {name: value.detach().cpu().clone() for name, value in model.state_dict().items()}
-
-
-def optimizer_state(optimizer: torch.optim.Optimizer) -> State:
-    """A copy of the optimiser's tensors by ``<parameter>.<name>``, on the host."""
-    state = optimizer.state_dict()["state"]
-    return {
-        f"{index}.{name}": torch.as_tensor(value).cpu().clone()
-        for index, values in state.items()
-        for name, value in values.items()
-        if value is not None
-    }
-
-
-def restore_optimizer(optimizer: torch.optim.Optimizer, state: State) -> None:
-    """Give an optimiser the tensors of :func:`optimizer_state`."""
-    nested: dict[int, State] = {}
-    for key, value in state.items():
-        index, _, name = key.partition(".")
-        nested.setdefault(int(index), {})[name] = value
-    optimizer.load_state_dict({**optimizer.state_dict(), "state": nested})

@@ -18,8 +18,8 @@ from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.simulation.collect import cache_path, collect
 from ddco_pyro.simulation.task import find_task
 from ddco_pyro.spec import Spec
-from ddco_pyro.training.em import uses_em
 from ddco_pyro.training.networks import Dimensions, check_networks
+from ddco_pyro.training.optimizers import optimizer_of
 
 
 def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
@@ -74,7 +74,7 @@ def tuning_split(spec: Spec, dimensions: Dimensions, train: Demonstrations) -> t
     With ``training.tune_fraction: 0`` both are all of them where EM trains the model, which needs no early stopping.
     """
     fraction = spec.training.tune_fraction
-    if fraction == 0 and uses_em(spec.training.optimizer, check_networks(spec, dimensions)):
+    if fraction == 0 and optimizer_of(spec.training.optimizer, check_networks(spec, dimensions)) == "em":
         return train, train
     return train.split(fraction, spec.seed)
 
@@ -88,7 +88,8 @@ def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:
         observed = demos[0].observations[key]
         if problem := problem_of_pictures(observed.shape[1:], observed.dtype):
             raise DemonstrationsError(f"obs/{key} {problem}")
-    if spec.training.tune_fraction > 0 or spec.training.optimizer.name != "em":  # or one is enough
+    own = spec.training
+    if own.tune_fraction > 0 or own.optimizer.name != "em" or spec.compare_with:  # or one is enough
         check_trained(parts(spec, demos)["train"].names)
 
 

@@ -28,7 +28,7 @@ from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.perceptrons import Mlp, StackedLinear
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import Tables
-from ddco_pyro.spec import OptimizerSpec, RidgeSpec
+from ddco_pyro.spec import RidgeSpec
 
 LARGEST = 3.0
 """The most that a weight of a logit changes in a step: Fisher scoring overshoots where a logistic curve is flat."""
@@ -55,11 +55,6 @@ def is_linear(model: Hierarchy) -> bool:
     )
 
 
-def uses_em(spec: OptimizerSpec, model: Hierarchy) -> bool:
-    """Whether a model is trained by EM: where the spec asks for it, and every network is linear."""
-    return spec.name == "em" and is_linear(model)
-
-
 @dataclass(frozen=True)
 class Information:
     """The information that the posterior expects of some outputs of a network.
@@ -84,21 +79,18 @@ class Sums:
     gradient: Tensor | float = 0.0
     groups: list[Information] = field(default_factory=list)
     information: list[Tensor] = field(default_factory=list)
-    count: list[Tensor] = field(default_factory=list)
     std: Tensor | float = 0.0
 
     def add(self, x: Tensor, gradient: Tensor, groups: Sequence[Information], std: Tensor | None) -> None:
         """Add those of a piece: features x [N, T, F] and gradients of outputs [N, T, K, n]."""
-        rows = x.flatten(0, 1)
-        self.gradient = self.gradient + torch.einsum("mf,mkn->kfn", rows, gradient.flatten(0, 1))
+        rows, copies = x.flatten(0, 1), gradient.shape[2]
+        own = rows.T @ gradient.flatten(2).flatten(0, 1)
+        self.gradient = self.gradient + own.unflatten(1, (copies, -1)).transpose(0, 1)
         self.std = self.std + (0.0 if std is None else std)
         found = [_information(rows, group) for group in groups]
-        counts = [group.weight.flatten(0, 1).sum(0) for group in groups]
-        if not self.groups:
-            self.groups, self.information, self.count = list(groups), found, counts
-        else:
-            self.information = [one + more for one, more in zip(self.information, found, strict=True)]
-            self.count = [one + more for one, more in zip(self.count, counts, strict=True)]
+        if self.groups:
+            found = [one + more for one, more in zip(self.information, found, strict=True)]
+        self.groups, self.information = list(groups), found
 
 
 def _information(rows: Tensor, group: Information) -> Tensor:
@@ -215,6 +207,7 @@ class Expectation:
             if caller.std is not None
         }
         self._before: dict[str, Tensor] | None = None
+        self._pieces: list[tuple[Tensor, Batch, dict[tuple[str, ...], Tensor]]] = []
         self.value, self.gain = -math.inf, math.inf
 
     def converged(self, roughly: bool = False) -> bool:
@@ -238,6 +231,7 @@ class Expectation:
     def step(self, batch: Batch) -> float:
         """One EM step over all demonstrations; their log-likelihood before the step, nats.
 
+        All steps are over the same demonstrations, whose features are kept.
         Where the last step lowered the penalised log-likelihood, that step is halved first.
         """
         value, sums = self._expect(batch)
@@ -297,13 +291,15 @@ class Expectation:
     def _expect(self, batch: Batch) -> tuple[float, dict[str, Sums]]:
         """The E-step: the score, and the sums that the M-step solves for each network that is trained."""
         total, sums = 0.0, {name: Sums() for name, network in self._networks.items() if network.trained}
-        for rows, piece in batch.pieces(self.model.steps_at_once):
-            total += self._expect_piece(rows, piece, sums)
+        self._pieces = self._pieces or [(*piece, {}) for piece in batch.pieces(self.model.steps_at_once)]
+        for piece in self._pieces:
+            total += self._expect_piece(*piece, sums)
         return total, sums
 
-    def _expect_piece(self, rows: Tensor, piece: Batch, sums: dict[str, Sums]) -> float:
+    def _expect_piece(
+        self, rows: Tensor, piece: Batch, xs: dict[tuple[str, ...], Tensor], sums: dict[str, Sums]
+    ) -> float:
         levels = self.model.option_levels()[: self._discovering]
-        xs: dict[tuple[str, ...], Tensor] = {}
         said: dict[str, Tensor] = {}
         for name, network in self._networks.items():
             if network.reads not in xs:
@@ -331,16 +327,15 @@ class Expectation:
         chosen, ended, acted = (tuple(next(gradients) for _ in range(size)) for size in (depth, depth, depth + 1))
         every = [*(f"{name}.policy" for name in named), *([] if self._discovering else ["meta_policy"])]
         choosing = [name for name in every if callers[name].options]
-        selection = dict(zip(choosing, zip(tables.selection, chosen, strict=True), strict=False))
+        selection = dict(zip(choosing, chosen, strict=False))
         for place, name in enumerate(every):
             if name not in sums or of[name] is None:
                 continue
             caller, groups = self._callers[name], list[Information]()
-            table, choices = selection.get(name, (None, None))
-            if caller.sizes[0] and table is not None and choices is not None:
-                extra = choices.shape[-1] - caller.sizes[0]
-                probabilities = table.detach().exp()[..., extra:]
-                groups.append(Information(slice(0, caller.sizes[0]), choices.sum(-1).double(), probabilities))
+            choices, columns = selection.get(name), slice(0, caller.sizes[0])
+            if caller.sizes[0] and choices is not None:
+                probabilities = said[name].detach()[..., columns].softmax(-1)
+                groups.append(Information(columns, choices.sum(-1).double(), probabilities))
             acting = acted[place]
             if caller.std is not None and acting is not None:
                 emitted = _emitted(
@@ -367,7 +362,7 @@ class Expectation:
             change = torch.zeros_like(network.weight)
             std = self._stds.get(name)
             value = None if std is None else std.value
-            for group, information, count in zip(own.groups, own.information, own.count, strict=True):
+            for group, information in zip(own.groups, own.information, strict=True):
                 columns = group.columns
                 gradient, weight = own.gradient[..., columns], network.weight[..., columns]
                 if group.std:
@@ -377,7 +372,8 @@ class Expectation:
                     solved = torch.linalg.solve(
                         information + torch.diag_embed(ridge), scale.square() * gradient - ridge.unsqueeze(-1) * weight
                     )
-                    square = self._squares(std, own.std, group, information, count, gradient, weight, solved)
+                    count = information[:, -1, -1]  # of the bias
+                    square = self._squares(std, own.std, group, information, gradient, weight, solved)
                     value = _merged(value, std.updated(square, count + self._prior_count(weight), group.std), group.std)
                 else:
                     solved = _damped(information, gradient, weight, network.ridge)
@@ -387,15 +383,15 @@ class Expectation:
                 std.value = value
 
     def _squares(
-        self, std: Std, of_std: Tensor | float, group: Information, information: Tensor, count: Tensor,
-        gradient: Tensor, weight: Tensor, change: Tensor,
+        self, std: Std, of_std: Tensor | float, group: Information, information: Tensor, gradient: Tensor,
+        weight: Tensor, change: Tensor,
     ) -> Tensor:  # fmt: skip
         """Σ w E[(a - W'^T x)²] + Σ_f ρ_f W'_f² of each copy and dimension, [K, n], from the gradient in σ (Fisher's
         identity).
         """
         assert isinstance(of_std, Tensor)
         sigma = std.value[:, list(group.std)]
-        before = sigma.square() * (count.unsqueeze(-1) + sigma * of_std[:, list(group.std)])
+        before = sigma.square() * (information[:, -1, -1:] + sigma * of_std[:, list(group.std)])
         moved = (change * (information @ change)).sum(1) - 2 * sigma.square() * (change * gradient).sum(1)
         return before + moved + _penalties(weight + change, self._ridge.policy)
 

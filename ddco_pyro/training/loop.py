@@ -11,10 +11,9 @@ compute them changes no bit either.
 
 from __future__ import annotations
 
-import inspect
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -31,11 +30,18 @@ from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seed, seeded
 from ddco_pyro.model.tables import Tables
-from ddco_pyro.spec import OptimizerSpec
-from ddco_pyro.training.checkpoint import Restart, State, TrainingData, copy_of, optimizer_state, restore_optimizer
+from ddco_pyro.training.checkpoint import Restart, State, TrainingData, copy_of
 from ddco_pyro.training.devices import device_of, repeatable
-from ddco_pyro.training.em import Expectation, uses_em
+from ddco_pyro.training.em import Expectation
 from ddco_pyro.training.objective import Diverged, Objective, read_ahead
+from ddco_pyro.training.optimizers import (
+    QuasiNewton,
+    gradient_optimizer,
+    learning_rate,
+    optimizer_of,
+    optimizer_state,
+    restore_optimizer,
+)
 from ddco_pyro.training.processes import ALONE, Ranks
 from ddco_pyro.training.stages import Stage, StageEnd, plan, share
 
@@ -59,8 +65,9 @@ def train(
 
     :param until: epochs of the last stage after which training pauses; None to train until patience or budget end it.
     :param seconds: training also pauses after about this time, at the end of an epoch.
-    :param checkpoint: the file that the restart is written to at the end of epochs.
-    :param ranks: the processes that train this restart together, none of them with a limit of ``seconds``.
+    :param checkpoint: the file that the restart is written to at the end of epochs and of the training.
+    :param ranks: the processes that train this restart together, none of them with a limit of ``seconds``; the first
+        writes the file.
     """
     now, states, spec = restart.progress, restart.states, data.spec.training
     device, deadline, saved = device_of(spec), time.monotonic() + seconds, -math.inf
@@ -77,18 +84,18 @@ def train(
                     overdue = now.epoch > begun and time.monotonic() > deadline
                     if overdue or (last and until is not None and now.epoch >= until):
                         states |= stage.states()
-                        return restart
+                        return restart.written(checkpoint)
                     on_event(stage.epoch(cap))
-                    if checkpoint is not None and time.monotonic() - saved > SAVE_EVERY:
+                    if checkpoint and time.monotonic() - saved > SAVE_EVERY:
                         states |= stage.states()
-                        restart.write(checkpoint)
+                        restart.written(checkpoint)
                         saved = time.monotonic()
                 stage.end(cap)
                 now.stage, now.epoch, now.done = (now.stage, now.epoch, True) if last else (now.stage + 1, 0, False)
             restart.states = {"best": states["best"]}
         except Diverged as error:
             now.done, now.diverged, now.best, restart.states = True, str(error), -math.inf, {}
-    return restart
+    return restart.written(checkpoint)
 
 
 class StageTraining:
@@ -98,6 +105,7 @@ class StageTraining:
     before the last stage goes on until it converges instead, since a stage is a start for the next one.
 
     :param last: whether it is the last stage of the restart.
+    :ivar whole: steps over all demonstrations at once; None for gradient steps on minibatches.
     :ivar kept: the model that is evaluated and kept: the exponential running mean of the weights over gradient steps
         (Polyak and Juditsky 1992) where ``training.average`` asks for it, the trained model otherwise.
     """
@@ -111,16 +119,19 @@ class StageTraining:
             model.begin_terminations()
         self.objective = Objective(data, now, stage, ranks, restart.states if now.epoch else None)
         self.parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
-        self.em: Expectation | None = None
-        if uses_em(self.spec.optimizer, model):
-            self.em = Expectation(model, stage.trained, self._score, self.spec.optimizer.ridge, stage.discovering)
+        self.whole: Expectation | QuasiNewton | None = None
+        optimizer = optimizer_of(self.spec.optimizer, model)
+        if optimizer == "em":
+            self.whole = Expectation(model, stage.trained, self._score, self.spec.optimizer.ridge, stage.discovering)
+        elif optimizer == "lbfgs":
+            self.whole = QuasiNewton(model, self._backward_whole, self.spec.optimizer.weight_decay)
         else:
-            self.optimizer = _optimizer(self.spec.optimizer, self.parameters)
+            self.optimizer = gradient_optimizer(optimizer, self.spec.optimizer, self.parameters)
         decay = self.spec.average
         self.mean = None if decay is None else AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(decay))
         if now.epoch > 0:
-            if self.em is not None:
-                self.em.load_states(restart.states["em"])
+            if self.whole is not None:
+                self.whole.load_states(restart.states["whole"])
             else:
                 restore_optimizer(self.optimizer, restart.states["optimizer"])
             if self.mean is not None:
@@ -134,15 +145,19 @@ class StageTraining:
 
     @property
     def converged(self) -> bool:
-        """Whether patience has run out, or EM gains nothing more."""
+        """Whether patience has run out, or a step over all demonstrations gains nothing more."""
         patience = self.spec.patience if self._tuned else None
         out = patience is not None and self.restart.progress.stale >= patience
-        return out or (self.em is not None and self.em.converged(roughly=not self.last))
+        return out or self._at_optimum
+
+    @property
+    def _at_optimum(self) -> bool:
+        return self.whole is not None and self.whole.converged(roughly=not self.last)
 
     @property
     def _tuned(self) -> bool:
         """Whether tuning demonstrations end the stage and choose its epoch."""
-        return self.em is None or self.last
+        return self.whole is None or self.last
 
     @property
     def kept(self) -> Hierarchy:
@@ -159,8 +174,8 @@ class StageTraining:
         """
         now, train = self.restart.progress, self.data.train
         place = now.restart, now.stage, now.epoch
-        if self.em is not None:
-            total = self.em.step(train) / self.objective.likelihoods
+        if self.whole is not None:
+            total = self.whole.step(train) / self.objective.likelihoods
         else:
             for group in self.optimizer.param_groups:
                 group["lr"] = learning_rate(self.spec.optimizer, now.epoch, cap)
@@ -178,6 +193,9 @@ class StageTraining:
 
     def _score(self, tables: Tables, piece: Batch, rows: Tensor) -> Tensor:
         return self.objective.values(self.objective.clamped(tables, rows), piece.lengths).sum()
+
+    def _backward_whole(self, model: Hierarchy, batch: Batch) -> float:
+        return backward(self.objective, model, batch, torch.arange(len(batch)))
 
     def _gradient_steps(self, place: tuple[int, int, int]) -> float:
         """A gradient step on each minibatch; the log-likelihood on the way, nats.
@@ -251,8 +269,8 @@ class StageTraining:
     def states(self) -> dict[str, State]:
         """What a checkpoint keeps of the stage, beside the best epoch and the objective."""
         average = {} if self.mean is None else {"average": copy_of(self.mean)}
-        if self.em is not None:
-            return {"model": copy_of(self.model), "em": self.em.states(), **average}
+        if self.whole is not None:
+            return {"model": copy_of(self.model), "whole": self.whole.states(), **average}
         return {"model": copy_of(self.model), "optimizer": optimizer_state(self.optimizer), **average}
 
     def end(self, cap: int | None) -> None:
@@ -260,8 +278,8 @@ class StageTraining:
         now = self.restart.progress
         self.model.load_state_dict(self.restart.states["best"])
         end = StageEnd.of(self.stage.name, cap, now.tune, self.spec.patience)
-        if self.em is not None and self.em.converged(roughly=not self.last):
-            end = replace(end, rising=0.0)  # at an optimum of the penalised likelihood
+        if self._at_optimum:
+            end = replace(end, rising=0.0)
         now.ended.append(asdict(end))
 
 
@@ -284,32 +302,6 @@ def backward(objective: Objective, model: Hierarchy, batch: Batch, rows: Tensor,
         (-value / (steps or batch.steps)).backward()  # posteriors weight the networks' gradients
         total += float(value.detach())
     return total / objective.likelihoods
-
-
-def learning_rate(spec: OptimizerSpec, epoch: int, cap: int | None) -> float:
-    """The learning rate of a stage's epoch, counted from 0.
-
-    :param cap: the epochs that the stage may take.
-    """
-    rate = spec.lr * min(1.0, (epoch + 1) / (spec.warmup + 1))
-    if spec.schedule == "constant":
-        return rate
-    assert cap is not None  # a spec with this schedule has a budget
-    return rate * 0.5 * (1 + math.cos(math.pi * epoch / cap))
-
-
-def _optimizer(spec: OptimizerSpec, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
-    common = {"params": parameters, "lr": spec.lr, "weight_decay": spec.weight_decay}
-    if spec.name == "momentum":
-        return _uncompiled(torch.optim.SGD)(**common, momentum=spec.momentum)
-    return _uncompiled(torch.optim.AdamW if spec.name == "adamw" else torch.optim.Adam)(**common)
-
-
-def _uncompiled(kind: type[torch.optim.Optimizer]) -> Callable[..., torch.optim.Optimizer]:
-    """The same optimiser without the decorators that import torch's compiler, which takes seconds."""
-    names = ("add_param_group", "load_state_dict", "state_dict", "zero_grad")
-    plain = {name: inspect.unwrap(getattr(kind, name)) for name in names}
-    return type(kind.__name__, (kind,), {**plain, "step": torch.no_grad()(inspect.unwrap(kind.step))})
 
 
 def _sum(before: np.ndarray | None, gradient: np.ndarray | None) -> np.ndarray | None:

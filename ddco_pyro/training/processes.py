@@ -6,6 +6,7 @@ whichever rank computed them.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -65,6 +66,12 @@ def results(parallel: Parallel, calls: Iterable[Callable[[], Result]], dead: str
             raise Failed(dead) from error
 
     return completed()
+
+
+def end_with(parent: int) -> None:
+    """End this process where the process that waits for it is gone: another command may go on in the same folder."""
+    if os.getppid() != parent:
+        os._exit(1)
 
 
 class LostProcess(Failed):

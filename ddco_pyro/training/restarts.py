@@ -10,6 +10,8 @@ changes the result.
 from __future__ import annotations
 
 import math
+import os
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -18,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
@@ -41,16 +42,16 @@ from ddco_pyro.spec import Spec
 from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData
 from ddco_pyro.training.data import tuning_split
 from ddco_pyro.training.devices import described, device_of
-from ddco_pyro.training.em import uses_em
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
-from ddco_pyro.training.processes import ALONE, Ranks, pool, results, useful_jobs
+from ddco_pyro.training.optimizers import optimizer_of
+from ddco_pyro.training.processes import ALONE, Ranks, end_with, pool, results, useful_jobs
 from ddco_pyro.training.stages import StageEnd, plan
 
-SLICE = 10.0
-"""Seconds that a job trains a restart before it returns, so that progress is shown and a checkpoint written."""
+SHORT = 10.0
+"""Seconds of training here before other processes start, which takes seconds itself."""
 
 DEAD = (
     "a process that trained a restart was ended from outside (too little memory?); what was trained is kept in a run "
@@ -105,8 +106,8 @@ class Trainer:
         them: of the training demonstrations, at the lowest level.
 
     :param checkpoints: the folder for a checkpoint of each restart; None for nowhere.
-    :param jobs: processes that train restarts side by side; -1 is one for each core. The result is the same for any
-        number.
+    :param jobs: processes that train restarts side by side, each a whole one; -1 is one for each core. The result is
+        the same for any number.
     :param ranks: processes that train each restart together instead, of which this is the first (:func:`follow`).
     :raises DemonstrationsError: a number is too large for networks.
     :raises SpecError: the demonstrations lack the labels that the spec names, or have more labels than options.
@@ -189,6 +190,8 @@ class Trainer:
             self.ranks.share(None)  # no further model
             raise TrainingError(why)
         if len(self.restarts) > 1 and self.hierarchy.depth:
+            from sklearn.metrics import normalized_mutual_info_score
+
             found = {n: self._segments(n) for n, restart in enumerate(self.restarts) if "best" in restart.states}
             own = found.pop(self.best)
             self.agreement = {n: float(normalized_mutual_info_score(own, other)) for n, other in found.items()}
@@ -210,8 +213,9 @@ class Trainer:
     @property
     def summary(self) -> dict[str, Any]:
         """``training`` of ``metrics.json``: the budget, the best restart's stages, and the epochs of all restarts."""
-        by_em = uses_em(self.spec.training.optimizer, self.hierarchy)
-        best, updates = self.best, 1 if by_em else math.ceil(len(self.data.train) / self.spec.training.batch_size)
+        optimizer = optimizer_of(self.spec.training.optimizer, self.hierarchy)
+        whole = optimizer in ("em", "lbfgs")
+        best, updates = self.best, 1 if whole else math.ceil(len(self.data.train) / self.spec.training.batch_size)
         ends = [StageEnd(**end) for end in self.restarts[best].progress.ended]
         each = [
             {
@@ -234,7 +238,8 @@ class Trainer:
             "converged": ends[-1].converged,  # the last stage trains what acts in the end
             "restarts": {"best": best, "spent": effort(len(self.history)), "each": each},
             "device": self.restarts[best].progress.device,
-            "by_em": by_em,
+            "by_em": optimizer == "em",
+            "by_lbfgs": optimizer == "lbfgs",
         }
 
     def _segments(self, number: int) -> np.ndarray:
@@ -291,45 +296,44 @@ class Trainer:
                     self.on_event(RestartStopped(number, progress.epoch))
 
     def _train(self, numbers: Sequence[int], until: int | None) -> None:
-        """Train restarts until so many epochs of the last stage, None for to the end; jobs train slice after slice.
+        """Train restarts until so many epochs of the last stage, None for to the end; jobs share what takes long.
 
         :raises OtherDevice: a restart was begun on another kind of device; nothing is trained then.
         """
         left = [number for number in numbers if not self.restarts[number].progress.done]
         for number in left:
             self._refuse_other_device(self.restarts[number].progress, until)
-        if self.jobs == 1 or len(left) < 2:
-            for number in left:
-                self.ranks.share((self.restarts[number], until))
-                self._keep(
-                    train(
-                        self.data,
-                        self.restarts[number],
-                        until,
-                        checkpoint=self._path(number),
-                        on_event=self.on_event,
-                        ranks=self.ranks,
-                    )
-                )
+        deadline = time.monotonic() + (math.inf if self.jobs == 1 else SHORT)
+        while left and (len(left) == 1 or time.monotonic() < deadline):
+            own, seconds = self.restarts[left[0]], math.inf if len(left) == 1 else deadline - time.monotonic()
+            self.ranks.share((own, until))
+            self._keep(train(self.data, own, until, seconds, self._path(left[0]), self.on_event, self.ranks))
+            if seconds == math.inf or time.monotonic() < deadline:  # or it has paused
+                del left[0]
+        if not left:
             return
-        with pool(self.jobs) as parallel:
-            while left:
-                calls = [partial(train, self.data, self.restarts[number], until, SLICE) for number in left]
-                for restart in results(parallel, calls, DEAD):
-                    before = self.restarts[restart.progress.restart].progress
-                    self._keep(restart)
-                    for row in restart.progress.history[len(before.history) :]:
-                        self.on_event(EpochEnded(**row))
-                left = [n for n in left if not self.restarts[n].progress.reached(self._last(n), until)]
+        with pool(min(self.jobs, len(left))) as parallel:
+            calls = [
+                partial(_train_apart, self.data, self.restarts[n], until, self._path(n), os.getpid()) for n in left
+            ]
+            for restart in results(parallel, calls, DEAD):
+                before = self.restarts[restart.progress.restart].progress
+                self._keep(restart)
+                for row in restart.progress.history[len(before.history) :]:
+                    self.on_event(EpochEnded(**row))
 
     def _keep(self, restart: Restart) -> None:
         number, why = restart.progress.restart, restart.progress.diverged
         self.restarts[number] = restart
-        path = self._path(number)
-        if path is not None:
-            restart.write(path)
         if why is not None and len(self.restarts) > 1:
             self.on_event(RestartDiverged(number, why))
+
+
+def _train_apart(
+    data: TrainingData, restart: Restart, until: int | None, checkpoint: Path | None, parent: int
+) -> Restart:
+    """Train a restart in a process of its own, which ends with the process that waits for it."""
+    return train(data, restart, until, math.inf, checkpoint, lambda event: end_with(parent))
 
 
 def follow(ranks: Ranks) -> None:

@@ -18,6 +18,7 @@ TRAINING = {
     },
     "device": "cpu",
     "by_em": False,
+    "by_lbfgs": False,
 }
 
 

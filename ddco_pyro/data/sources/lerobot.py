@@ -20,7 +20,7 @@ import numpy as np
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.sources.metadata import check_keys, check_links, filled, first_missing, inside
-from ddco_pyro.data.sources.recording import Column, Format, Recording, damaged, of_array
+from ddco_pyro.data.sources.recording import LABEL_NAMES, Column, Format, Recording, damaged, of_array
 from ddco_pyro.data.sources.video import video_column
 
 try:
@@ -39,6 +39,7 @@ _CONVERT = (
 )
 OBSERVATION = "observation."
 SUBTASK = "subtask_index"
+ANNOTATIONS = Path("meta") / "lerobot_annotations.json"
 IMAGES_AT_ONCE = 32
 _LONGEST = 1e9
 """Longest video, seconds."""
@@ -49,7 +50,8 @@ class LeRobot:
     """A dataset's folder: ``meta/info.json``, ``meta/episodes``, ``data`` and ``videos``.
 
     ``observation.images.top`` becomes ``obs/images/top``, ``action`` becomes ``actions``, and ``subtask_index`` becomes
-    ``labels/subtask``.
+    ``labels/subtask``. Without that column, the subtasks in ``meta/lerobot_annotations.json`` do: they are numbered in
+    the order in which they first occur, and -1 marks steps before the first one.
     """
 
     format: Format = "lerobot"
@@ -74,12 +76,34 @@ class LeRobot:
         self.frequency = float(fps) if isinstance(fps, int | float) and 0 < fps < math.inf else None
         self.masks = self._masks()
         robot = self.info.get("robot_type")
-        self.attributes: Mapping[str, Attribute] = {"robot_type": robot} if isinstance(robot, str) else {}
+        self._subtasks, subtasks = self._annotations() if SUBTASK not in self.features else ({}, [])
+        named = {LABEL_NAMES: json.dumps({"subtask": subtasks})} if subtasks else {}
+        about = {"robot_type": robot} if isinstance(robot, str) else {}
+        self.attributes: Mapping[str, Attribute] = {**about, **named}
         self.data_files = self._data_files()
         self._check_frames()
         meta = sorted((folder / "meta").rglob("*.parquet"))
-        data = (folder / path for path in self.data_files)
-        self.files = (folder / "meta" / "info.json", *meta, *(path for path in data if path.is_file()))
+        more = (folder / path for path in (ANNOTATIONS, *self.data_files))
+        self.files = (folder / "meta" / "info.json", *meta, *(path for path in more if path.is_file()))
+
+    def _annotations(self) -> tuple[dict[int, list[tuple[int, int]]], list[str]]:
+        """The subtasks of each annotated episode as (first step, number of its name), and the names."""
+        path = self.folder / ANNOTATIONS
+        if not path.is_file() or self.frequency is None:
+            return {}, []
+        names = dict[str, int]()
+        try:
+            found = {}
+            for episode, noted in json.loads(path.read_text(encoding="utf-8"))["episodes"].items():
+                atoms = [atom for atom in noted.get("atoms", ()) if atom["style"] == "subtask" and atom["content"]]
+                atoms.sort(key=lambda atom: float(atom["timestamp"]))
+                found[int(episode)] = [
+                    (round(atom["timestamp"] * self.frequency), names.setdefault(str(atom["content"]), len(names)))
+                    for atom in atoms
+                ]
+        except (*_DAMAGE, AttributeError, OverflowError, RecursionError) as error:
+            raise damaged(path, "", error) from error
+        return {episode: subtasks for episode, subtasks in found.items() if subtasks}, list(names)
 
     def _data_files(self) -> tuple[Path, ...]:
         """The files of the episodes' rows, relative to the folder; some may be missing."""
@@ -147,10 +171,19 @@ class LeRobot:
             keys = [key for key in self.features if key.startswith(OBSERVATION)]
             observations = {_key(key): self._column(rows, key, index) for key in keys}
             labels = {"subtask": rows.vectors(SUBTASK, ())} if SUBTASK in rows.present else {}
+            if self._subtasks:
+                labels = {"subtask": of_array(self._labels(index, len(rows)))}
             actions = rows.vectors("action", self.features["action"]["shape"])
         except _DAMAGE as error:
             raise damaged(self.folder, name, error) from error
         return Recording(name, observations, actions, labels, self._facts(index))
+
+    def _labels(self, index: int, steps: int) -> np.ndarray:
+        """The number of the annotated subtask at each step [T]; -1 where there is none."""
+        labels = np.full(steps, -1)
+        for start, number in self._subtasks.get(index, ()):
+            labels[max(start, 0) :] = number
+        return labels
 
     def _check(self, rows: _Rows, index: int) -> None:
         """Refuse an episode with a wrong number of rows, or with rows out of order."""

@@ -1,29 +1,28 @@
-"""Files of segments: labels in HDF5 demonstrations, and tables with a row for each step in CSV and Parquet."""
+"""Labels for each step in an HDF5 file of demonstrations, or in a copy of it."""
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import os
 import shutil
-from collections.abc import Iterable, Iterator
-from itertools import chain
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.hdf5 import DemonstrationsError, opened, written
-from ddco_pyro.drawing.words import option_name
 from ddco_pyro.errors import BadInput
-from ddco_pyro.segmenting import Segmented, Segments
+from ddco_pyro.segmenting import Segmented, Segments, chosen_names
+from ddco_pyro.segmenting.formats import Writer
 
 BOUNDARY = "_boundary"
 OURS = "segmented_by"
 """Attribute of labels written by this library; other labels are never replaced."""
 
 SIGNATURE = "ddco-pyro"
+
+NO_LABELS = "labels go into HDF5 files only; name another format, such as --csv, --html or --lerobot"
 
 COPIED = "segmented_from"
 """Attribute of a labelled copy: digests of the file that was copied."""
@@ -41,6 +40,22 @@ def labels_of(demo: Segments) -> dict[str, np.ndarray]:
         labels[name] = options.astype(np.int16)
         labels[name + BOUNDARY] = boundaries.astype(np.int8)
     return labels
+
+
+class Labels(Writer):
+    """``labels/<level>`` and ``labels/<level>_boundary`` of every level, in a copy or in the file itself."""
+
+    def check(self) -> None:
+        fit, demos, source = self.asked.fit, self.asked.demos, self.asked.source
+        if source.format != "robomimic":
+            raise BadInput(f"{demos}: {NO_LABELS}")
+        if not (self.asked.overwrite or _same(self.out, demos)):
+            check_copy(demos, self.out)
+        check_labels(demos, [*fit.names, *self.asked.baselines], chosen_names(source, fit))
+
+    def write(self, segmented: Segmented) -> str:
+        write_labels(self.asked.demos, self.out, segmented)
+        return f"{self.out}: labels/{', labels/'.join([*segmented.counts, *segmented.segments[0].baselines])}"
 
 
 def check_labels(path: Path, given: Iterable[str], names: Iterable[str]) -> None:
@@ -79,7 +94,7 @@ def write_labels(path: Path, out: Path, segmented: Segmented) -> None:
     Labels of the same name are replaced. A file that has these very labels is not written again. For a copy, ``path``
     must also be unchanged since it was copied.
     """
-    in_place = out.exists() and out.samefile(path)
+    in_place = _same(out, path)
     if (in_place or _copied_from(out) == _version(path)) and _has(out, segmented):
         return
     with whole_file(out) as temporary:
@@ -93,6 +108,10 @@ def write_labels(path: Path, out: Path, segmented: Segmented) -> None:
                     group.create_dataset(name, data=values).attrs[OURS] = SIGNATURE
             if not in_place:
                 file.attrs[COPIED] = _version(path)
+
+
+def _same(out: Path, path: Path) -> bool:
+    return out.exists() and out.samefile(path)
 
 
 def _version(path: Path) -> list[str]:
@@ -119,62 +138,3 @@ def _has(path: Path, segmented: Segmented) -> bool:
                 if name not in group or not np.array_equal(group[name], values):
                     return False
     return True
-
-
-# --- tables -----------------------------------------------------------------------------------------------------------
-
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""First characters of a text that a spreadsheet may execute as a formula."""
-
-
-def cell(value: Any) -> Any:
-    """A value for CSV: an apostrophe goes before a text that a spreadsheet would execute."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
-
-
-def columns(segmented: Segmented) -> list[str]:
-    """Names of the columns: for each level the option, whether it is a new choice, probability, name; baselines."""
-    levels = [f"{name}{suffix}" for name in segmented.counts for suffix in ("", BOUNDARY, "_probability", "_name")]
-    return [
-        "demonstration",
-        "step",
-        *(["seconds"] if segmented.frequency else []),
-        *levels,
-        *segmented.segments[0].baselines,
-    ]
-
-
-def rows(segmented: Segmented) -> Iterator[list[Any]]:
-    """A row for each step of each demonstration."""
-    for demo in segmented.segments:
-        for step in range(len(demo)):
-            row: list[Any] = [demo.name, step, *([step / segmented.frequency] if segmented.frequency else [])]
-            for name, level in demo.levels.items():
-                option = int(level.options[step])
-                row += [option, int(level.boundaries[step]), float(level.probability[step])]
-                row.append(option_name(option, segmented.names.get(name, ())))
-            yield row + [int(kinds[step]) for kinds in demo.baselines.values()]
-
-
-def write_csv(path: Path, segmented: Segmented) -> None:
-    """Write the table as CSV, whole or not at all."""
-    with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        for row in chain([columns(segmented)], rows(segmented)):
-            writer.writerow(map(cell, row))
-
-
-def write_parquet(path: Path, segmented: Segmented) -> None:
-    """Write the table as Parquet, whole or not at all.
-
-    :raises BadInput: pyarrow is not installed.
-    """
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError:
-        raise BadInput("--parquet needs pyarrow; install it with: pip install 'ddco-pyro[lerobot]'") from None
-    values = zip(*rows(segmented), strict=True)
-    table = pyarrow.table({name: list(column) for name, column in zip(columns(segmented), values, strict=True)})
-    with whole_file(path) as temporary:
-        parquet.write_table(table, temporary)

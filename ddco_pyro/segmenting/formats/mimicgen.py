@@ -1,0 +1,84 @@
+"""Ends of subtasks for MimicGen and Isaac Lab Mimic, in a copy of a file that their own scripts have prepared."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from typing import ClassVar
+
+import h5py
+import numpy as np
+
+from ddco_pyro.data.files import whole_file
+from ddco_pyro.data.hdf5 import opened, written
+from ddco_pyro.errors import BadInput
+from ddco_pyro.segmenting import Segmented, chosen_names
+from ddco_pyro.segmenting.formats import Writer
+
+
+class MimicGen(Writer):
+    """``datagen_info/subtask_term_signals/<subtask>`` [T] of each demonstration.
+
+    A signal is 0, and 1 from the last step of its subtask on. The last subtask of a demonstration has none. The copy
+    has only demonstrations whose subtasks follow one order.
+    """
+
+    place: ClassVar = "datagen_info"
+    prepared: ClassVar[Sequence[str]] = ("eef_pose", "object_poses", "target_pose", "gripper_action")
+    """What the tool's own script writes there."""
+
+    script: ClassVar = "python mimicgen/scripts/prepare_src_dataset.py --dataset {}"
+
+    def check(self) -> None:
+        asked = self.asked
+        if asked.source.format != "robomimic":
+            raise BadInput(f"{asked.demos}: is no HDF5 file in robomimic's layout, which {self.option} copies")
+        with opened(asked.demos) as file:
+            for name in chosen_names(asked.source, asked.fit):
+                there = file[f"data/{name}"].get(self.place, {})
+                if missing := [key for key in self.prepared if key not in there]:
+                    raise BadInput(
+                        f"{asked.demos}: {name}: has no {self.place}/{missing[0]}, so the file is not prepared for "
+                        f"{self.option}; first: {self.script.format(asked.demos)}"
+                    )
+
+    def write(self, segmented: Segmented) -> str:
+        names, runs = self.one_order(segmented)
+        with whole_file(self.out) as temporary:
+            shutil.copyfile(self.asked.demos, temporary)
+            with written(temporary, "r+") as file:
+                left_out = [name for name in file["data"] if name not in runs]
+                for name in left_out:
+                    del file[f"data/{name}"]
+                if left_out:
+                    _forget(file, set(left_out))
+                for name, each in runs.items():
+                    group = file[f"data/{name}"].require_group(self.place)
+                    steps = np.arange(each[-1][2])
+                    for subtask, (_, _, stop) in zip(names[:-1], each, strict=False):
+                        signal = f"subtask_term_signals/{subtask.replace('/', '_')}"
+                        if signal in group:
+                            del group[signal]
+                        group[signal] = (steps >= stop - 1).astype(np.int64)
+        missing = f"; left out: {', '.join(left_out)}" if left_out else ""
+        return f"{self.out}: {len(runs)} demonstrations with subtasks {', '.join(names)}{missing}"
+
+
+class Isaac(MimicGen):
+    """The same in ``obs/datagen_info``."""
+
+    place: ClassVar = "obs/datagen_info"
+    prepared: ClassVar = ("eef_pose", "object_pose", "target_eef_pose")
+    script: ClassVar = (
+        "scripts/imitation_learning/isaaclab_mimic/annotate_demos.py --auto --input_file {} --output_file PREPARED"
+    )
+
+
+def _forget(file: h5py.File, names: set[str]) -> None:
+    """Remove demonstrations from masks, and from the number of all steps where the file has it."""
+    for name, members in file.get("mask", {}).items():
+        kept = [member for member in members[()] if member.decode() not in names]
+        del file[f"mask/{name}"]
+        file[f"mask/{name}"] = np.array(kept, dtype="S")
+    if "total" in file["data"].attrs:
+        file["data"].attrs["total"] = sum(len(demo["actions"]) for demo in file["data"].values())

@@ -1,0 +1,78 @@
+"""Tables with a row for each step, in CSV and Parquet."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from itertools import chain
+from typing import Any
+
+from ddco_pyro.data.files import whole_file
+from ddco_pyro.drawing.words import option_name
+from ddco_pyro.errors import BadInput
+from ddco_pyro.segmenting import Segmented
+from ddco_pyro.segmenting.formats import Writer
+from ddco_pyro.segmenting.formats.labels import BOUNDARY
+
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""First characters of a text that a spreadsheet may execute as a formula."""
+
+
+def cell(value: Any) -> Any:
+    """A value for CSV: an apostrophe goes before a text that a spreadsheet would execute."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
+
+
+def columns(segmented: Segmented) -> list[str]:
+    """Names of the columns: for each level the option, whether it is a new choice, probability, name; baselines."""
+    levels = [f"{name}{suffix}" for name in segmented.counts for suffix in ("", BOUNDARY, "_probability", "_name")]
+    return [
+        "demonstration",
+        "step",
+        *(["seconds"] if segmented.frequency else []),
+        *levels,
+        *segmented.segments[0].baselines,
+    ]
+
+
+def rows(segmented: Segmented) -> Iterator[list[Any]]:
+    """A row for each step of each demonstration."""
+    for demo in segmented.segments:
+        for step in range(len(demo)):
+            row: list[Any] = [demo.name, step, *([step / segmented.frequency] if segmented.frequency else [])]
+            for name, level in demo.levels.items():
+                option = int(level.options[step])
+                row += [option, int(level.boundaries[step]), float(level.probability[step])]
+                row.append(option_name(option, segmented.names.get(name, ())))
+            yield row + [int(kinds[step]) for kinds in demo.baselines.values()]
+
+
+class CSV(Writer):
+    """The table as CSV."""
+
+    def write(self, segmented: Segmented) -> str:
+        with whole_file(self.out) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            for row in chain([columns(segmented)], rows(segmented)):
+                writer.writerow(map(cell, row))
+        return str(self.out)
+
+
+class Parquet(Writer):
+    """The table as Parquet, with pyarrow."""
+
+    def check(self) -> None:
+        try:
+            import pyarrow  # noqa: F401
+        except ImportError:
+            raise BadInput(f"{self.option} needs pyarrow; install it with: pip install 'ddco-pyro[lerobot]'") from None
+
+    def write(self, segmented: Segmented) -> str:
+        import pyarrow
+        from pyarrow import parquet
+
+        values = zip(*rows(segmented), strict=True)
+        table = pyarrow.table({name: list(column) for name, column in zip(columns(segmented), values, strict=True)})
+        with whole_file(self.out) as temporary:
+            parquet.write_table(table, temporary)
+        return str(self.out)

@@ -1,0 +1,173 @@
+"""Optimisers: which one trains a model, and its state in a checkpoint."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.networks.perceptrons import Mlp, PerTimestep
+from ddco_pyro.spec import OptimizerSpec
+from ddco_pyro.training.em import is_linear
+
+
+def optimizer_of(spec: OptimizerSpec, model: Hierarchy) -> str:
+    """The optimiser that trains a model: the spec's own, except for ``em`` and networks that are not linear.
+
+    Without options the log-likelihood is a sum over steps: ``lbfgs`` maximises it for perceptrons that draw nothing at
+    random. ``adam`` trains all others.
+    """
+    if spec.name != "em":
+        return spec.name
+    if is_linear(model):
+        return "em"
+    networks = model.networks().values()
+    exact = all(isinstance(network, Mlp | PerTimestep) for network in networks)
+    random = any(isinstance(module, nn.Dropout) and module.p > 0 for module in model.modules())
+    return "lbfgs" if model.depth == 0 and exact and not random else "adam"
+
+
+# --- gradient steps on minibatches ------------------------------------------------------------------------------------
+
+
+def gradient_optimizer(name: str, spec: OptimizerSpec, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
+    """``adam``, ``adamw`` or ``momentum``."""
+    common = {"params": parameters, "lr": spec.lr, "weight_decay": spec.weight_decay}
+    if name == "momentum":
+        return _uncompiled(torch.optim.SGD)(**common, momentum=spec.momentum)
+    return _uncompiled(torch.optim.AdamW if name == "adamw" else torch.optim.Adam)(**common)
+
+
+def learning_rate(spec: OptimizerSpec, epoch: int, cap: int | None) -> float:
+    """The learning rate of a stage's epoch, counted from 0.
+
+    :param cap: the epochs that the stage may take.
+    """
+    rate = spec.lr * min(1.0, (epoch + 1) / (spec.warmup + 1))
+    if spec.schedule == "constant":
+        return rate
+    assert cap is not None  # a spec with this schedule has a budget
+    return rate * 0.5 * (1 + math.cos(math.pi * epoch / cap))
+
+
+def _uncompiled(kind: type[torch.optim.Optimizer]) -> Callable[..., torch.optim.Optimizer]:
+    """The same optimiser without the decorators that import torch's compiler, which takes seconds."""
+    names = ("add_param_group", "load_state_dict", "state_dict", "zero_grad")
+    plain = {name: inspect.unwrap(getattr(kind, name)) for name in names}
+    return type(kind.__name__, (kind,), {**plain, "step": torch.no_grad()(inspect.unwrap(kind.step))})
+
+
+def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """A copy of the optimiser's tensors by ``<parameter>.<name>``, on the host."""
+    state = optimizer.state_dict()["state"]
+    return {
+        f"{index}.{name}": torch.as_tensor(value).cpu().clone()
+        for index, values in state.items()
+        for name, value in values.items()
+        if value is not None
+    }
+
+
+def restore_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Tensor]) -> None:
+    """Give an optimiser the tensors of :func:`optimizer_state`."""
+    nested: dict[int, dict[str, Tensor]] = {}
+    for key, value in state.items():
+        index, _, name = key.partition(".")
+        nested.setdefault(int(index), {})[name] = value
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": nested})
+
+
+# --- steps over all demonstrations ------------------------------------------------------------------------------------
+
+HISTORY = 20
+"""Pairs of steps and changes of the gradient that L-BFGS keeps."""
+EVALUATIONS = 25
+"""The most gradients that a line search takes."""
+NOTHING = 1e-9
+"""L-BFGS has converged where a step gains less, in nats per step of the demonstrations."""
+
+_LISTS = ("old_dirs", "old_stps", "ro")
+_KEPT = ("n_iter", "func_evals", "d", "t", "H_diag", "prev_flat_grad", "prev_loss")
+
+
+class QuasiNewton:
+    """L-BFGS (Liu and Nocedal 1989) with a line search for the strong Wolfe conditions, over all demonstrations.
+
+    It works on a copy of the model in float64.
+
+    :param backward: adds the gradient of minus the log-likelihood per step; the log-likelihood, nats.
+    :param decay: L2 penalty.
+    :ivar gain: what the last step gained, nats per step.
+    """
+
+    def __init__(self, model: Hierarchy, backward: Callable[[Hierarchy, Batch], float], decay: float) -> None:
+        self.model, self._backward, self._decay, self.gain = model, backward, decay, math.inf
+        self._exact = deepcopy(model).double()
+        self._parameters = list(self._exact.parameters())
+        self._optimizer = _uncompiled(torch.optim.LBFGS)(
+            self._parameters, max_iter=1, max_eval=EVALUATIONS, history_size=HISTORY, tolerance_grad=0.0,
+            tolerance_change=0.0, line_search_fn="strong_wolfe",
+        )  # fmt: skip
+        self._batch: Batch | None = None
+        self._known: list[tuple[Tensor, float, float, list[Tensor]]] = []
+
+    def converged(self, roughly: bool = False) -> bool:
+        """Whether the last step gained less than :data:`NOTHING`."""
+        return self.gain < NOTHING
+
+    def step(self, batch: Batch) -> float:
+        """One step; the log-likelihood before it, nats."""
+        if self._batch is None:
+            inputs = batch.inputs
+            exact = {name: vector.double() for name, vector in inputs.vectors.items()}
+            self._batch = replace(batch, inputs=Inputs(exact, inputs.images, inputs.time))
+        loss, value = self._evaluate()
+        self._optimizer.step(lambda: self._evaluate()[0])
+        self.gain = loss - self._evaluate()[0]
+        self._known = self._known[-1:]
+        self.model.load_state_dict(self._exact.state_dict())
+        return value
+
+    def _evaluate(self) -> tuple[float, float]:
+        """The loss, its gradient in the parameters, and the log-likelihood; what is known is not computed again."""
+        assert self._batch is not None  # a step has begun
+        weights = nn.utils.parameters_to_vector(self._parameters).detach()
+        number = next((n for n, known in enumerate(self._known) if torch.equal(known[0], weights)), None)
+        if number is None:
+            self._optimizer.zero_grad()
+            with torch.enable_grad():
+                value = self._backward(self._exact, self._batch)
+            gradients = [p.grad + self._decay * p.detach() for p in self._parameters if p.grad is not None]
+            loss = 0.5 * self._decay * float(weights @ weights) - value / self._batch.steps
+            known = weights, loss, value, gradients
+        else:
+            known = self._known.pop(number)
+        self._known.append(known)
+        for parameter, gradient in zip(self._parameters, known[3], strict=True):
+            parameter.grad = gradient.clone()
+        return known[1], known[2]
+
+    def states(self) -> dict[str, Tensor]:
+        """What a checkpoint keeps: the weights in float64, and the optimiser's history."""
+        own = self._optimizer.state[self._parameters[0]]
+        lists = {name: torch.stack([torch.as_tensor(one) for one in own[name]]) for name in _LISTS if own.get(name)}
+        numbers = {name: torch.as_tensor(own[name]).clone() for name in _KEPT if own.get(name) is not None}
+        weights = nn.utils.parameters_to_vector(self._parameters).detach()
+        return {"weights": weights, "gain": torch.tensor(self.gain).double(), **lists, **numbers}
+
+    def load_states(self, states: Mapping[str, Tensor]) -> None:
+        """Go on from what :meth:`states` kept."""
+        nn.utils.vector_to_parameters(states["weights"], self._parameters)
+        self.gain = float(states["gain"])
+        own = self._optimizer.state[self._parameters[0]]
+        own |= {name: list(states.get(name, ())) for name in _LISTS}
+        own |= {name: states[name].clone() for name in _KEPT if name in states}
+        own["n_iter"] = int(own["n_iter"])

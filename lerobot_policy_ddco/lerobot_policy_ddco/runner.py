@@ -1,0 +1,1 @@
+../../ddco_pyro/exporting/runner.py

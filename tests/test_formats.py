@@ -1,0 +1,422 @@
+"""Planted segments in every format, read back by readers of their own: the tool's where it is installed."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from importlib import import_module
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from xml.etree import ElementTree
+
+import h5py
+import numpy as np
+import pyarrow.parquet as parquet
+import pytest
+from command_line import call
+from safetensors.numpy import load_file
+
+from ddco_pyro.cli.runs import FORMATS
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.importing import import_demonstrations
+from ddco_pyro.data.sources import open_source
+from ddco_pyro.errors import BadInput
+from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
+from ddco_pyro.segmenting.formats import Asked, Writer
+from ddco_pyro.segmenting.formats.elan import ELAN
+from ddco_pyro.segmenting.formats.label_studio import LabelStudio
+from ddco_pyro.segmenting.formats.lerobot import SARM, Annotated
+from ddco_pyro.segmenting.formats.mimicgen import Isaac, MimicGen
+from ddco_pyro.segmenting.formats.rabc import RABC
+from ddco_pyro.segmenting.formats.rlds import RLDS
+from ddco_pyro.segmenting.formats.tables import CSV
+
+HERE = Path(__file__).parent
+NAMES = ("control", "place", "reach", "grasp")
+ORDERED = [[(2, 4), (3, 3), (1, 5)], [(2, 2), (3, 1), (1, 1)], [(2, 6), (3, 2), (1, 3)]]
+"""Of each demonstration, its subtasks as (option, steps), in one order: reach, grasp, place."""
+OTHER = [*ORDERED, [(2, 3), (1, 3), (2, 2), (1, 2)]]
+"""The last one reaches twice and does not grasp."""
+
+
+class Planted:
+    """Demonstrations in a file, with known segments."""
+
+    def __init__(self, folder, plan, pictures=False, frequency=20.0):
+        self.folder, self.file = folder, folder / "demos.hdf5"
+        self.options = [np.concatenate([np.full(steps, option) for option, steps in each]) for each in plan]
+        rng = np.random.default_rng(0)
+        demos = []
+        for number, options in enumerate(self.options):
+            seen = {"arm/joints": rng.normal(size=(len(options), 3)), "jaw": rng.normal(size=(len(options), 1))}
+            if pictures:
+                seen["camera"] = rng.integers(0, 256, (len(options), 8, 10, 3), np.uint8)
+            demos.append(Demonstration(f"demo_{number}", seen, rng.normal(size=(len(options), 2))))
+        self.demos = Demonstrations(tuple(demos), attributes={"control_frequency": frequency, "task": "plant"})
+        self.demos.write(self.file)
+        certain = [0.5 + 0.5 * rng.random(len(options)) for options in self.options]
+        labels = [
+            LevelLabels(options, np.diff(options, prepend=-1) != 0, probability)
+            for options, probability in zip(self.options, certain, strict=True)
+        ]
+        self.segmented = Segmented(
+            tuple(Segments(f"demo_{n}", {"skill": level}, 0.0, False) for n, level in enumerate(labels)),
+            {"skill": 3},
+            frequency,
+            names={"skill": NAMES},
+        )
+
+    def runs(self, number):
+        """(name, first step, step after the last) of each subtask."""
+        options = self.options[number]
+        edges = [0, *(np.flatnonzero(np.diff(options)) + 1), len(options)]
+        return [(NAMES[options[a]], int(a), int(b)) for a, b in pairwise(edges)]
+
+    def write(self, kind, name, option="--option", demos=None, **more):
+        """What a writer writes, checked as the command checks it before."""
+        spec = SimpleNamespace(demonstrations=SimpleNamespace(path=None, exclude=()))
+        fit = SimpleNamespace(names={"skill": NAMES}, spec=spec)
+        out, demos = self.folder / name, demos or self.file
+        with open_source(demos) as source:
+            writer = kind(option, out, Asked(fit, self.folder / "run", demos, source, "skill", **more))
+            writer.check()
+            self.said = writer.write(self.segmented)
+        return out
+
+
+@pytest.fixture
+def planted(tmp_path):
+    return Planted(tmp_path, ORDERED)
+
+
+# --- the list ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", FORMATS, ids=lambda form: form.option)
+def test_every_format_has_a_writer_and_a_row_in_the_documentation(form):
+    module, _, kind = form.writer.partition(":")
+    assert issubclass(getattr(import_module(f"ddco_pyro.segmenting.formats.{module}"), kind), Writer)
+    page = (HERE.parent / "docs" / "formats.md").read_text()
+    assert f"| `{form.option}" in page
+
+
+# --- MimicGen and Isaac Lab Mimic -------------------------------------------------------------------------------------
+
+PREPARED = {
+    MimicGen: ("datagen_info", ("eef_pose", "object_poses/cube", "target_pose", "gripper_action")),
+    Isaac: ("obs/datagen_info", ("eef_pose/arm", "object_pose/cube", "target_eef_pose/arm")),
+}
+
+
+def prepare(planted, kind):
+    place, needed = PREPARED[kind]
+    with h5py.File(planted.file, "r+") as file:
+        for demo in file["data"].values():
+            for name in needed:
+                demo[f"{place}/{name}"] = np.zeros((len(demo["actions"]), 4, 4))
+            demo[place].attrs["env_interface_name"] = "MG_Plant"
+        file["mask/train"] = np.array([b"demo_0", *([b"demo_3"] if len(file["data"]) > 3 else [])])
+        file["data"].attrs["total"] = sum(len(demo["actions"]) for demo in file["data"].values())
+
+
+def arrays(group):
+    """Every dataset below a group, by name."""
+    found = {}
+    group.visititems(lambda name, item: found.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
+    return found
+
+
+def spans(signals, subtasks, steps):
+    """Subtasks as (start, stop), as MimicGen's documentation of termination signals defines them.
+
+    A subtask ends with the step where its signal goes from 0 to 1 for the first time; the last one ends with the
+    demonstration.
+    """
+    stops = []
+    for name in subtasks[:-1]:
+        signal = signals[name][()]
+        assert signal.shape == (steps,)
+        stops.append(next(t for t in range(1, steps) if signal[t - 1] == 0 and signal[t] == 1) + 1)
+    return list(pairwise([0, *stops, steps]))
+
+
+@pytest.mark.parametrize("kind", [MimicGen, Isaac])
+def test_signals_give_the_true_ends_of_subtasks_back(planted, kind):
+    prepare(planted, kind)
+    with h5py.File(planted.write(kind, "copy.hdf5")) as copy, h5py.File(planted.file) as file:
+        for number in range(3):
+            demo = copy[f"data/demo_{number}"]
+            signals = demo[f"{PREPARED[kind][0]}/subtask_term_signals"]
+            assert set(signals) == {"reach", "grasp"}  # no signal for the last subtask
+            assert {signal.dtype for signal in signals.values()} == {np.dtype(np.int64)}
+            found = spans(signals, ["reach", "grasp", "place"], len(demo["actions"]))
+            assert found == [run[1:] for run in planted.runs(number)]
+            before, after = arrays(file[f"data/demo_{number}"]), arrays(demo)
+            assert all("subtask_term_signals" in name for name in after.keys() - before.keys())
+            assert all(np.array_equal(values, after[name]) for name, values in before.items())
+        assert copy["data"].attrs["total"] == file["data"].attrs["total"]
+
+
+def test_an_order_that_differs_is_refused_or_left_out(tmp_path):
+    planted = Planted(tmp_path, OTHER)
+    prepare(planted, MimicGen)
+    with pytest.raises(BadInput) as refused:
+        planted.write(MimicGen, "copy.hdf5", "--mimicgen")
+    assert str(refused.value) == (
+        "--mimicgen: demo_3: its subtasks are reach, place, reach, place, and those of 3 of 4 demonstrations are "
+        "reach, grasp, place; --same-order leaves such demonstrations out (1 of 4)"
+    )
+    assert not (tmp_path / "copy.hdf5").exists()
+    with h5py.File(planted.write(MimicGen, "copy.hdf5", same_order=True)) as copy:
+        assert set(copy["data"]) == {"demo_0", "demo_1", "demo_2"}
+        assert list(copy["mask/train"]) == [b"demo_0"]
+        assert copy["data"].attrs["total"] == sum(map(len, planted.options[:3]))
+    assert planted.said.endswith("3 demonstrations with subtasks reach, grasp, place; left out: demo_3")
+
+
+def test_a_subtask_that_occurs_twice_has_a_number(tmp_path):
+    planted = Planted(tmp_path, [[(2, 3), (3, 2), (2, 2), (1, 4)]] * 2)
+    prepare(planted, MimicGen)
+    with h5py.File(planted.write(MimicGen, "copy.hdf5")) as copy:
+        signals = copy["data/demo_1/datagen_info/subtask_term_signals"]
+        found = spans(signals, ["reach", "grasp", "reach_2", "place"], 11)
+    assert found == [(0, 3), (3, 5), (5, 7), (7, 11)]
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        ([[(2, 1), (3, 3)]], "demo_0: its first subtask, reach, lasts one step, whose end cannot be marked"),
+        ([[(2, 4)], [(2, 3)]], "most demonstrations have one subtask, reach: there is no end to mark"),
+    ],
+)
+def test_ends_that_no_signal_can_mark_are_refused(tmp_path, plan, message):
+    planted = Planted(tmp_path, plan)
+    prepare(planted, MimicGen)
+    with pytest.raises(BadInput, match=message):
+        planted.write(MimicGen, "copy.hdf5", same_order=True)
+    assert not (tmp_path / "copy.hdf5").exists()
+
+
+@pytest.mark.parametrize(("kind", "first"), [(MimicGen, "datagen_info/eef_pose"), (Isaac, "obs/datagen_info/eef_pose")])
+def test_a_file_that_is_not_prepared_is_refused(planted, kind, first):
+    with pytest.raises(BadInput) as refused:
+        planted.write(kind, "copy.hdf5")
+    said = str(refused.value)
+    assert f"demo_0: has no {first}, so the file is not prepared for" in said
+    assert said.count("\n") == 0
+
+
+# --- LeRobot ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("frequency", [20.0, 30.0])
+def test_a_new_lerobot_dataset_holds_the_demonstrations_and_their_subtasks(tmp_path, frequency):
+    """Read back by this library's reader of LeRobot datasets, annotations included; LeRobot's own below."""
+    planted = Planted(tmp_path, OTHER, pictures=True, frequency=frequency)
+    out = planted.write(Annotated, "dataset")
+    with open_source(out) as source:
+        assert source.frequency == frequency
+        assert json.loads(source.attributes["label_names"]) == {"subtask": ["reach", "grasp", "place"]}
+        for number, demo in enumerate(planted.demos):
+            found = source.recording(f"demo_{number}")
+            joints, jaw = demo.observations["arm/joints"], demo.observations["jaw"]
+            for key, expected in (("arm/joints", joints), ("jaw", jaw), ("state", np.hstack([joints, jaw]))):
+                np.testing.assert_allclose(found.observations[key].array(), expected, rtol=1e-6)
+            np.testing.assert_array_equal(found.observations["camera"].array(), demo.observations["camera"])
+            np.testing.assert_allclose(found.actions.array(), demo.actions, rtol=1e-6)
+            named = [("reach", "grasp", "place")[label] for label in found.labels["subtask"].array()]
+            assert named == [NAMES[option] for option in planted.options[number]]
+            assert found.attributes["task"] == "plant"
+    assert planted.write(Annotated, "dataset") == out  # the very same again
+    stats = json.loads((out / "meta" / "stats.json").read_text())
+    actions = np.concatenate([demo.actions for demo in planted.demos])
+    np.testing.assert_allclose(stats["action"]["std"], actions.std(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(stats["action"]["q90"], np.quantile(actions, 0.9, axis=0), rtol=1e-5)
+    assert np.shape(stats["observation.camera"]["mean"]) == (3, 1, 1)
+
+
+def test_annotations_are_imported_as_labels_with_names(tmp_path):
+    """As the page on which LeRobot's users label keeps them, for some episodes."""
+    planted = Planted(tmp_path, ORDERED)
+    out = planted.write(Annotated, "dataset")
+    atom = {"role": "assistant", "style": "subtask", "tool_calls": None}
+    memory = {"role": "assistant", "style": "memory", "content": "seen", "timestamp": 0.0}
+    atoms = [{**atom, "content": "lift it", "timestamp": 0.25}, memory, {**atom, "content": "go", "timestamp": 0.1}]
+    annotations = {"version": 2, "schema": {}, "episodes": {"0": {"atoms": atoms}, "2": {"atoms": []}}}
+    (out / "meta" / "lerobot_annotations.json").write_text(json.dumps(annotations))
+    import_demonstrations(out, tmp_path / "imported.hdf5")
+    with h5py.File(tmp_path / "imported.hdf5") as file:
+        np.testing.assert_array_equal(file["data/demo_0/labels/subtask"], [-1, -1, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1])
+        np.testing.assert_array_equal(file["data/demo_2/labels/subtask"], np.full(11, -1))
+        named = [
+            json.loads(file[place].attrs["label_names"])
+            for place in ("/", "data")
+            if "label_names" in file[place].attrs
+        ]
+        assert named == [{"subtask": ["go", "lift it"]}]
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"episodes": 3}', '{"episodes": {"x": {"atoms": [{}]}}}'])
+def test_damaged_annotations_are_one_line(planted, text):
+    out = planted.write(Annotated, "dataset")
+    (out / "meta" / "lerobot_annotations.json").write_text(text)
+    with pytest.raises(BadInput, match=r"lerobot_annotations\.json: cannot be read, or is damaged"), open_source(out):
+        pass
+
+
+def test_the_stages_of_sarm(tmp_path):
+    planted = Planted(tmp_path, OTHER)
+    out = planted.write(SARM, "dataset")
+    rows = parquet.read_table(next((out / "meta" / "episodes").rglob("*.parquet"))).to_pylist()
+    for number, row in enumerate(rows):
+        stages = zip(*(row[f"dense_subtask_{key}"] for key in ("names", "start_frames", "end_frames")), strict=True)
+        assert [(name, start, end + 1) for name, start, end in stages] == planted.runs(number)
+    shares = json.loads((out / "meta" / "temporal_proportions_dense.json").read_text())
+    assert list(shares) == ["reach", "grasp", "place"]
+    expected = [np.mean([np.mean(each == option) for each in planted.options]) for option in (2, 3, 1)]
+    np.testing.assert_allclose(list(shares.values()), expected)
+
+
+def test_a_copy_of_a_dataset_gets_stages_beside_its_subtasks(planted):
+    """And existing stages are replaced."""
+    first = planted.write(Annotated, "first")
+    second = planted.write(SARM, "second", demos=first)
+    third = planted.write(SARM, "third", demos=second)
+    assert (second / "meta" / "lerobot_annotations.json").read_text() == (
+        first / "meta" / "lerobot_annotations.json"
+    ).read_text()
+    names = [parquet.read_schema(next((one / "meta" / "episodes").rglob("*.parquet"))).names for one in (second, third)]
+    assert names[0] == names[1]
+    with pytest.raises(BadInput, match="lies in the dataset; choose another --option"):
+        planted.write(SARM, "first/inside", demos=first)
+    (planted.folder / "taken").mkdir()
+    with pytest.raises(BadInput, match="taken: exists; choose another --option"):
+        planted.write(SARM, "taken", demos=first)
+
+
+def test_progress_is_the_place_in_the_order_and_the_part_of_the_run(tmp_path):
+    planted = Planted(tmp_path, OTHER)
+    rows = parquet.read_table(planted.write(RABC, "progress.parquet")).to_pylist()
+    assert [row["index"] for row in rows] == list(range(len(rows)))
+    order, expected = ["reach", "grasp", "place"], []
+    for number in range(len(OTHER)):
+        for name, start, stop in planted.runs(number):
+            last = stop - 1 - start
+            tau = [t / last if last else 1.0 for t in range(stop - start)]
+            expected += [(number, (order.index(name) + each) / 3) for each in tau]
+    assert [row["episode_index"] for row in rows] == [episode for episode, _ in expected]
+    np.testing.assert_allclose([row["progress_dense"] for row in rows], [value for _, value in expected], rtol=1e-6)
+
+
+# --- annotation tools and steps ---------------------------------------------------------------------------------------
+
+
+def test_predictions_for_label_studio(planted):
+    out = planted.write(LabelStudio, "studio")
+    for number, task in enumerate(json.loads((out / "tasks.json").read_text())):
+        (prediction,) = task["predictions"]
+        values = [region["value"] for region in prediction["result"]]
+        found = [(*value["timeserieslabels"], value["start"], value["end"] + 1) for value in values]
+        assert found == planted.runs(number)
+        probability = planted.segmented.segments[number].levels["skill"].probability
+        scores = [region["score"] for region in prediction["result"]]
+        np.testing.assert_allclose(scores, [probability[a:b].mean() for _, a, b in planted.runs(number)])
+        assert prediction["score"] == min(scores)
+        np.testing.assert_allclose(task["data"]["series"]["control_1"], planted.demos[number].actions[:, 1])
+    config = ElementTree.parse(out / "config.xml")
+    assert [label.get("value") for label in config.iter("Label")] == ["reach", "grasp", "place"]
+    assert [channel.get("column") for channel in config.iter("Channel")] == ["control_0", "control_1"]
+
+
+def test_annotations_for_elan(planted):
+    out = planted.write(ELAN, "elan")
+    for number in range(3):
+        document = ElementTree.parse(out / f"demo_{number}.eaf")
+        times = {slot.get("TIME_SLOT_ID"): int(slot.get("TIME_VALUE")) for slot in document.iter("TIME_SLOT")}
+        (tier,) = document.iter("TIER")
+        found = [
+            (one.findtext("ANNOTATION_VALUE"), *(times[one.get(f"TIME_SLOT_REF{side}")] for side in (1, 2)))
+            for one in tier.iter("ALIGNABLE_ANNOTATION")
+        ]
+        assert tier.get("TIER_ID") == "skill"
+        assert found == [(name, 50 * start, 50 * stop) for name, start, stop in planted.runs(number)]  # 20 Hz
+
+
+def test_steps_of_rlds_need_no_pickle(planted):
+    out = planted.write(RLDS, "rlds")
+    for number, demo in enumerate(planted.demos):
+        with np.load(out / f"demo_{number}.npz", allow_pickle=False) as steps:
+            assert steps["subtask"].tolist() == [NAMES[option] for option in planted.options[number]]
+            np.testing.assert_array_equal(steps["observation/arm/joints"], demo.observations["arm/joints"])
+            np.testing.assert_array_equal(steps["action"], demo.actions)
+            last = [False] * (len(demo) - 1) + [True]
+            assert steps["is_last"].tolist() == steps["is_terminal"].tolist() == last
+            assert steps["is_first"].tolist() == last[::-1]
+
+
+# --- the tools themselves ---------------------------------------------------------------------------------------------
+
+TOOLS = Path(os.environ.get("DDCO_PYRO_TOOLS", HERE.parent / ".venv-tools")) / "bin" / "python"
+"""``make tools`` makes this environment."""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not TOOLS.exists(), reason="the tools are not installed: make tools")
+@pytest.mark.parametrize(
+    ("form", "kind", "plan"),
+    [
+        ("lerobot", "lerobot:Annotated", OTHER),
+        ("sarm", "lerobot:SARM", OTHER),
+        ("rabc", "rabc:RABC", OTHER),
+        ("label_studio", "label_studio:LabelStudio", OTHER),
+        ("elan", "elan:ELAN", OTHER),
+        ("rerun", "rerun:Rerun", OTHER),
+    ],
+)
+def test_the_tool_reads_what_was_planted(tmp_path, form, kind, plan):
+    if form == "rerun":
+        pytest.importorskip("rerun")
+    planted = Planted(tmp_path, plan)
+    module, _, name = kind.partition(":")
+    out = planted.write(getattr(import_module(f"ddco_pyro.segmenting.formats.{module}"), name), "out")
+    table = planted.write(CSV, "table.csv")
+    in_tools("read_formats.py", form, out, table, "skill")
+
+
+def in_tools(script, *arguments):
+    command = [str(TOOLS), str(HERE / "fixtures" / script), *map(str, arguments)]
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    ended = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert ended.returncode == 0, ended.stderr
+    print(ended.stdout)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not TOOLS.exists(), reason="the tools are not installed: make tools")
+def test_lerobot_acts_as_the_run_does(toy_run, tmp_path):
+    ended = call("export", toy_run.folder, "--lerobot", tmp_path / "policy", "--out", tmp_path / "export")
+    assert ended.status == 0
+    in_tools("act_lerobot.py", tmp_path / "policy", tmp_path / "export")
+
+
+def test_a_policy_for_lerobot_has_the_weights_of_the_export(toy_run, tmp_path):
+    """Its ``runner.py`` acts with them alone, as the export's does."""
+    assert call("export", toy_run.folder, "--lerobot", tmp_path / "policy").status == 0
+    assert call("export", toy_run.folder, "--out", tmp_path / "export").status == 0
+    config = json.loads((tmp_path / "policy" / "config.json").read_text())
+    assert config["type"] == "ddco"
+    assert config["input_features"]["observation.offsets"] == {"type": "STATE", "shape": [4]}
+    assert config["output_features"] == {"action": {"type": "ACTION", "shape": [2]}}
+    assert json.loads(config["controller"]) == json.loads((tmp_path / "export" / "controller.json").read_text())
+    weights = load_file(tmp_path / "policy" / "model.safetensors")
+    shapes = {name: [list(array.shape), str(array.dtype)] for name, array in weights.items()}
+    assert json.loads(config["weights"]) == shapes
+    with np.load(tmp_path / "export" / "weights.npz") as file:
+        assert {name.replace(".", "/") for name in file.files} == weights.keys()
+        assert all(np.array_equal(file[name.replace("/", ".")], array) for name, array in weights.items())
+    (tmp_path / "policy" / "mine.txt").touch()
+    ended = call("export", toy_run.folder, "--lerobot", tmp_path / "policy")
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
