@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.inference import log_likelihood
+from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Chain, Tables

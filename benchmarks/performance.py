@@ -29,8 +29,9 @@ from measuring import Row, of_pairs, seconds, side_by_side, table
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import EpochEnded, Event
-from ddco_pyro.inference import Engine, fused, log_likelihood
-from ddco_pyro.inference.kernel import Rows, Structure, any_levels, match_torch_threads, one_level
+from ddco_pyro.inference import Engine, fused
+from ddco_pyro.inference.engines import log_likelihood
+from ddco_pyro.inference.kernel import Rows, Structure, any_levels, on_threads, one_level
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables, complete
@@ -179,10 +180,10 @@ def kernel(tables: Tables, lengths: torch.Tensor) -> Callable[[], float]:
     run = one_level if tables.depth == 1 else any_levels
 
     def call() -> float:
-        match_torch_threads()
         value, exact = np.empty(len(lengths)), np.empty(len(lengths), dtype=np.bool_)
         posteriors = Rows(*(np.empty_like(row) for row in rows), nothing)
-        run(Rows(*rows, nothing), starts, lengths.numpy(), value, exact, posteriors, structure)
+        others = Rows(*rows, nothing), starts, lengths.numpy(), value, exact, posteriors, structure
+        on_threads(lambda first, last: run(first, last, *others), lengths.numpy())
         return float(value.sum())
 
     return call
