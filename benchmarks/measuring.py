@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-
 TURN = 0.02
 """Seconds of a turn in a pair."""
 
