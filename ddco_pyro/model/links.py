@@ -155,33 +155,14 @@ class LogTable(Link):
 
     def fill(self, alive: Alive, rows: Array, first: int) -> None:
         """Copy the table, or its exponentials."""
-        own = alive.take(self.inputs[0]).reshape(len(rows), -1)
-        if self.log:
-            rows[:, first : first + self.columns] = own
-        else:
-            _exponentiate(own, rows, first)
+        own = torch.from_numpy(alive.take(self.inputs[0])).flatten(1)
+        torch.from_numpy(rows)[:, first : first + self.columns].copy_(own if self.log else own.exp())
 
     def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
         """The posterior itself."""
-        gradient = alive.empty(self.inputs[0])
-        _weigh(posterior.found, posterior.weight, first, gradient.reshape(len(gradient), -1))
+        gradient = torch.empty(len(posterior.weight), self.columns, dtype=self.inputs[0].dtype).numpy()
+        _weigh(posterior.found, posterior.weight, first, gradient)
         return (alive.gradient(gradient, self.inputs[0]),)
-
-
-@jit
-def _exponentiate(table: Array, rows: Array, first: int) -> None:
-    steps, columns = table.shape
-    block = max(BLOCK // columns, 1)
-    x = np.empty((block, columns))
-    for begin in range(0, steps, block):
-        own, out = table[begin : begin + block], rows[begin : begin + block, first : first + columns]
-        for m in range(len(own)):
-            for c in range(columns):
-                x[m, c] = own[m, c]
-        exponentials(x.reshape(-1)[: len(own) * columns])
-        for m in range(len(own)):
-            for c in range(columns):
-                out[m, c] = x[m, c]
 
 
 @jit
