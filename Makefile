@@ -3,6 +3,7 @@
 #   make test     lint, then the tests that take seconds
 #   make test-all lint, all tests, all notebooks, and the documentation site
 #   make bench    what exact inference costs, beside other tools
+#   make release-check  build the sdist and the wheel, and use each in an environment of its own, without a clone
 #   make docs     the documentation site, in build/site; the commands of its tutorial are run meanwhile
 #   make .venv    the environment alone: what the demo needs
 #   make dev      the environment with what tests and lint need besides
@@ -18,7 +19,7 @@ TORCH_CPU := https://download.pytorch.org/whl/cpu/torch/
 SIZE := 1.9 GB (0.6 GB to download)
 
 .NOTPARALLEL:
-.PHONY: demo test test-all bench docs lint format clean dev .venv python opengl
+.PHONY: demo test test-all bench release-check docs lint format clean dev .venv python opengl
 
 # --resume: an interrupted demo goes on where it stopped, a finished one shows its result again.
 demo: opengl $(DEMO)
@@ -28,7 +29,7 @@ demo: opengl $(DEMO)
 test: lint
 	$(BIN)/pytest -n 2 --dist worksteal -q
 
-# About an hour: planted recoveries, kills, several processes, every notebook, dynamax, and the site besides.
+# About an hour: planted recoveries, many kills, more processes, every notebook, dynamax, and the site besides.
 test-all: lint
 	$(PIP) -e '.[bench,docs]'
 	$(BIN)/pytest -n 2 --dist worksteal -q -m ''
@@ -40,6 +41,13 @@ test-all: lint
 bench: $(DEMO)
 	$(PIP) -e '.[bench,segments]'
 	$(BIN)/python benchmarks/performance.py
+
+# CHECK='--packages FOLDER': dependencies that are installed already, instead of those that pip finds.
+release-check: $(DEV)
+	$(PIP) build
+	rm -rf dist
+	$(BIN)/python -m build
+	$(BIN)/python tests/release_check.py $(CHECK) dist/*
 
 docs: $(DEMO)
 	$(PIP) -e '.[docs,export]'

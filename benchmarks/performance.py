@@ -26,6 +26,7 @@ import pictures
 import torch
 import yaml
 from measuring import Row, of_pairs, seconds, side_by_side, table
+from provenance import is_kept, record, sentence, text
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import EpochEnded, Event
@@ -41,9 +42,6 @@ from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import Trainer
 
 ROOT = Path(__file__).parents[1]
-sys.path.append(str(ROOT / "studies"))
-from provenance import is_kept, record, sentence, text  # noqa: E402
-
 COMMAND = ROOT / ".venv/bin/ddco-pyro" if (ROOT / ".venv").exists() else Path(sys.executable).with_name("ddco-pyro")
 RESULTS, PAGE = ROOT / "benchmarks/results", ROOT / "docs/performance.md"
 BEGIN, END = "<!-- tables, written by make bench -->\n", "<!-- end of tables -->\n"
@@ -391,7 +389,7 @@ PARTS: dict[str, Callable[[], Iterator[Row]]] = {
 def measure(part: str, again: bool) -> None:
     """Measure a part and keep its rows; nothing where this very code has given those that are kept."""
     path, made_by = RESULTS / f"{part}.json", record(f"python benchmarks/performance.py {part}")
-    if not again and path.exists() and is_kept(json.loads(path.read_text()), {}, made_by):
+    if not again and path.exists() and is_kept(json.loads(path.read_text()), made_by):
         return
     rows = []
     for row in PARTS[part]():
@@ -400,7 +398,7 @@ def measure(part: str, again: bool) -> None:
             f"{part}: {row.first} {row.value:.3g} {row.unit}, {row.second} {row.other:.3g}: {row.ratio:.3g}", flush=True
         )
     RESULTS.mkdir(exist_ok=True)
-    path.write_text(text({"rows": rows}, [made_by]))
+    path.write_text(text({"rows": rows}, made_by))
 
 
 def tables() -> str:
@@ -410,7 +408,7 @@ def tables() -> str:
         path = RESULTS / f"{part}.json"
         if path.exists():
             kept: dict[str, Any] = json.loads(path.read_text())
-            made = sentence(f"python benchmarks/performance.py {part}", kept["provenance"])
+            made = sentence(kept["provenance"][0])
             title = " ".join((rows.__doc__ or "").split())
             shown.append(f"### {part}\n\n{title} {made}\n\n" + table([Row(**r) for r in kept["results"]["rows"]], AIMS))
     return "\n".join(shown)

@@ -5,7 +5,7 @@
 
 ``folds`` counts the time of the CPU, so it can be measured beside other work; ten folds on two idle cores take at least
 five times the sum. ``speed-up`` compares clocks, and says how busy the machine was: on a busy one it means little.
-Writes ``docs/results/selection_time_folds.json`` and ``selection_time_speed_up.json``.
+Writes ``benchmarks/results/selection_time_folds.json`` and ``selection_time_speed_up.json``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -26,10 +25,7 @@ from ddco_pyro.selection import Workers, folds, grid, select
 from ddco_pyro.spec import load_spec
 from ddco_pyro.training.data import demonstrations
 
-sys.path.append(str(Path(__file__).parents[1] / "studies"))
-from provenance import record, text
-
-OUT = Path("docs/results")
+OUT = Path("benchmarks/results")
 GRID = "selection.grid.hierarchy.levels.0.count=[1, 2, 3, 4, 5, 6, 7, 8]"
 SHORT = ("selection.grid.hierarchy.levels.0.count=[2, 3, 4, 5]", "selection.folds=4", "training.epochs=100")
 
@@ -80,10 +76,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["folds", "speed-up"])
     what = parser.parse_args().what
-    made_by = record(f"python benchmarks/selection_time.py {what}")
     found = one_fold() if what == "folds" else speed_up()
     print(json.dumps(found, indent=1))
-    write_text(OUT / f"selection_time_{what.replace('-', '_')}.json", text(found, [made_by]))
+    write_text(OUT / f"selection_time_{what.replace('-', '_')}.json", json.dumps(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from ddco_pyro.acting.monitor import Monitor
     from ddco_pyro.comparison import compare
     from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+    from ddco_pyro.estimator import OptionSegmenter
     from ddco_pyro.exporting import export
     from ddco_pyro.fitting.fit import fit
     from ddco_pyro.fitting.fitted import Fit, load
@@ -24,13 +25,14 @@ _PLACES = {
     "Demonstration": "data.demonstrations",
     "Demonstrations": "data.demonstrations",
     "EliminatedAHMM": "inference.marginal",
-    "Fit": "fitting.fit",
+    "Fit": "fitting.fitted",
     "Monitor": "acting.monitor",
+    "OptionSegmenter": "estimator",
     "Spec": "spec",
     "compare": "comparison",
     "export": "exporting",
     "fit": "fitting.fit",
-    "load": "fitting.fit",
+    "load": "fitting.fitted",
     "load_spec": "spec",
     "segment": "segmenting",
     "select": "selection",
@@ -44,6 +46,7 @@ __all__ = [
     "EliminatedAHMM",
     "Fit",
     "Monitor",
+    "OptionSegmenter",
     "Spec",
     "compare",
     "encoding",

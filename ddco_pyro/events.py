@@ -104,6 +104,22 @@ class EpisodeEnded:
     total: int
 
 
+@dataclass(frozen=True)
+class StudyBegan:
+    """A study of ``total`` cells begins; ``kept`` of them are done already."""
+
+    total: int
+    kept: int
+
+
+@dataclass(frozen=True)
+class CellDone:
+    """A cell of a study is done, or failed for the reason ``failed``."""
+
+    cell: str
+    failed: str
+
+
 Event = (
     DemonstrationsDone
     | TrainingBegan
@@ -117,6 +133,8 @@ Event = (
     | CandidateGivenUp
     | SeedFitted
     | EpisodeEnded
+    | StudyBegan
+    | CellDone
 )
 OnEvent = Callable[[Event], None]
 

@@ -62,4 +62,4 @@ Markdown((found.folder / "selection.md").read_text())
 # On demonstrations that were drawn from k skills, how often does the one-standard-error rule choose k?
 
 # %%
-Markdown(Path("../docs/results/selection_planted.md").read_text())
+Markdown(Path("../docs/results/selection.md").read_text().replace("](", "](../docs/results/"))

@@ -61,7 +61,4 @@ Image(RUNS / "comparison" / "compare.png")
 # The figure A of the paper's needle experiment (SM 1.3), and dropout (SM 2.5), by cross-validation:
 
 # %%
-Image("../docs/results/learning_curve.png")
-
-# %%
-Markdown(Path("../docs/results/learning_curve.md").read_text())
+Image("../docs/results/selection_learning_curve.png")

@@ -19,21 +19,26 @@
 # the picture.
 
 # %%
+import csv
 from pathlib import Path
 
-from IPython.display import Image, Markdown
+import matplotlib.pyplot as plt
 
-RESULTS = Path("../docs/results")
-
-# %%
-Image(RESULTS / "stability.png")
+with Path("../docs/results/selection.csv").open() as file:
+    rows = [row for row in csv.DictReader(file) if row["study"] == "stability"]
+tasks, ways = (list(dict.fromkeys(row[key] for row in rows)) for key in ("task", "method"))
+measures = ("nats", "NMI of two seeds", "P(option)")
+figure, panels = plt.subplots(len(tasks), len(measures), figsize=(12, 6), sharey=True, layout="constrained")
+for task, line in zip(tasks, panels, strict=True):
+    for measure, axes in zip(measures, line, strict=True):
+        own = [row for row in rows if (row["task"], row["measure"]) == (task, measure)]
+        axes.plot([float(row["value"]) for row in own], [row["method"] for row in own], "o", alpha=0.5)
+        axes.set_title(f"{task}: {measure}", fontsize=9)
+plt.show()
 
 # %% [markdown]
-# Left: a dot is a seed, the bar their mean; the closer the dots, the more stable. Middle: a dot is a pair of seeds,
-# and 1 means that both divide every demonstration alike. Right: near 1 the meta-policy leaves control to its options.
-
-# %%
-Markdown((RESULTS / "stability.md").read_text())
+# Left: a dot is a seed; the closer the dots, the more stable. Middle: a dot is a pair of seeds, and 1 means that both
+# divide every demonstration alike. Right: near 1 the meta-policy leaves control to its options.
 
 # %% [markdown]
 # What the paper found, a variance halved by VQ and layer-wise training and segments that agree more, is seen on

@@ -4,8 +4,8 @@
         [--set KEY=VALUE]... [--demonstrations 70] [--noise 0.1] [--out DIR] [--runs DIR]
 
 Records the demonstrations of Meta-World's scripted experts in an environment of its own (``RUNS/venv``), fits what
-``ddco-pyro init`` writes for them, and lets ddco, flat and flat_equal act. A cell (task, number, seed) that this code
-has done with these settings is not done again. Writes ``summary.json``, ``summary.md`` and ``arena.png``.
+``ddco-pyro init`` writes for them, and lets ddco, flat and flat_equal act. A cell (task, number, seed) that was done
+with these settings is not done again. Adds its numbers to ``docs/results/arena.csv``.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ import argparse
 import itertools
 
 import arena_cell
-import arena_results
+import study
 from cells import Cell, described
-from study import Study
 
 TASKS = tuple(
     f"{name}-v3"
@@ -39,8 +38,7 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), metavar="TASK")
     parser.add_argument("--counts", type=int, nargs="+", default=[5, 10, 20, 50])
     parser.add_argument("--seeds", type=int, default=5)
-    axes = ("tasks", "counts", "seeds")
-    Study("arena", axes, cells, arena_cell.sawyer, arena_results, arena_cell.DEFAULTS, jobs=2).main(parser)
+    study.main("arena", parser, arena_cell.DEFAULTS, cells, lambda settings: arena_cell.sawyer(settings).made())
 
 
 if __name__ == "__main__":

@@ -4,13 +4,14 @@
 
 The spec is what ``ddco-pyro init`` writes for the demonstrations that the cell trains on, whatever the task; ``--set``
 changes it for all. Keeps the fit and a JSON with held-out log-likelihoods, agreement with the expert's phases, and how
-often each method succeeded from the same initial states. What this code has done with these settings is kept.
+often each method succeeded from the same initial states. What was done with these settings is kept.
 """
 
 from __future__ import annotations
 
 import hashlib
 import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ import numpy as np
 from apart import HELD_OUT, Apart, expert
 from arena_segments import scored
 from cells import Cell, Settings
+from table import Row
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
@@ -89,6 +91,18 @@ class ArenaCell(Cell):
             "options": metrics["options"],
             "seconds": {"fit": trained - begun, "play": ended - trained, "all": ended - begun},
         }
+
+    def rows(self, results: Mapping[str, Any]) -> Iterator[Row]:
+        """Success and likelihood of each method, and agreement of every segmentation with the phases."""
+        for method, one in results["methods"].items():
+            named = "arena", self.task, method, self.count, self.seed
+            yield Row(*named, "success", float(np.mean(one["success"])))
+            yield Row(*named, "nats", one["log_likelihood_per_step"]["valid"])
+        yield Row("arena", self.task, OURS, self.count, self.seed, "NMI", results["segments"][OURS]["nmi"])
+        for method, scores in results["segments"].items():
+            for measure in ("nmi", "accuracy", "f1_50"):
+                name = "NMI" if measure == "nmi" else measure
+                yield Row("segments", self.task, method, self.count, self.seed, name, scores[measure])
 
 
 def sawyer(settings: Settings) -> Apart:

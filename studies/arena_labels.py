@@ -4,7 +4,7 @@
         [--set KEY=VALUE]... [--demonstrations 70] [--noise 0.1] [--out DIR] [--runs DIR]
 
 With the demonstrations and the environment of ``studies/arena.py``. A cell (task, labelled demonstrations, seed) that
-this code has done with these settings is not done again. Writes ``summary.json``, ``summary.md``, ``arena_labels.png``.
+was done with these settings is not done again. Adds its numbers to ``docs/results/arena.csv``.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ import argparse
 import itertools
 
 import arena_labels_cell
-import arena_labels_results
+import study
 from arena import TASKS
 from arena_cell import sawyer
 from cells import Cell, described
-from study import Study
 
 
 def cells(own: argparse.Namespace) -> list[Cell]:
@@ -32,9 +31,7 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), metavar="TASK")
     parser.add_argument("--labelled", type=int, nargs="+", default=[0, 1, 3, 10])
     parser.add_argument("--seeds", type=int, default=2)
-    axes = ("tasks", "labelled", "seeds")
-    defaults = arena_labels_cell.DEFAULTS
-    Study("arena_labels", axes, cells, sawyer, arena_labels_results, defaults, jobs=2).main(parser)
+    study.main("arena", parser, arena_labels_cell.DEFAULTS, cells, lambda settings: sawyer(settings).made())
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ many demonstrations given to training.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import numpy as np
 from arena_cell import LABELS, ArenaCell, fitted_cell, recorded
 from arena_segments import flat
 from cells import Cell, Settings
+from table import Row
 
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement
@@ -58,6 +60,13 @@ class LabelsCell(Cell):
             "converged": fitted.metrics.training.converged,
             "measures": measured(fitted, kinds),
         }
+
+    def rows(self, results: Mapping[str, Any]) -> Iterator[Row]:
+        """Agreement with the phases, and the part of the steps that have the right name."""
+        for measure in ("nmi", "accuracy", "named", "f1_50"):
+            name = "NMI" if measure == "nmi" else measure
+            method = f"{self.labelled} labelled"
+            yield Row("labels", self.task, method, TRAINED, self.seed, name, results["measures"][measure])
 
 
 def phases(source: Path) -> list[int]:

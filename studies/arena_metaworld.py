@@ -93,8 +93,10 @@ def demonstrate(world: Sawyer, expert: Any, phases: Phases, seed: int, noise: fl
     return None if left is None else steps
 
 
-def collect(task: str, out: Path, number: int, held_out: int, noise: float) -> None:
-    """Record the first successful episodes."""
+def collect(
+    task: str, out: Path, number: int, held_out: int, noise: float, first: int = 0, attempts: int | None = None
+) -> None:
+    """Record the first successful episodes from seed ``first`` on."""
     world, expert = Sawyer(task), ENV_POLICY_MAP[task]()
     phases = Phases(type(expert)._desired_pos)
 
@@ -103,7 +105,7 @@ def collect(task: str, out: Path, number: int, held_out: int, noise: float) -> N
         return steps and recorded(steps)
 
     labels, about = {"phase": len(phases.lines)}, {"noise": noise, "lines": phases.lines}
-    arena_recording.collect(out, f"metaworld/{task}", demonstration, number, held_out, labels, **about)
+    arena_recording.collect(out, f"metaworld/{task}", demonstration, number, held_out, labels, first, attempts, **about)
 
 
 def recorded(steps: list[Step]) -> Recorded:
@@ -151,9 +153,10 @@ def main() -> None:
         raise SystemExit(2)
     controllers = named_controllers(own.controllers)
     if own.what == "collect":
-        collect(own.task, own.out, own.number, own.held_out, own.noise)
+        collect(own.task, own.out, own.number, own.held_out, own.noise, own.first or 0, own.attempts)
     elif own.what == "play":
-        play_all(Sawyer(own.task), own.out, controllers, range(UNSEEN, UNSEEN + own.episodes), own.recorded)
+        first = UNSEEN if own.first is None else own.first
+        play_all(Sawyer(own.task), own.out, controllers, range(first, first + own.episodes), own.recorded)
     else:
         film(own.task, own.out, next(iter(controllers.values())), own.frames)
 

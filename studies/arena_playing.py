@@ -42,6 +42,8 @@ def arguments(text: str | None, what: tuple[str, ...], number: int) -> argparse.
     parser.add_argument("--number", type=int, default=number)
     parser.add_argument("--held-out", type=int, default=20)
     parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--first", type=int, help="the seed of the first episode")
+    parser.add_argument("--attempts", type=int, help="to record episodes, at most")
     parser.add_argument("--recorded", type=Path)
     return parser
 
@@ -52,14 +54,41 @@ def named_controllers(named: Iterable[str]) -> dict[str, Any]:
 
 
 def exported(folder: str | Path) -> Any:
-    """The ``Runner`` of an exported controller, by the ``runner.py`` that was exported beside it."""
+    """The ``Runner`` of an exported controller, by the ``runner.py`` that was exported beside it.
+
+    With a number above 1 in ``chunk.json`` beside it, the controller gives chunks of actions (:class:`Chunks`).
+    """
     path = Path(folder) / "runner.py"
     spec = importlib.util.spec_from_file_location("exported_runner", path)
     if spec is None or spec.loader is None or not path.exists():
         raise FileNotFoundError(f"{path}: no controller was exported there")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.Runner(folder)
+    beside = path.with_name("chunk.json")
+    chunk = json.loads(beside.read_text()) if beside.exists() else 1
+    return Chunks(module.Runner(folder), chunk) if chunk > 1 else module.Runner(folder)
+
+
+class Chunks:
+    """Acts by chunks of actions: the mean of what the last chunks say of this step, the older the heavier."""
+
+    DECAY = 0.01
+
+    def __init__(self, controller: Any, chunk: int) -> None:
+        self.controller, self.chunk = controller, chunk
+
+    def reset(self, seed: int) -> None:
+        """Forget the last episode."""
+        self.controller.reset(seed)
+        self.chunks: list[np.ndarray] = []
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """The control for this observation, [A]."""
+        self.chunks = [*self.chunks, self.controller.act(observation).reshape(self.chunk, -1)][-self.chunk :]
+        newest = len(self.chunks) - 1
+        said = np.stack([own[newest - number] for number, own in enumerate(self.chunks)])
+        weights = np.exp(-self.DECAY * np.arange(len(said)))
+        return np.asarray(weights @ said / weights.sum())
 
 
 def play(controller: Any, environment: Environment, seed: int) -> dict[str, Any]:

@@ -24,6 +24,8 @@ def collect(
     number: int,
     held_out: int,
     labels: Mapping[str, int],
+    first: int = 0,
+    attempts: int | None = None,
     **about: Any,
 ) -> None:
     """Record the first successful episodes; of them the first ones are held out, however many there are.
@@ -33,17 +35,19 @@ def collect(
 
     :param demonstrate: the episode of a seed; None where it had no success.
     :param labels: how many values each of the labels can have.
+    :param first: the seed of the first attempt; at most so many ``attempts``.
     :raises SystemExit: too few episodes succeed; nothing is written.
     """
-    temporary, seed, names = out.with_name(f".{out.name}.tmp"), 0, []
+    temporary, seed, names = out.with_name(f".{out.name}.tmp"), first, []
+    attempts = GIVE_UP * number if attempts is None else attempts
     counts = {label: np.zeros(values, int) for label, values in labels.items()}
     with h5py.File(temporary, "w") as file:
         data, total = file.create_group("data"), 0
         while len(names) < number:
-            if seed >= GIVE_UP * number:
+            if seed >= first + attempts:
                 temporary.unlink()
                 raise SystemExit(
-                    f"{environment}: the expert succeeded in {len(names)} of {seed} episodes; {number} are needed"
+                    f"{environment}: the expert succeeded in {len(names)} of {attempts} episodes; {number} are needed"
                 )
             recorded = demonstrate(seed)
             if recorded is not None:
@@ -58,7 +62,7 @@ def collect(
         data.attrs["total"] = total
         data.attrs["env_args"] = json.dumps({"env_name": environment, "type": 2, "env_kwargs": {}})
         shares = {label: (count / total).tolist() for label, count in counts.items()}
-        said = {"successes": number, "attempts": seed, "shares": shares, **about}
+        said = {"successes": number, "attempts": seed - first, "shares": shares, **about}
         file.attrs["expert"] = json.dumps(said)
     temporary.replace(out)
 

@@ -4,8 +4,8 @@
         [--set KEY=VALUE]... [--demonstrations 80] [--out DIR] [--runs DIR]
 
 Records minigrid's bot in an environment of its own (``RUNS/venv``), fits one level of options, two, and policies
-without options, and lets them act. A cell (level, progress, seed) that this code has done with these settings is not
-done again. Writes ``summary.json``, ``summary.md`` and ``babyai.png``.
+without options, and lets them act. A cell (level, progress, seed) that was done with these settings is not done
+again. Adds its numbers to ``docs/results/babyai.csv``.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ import argparse
 import itertools
 
 import babyai_cell
-import babyai_results
+import study
 from cells import Cell, described
-from study import Study
 
 LEVELS = ("GoToSeqS5R2", "MoveTwoAcrossS5N2", "MiniBossLevel")
 
@@ -33,8 +32,8 @@ def main() -> None:
     parser.add_argument("--levels", nargs="+", default=list(LEVELS), metavar="LEVEL")
     parser.add_argument("--progress", nargs="+", choices=babyai_cell.PROGRESS, default=list(babyai_cell.PROGRESS))
     parser.add_argument("--seeds", type=int, default=2)
-    axes = ("levels", "progress", "seeds")
-    Study("babyai", axes, cells, babyai_cell.gridworld, babyai_results, babyai_cell.DEFAULTS, jobs=1).main(parser)
+    defaults = babyai_cell.DEFAULTS
+    study.main("babyai", parser, defaults, cells, lambda settings: babyai_cell.gridworld(settings).made())
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import h5py
 import numpy as np
 from apart import HELD_OUT, Apart, expert
 from cells import Cell, Settings
+from table import Row
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
@@ -68,6 +69,7 @@ class BabyAICell(Cell):
         valid = demos.select(demos.masks["valid"])
         return {
             "demonstrations_sha256": hashlib.sha256(source.read_bytes()).hexdigest(),
+            "trained": len(demos.masks["train"]),
             "bot": expert(source) | {"steps": list(map(len, demos))},
             "methods": {
                 name: {
@@ -88,6 +90,21 @@ class BabyAICell(Cell):
             "options": {name: one.metrics.model_dump()["options"] for name, one in fits.items()},
             "seconds": {"fit": trained - begun, "play": ended - trained, "all": ended - begun},
         }
+
+    def rows(self, results: Mapping[str, Any]) -> Iterator[Row]:
+        """Likelihood and success of each method, and agreement of the options with what the bot was about."""
+        task, count = f"{self.level}, {self.progress}", results["trained"]
+        for method, one in results["methods"].items():
+            nats = one["log_likelihood_per_step"]["valid"]
+            yield Row("babyai", task, method, count, self.seed, "nats", nats)
+        for method, one in results["played"].items():
+            yield Row("babyai", task, method, count, self.seed, "success", float(np.mean(one["success"])))
+        crossed = {f"{fit}, level {number}": one for fit, own in results["crossed"].items()
+                   for number, one in enumerate(own, 1)}  # fmt: skip
+        for method, labels in (crossed | results["references"]).items():
+            for label, found in labels.items():
+                if found:
+                    yield Row("babyai", task, method, count, self.seed, f"NMI with {label}", found["nmi"])
 
 
 def gridworld(settings: Settings) -> Apart:

@@ -1,4 +1,4 @@
-"""Cells of a study: each is kept as JSON once it is done, and not done again by the same code and settings."""
+"""Cells of a study: each is kept as JSON once it is done, and not done again with the same settings."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import hashlib
 import json
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_type_hints
 
 import torch
-from provenance import Record, is_kept, record, text
+from table import Row
 from threadpoolctl import threadpool_limits
 
 from ddco_pyro.data.files import write_text
@@ -36,11 +36,6 @@ class Settings:
     def kept(self) -> dict[str, Any]:
         """What decides a result."""
         return {**self.values, "overrides": list(self.overrides)}
-
-    def words(self) -> str:
-        """The same as words of a command."""
-        values = " ".join(f"--{name} {value:g}" for name, value in self.values.items())
-        return values + "".join(f" --set '{change}'" for change in self.overrides)
 
     def add_to(self, parser: argparse.ArgumentParser) -> None:
         """The arguments that :meth:`given` reads; these settings are their defaults."""
@@ -68,6 +63,10 @@ class Cell(ABC):
         :raises Failed: the simulator cannot be used, or its expert fails.
         """
 
+    @abstractmethod
+    def rows(self, results: Mapping[str, Any]) -> Iterable[Row]:
+        """Its numbers in the study's table."""
+
     @property
     def name(self) -> str:
         """Of its files."""
@@ -77,21 +76,14 @@ class Cell(ABC):
         """Its JSON; other settings have other folders."""
         return settings.runs / "cells" / digest(settings.kept()) / f"{self.name}.json"
 
-    def command(self, settings: Settings) -> str:
-        """What runs it."""
-        words = " ".join(map(str, astuple(self)))
-        return f"python studies/{self.script} {words} {settings.words()}"
+    def run(self, settings: Settings) -> dict[str, Any]:
+        """Its results, as its JSON has them; nothing is done again.
 
-    def run(self, settings: Settings, made_by: Record) -> dict[str, Any]:
-        """Its provenance and results, as its JSON has them; nothing is done again.
-
-        :param made_by: what was known of the code of its script when the work began.
         :raises Failed: as :meth:`results` does.
         """
-        path, made_by = self.path(settings), made_by | {"command": self.command(settings)}
-        folder = settings.runs / "fits" / made_by["code"][:12] / path.parent.name / path.stem
-        named = asdict(self) | settings.kept()
-        return kept(path, named, made_by, lambda: self.results(settings, folder))
+        path = self.path(settings)
+        folder = settings.runs / "fits" / path.parent.name / path.stem
+        return kept(path, asdict(self) | settings.kept(), lambda: self.results(settings, folder))
 
     @classmethod
     def main(cls, text: str | None, defaults: Settings, **choices: Sequence[str]) -> None:
@@ -108,11 +100,7 @@ class Cell(ABC):
         settings = defaults.given(own)
         words = [getattr(own, field.name) for field in fields(cls)]
 
-        def work() -> str:
-            cell = cls(*words)
-            return json.dumps(cell.run(settings, record(cell.command(settings))), indent=1)
-
-        printed(work)
+        printed(lambda: json.dumps(cls(*words).run(settings), indent=1))
 
 
 T = TypeVar("T")
@@ -147,23 +135,20 @@ def digest(settings: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:8]
 
 
-def kept(
-    path: Path, settings: Mapping[str, Any], made_by: Record, work: Callable[[], dict[str, Any]]
-) -> dict[str, Any]:
-    """A cell's provenance and results, as its JSON in ``path`` has them; ``work``, on one thread, is done only once.
+def kept(path: Path, settings: Mapping[str, Any], work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """A cell's results, as its JSON in ``path`` has them; ``work``, on one thread, is done only once.
 
     :param settings: what names the cell and decides its results; part of them.
-    :param made_by: what was known of the code when the study began.
-    :raises ValueError: a result is named like a setting, which it would replace: it could not be told what was done.
+    :raises ValueError: a result is named like a setting, which it would replace.
     """
     if path.exists():
         content: dict[str, Any] = json.loads(path.read_text())
-        if is_kept(content, settings, made_by):
+        if all(content.get(key) == value for key, value in settings.items()):
             return content
     torch.set_num_threads(1)
     with threadpool_limits(1):
         results = work()
     if twice := sorted(settings.keys() & results.keys()):
         raise ValueError(f"{path}: results are named like settings: {', '.join(twice)}")
-    write_text(path, text({**settings, **results}, [made_by]))
+    write_text(path, json.dumps({**settings, **results}, indent=1) + "\n")
     return dict(json.loads(path.read_text()))

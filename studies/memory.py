@@ -10,55 +10,57 @@
 
 A mixture is the hierarchy of that study's spec whose options end after every step (``termination: always``): the same
 demonstrations, training seeds, starts and gradient steps. ``--check`` fits options of so many seeds again, to see
-whether this code gives what the study's page has. ``--em`` fits them by expectation-maximisation, with its
-ridges and without. Each cell is a few rows of ``cells.csv`` as soon as it is done, and is not done again. ``page``
-pairs mixtures by seed with the numbers of those studies, and writes ``memory.md`` and ``memory.png``.
+whether this code gives what the study's table has. ``--em`` fits them by expectation-maximisation, with its
+ridges and without. Each cell is a few rows of ``docs/results/memory.csv`` as soon as it is done, and is not done again.
+``page`` pairs mixtures by seed with the tables of those studies, and writes ``memory.md``, ``memory.png``, and the
+table and figure of the README.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import itertools
 import json
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import astuple, dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import arena_cell
 import bin_picking
-import needle_success
+import needle as needle_study
 import planted_levels
-import pushing_cell
+import pushing as pushing_study
 import torch
 from arena import TASKS
-from arena_results import nmi
 from cells import described, printed, some
 from ddco_tasks.pushing import environment as pushing_task
 from memory_results import (
+    ACTING_BY,
     EM,
+    FAR_END,
     FREE,
     MIXTURE,
     OPTIONS,
+    Numbers,
     checks,
     comparisons,
     draw,
     everything,
+    numbers,
     of_pages,
     page,
     short,
     shortest,
     with_table,
 )
-from provenance import ROOT, Record, record, sentence, text
+from table import RESULTS, ROOT, Row, add, read
 from threadpoolctl import threadpool_limits
 
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.data.files import only_one, write_text
+from ddco_pyro.data.files import write_text
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.rollouts import roll_out
@@ -75,7 +77,7 @@ METHODS: dict[str, dict[str, Any]] = {
 ADAM = {"name": "adam", "lr": 3e-3}
 """The optimiser of the arena's page, instead of the one that ``init`` writes, which is expectation-maximisation."""
 ACTING = ("marginal", "sample", "most_likely")
-EPISODES = {"needle": {20: 60, 100: 200}, "arena": 20, "bins": 20, "pushing": pushing_cell.EPISODES}
+EPISODES = {"needle": {20: 60, 100: 200}, "arena": 20, "bins": 20, "pushing": pushing_study.EPISODES}
 """Starts of each fit, as on the pages."""
 
 
@@ -103,9 +105,6 @@ class Measured(NamedTuple):
     value: float
 
 
-COLUMNS = (*(field.name for field in fields(Cell)), *Measured._fields)
-
-
 def overridden(cell: Cell) -> dict[str, Any]:
     """What a cell changes in its study's spec: nothing is trained beside."""
     return {"compare_with": [], **METHODS[cell.method]}
@@ -117,9 +116,9 @@ def words(cell: Cell) -> list[str]:
 
 
 def needle(cell: Cell, runs: Path) -> list[Measured]:
-    """As ``needle_success.py`` and ``needle_curve.py`` do."""
+    """As ``needle.py`` does."""
     changes = ["rollout.policies=[]", *words(cell)]
-    spec = needle_success.spec_of("ddco", cell.seed, cell.demonstrations, changes)
+    spec = needle_study.spec_of("ddco", cell.seed, cell.demonstrations, changes)
     fitted = fit(spec, out=runs / "fits" / cell.name)
     rolled = roll_out(fitted, EPISODES["needle"].get(cell.demonstrations, 60), jobs=1)
     success = rolled.success_rates[fitted.name].rate
@@ -128,21 +127,21 @@ def needle(cell: Cell, runs: Path) -> list[Measured]:
 
 
 def pushing(cell: Cell, runs: Path) -> list[Measured]:
-    """As ``pushing_cell.py`` does, by each way of acting."""
-    spec = pushing_cell.spec_of(pushing_cell.Cell("DDCO MLP", 2, cell.demonstrations, cell.seed))
+    """As ``pushing_study.py`` does, by each way of acting."""
+    spec = pushing_study.spec_of(pushing_study.PushingCell("DDCO MLP", 2, cell.demonstrations, cell.seed))
     spec = with_overrides(spec, overridden(cell))
-    demos = pushing_cell.pool(runs / "pushing", spec)
+    demos = pushing_study.pool(runs / "pushing", spec)
     demos = demos.select(demos.names[: cell.demonstrations])
-    hierarchy, _ = pushing_cell.fit(spec, demos, runs / "fits" / cell.name)
-    held_out = pushing_cell.held_out(runs / "pushing", spec)
-    found = [Measured("", "nats", pushing_cell.per_step(Fit(spec, hierarchy), held_out))]
-    first = pushing_cell.EVALUATION + 1000 * cell.seed
+    hierarchy = pushing_study.fit(spec, demos, runs / "fits" / cell.name)
+    held_out = pushing_study.held_out(runs / "pushing", spec)
+    found = [Measured("", "nats", pushing_study.per_step(Fit(spec, hierarchy), held_out))]
+    first = pushing_study.EVALUATION + 1000 * cell.seed
     for acting in ACTING:
         rollout = spec.rollout.model_copy(update={"options": acting})
         episodes = play(
-            pushing_task.task, Controller.from_spec(hierarchy, rollout), range(first, first + pushing_cell.EPISODES)
+            pushing_task.task, Controller.from_spec(hierarchy, rollout), range(first, first + pushing_study.EPISODES)
         )
-        goals = pushing_cell.summary(episodes)["goals"]
+        goals = pushing_study.summary(episodes)["goals"]
         found.append(Measured(acting, "goals", sum(goals) / len(goals)))
     return found
 
@@ -159,7 +158,7 @@ def arena(cell: Cell, runs: Path) -> list[Measured]:
     successes = [episode["success"] for episode in played["episodes"][cell.method]]
     return [
         Measured("", "nats", fitted.metrics.log_likelihood_per_step.valid),
-        Measured("", "NMI", nmi(fitted.metrics.model_dump()["agreement"])),
+        Measured("", "NMI", fitted.metrics.model_dump()["agreement"]["valid"][0]["nmi"]),
         Measured(fitted.spec.rollout.options, "success", sum(successes) / len(successes)),
     ]
 
@@ -219,50 +218,27 @@ def cells_of(study: str, asked: Asked) -> list[Cell]:
     return [Cell(study, task, method, count, seed) for seed, count, task, method in grid if seed < seeds[method]]
 
 
-Row = dict[str, Any]
-"""A line of the table, by column."""
+def row_of(cell: Cell, one: Measured) -> Row:
+    """A number in the table; its measure says how options were chosen."""
+    acting = f"{ACTING_BY}{one.acting}" if one.acting else ""
+    return Row(cell.study, cell.task, cell.method, cell.demonstrations, cell.seed, f"{one.measure}{acting}", one.value)
 
 
-def read(path: Path) -> list[Row]:
-    """The rows of a table; none where it is not there."""
-    if not path.exists():
-        return []
-    with path.open(encoding="utf-8", newline="") as table:
-        kinds = {"demonstrations": int, "seed": int, "value": float}
-        return [{key: kinds.get(key, str)(value) for key, value in row.items()} for row in csv.DictReader(table)]
+def done_in(path: Path) -> set[Cell]:
+    """The cells of a table."""
+    return {Cell(*row[:5]) for row in read(path)}
 
 
-def cell_of(row: Row) -> Cell:
-    """The cell whose row it is."""
-    return Cell(*(row[field.name] for field in fields(Cell)))
-
-
-def keep(out: Path, cell: Cell, measured: Iterable[Measured], made_by: Record) -> None:
-    """Add a cell's rows to the table, instead of those that another process has added, and what made them beside it."""
-    path = out / "cells.csv"
-    with only_one(out, wait=True):
-        others = [row for row in read(path) if cell_of(row) != cell]
-        rows = others + [dict(zip(COLUMNS, (*astuple(cell), *one), strict=True)) for one in measured]
-        written = io.StringIO()
-        table = csv.DictWriter(written, COLUMNS, lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
-        beside = path.with_suffix(".json")
-        records = json.loads(beside.read_text())["provenance"] if beside.exists() else []
-        write_text(beside, text(None, [*records, made_by]))
-        write_text(path, written.getvalue())
-
-
-def work(cells: Sequence[Cell], runs: Path, out: Path, made_by: Record) -> str:
+def work(cells: Sequence[Cell], runs: Path, out: Path) -> str:
     """Do the cells that the table has not, one by one; a line of how many there are."""
-    done = {cell_of(row) for row in read(out / "cells.csv")}
+    done = done_in(out)
     todo = [cell for cell in cells if cell not in done]
     torch.set_num_threads(1)
     for cell in todo:
         begun, used = time.perf_counter(), sum(os.times()[:4])
         with threadpool_limits(1):
             measured = STUDIES[cell.study](cell, runs)
-        keep(out, cell, measured, made_by)
+        add(out, [row_of(cell, one) for one in measured])
         shown = ", ".join(f"{one.measure} {one.acting} {one.value:.3f}" for one in measured)
         seconds = f"{time.perf_counter() - begun:.0f} s, {sum(os.times()[:4]) - used:.0f} s of them worked"
         print(f"{cell.name}: {shown} ({seconds})", flush=True)
@@ -293,21 +269,24 @@ def command(study: str, asked: Asked) -> str:
 
 
 def write_page(out: Path) -> str:
-    """``memory.md``, ``.json`` and ``.png`` beside the folder of the table, README's table and its figure; the page."""
-    earlier = read(out / "far_end.csv")  # of a bin that the tree has no more
-    rows = read(out / "cells.csv") + [row for row in earlier if row["method"] == MIXTURE]
-    pages = of_pages() + [row for row in earlier if row["method"] != MIXTURE]
-    found = comparisons(rows, pages)
-    records = json.loads((out / "cells.json").read_text())["provenance"]
-    made_by = sentence("python studies/memory.py page", records)
-    shown = page(found, checks(rows, pages), missing({cell_of(row) for row in rows}), made_by)
-    write_text(out.with_suffix(".json"), text(found, records))
+    """``memory.md`` and ``memory.png`` beside the table, README's table and its figure; the page."""
+    found, again = compared(out)
+    shown = page(found, again, missing(done_in(out)))
     write_text(out.with_suffix(".md"), shown)
     draw(everything(found), out.with_suffix(".png"))
     draw(shortest(found), ROOT / "docs" / "images" / "worth.png", columns=1)
     readme = ROOT / "README.md"
     write_text(readme, with_table(readme.read_text(encoding="utf-8"), short(found)))
     return shown
+
+
+def compared(path: Path = RESULTS / "memory.csv") -> tuple[list[Numbers], list[Numbers]]:
+    """What mixtures say beside the numbers of the other studies, and options that were fitted again beside theirs."""
+    own = numbers(read(path))
+    far = [one for one in own if one["task"] == FAR_END]  # of a bin that the tree has no more
+    rows = [one for one in own if one["task"] != FAR_END or one["method"] == MIXTURE]
+    pages = [*of_pages(), *(one for one in far if one["method"] != MIXTURE)]
+    return comparisons(rows, pages), checks(rows, pages)
 
 
 def main() -> None:
@@ -318,7 +297,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, nargs="+" if name == "counts" else None)
     parser.add_argument("--tasks", nargs="+")
     parser.add_argument("--runs", type=Path, default=Path("runs/memory"))
-    parser.add_argument("--out", type=Path, default=Path("docs/results/memory"))
+    parser.add_argument("--out", type=Path, default=RESULTS / "memory.csv")
     own = parser.parse_args()
     printed(lambda: run(own))
 
@@ -331,7 +310,7 @@ def run(own: argparse.Namespace) -> str:
     asked = WHOLE[own.study]._replace(
         **{name: tuple(one) if name in ("counts", "tasks") else one for name, one in said.items()}
     )
-    return work(some(cells_of(own.study, asked)), own.runs, own.out, record(command(own.study, asked)))
+    return work(some(cells_of(own.study, asked)), own.runs, own.out)
 
 
 if __name__ == "__main__":

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from needle_success import over_seeds, spread
-from provenance import ROOT
+from table import RESULTS, Row, over_seeds, read, spread
 
 from ddco_pyro.drawing.figures import FAINT, blank, save, style
 
@@ -21,11 +18,14 @@ AGAIN = "options again"
 """Those that the code of the mixtures has fitted."""
 DIFFERENCES = ((MIXTURE, FLAT), (MIXTURE, EQUAL), (OPTIONS, MIXTURE), (AGAIN, MIXTURE))
 BY_EM = ((EM, OPTIONS), (FREE, OPTIONS), (EM, FREE))
-RESULTS = ROOT / "docs" / "results"
 ROUNDING = 1e-6
 """Two codes that do the same differ by less."""
 
-Row = dict[str, Any]
+ACTING_BY = ", acting by "
+"""In a measure of the table, before how options are chosen."""
+FAR_END = "flat far end"
+
+Numbers = dict[str, Any]
 """A number, by column: ``study``, ``task``, ``method``, ``demonstrations``, ``seed``, ``acting``, ``measure``,
 ``value``.
 """
@@ -37,82 +37,50 @@ Values = dict[int, float]
 # --- what the other studies keep --------------------------------------------------------------------------------------
 
 
-def of_pages(root: Path = RESULTS) -> list[Row]:
+def numbers(rows: Iterable[Row]) -> list[Numbers]:
+    """Rows of this study's table, with how options are chosen apart."""
+    found = []
+    for row in rows:
+        measure, _, acting = row.measure.partition(ACTING_BY)
+        found.append(row._asdict() | {"measure": measure, "acting": acting})
+    return found
+
+
+SOURCES: dict[str, tuple[str, str, dict[str, str]]] = {
+    "needle": ("needle", "needle", {"ddco": OPTIONS, FLAT: FLAT, EQUAL: EQUAL}),
+    "pushing": (
+        "pushing",
+        "perceptrons",
+        {"DDCO MLP, k = 2": OPTIONS, "flat MLP": FLAT, "flat MLP, equal parameters": EQUAL},
+    ),
+    "arena": ("arena", "arena", {"ddco": OPTIONS, FLAT: FLAT, EQUAL: EQUAL}),
+    "bins": ("bin_picking", "bin_picking", {"DDCO": OPTIONS, FLAT: FLAT, EQUAL: EQUAL}),
+    "planted": ("segments", "planted_levels", {"segments": OPTIONS, "joint": OPTIONS, "layer-wise": OPTIONS}),
+}
+"""Of each study here: the table of its numbers, the study in that table, and what its methods are called here."""
+ACTING_MEASURES = ("success", "goals")
+
+
+def of_pages(root: Path = RESULTS) -> list[Numbers]:
     """The numbers of options and of flat policies that the other studies keep, by seed; only ways of acting that the
     study has of its own.
     """
-    return [
-        dict(zip(("study", "task", "method", "demonstrations", "seed", "acting", "measure", "value"), row, strict=True))
-        for study in (_needle, _pushing, _arena, _bins, _planted)
-        for row in study(root)
-    ]
-
-
-def _needle(root: Path) -> Iterator[tuple[Any, ...]]:
-    for path in sorted((root / "needle").glob("*seed-*.json")):
-        own = _results(path)
-        if path.name.startswith("clock"):
-            continue
-        count, seed = own.get("count", 100), own["seed"]
-        for method, name in ((OPTIONS, "ddco"), (FLAT, FLAT), (EQUAL, EQUAL)):
-            success = own["methods"][name]["measures"]["success"]["rate"]
-            yield "needle", "needle", method, count, seed, "", "nats", own["log_likelihood_per_step"][name]["valid"]
-            yield "needle", "needle", method, count, seed, "marginal", "success", success
-
-
-def _pushing(root: Path) -> Iterator[tuple[Any, ...]]:
-    called = {"DDCO MLP": OPTIONS, "flat MLP": FLAT, "flat MLP, equal parameters": EQUAL}
-    with (root / "pushing" / "perceptrons" / "sample_complexity.csv").open(encoding="utf-8", newline="") as table:
-        for one in csv.DictReader(table):
-            own = ("pushing", "pushing", called[one["method"]], int(one["demonstrations"]), int(one["seed"]))
-            yield *own, "", "nats", float(one["log_likelihood_held_out"])
-            yield *own, "marginal", "goals", float(one["goals"])
-
-
-def _arena(root: Path) -> Iterator[tuple[Any, ...]]:
-    for task, found in _results(root / "arena" / "summary.json")["tasks"].items():
-        for count, one in found["counts"].items():
-            for seed, value in enumerate(one["nmi_valid"]["by_seed"]):
-                yield "arena", task, OPTIONS, int(count), seed, "", "NMI", value
-            for method, name in ((OPTIONS, "ddco"), (FLAT, FLAT), (EQUAL, EQUAL)):
-                own = one["methods"][name]
-                for seed, value in enumerate(own["log_likelihood_valid"]["by_seed"]):
-                    yield "arena", task, method, int(count), seed, "", "nats", value
-                for seed, value in enumerate(own["success"]["by_seed"]):
-                    yield "arena", task, method, int(count), seed, "marginal", "success", value
-
-
-def _bins(root: Path) -> Iterator[tuple[Any, ...]]:
-    known = {60: _results(root / "bin_picking" / "summary.json")}
-    fewer = _results(root / "bin_picking" / "fewer.json")
-    known |= {int(name.rpartition("-")[2]): methods for name, methods in fewer.items()}
-    for count, methods in known.items():
-        for method, name in ((OPTIONS, "DDCO"), (FLAT, FLAT), (EQUAL, EQUAL)):
-            seeds = len(methods[name]["held_out"])
-            trials = methods[name]["criteria"]["bins cleared"]["trials"] / seeds
-            for seed in range(seeds):
-                own = ("bins", "bins", method, count, seed)
-                yield *own, "", "nats", methods[name]["held_out"][seed]
-                yield *own, "marginal", "success", methods[name]["cleared by seed"][seed] / trials
-
-
-def _planted(root: Path) -> Iterator[tuple[Any, ...]]:
-    for one in _results(root / "planted_levels.json"):
-        if "fitted" not in one and not one["way"].endswith("320"):
-            own = ("planted", one["way"], OPTIONS, 80, one["seed"], "")
-            yield *own, "nats", one["found"]
-            for number, value in enumerate(one["found nmi"], 1):
-                yield *own, f"NMI, level {number}", value
-
-
-def _results(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8"))["results"]
+    found = []
+    for study, (table, name, methods) in SOURCES.items():
+        for row in read(root / f"{table}.csv"):
+            measured = row.measure in ("nats", "NMI", *ACTING_MEASURES) or row.measure.startswith("NMI, level")
+            if row.study == name and row.method in methods and measured and row.seed is not None:
+                task = row.task if study in ("arena", "planted") else study
+                acting = "marginal" if row.measure in ACTING_MEASURES else ""
+                own = {"study": study, "task": task, "method": methods[row.method], "acting": acting}
+                found.append(row._asdict() | own)
+    return found
 
 
 # --- pairs ------------------------------------------------------------------------------------------------------------
 
 
-def comparisons(rows: Sequence[Row], pages: Sequence[Row]) -> list[Row]:
+def comparisons(rows: Sequence[Numbers], pages: Sequence[Numbers]) -> list[Numbers]:
     """For each study, task, number of demonstrations and measure that mixtures have: the values of each method, and
     differences of those that one is paired with by seed, over seeds.
 
@@ -127,7 +95,7 @@ KEY = ("study", "task", "demonstrations", "measure", "acting")
 ORDER = ("needle", "pushing", "arena", "bins", "planted")
 
 
-def _key(row: Row) -> tuple[Any, ...]:
+def _key(row: Numbers) -> tuple[Any, ...]:
     return tuple(row[key] for key in KEY)
 
 
@@ -136,11 +104,11 @@ def _order(key: tuple[Any, ...]) -> tuple[Any, ...]:
     return (ORDER.index(study), task, count, measure != "nats", measure, acting)
 
 
-def _in_order(one: Row) -> int:
+def _in_order(one: Numbers) -> int:
     return ORDER.index(one["study"])
 
 
-def _compared(named: Row, rows: Sequence[Row], pages: Sequence[Row]) -> Row:
+def _compared(named: Numbers, rows: Sequence[Numbers], pages: Sequence[Numbers]) -> Numbers:
     anyhow = named | {"acting": "marginal"} if named["acting"] else named  # flat policies act in one way
     values = {
         FLAT: _values(anyhow, FLAT, pages),
@@ -161,7 +129,7 @@ def _compared(named: Row, rows: Sequence[Row], pages: Sequence[Row]) -> Row:
     return found
 
 
-def _values(named: Row, method: str, rows: Iterable[Row]) -> Values:
+def _values(named: Numbers, method: str, rows: Iterable[Numbers]) -> Values:
     wanted = (*(named[key] for key in KEY), method)
     return {row["seed"]: row["value"] for row in rows if (*_key(row), row["method"]) == wanted}
 
@@ -171,9 +139,9 @@ def paired(more: Values, less: Values) -> list[float]:
     return [more[seed] - less[seed] for seed in sorted(more.keys() & less.keys())]
 
 
-def over_tasks(found: Sequence[Row]) -> list[Row]:
+def over_tasks(found: Sequence[Numbers]) -> list[Numbers]:
     """Of a study with several tasks: means over seeds, and over tasks with intervals over tasks."""
-    groups: dict[tuple[Any, ...], list[Row]] = {}
+    groups: dict[tuple[Any, ...], list[Numbers]] = {}
     for one in found:
         if one["study"] == "arena":
             groups.setdefault((one["demonstrations"], one["measure"], one["acting"]), []).append(one)
@@ -187,13 +155,13 @@ def over_tasks(found: Sequence[Row]) -> list[Row]:
     return whole
 
 
-def _over(group: Sequence[Row], part: str) -> Row:
+def _over(group: Sequence[Numbers], part: str) -> Numbers:
     names = group[0][part]
     means = {name: [one[part][name]["mean"] for one in group if one[part][name]["mean"] is not None] for name in names}
     return {name: over_seeds(values) for name, values in means.items()}
 
 
-def checks(rows: Sequence[Row], pages: Sequence[Row]) -> list[Row]:
+def checks(rows: Sequence[Numbers], pages: Sequence[Numbers]) -> list[Numbers]:
     """Of each cell of options that was fitted again by how much it differs from what its study keeps."""
     again = [row for row in rows if row["method"] == OPTIONS]
     kept = {(*_key(row), row["seed"]): row["value"] for row in pages if row["method"] == OPTIONS}
@@ -206,7 +174,7 @@ FORMS = {"nats": "{:.2f}", "success": "{:.0%}", "goals": "{:.1f}"}
 NAMED = {"needle": "needle", "pushing": "pushing", "arena": "Meta-World", "bins": "bin picking", "planted": "planted"}
 
 
-def form_of(one: Row, difference: bool = False) -> str:
+def form_of(one: Numbers, difference: bool = False) -> str:
     """How a measure is shown; pushing's likelihoods differ by hundredths."""
     form = (
         "{:.3f}" if one["measure"] == "nats" and one["study"] in ("pushing", "planted") else FORMS.get(one["measure"])
@@ -215,7 +183,7 @@ def form_of(one: Row, difference: bool = False) -> str:
     return form.replace("{:", "{:+") if difference else form
 
 
-def table(found: Sequence[Row]) -> list[str]:
+def table(found: Sequence[Numbers]) -> list[str]:
     """Lines of Markdown."""
     head = ["study", "demonstrations", "measure", "flat", "flat of equal size", "mixture", "options", "options again"]
     head += ["mixture − flat", "mixture − flat of equal size", "options − mixture", "options again − mixture", "seeds"]
@@ -230,7 +198,7 @@ def table(found: Sequence[Row]) -> list[str]:
     return lines
 
 
-def table_by_em(found: Sequence[Row]) -> list[str]:
+def table_by_em(found: Sequence[Numbers]) -> list[str]:
     """Lines of Markdown: what another optimiser changes, where it was tried."""
     head = ["study", "demonstrations", "measure", *(f"{more} − {less}" for more, less in BY_EM)]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
@@ -242,25 +210,25 @@ def table_by_em(found: Sequence[Row]) -> list[str]:
     return lines if len(lines) > 2 else []
 
 
-def _seeds(one: Row) -> str:
+def _seeds(one: Numbers) -> str:
     """How many seeds: of a mean over tasks of which some have fewer, ``1 to 3``."""
     most, fewest = len(one["seeds"]), one.get("fewest", len(one["seeds"]))
     return str(most) if fewest == most else f"{fewest} to {most}"
 
 
-def _mean(one: Row, method: str) -> str:
+def _mean(one: Numbers, method: str) -> str:
     value = one["mean"][method]["mean"]
     return "-" if value is None else form_of(one).format(value)
 
 
-def _difference(one: Row, more: str, less: str) -> str:
+def _difference(one: Numbers, more: str, less: str) -> str:
     own = one["difference"][f"{more} - {less}"]
     fewer = one["study"] != "arena" and own["mean"] is not None and len(own["by_seed"]) < len(one["seeds"])
     shown = spread(own, form_of(one, True)) + (f" ({len(own['by_seed'])} seeds)" if fewer else "")
     return f"**{shown}**" if own["interval"] and np.prod(np.sign(own["interval"])) > 0 else shown
 
 
-def reproduced(found: Sequence[Row]) -> Iterator[str]:
+def reproduced(found: Sequence[Numbers]) -> Iterator[str]:
     """A line for each study: which cells were fitted again, and by how much they differ."""
     for study in ORDER:
         own = [one for one in found if one["study"] == study]
@@ -276,13 +244,11 @@ def reproduced(found: Sequence[Row]) -> Iterator[str]:
         yield " ".join(lines).rstrip(";") + "."
 
 
-def page(found: Sequence[Row], again: Sequence[Row], missing: Sequence[str], made_by: str) -> str:
+def page(found: Sequence[Numbers], again: Sequence[Numbers], missing: Sequence[str]) -> str:
     """The results as Markdown."""
     tasks, whole = [one for one in found if one["study"] == "arena"], over_tasks(found)
     main = sorted([*(one for one in found if one["study"] != "arena"), *whole], key=_in_order)
     lines = [
-        made_by,
-        "",
         "# Is it memory, or is it several policies?",
         "",
         "A hierarchy differs from a flat policy in two things. It has several policies behind a meta-policy that "
@@ -292,11 +258,11 @@ def page(found: Sequence[Row], again: Sequence[Row], missing: Sequence[str], mad
         "",
         "Differences are paired by training seed: means with 95 % t intervals over seeds, and for Meta-World over "
         "tasks, of means over seeds. They are not corrected for the number of comparisons; bold ones leave out 0. "
-        "Options and flat policies are of the studies' own pages, with the same demonstrations, seeds and starts. "
+        "Options and flat policies are of the studies' own tables, with the same demonstrations, seeds and starts. "
         "Starts: needle 60 with 20 demonstrations and 200 with 100, pushing 20 episodes of 2000 steps, Meta-World 20, "
         "bin picking 20 bins, where success is a bin that is cleared. Nats are per step, and NMI is with the labels; "
         "both are of held-out demonstrations. "
-        "*Bin picking, flat far end* shows loads over the pile (`memory/far_end.csv`): its mixtures are hierarchies of "
+        "*Bin picking, flat far end* shows loads over the pile: its mixtures are hierarchies of "
         "commit 579683a with all logits of terminations at 40, beside the numbers of commit 9c3163b. "
         "Pushing's page has `marginal` alone of the three ways of choosing options; a flat policy acts in one way.",
         "",
@@ -333,7 +299,7 @@ ACTED = (("needle", "success"), ("pushing", "goals"), ("arena", "success"), ("ar
 """The measures of acting, and of segments, in the table and the figure of README."""
 
 
-def shortest(found: Sequence[Row]) -> list[Row]:
+def shortest(found: Sequence[Numbers]) -> list[Numbers]:
     """The rows of README: of each measure of :data:`ACTED` the one with most demonstrations.
 
     Options are those that were fitted again, where all were.
@@ -351,7 +317,7 @@ def shortest(found: Sequence[Row]) -> list[Row]:
     return chosen
 
 
-def short(found: Sequence[Row]) -> str:
+def short(found: Sequence[Numbers]) -> str:
     """The table of README: the two differences of each row of :func:`shortest`."""
     lines = [
         "| task | demonstrations | measure | several policies (mixture − flat) | lasting (options − mixture) | seeds |",
@@ -387,12 +353,12 @@ PANELS: dict[str, Callable[[str], bool]] = {
 }
 
 
-def everything(found: Sequence[Row]) -> list[Row]:
+def everything(found: Sequence[Numbers]) -> list[Numbers]:
     """The rows of the page's figure: every comparison, of Meta-World the means over tasks."""
     return sorted([*(one for one in found if one["study"] != "arena"), *over_tasks(found)], key=_in_order)
 
 
-def draw(rows: Sequence[Row], path: Path, columns: int = 2) -> None:
+def draw(rows: Sequence[Numbers], path: Path, columns: int = 2) -> None:
     """The two differences of every comparison, a panel for each measure; in one column on half the width."""
     groups = {name: [one for one in rows if belongs(one["measure"])] for name, belongs in PANELS.items()}
     groups = {name: group for name, group in groups.items() if group}
@@ -412,7 +378,7 @@ def draw(rows: Sequence[Row], path: Path, columns: int = 2) -> None:
         save(figure, path, "What several policies are worth, and what it is worth that they last", "")
 
 
-def _panel(axes: Axes, name: str, group: Sequence[Row]) -> None:
+def _panel(axes: Axes, name: str, group: Sequence[Numbers]) -> None:
     for place, one in enumerate(group):
         for shift, (difference, colour) in zip((-0.22, 0, 0.22), COLOURS.items(), strict=True):
             own = one["difference"].get(difference)
@@ -437,7 +403,7 @@ def _once(axes: Axes, difference: str) -> str | None:
     return None if label in axes.get_legend_handles_labels()[1] else label
 
 
-def _label(one: Row) -> str:
+def _label(one: Numbers) -> str:
     words = [NAMED[one["study"]], str(one["demonstrations"])]
     words += [one["task"]] if one["study"] == "planted" else []
     words += [one["acting"].replace("_", " ")] if one["measure"] == "goals" and one["acting"] else []

@@ -9,32 +9,28 @@ levels: with the truth's lowest level they maximise the likelihood by EM, over w
 starts at the truth's own probabilities, ``search`` where ``segments`` does, from random ones. ``-320``: the same with
 four times as many demonstrations.
 
-Writes ``planted_levels.json`` after each fit, and ``planted_levels.md`` from it. Fits of the ways that are named are
-not done again where the same code has made them; those of the other ways stay as they are.
+Adds its numbers to ``docs/results/segments.csv`` after each fit.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
+from cells import described
 from joblib import Parallel, delayed
-from provenance import record, sentence, text
-from scipy import stats
 from sklearn.metrics import normalized_mutual_info_score
+from table import RESULTS, Row, add, shown
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plant, recovered
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import write_text
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.batch import encode
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -56,11 +52,11 @@ WAYS = {
 LIMITS = ("limit", "search")
 NAMES = tuple(f"{way}{many}" for way in (*WAYS, *LIMITS) for many in ("", MANY))
 
-Row = dict[str, Any]
-"""The ``way``, the ``seed``, what was found, and what made it."""
+Result = dict[str, Any]
+"""The ``way``, the ``seed``, and what was found."""
 
 
-def one_fit(way: str, seed: int, lasting: bool = True) -> Row:
+def one_fit(way: str, seed: int, lasting: bool = True) -> Result:
     """A way of training on a seed's demonstrations.
 
     :param lasting: False: the options that are trained end after every step, at every level.
@@ -109,73 +105,32 @@ def _per_step(tables: Tables, lengths: Tensor) -> float:
     return float(log_likelihood(tables, lengths).sum()) / int(lengths.sum())
 
 
-def interval(values: list[float]) -> str:
-    """Mean and 95 % t interval."""
-    half = stats.sem(values) * stats.t.ppf(0.975, len(values) - 1)
-    return f"{np.mean(values):.3f} ± {half:.3f}"
-
-
-def table(rows: list[Row], made_by: str) -> str:
-    """The numbers as Markdown."""
-    lines = [
-        made_by, "",
-        f"{COUNTS} options, lowest level first; {DEMONSTRATIONS} demonstrations of {STEPS} steps, {HELD_OUT} held out; "
-        "mean over seeds and 95 % t interval.", "",
-        "| model | seeds | held-out log-likelihood per step, nats | NMI with the true options, level 1 | level 2 "
-        "| level 3 |",
-        "|---|---|---|---|---|---|",
-        _line("truth", list({row["seed"]: row for row in rows}.values()), "truth"),
-        *(_line(way, own, "found") for way in NAMES if (own := _of(rows, way))), "",
-        "| less than the truth's own, paired by seed | nats per step | NMI, level 1 | level 2 | level 3 |",
-        "|---|---|---|---|---|",
-        *(_short(way, own) for way in NAMES if (own := _of(rows, way))),
-    ]  # fmt: skip
-    for many in ("", MANY):
-        best, searched = ({row["seed"]: row["fitted"] for row in _of(rows, f"{way}{many}")} for way in LIMITS)
-        if seeds := sorted(best.keys() & searched.keys()):
-            more = ", ".join(f"{searched[seed] - best[seed]:+.0e}" for seed in seeds)
-            lines += ["", f"Training log-likelihood of search{many}, minus limit{many}, nats per step by seed: {more}."]
-    return "\n".join(lines) + "\n"
-
-
-def _of(rows: list[Row], way: str) -> list[Row]:
-    return [row for row in rows if row["way"] == way]
-
-
-def _line(name: str, rows: list[Row], model: str) -> str:
-    levels = [interval(list(level)) for level in zip(*(row[f"{model} nmi"] for row in rows), strict=True)]
-    seeds = ", ".join(str(row["seed"]) for row in rows)
-    return f"| {name} | {seeds} | {interval([row[model] for row in rows])} | {' | '.join(levels)} |"
-
-
-def _short(name: str, rows: list[Row]) -> str:
-    """By how much what was found is worse than the truth."""
-    short = [np.array([row["truth"], *row["truth nmi"]]) - [row["found"], *row["found nmi"]] for row in rows]
-    return f"| {name} | {' | '.join(interval(list(column)) for column in zip(*short, strict=True))} |"
+def rows_of(one: Result) -> Iterator[Row]:
+    """Its numbers in the table, and those of the truth on the same demonstrations."""
+    way, seed = one["way"], one["seed"]
+    count = DEMONSTRATIONS * (4 if way.endswith(MANY) else 1)
+    for model, method in (("found", way), ("truth", "truth")):
+        yield Row("planted_levels", way, method, count, seed, "nats", one[model])
+        for level, value in enumerate(one[f"{model} nmi"], 1):
+            yield Row("planted_levels", way, method, count, seed, f"NMI, level {level}", value)
+    if "fitted" in one:
+        yield Row("planted_levels", way, way, count, seed, "nats, training", one["fitted"])
 
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = described(__doc__)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--ways", nargs="+", choices=NAMES, default=[*WAYS, *LIMITS])
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=Path("docs/results"))
-    arguments = parser.parse_args()
-    command = f"python studies/planted_levels.py --seeds {arguments.seeds} --ways {' '.join(arguments.ways)}"
-    made_by, path = record(command), arguments.out / "planted_levels.json"
-    before = json.loads(path.read_text())["results"] if path.exists() else []
-    rows = [row for row in before if row["way"] not in arguments.ways or row["made by"]["code"] == made_by["code"]]
-    done = {(row["way"], row["seed"]) for row in rows}
-    cells = [(way, seed) for way in arguments.ways for seed in range(arguments.seeds) if (way, seed) not in done]
-    calls = (delayed(one_fit)(way, seed) for way, seed in cells)
-    for row in Parallel(n_jobs=arguments.jobs, return_as="generator_unordered")(calls):
-        rows.append({**row, "made by": made_by})
-        write_text(path, text(rows, [row["made by"] for row in rows]))
-    rows.sort(key=lambda row: row["seed"])
-    page = table(rows, sentence(made_by["command"], [row["made by"] for row in rows]))
-    write_text(path.with_suffix(".md"), page)
-    print(page)
+    parser.add_argument("--out", type=Path, default=RESULTS / "segments.csv")
+    own = parser.parse_args()
+    cells = [(way, seed) for way in own.ways for seed in range(own.seeds)]
+    found = []
+    for one in Parallel(n_jobs=own.jobs, return_as="generator_unordered")(delayed(one_fit)(*cell) for cell in cells):
+        found += rows_of(one)
+        add(own.out, found)
+    print(shown(found))
 
 
 if __name__ == "__main__":

@@ -1,34 +1,271 @@
 """Pushing from pictures (paper §5.1, SM 1.2, SM 1.5): goals against demonstrations, the same over the features of a
-flat policy (``encoded``), of pictures as the camera has them beside small ones (``large``), goals against options, and
+flat policy (``encoded``), of pictures as the camera has them beside small ones (``large``), against options, and
 augmentation.
 
     python studies/pushing_pictures.py demonstrations|encoded|large|options|augmentation [--seeds 3]
-        [--methods ff ff_flat ...] [--counts 80 40 20 10] [--options 1 2 3 4 5 6] [--updates 4000] [--episodes 5]
-        [--set KEY=VALUE]... [--summarize] [--minutes 60] [--jobs 1] [--out DIR] [--runs DIR]
+        [--methods ff ff_flat ...] [--counts 80 40 20 10] [--options 1 2 4] [--updates 4000] [--episodes 5]
+        [--set KEY=VALUE]... [--summarize] [--jobs 1] [--runs DIR]
 
-Does cells one seed after the other, and begins none after so many minutes; what this code has done with these settings
-is not done again, and neither is what the JSON of this study, or of another in DIR, has of these settings, by whatever
-code. Writes ``NAME.json``, ``NAME.md`` and ``NAME.png`` of all cells that are done, and says which are not.
+Demonstrations and evaluation episodes are those of ``pushing.py`` with the same seeds. Pictures are drawn three times
+as fine as they are seen, 48 x 64, and reduced by means. ``ff_large`` sees all of 480 x 640, which takes a GPU, or 4 s
+of processor time for each gradient step. All pictures have to be in memory, 0.9 MB each (``DDCO_PYRO_MEMORY=18GB``
+allows 80 demonstrations). Fits are done on a GPU where there is one. A cell that was done with these settings
+is not done again. Adds its numbers to ``docs/results/pushing_pictures.csv``.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import pushing_pictures_results as shown
-from cells import Settings, described, printed, some
-from joblib import Parallel, delayed
-from provenance import Record, record, sentence, text
-from pushing_pictures_cell import DEFAULTS, METHODS, PictureCell, spec_of
+import dm_env
+import numpy as np
+import study
+from cells import Cell, Settings, described, digest
+from ddco_tasks.pushing import environment as pushing
+from pushing import EVALUATION, HELD_OUT, HELD_OUT_SEED, LABELS, POOL, TRAINING, per_step, summary
+from table import Row
 
-from ddco_pyro.data.files import write_text
+from ddco_pyro.acting.controller import Controller
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.pictures import MOVED, Transform, shifted
+from ddco_pyro.encoding.fitted import FittedReader, from_fit
+from ddco_pyro.errors import BadInput
+from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.simulation.cameras import Camera, Encoded
+from ddco_pyro.simulation.episodes import play, run_episode
+from ddco_pyro.simulation.task import Task
+from ddco_pyro.spec import Spec, load_spec, with_overrides
+from ddco_pyro.training.devices import device_of
+from ddco_pyro.training.networks import Dimensions, baseline_spec, parameters
+from ddco_pyro.training.restarts import Trainer, train_model
+
+SPECS = Path(__file__).parents[1] / "specs"
+SIZE, FINER, LARGE = (48, 64), 3, (480, 640)
+SUPERVISOR = "scripted_noisy_0.3"
+
+METHODS = {
+    **dict.fromkeys(("ff", "ff_flat", "ff_two", "ff_two_flat", "ff_large", "ff_large_flat"), "pushing_image_ff"),
+    **dict.fromkeys(("rnn", "rnn_flat"), "pushing_image_rnn"),
+    **{"ff_hybrid": "pushing_image_ff_hybrid", "rnn_hybrid": "pushing_image_rnn_hybrid"},
+    **dict.fromkeys(("encoded", "encoded_flat"), "pushing_mlp"),
+}
+"""The spec of each method. ``_flat``: as many parameters as the hierarchy beside it has with the options of its spec;
+``ff_two``: of two pictures side by side instead of one; ``ff_large``: of pictures as the camera has them; ``encoded``:
+perceptrons over what the convolutions of ``ff_flat``, fitted to the same demonstrations, give of a picture, or in
+training of one that is moved."""
+
+ENCODED = (
+    "observations=[{key: camera_features, augment: {versions: camera_features_moved}}]",
+    "control.std=0.35",
+    "training.optimizer={name: adam, lr: 1.0e-3, schedule: cosine}",
+    "training.batch_size=16",
+)
+"""What is changed in ``pushing_mlp.yaml`` to read features. Of σ of 1, 0.5, 0.35 and 0.25 this one is the likeliest
+on the held-out demonstrations of a development seed, for options and flat policy alike."""
+
+REDUCING = [{"filters": 16, "kernel": 5, "stride": 5}, {"filters": 16, "kernel": 5, "stride": 2, "padding": 2}]
+"""Two convolutions before those of the spec, by which pictures of ``LARGE`` have maps of ``SIZE``: a network of
+``ff_large`` learns to reduce its pictures."""
+
+VERSIONS = 24
+"""How many versions of the features of each demonstration there are, of pictures moved as ``ff_flat`` sees them."""
+
+DEVELOPMENT = 7
+"""The first training seed by which nothing but settings is chosen."""
+
+DEFAULTS = Settings({"updates": 4000, "episodes": 5}, Path("runs/pushing-pictures"))
+"""Gradient steps of a fit, and what each one plays."""
+
+
+@dataclass(frozen=True)
+class PictureCell(Cell):
+    """A method with k options (0: flat), a number of demonstrations, and a training seed."""
+
+    script = "pushing_pictures.py"
+
+    method: str
+    options: int
+    count: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        """:raises BadInput: a flat policy has options, or a hierarchy has none."""
+        flat = self.method.endswith("_flat")
+        if self.options != 0 if flat else self.options < 1:
+            allowed = "0, as it is a flat policy" if flat else "1 or more; flat policies are methods of their own"
+            raise BadInput(f"{self.method} with {self.options} options: it has to be {allowed}")
+
+    def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
+        """Fit and play."""
+        device_of(spec_of(self, settings).training)  # what is wrong is said before anything is drawn
+        own, tasks = settings.values, (watched(pushing.task, self.camera), watched(pushing.limited, self.camera))
+        demos, test = self.demonstrations(settings), held_out(settings.runs, self.seed, self.camera)
+        if self.method.startswith("encoded"):
+            reader = self._reader(settings, folder)
+            demos, test = encoded(reader, demos, VERSIONS, self.seed), encoded(reader, test)
+            tasks = tuple(_seen_through(reader, task) for task in tasks)
+        begun, before = time.perf_counter(), time.process_time()
+        spec, trained = self.fitted(settings, demos, folder)
+        fitted, cpu = time.perf_counter(), time.process_time() - before
+        found = Fit(spec, trained.hierarchy)
+        likelihood = {name: per_step(found, each) for name, each in (("train", demos), ("held_out", test))}
+        first = EVALUATION + 1000 * self.seed
+        seeds = range(first, first + int(own["episodes"]))
+        controller = Controller.from_spec(trained.hierarchy, spec.rollout)
+        observed = trained.hierarchy.encoder.shapes
+        episodes, limited = (play(task, controller, seeds, observed) for task in tasks)
+        ended = time.perf_counter()
+        return {
+            "std": spec.control.std,
+            "log_likelihood_per_step": likelihood,
+            "parameters": parameters(trained.hierarchy),
+            "steps": trained.summary,
+            "unlimited": summary(episodes),
+            "limited": summary(limited),
+            "seconds": {"fit": fitted - begun, "fit_processor": cpu, "play": ended - fitted},
+        }
+
+    def rows(self, results: Mapping[str, Any]) -> Iterator[Row]:
+        """Means over episodes, and the likelihoods."""
+        method = self.method + (f", k = {self.options}" if self.options else "")
+        named = "pushing_pictures", f"σ = {results['std']:g}", method, self.count, self.seed
+        own, limited = results["unlimited"], results["limited"]
+        yield Row(*named, "goals", float(np.mean(own["goals"])))
+        yield Row(*named, "goals, 250 steps each", float(np.mean(limited["goals"])))
+        yield Row(*named, "topples", float(np.mean(own["topples"])))
+        yield Row(*named, "nats", results["log_likelihood_per_step"]["held_out"])
+        yield Row(*named, "nats, training", results["log_likelihood_per_step"]["train"])
+        if own["dwell"] is not None:
+            yield Row(*named, "steps an option lasts", own["dwell"])
+            yield Row(*named, "steps under own control", own["own_control"])
+
+    @property
+    def camera(self) -> Camera:
+        """What it sees."""
+        return Camera(LARGE, pushing.camera(*LARGE).draw) if self.method.startswith("ff_large") else CAMERA
+
+    def demonstrations(self, settings: Settings) -> Demonstrations:
+        """What is trained with."""
+        if self.camera is CAMERA:
+            demos = pool(settings.runs, self.seed)
+            return demos.select(demos.names[: self.count])
+        return drawn(self.camera, TRAINING + 1000 * self.seed, self.count)
+
+    def fitted(self, settings: Settings, demos: Demonstrations, folder: Path) -> tuple[Spec, Trainer]:
+        """The fit, which is done only once."""
+        spec, size = spec_of(self, settings), Dimensions.of(demos)
+        spec = spec if self.options else baseline_spec(spec, spec.compare_with[-1], size)
+        return spec, train_model(spec, size, demos, checkpoints=folder)
+
+    def _reader(self, settings: Settings, folder: Path) -> FittedReader:
+        """The convolutions of the flat policy of the same demonstrations, which is fitted as its own cell has it."""
+        flat, plain = PictureCell("ff_flat", 0, self.count, self.seed), replace(settings, overrides=())
+        its = folder.parents[1] / digest(plain.kept()) / flat.name
+        spec, trained = flat.fitted(plain, flat.demonstrations(plain), its)
+        return from_fit(Fit(spec, trained.hierarchy), "camera", (*SIZE, 3))
+
+
+def spec_of(cell: PictureCell, settings: Settings) -> Spec:
+    """The spec of a cell, whose pictures are small already."""
+    features = cell.method.startswith("encoded")
+    changed: dict[str, Any] = {"seed": cell.seed, "demonstrations.count": cell.count}
+    if cell.options:
+        changed["hierarchy.levels.0.count"] = cell.options
+    if not features:
+        changed |= {"observations.0.resize": None, "observations.0.frames": 2 if "_two" in cell.method else 1}
+    always = ("training.device=auto", *(ENCODED if features else ()))
+    base = load_spec(SPECS / f"{METHODS[cell.method]}.yaml", [*always, *settings.overrides])
+    if cell.method.startswith("ff_large"):
+        changed |= _large(base)
+    spec = with_overrides(base, changed)
+    trained = cell.count - max(1, round(cell.count * spec.training.tune_fraction))
+    epochs = int(np.ceil(settings.values["updates"] / np.ceil(trained / spec.training.batch_size)))
+    return with_overrides(spec, {"training.epochs": epochs})
+
+
+def _large(spec: Spec) -> dict[str, Any]:
+    """What a spec is changed to where its pictures are ten times as large, in the hierarchy and in its baseline."""
+    layers = [layer.model_dump(exclude_defaults=True) for layer in spec.hierarchy.trunk.of["camera"].layers]
+    places = ("hierarchy.trunk", "compare_with.0.policy")
+    shift = LARGE[0] // SIZE[0] * spec.observations[0].augment.shift
+    return {f"{place}.of.camera.layers": REDUCING + layers for place in places} | {
+        "observations.0.augment.shift": shift
+    }
+
+
+def _finely_drawn(environment: dm_env.Environment) -> np.ndarray:
+    """The scene, drawn finer than it is seen and reduced by means: edges tell where things are between two pixels."""
+    height, width = SIZE
+    drawn = pushing.camera(FINER * height, FINER * width).draw(environment)
+    return Transform(resize=SIZE)(drawn[None])[0]
+
+
+CAMERA = Camera(SIZE, _finely_drawn)
+
+
+def watched(task: Task, camera: Camera = CAMERA) -> Task:
+    """The task with a camera that policies may look at."""
+    return replace(task, cameras={"camera": camera})
+
+
+def pool(folder: Path, seed: int) -> Demonstrations:
+    """All demonstrations of a training seed; a cell takes the first ones."""
+    return recorded(folder, TRAINING + 1000 * seed, POOL)
+
+
+def held_out(folder: Path, seed: int, camera: Camera = CAMERA) -> Demonstrations:
+    """Demonstrations that nothing is trained on; others for a development seed."""
+    first = HELD_OUT_SEED + 1000 * (seed >= DEVELOPMENT)
+    return recorded(folder, first, HELD_OUT) if camera is CAMERA else drawn(camera, first, HELD_OUT)
+
+
+def recorded(folder: Path, first: int, count: int) -> Demonstrations:
+    """Demonstrations of one goal each from seeds ``first`` on, with pictures and labels in memory; kept in a file."""
+    path = folder / "demonstrations" / f"{first}.hdf5"
+    if not path.exists():
+        drawn(CAMERA, first, count).write(path)
+    kept = Demonstrations.read(path, labels=LABELS)
+    return replace(kept, demonstrations=tuple(map(_in_memory, kept)))
+
+
+def drawn(camera: Camera, first: int, count: int) -> Demonstrations:
+    """Demonstrations of one goal each from seeds ``first`` on, in memory and nowhere else."""
+    task, seeds = watched(pushing.single, camera), range(first, first + count)
+    episodes = [run_episode(task, SUPERVISOR, seed, observed=["camera"], keep=["camera"]) for seed in seeds]
+    return Demonstrations(tuple(one.record for one in episodes))
+
+
+def encoded(reader: FittedReader, demos: Demonstrations, versions: int = 0, seed: int = 0) -> Demonstrations:
+    """Features in the place of the pictures, and so many versions of them, each of pictures that are moved alike."""
+    shift = load_spec(SPECS / "pushing_image_ff.yaml").observations[0].augment.shift
+    moves = np.random.default_rng(seed).integers(-shift, shift + 1, (len(demos), versions, 2)).tolist()
+    copies = []
+    for demo, own in zip(demos, moves, strict=True):
+        pictures = np.asarray(demo.observations["camera"])
+        seen = {"camera_features": reader.encode(pictures)}
+        if own:
+            each = [reader.encode(shifted(pictures, *by)) for by in own]
+            seen[f"camera_features{MOVED}"] = np.stack(each, axis=1)
+        copies.append(replace(demo, observations=seen))
+    return replace(demos, demonstrations=tuple(copies))
+
+
+def _seen_through(reader: FittedReader, task: Task) -> Task:
+    """The same task, whose pictures are encoded."""
+    seen = Encoded(CAMERA, lambda picture: reader.encode(picture[None])[0], reader.features)
+    return replace(task, cameras={"camera_features": seen})
+
+
+def _in_memory(demo: Demonstration) -> Demonstration:
+    """So small that it need not be read from the file in each epoch."""
+    return replace(demo, observations={key: np.asarray(values) for key, values in demo.observations.items()})
+
 
 STUDIES = {
     "demonstrations": ("ff_flat", "ff", "rnn_flat", "rnn", "ff_two_flat", "ff_two"),
@@ -38,123 +275,36 @@ STUDIES = {
     "augmentation": ("ff", "ff_hybrid", "rnn", "rnn_hybrid"),
 }
 """The methods of each."""
-
 OWN_OPTIONS = {"ff": 2, "rnn": 4, "encoded": 2}
 """What the supplement says; the text has them the other way round."""
-
 COUNT = 40
 """Demonstrations where their number is not what is varied."""
 
-FIELDS = tuple(field.name for field in fields(PictureCell))
-"""Of a row, what names its cell."""
 
-
-def cells(own: argparse.Namespace) -> list[PictureCell]:
+def cells(own: argparse.Namespace) -> Sequence[PictureCell]:
     """All of a study, one seed after the other."""
     methods = [name for name in STUDIES[own.study] if name in own.methods]
-    if shown.ACROSS[own.study] == "count":
-        product = itertools.product(range(own.seeds), own.counts, methods)
-        return [PictureCell(name, _own_options(name), count, seed) for seed, count, name in product]
-    grid = itertools.product(range(own.seeds), own.options, methods)
-    return [PictureCell(name, options, COUNT, seed) for seed, options, name in grid]
+    if own.study in ("options", "augmentation"):
+        grid = itertools.product(range(own.seeds), own.options, methods)
+        return [PictureCell(name, options, COUNT, seed) for seed, options, name in grid]
+    grid = itertools.product(range(own.seeds), own.counts, methods)
+    return [PictureCell(name, own_options(name), count, seed) for seed, count, name in grid]
 
 
-def _own_options(method: str) -> int:
+def own_options(method: str) -> int:
+    """How many a method has where their number is not what is varied."""
     return 0 if method.endswith("_flat") else OWN_OPTIONS[method.partition("_")[0]]
-
-
-def arguments(parser: argparse.ArgumentParser) -> None:
-    """Which study, which part of it, and where it is kept."""
-    parser.add_argument("study", choices=STUDIES)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
-    parser.add_argument("--counts", type=int, nargs="+", default=[80, 40, 20, 10])
-    parser.add_argument("--options", type=int, nargs="+", default=[1, 2, 3, 4, 5, 6])
-    parser.add_argument("--summarize", action="store_true", help="do nothing that is not done")
-    parser.add_argument("--minutes", type=float, default=float("inf"))
-    parser.add_argument("--jobs", type=int, default=1, help="cells at a time; each works on one thread")
-    parser.add_argument("--out", type=Path, default=Path("docs/results/pushing_pictures"))
-    DEFAULTS.add_to(parser)
 
 
 def main() -> None:
     """Run one study."""
     parser = described(__doc__)
-    arguments(parser)
-    printed(lambda: run(parser.parse_args()))
-
-
-def run(own: argparse.Namespace) -> str:
-    """Do what is not done yet, and write what there is; the page."""
-    settings, asked = DEFAULTS.given(own), some(cells(own))
-    before = Page.known(own, asked)
-    made_by, until = record(asked[0].command(settings)), time.monotonic() + 60 * own.minutes
-    if not own.summarize:
-        todo = [cell for cell in asked if cell not in before.rows]
-        Parallel(n_jobs=own.jobs, verbose=10)(delayed(_begun)(cell, settings, made_by, until) for cell in todo)
-    return write(own, settings, asked, before)
-
-
-@dataclass(frozen=True)
-class Page:
-    """What ``NAME.json`` has of cells with the settings that are asked for."""
-
-    rows: dict[PictureCell, shown.Row]
-    records: list[Record | None]
-
-    @classmethod
-    def known(cls, own: argparse.Namespace, asked: Sequence[PictureCell]) -> Page:
-        """With the cells that are asked for and that other studies' pages beside it have."""
-        page = cls.read(own, own.study)
-        for other in (cls.read(own, name) for name in STUDIES):
-            taken = {cell: other.rows[cell] for cell in asked if cell in other.rows.keys() - page.rows.keys()}
-            commits = {row["commit"] for row in taken.values()}
-            records = [one for one in other.records if one is not None and one["commit"] in commits]
-            page = cls({**page.rows, **taken}, [*page.records, *records])
-        return page
-
-    @classmethod
-    def read(cls, own: argparse.Namespace, name: str) -> Page:
-        """That of a study. Nothing, where there is no file, or one of other settings."""
-        path = own.out / f"{name}.json"
-        content = json.loads(path.read_text()) if path.exists() else {"results": {}}
-        if content["results"].get("settings") != DEFAULTS.given(own).kept():
-            return cls({}, [])
-        rows = {PictureCell(*(row[name] for name in FIELDS)): row for row in content["results"]["cells"]}
-        return cls(rows, content["provenance"])
-
-
-def _part(own: argparse.Namespace) -> str:
-    """The words that say which part of a study is asked for."""
-    across = {"count": "counts", "options": "options"}[shown.ACROSS[own.study]]
-    methods = [name for name in STUDIES[own.study] if name in own.methods]
-    return f"--{across} {' '.join(map(str, getattr(own, across)))} --methods {' '.join(methods)}"
-
-
-def _begun(cell: PictureCell, settings: Settings, made_by: dict[str, str], until: float) -> None:
-    if time.monotonic() < until:
-        cell.run(settings, made_by)
-
-
-def write(own: argparse.Namespace, settings: Settings, asked: Sequence[PictureCell], before: Page) -> str:
-    """Write what there is of a study; the page."""
-    paths = {cell: cell.path(settings) for cell in asked if cell not in before.rows}
-    done = {cell: json.loads(path.read_text()) for cell, path in paths.items() if path.exists()}
-    missing = [cell.name for cell in paths if cell not in done]
-    new = [_row(cell, content, spec_of(cell, settings).control.std) for cell, content in done.items()]
-    rows = shown.at_one_std([*before.rows.values(), *new])
-    records = [*before.records, *(content["provenance"][0] for content in done.values())]
-    command = f"python studies/pushing_pictures.py {own.study} --seeds {own.seeds} {_part(own)} {settings.words()}"
-    page = shown.page(own.study, rows, missing, sentence(command, records))
-    results = {"settings": settings.kept(), "cells": rows, "missing": missing}
-    write_text(own.out / f"{own.study}.json", text(results, records))
-    write_text(own.out / f"{own.study}.md", page)
-    shown.draw(own.study, rows, own.out / f"{own.study}.png")
-    return page
-
-
-def _row(cell: PictureCell, content: dict[str, Any], std: Any) -> shown.Row:
-    return shown.row_of(cell, content["results"]) | {"std": std, "commit": content["provenance"][0]["commit"]}
+    parser.add_argument("study", choices=STUDIES)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
+    parser.add_argument("--counts", type=int, nargs="+", default=[80, 40, 20, 10])
+    parser.add_argument("--options", type=int, nargs="+", default=[1, 2, 4])
+    study.main("pushing_pictures", parser, DEFAULTS, cells)
 
 
 if __name__ == "__main__":

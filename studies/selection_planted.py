@@ -1,27 +1,22 @@
 """Does the one-standard-error rule find the number of options that was planted?
 
-    python studies/selection_planted.py [--options 1 3 5] [--draws 10] [--folds 10] [--most 8] [--jobs -1]
+    python studies/selection_planted.py [--options 1 3 5] [--draws 10] [--folds 5] [--most 6] [--jobs -1]
 
 Draws demonstrations of k linear skills, selects among 1 to ``--most`` options by cross-validation, and counts how often
-k is chosen. All k of a draw come before the next draw, and what ``docs/results/selection_planted.json`` has already is
-not done again; ``selection_planted.md`` beside it has the counts.
+k is chosen. Adds its numbers to ``docs/results/selection.csv``.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import tempfile
-import time
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from provenance import Record, record, sentence, text
+from cells import described
+from table import RESULTS, Row, add
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.files import write_text
 from ddco_pyro.fitting.run import claim
 from ddco_pyro.selection import Workers, select
 from ddco_pyro.spec import Spec, parse_spec
@@ -88,9 +83,8 @@ def planted_spec(path: Path, folds: int, most: int, seed: int) -> Spec:
     return parse_spec(data)
 
 
-def draw(options: int, seed: int, folds: int, most: int, jobs: int, made_by: Record) -> dict[str, Any]:
-    """One selection: what was planted, chosen and best, and the differences to the best."""
-    start = time.process_time()
+def draw(options: int, seed: int, folds: int, most: int, jobs: int) -> list[Row]:
+    """One selection: how many options the rule chooses, and how many are the likeliest."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "planted.hdf5"
         plant(options, seed).write(path)
@@ -99,69 +93,26 @@ def draw(options: int, seed: int, folds: int, most: int, jobs: int, made_by: Rec
         found = select(spec, Path(folder) / "run", workers=Workers(jobs)).choice
     assert found.best is not None
     assert found.chosen is not None
-    return {
-        "options": options,
-        "seed": seed,
-        "made_by": made_by,
-        "chosen": found.chosen.candidate.number + 1,
-        "best": found.best.candidate.number + 1,
-        "means": [row.mean for row in found.rows],
-        "best_standard_error": found.best.error,
-        "differences": [row.difference for row in found.rows],
-        "failed": sum(len(row.failed) for row in found.rows),
-        "cpu_seconds": time.process_time() - start,  # of this process; of all the work where --jobs is 1
-    }
-
-
-def table(rows: list[dict[str, Any]], made_by: str) -> str:
-    """How often what was planted was chosen, as Markdown."""
-    lines = [
-        made_by,
-        "",
-        "| planted | chosen | right | best instead | right |",
-        "|--:|---|--:|---|--:|",
+    return [
+        Row("selection_planted", f"{options} planted", "ddco", None, seed, measure, row.candidate.number + 1)
+        for measure, row in (("chosen", found.chosen), ("likeliest", found.best))
     ]
-    for options in dict.fromkeys(row["options"] for row in rows):
-        own = [row for row in rows if row["options"] == options]
-        counts = [f"{sum(row[key] == options for row in own)} of {len(own)}" for key in ("chosen", "best")]
-        chosen, best = (", ".join(str(row[key]) for row in own) for key in ("chosen", "best"))
-        lines.append(f"| {options} | {chosen} | {counts[0]} | {best} | {counts[1]} |")
-    return "\n".join(lines) + "\n"
 
 
 def main() -> None:
     """Run the study."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = described(__doc__)
     parser.add_argument("--options", type=int, nargs="+", default=[1, 3, 5])
     parser.add_argument("--draws", type=int, default=10)
-    parser.add_argument("--folds", type=int, default=10)
-    parser.add_argument("--most", type=int, default=8)
+    parser.add_argument("--folds", type=int, default=5)
+    parser.add_argument("--most", type=int, default=6)
     parser.add_argument("--jobs", type=int, default=-1)
+    parser.add_argument("--out", type=Path, default=RESULTS / "selection.csv")
     own = parser.parse_args()
-    command = (
-        f"python studies/selection_planted.py --options {' '.join(map(str, own.options))} --draws {own.draws} "
-        f"--folds {own.folds} --most {own.most}"
-    )
-    made_by = record(command)
-    settings = {"folds": own.folds, "most": own.most}
-    path = OUT / "selection_planted.json"
-    stored = json.loads(path.read_text()) if path.exists() else {"results": {"draws": []} | settings}
-    kept = stored["results"]
-    if any(kept[key] != value for key, value in settings.items()):
-        raise SystemExit(f"{path}: was made with other --folds or --most; remove it first")
-    for row in kept["draws"]:
-        row.setdefault("made_by", stored["provenance"][0])  # draws that were adopted as a whole
-    done = {(row["seed"], row["options"]): row for row in kept["draws"]}
-    wanted = list(product(range(FIRST_SEED, FIRST_SEED + own.draws), own.options))
-    for seed, options in wanted:
-        if (seed, options) not in done:
-            done[seed, options] = draw(options, seed, own.folds, own.most, own.jobs, made_by)
-            print(done[seed, options], flush=True)
-        rows = [done[key] for key in sorted(done, key=lambda key: (key[1], key[0]))]
-        page = table(rows, sentence(command, (row.get("made_by") for row in rows)))
-        write_text(path, text(settings | {"draws": rows}, (row.get("made_by") for row in rows)))
-        write_text(OUT / "selection_planted.md", page)
-    print(page)
+    for seed, options in product(range(FIRST_SEED, FIRST_SEED + own.draws), own.options):
+        found = draw(options, seed, own.folds, own.most, own.jobs)
+        add(own.out, found)
+        print(*(f"{row.task}, {row.measure}: {row.value:g}" for row in found), sep="; ", flush=True)
 
 
 if __name__ == "__main__":

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import json
-import math
 
 import apart
 import arena_cell
 import arena_playing
 import arena_recording
-import cells
 import h5py
 import numpy as np
 import pytest
 import torch
 from arena_playing import controls, exported, play
-from arena_results import draw, mean_success, page, summarize
-from arena_segments import MEASURES
 
 from ddco_pyro.errors import BadInput
 from ddco_pyro.exporting import write_numpy
@@ -163,21 +159,6 @@ def test_controllers_are_played_and_shown_a_demonstration_scripted_ones_played_a
     }
 
 
-def test_a_cell_is_done_once_for_each_code_and_settings(tmp_path):
-    done = []
-
-    def work():
-        done.append(len(done))
-        return {"value": done[-1]}
-
-    for code, settings, value in (("a", {"seed": 1}, 0), ("a", {"seed": 1}, 0), ("b", {"seed": 1}, 1)):
-        content = cells.kept(tmp_path / "cell.json", settings, {"code": code}, work)
-        assert content == {"provenance": [{"code": code}], "results": settings | {"value": value}}
-    assert cells.kept(tmp_path / "cell.json", {"seed": 2}, {"code": "b"}, work)["results"] == {"seed": 2, "value": 2}
-    with pytest.raises(ValueError, match="results are named like settings: seed"):  # it would be done each time
-        cells.kept(tmp_path / "cell.json", {"seed": 3}, {"code": "b"}, lambda: {"seed": [1.0]})
-
-
 # --- cells ------------------------------------------------------------------------------------------------------------
 
 
@@ -198,77 +179,3 @@ def test_the_same_demonstrations_are_held_out_from_all_cells(tmp_path):
     assert used[5, 0] != used[5, 1]
     with pytest.raises(BadInput, match="has 8 demonstrations to train on, 9 are asked for"):
         arena_cell.chosen(tmp_path / "demos.hdf5", arena_cell.ArenaCell("task", 9, 0))
-
-
-def cell(seed, nmi, ours, flat, success, task="hammer-v3"):
-    methods = {
-        name: {
-            "log_likelihood_per_step": {"valid": value},
-            "success": [True] * successes + [False] * (4 - successes),
-            "converged": True,
-            "bridge_difference": 1e-7,
-        }
-        for name, value, successes in zip(("ddco", "flat"), (ours, flat), success, strict=True)
-    }
-    return {
-        "task": task,
-        "count": 5,
-        "seed": seed,
-        "expert": {"successes": 70, "attempts": 72, "shares": {"phase": [0.5, 0.495, 0.005]}},
-        "methods": methods,
-        "difference": {"flat": {"nats_per_step": ours - flat}},
-        "held_out": [{"log_likelihood_per_step": {"ddco": ours + more, "flat": flat}} for more in (0.0, -1.0)],
-        "agreement": {"labels": "phase", "valid": [nmi]},
-        "segments": {"ddco": dict.fromkeys(MEASURES, nmi), "kmeans": dict.fromkeys(MEASURES, 0.5)},
-        "seconds": {"all": 60.0},
-    }
-
-
-def test_the_page_of_two_seeds_worked_by_hand():
-    results = summarize([cell(0, 0.5, 1.0, 0.75, (1, 0)), cell(1, 0.7, 2.0, 1.75, (3, 2))])
-    found = results["tasks"]["hammer-v3"]["counts"]["5"]
-    assert found["nmi_valid"]["mean"] == pytest.approx(0.6)
-    assert found["methods"]["ddco"]["success"]["by_seed"] == [0.25, 0.75]
-    text = page(json.loads(json.dumps(results)), "Made.")
-    assert "| hammer-v3 | 5 | 0.60 [0.00, 1.00] | 1.50 [-4.85, 7.85] | +0.25 [+0.25, +0.25]; 50% |" in text
-    assert "| 4 of 8, 50% [0%, 100%] | 2 of 8, 25% [0%, 100%] | 60 [60, 60] |" in text
-    assert "| hammer-v3 | 70 of 72 | 50%, 50%, 0.5% (rare) |" in text
-
-
-def test_segments_are_compared_over_tasks_and_not_over_seeds():
-    """Means over seeds of 0.6, 0.7, 0.8 against 0.5: 0.2 ± t(2) · 0.1 / √3, better on three of three."""
-    by_task = {"hammer-v3": (0.5, 0.7), "assembly-v3": (0.6, 0.8), "shelf-place-v3": (0.9, 0.7)}
-    cells = [cell(seed, nmi, 1.0, 0.5, (1, 0), task) for task, own in by_task.items() for seed, nmi in enumerate(own)]
-    measures = summarize(cells)["segments"]["5"]["measures"]
-    assert measures["nmi"]["methods"]["ddco"]["mean"] == pytest.approx(0.7)
-    difference = measures["nmi"]["difference"]["kmeans"]
-    half = 4.302653 * 0.1 / math.sqrt(3)
-    assert difference["interval"] == pytest.approx([0.2 - half, 0.2 + half], abs=1e-6)
-    assert difference["wins"] == 3
-    assert difference["wilcoxon_p"] == pytest.approx(0.25)  # the least that three pairs can have
-
-
-def test_success_is_compared_over_tasks():
-    """1, 2 and 3 of 4 episodes in both seeds, flat none: 0.5 ± t(2) · 0.25 / √3, better on three of three."""
-    tasks = ("hammer-v3", "assembly-v3", "shelf-place-v3")
-    cells = [cell(seed, 0.5, 1.0, 0.5, (often, 0), task) for often, task in enumerate(tasks, 1) for seed in (0, 1)]
-    half = 100 * 4.302653 * 0.25 / math.sqrt(3)
-    text = page(summarize(cells), "Made.")
-    assert f"| flat | 0 of 24 | +50.0% [{50 - half:+.1f}%, {50 + half:+.1f}%]; 3; p = 0.25 |" in text
-    assert "| ddco | 12 of 24 | - |" in text
-
-
-def test_the_figure_has_success_over_numbers_in_the_mean_over_tasks(tmp_path):
-    """Of 4 episodes: ddco 1 and 3 with five demonstrations, 2 and 4 with ten, flat 0 and 2 with either."""
-    given = {
-        (5, "hammer-v3"): (1, 0),
-        (5, "assembly-v3"): (3, 2),
-        (10, "hammer-v3"): (2, 0),
-        (10, "assembly-v3"): (4, 2),
-    }
-    results = summarize(
-        [cell(0, 0.5, 1.0, 0.5, often, task) | {"count": count} for (count, task), often in given.items()]
-    )
-    assert mean_success(results["tasks"]) == {"ddco": [0.5, 0.75], "flat": [0.25, 0.25]}
-    draw(results, tmp_path / "arena.png")
-    assert (tmp_path / "arena.png").read_bytes().startswith(b"\x89PNG")

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import doctest
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
 import typer
+import yaml
 
 import ddco_pyro
 from ddco_pyro.cli.app import app
@@ -47,6 +49,30 @@ def test_the_site_is_generated_from_the_code() -> None:
         assert all(one.opts[0] in commands for one in command.params if one.param_type_name == "option")
 
 
+def anchors(page: Path) -> set[str]:
+    """Of the headings of a page, as GitHub and mkdocs write them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\s-]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+GENERATED = {"spec.md", "cli.md"}
+"""Pages that are made while the site is built."""
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_link_leads_somewhere(page: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    links = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r'src="([^"]+)"', text)
+    for link in links:
+        name, _, anchor = link.partition("#")
+        target = page.parent / name if name else page
+        if "://" in link or name in GENERATED:
+            continue
+        assert target.exists(), link
+        if anchor:
+            assert anchor in anchors(target), link
+
+
 @pytest.mark.parametrize("page", ["README.md", "docs/install.md"])
 def test_what_the_demo_installs_is_said_as_make_says_it(page: str) -> None:
     sizes = re.findall(r"^SIZE := (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
@@ -65,3 +91,9 @@ def test_every_make_target_that_is_named_exists() -> None:
     targets = set(re.findall(r"^([.a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     for page in PAGES:
         assert set(re.findall(r"(?:^|`)make ([.a-z-]+)", page.read_text(), re.MULTILINE)) <= targets, page
+
+
+def test_the_citation_has_the_version_of_the_package() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert citation["references"][0]["year"] == 2017

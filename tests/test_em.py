@@ -297,6 +297,29 @@ def test_a_spec_that_em_would_not_follow_is_refused():
             with_overrides(small_spec(), {key: value})
 
 
+def test_linear_networks_are_trained_by_em_unless_the_spec_asks_for_gradient_steps():
+    linear, data = {"network": "linear"}, {"demonstrations": {"path": "unused.hdf5"}, "observations": ["pose"]}
+    own = {"levels": [{"count": 2, "policy": linear}], "meta_policy": linear}
+    flat = {"baseline": {"kind": "flat", "policy": linear}}
+
+    def chosen(model=None, **rest):
+        return parse_spec({**data, **(model or {"hierarchy": own}), **rest}).training.optimizer.name
+
+    assert chosen() == chosen(flat) == chosen(training={"optimizer": {"ridge": {"policy": 2}}}) == "em"
+    for asked in ({"optimizer": {"lr": 0.1}}, {"optimizer": {"name": "adam"}}, {"average": 0.9}, {"clip_gradient": 1}):
+        assert chosen(training=asked) == "adam"
+    for changed in (
+        {"meta_policy": {"network": "mlp"}},
+        {"trunk": {"network": "mlp", "hidden": [4]}},
+        {"levels": [{"count": 2, "policy": linear, "trunk": {"network": "mlp", "hidden": [4]}}]},
+        {"levels": [{"count": 2, "policy": linear, "termination": {"network": "mlp"}}]},
+    ):
+        assert chosen({"hierarchy": own | changed}) == "adam"
+    assert chosen({"baseline": {"kind": "per_timestep", "policy": linear}}) == "adam"
+    assert chosen(observations=[{"key": "pose", "augment": {"versions": "others"}}]) == "adam"
+    assert chosen(training={"optimizer": {"name": "em"}}, hierarchy=own | {"meta_policy": {"network": "mlp"}}) == "em"
+
+
 def test_tuning_demonstrations_decide_nothing_before_the_last_stage():
     """One tuning demonstration likes the beginning of a stage better than its end, where few train; segments then get
     lost.

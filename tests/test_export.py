@@ -31,12 +31,21 @@ LIKE_OTHERS = (
 )
 def test_every_form_acts_as_the_controller_does(name, tmp_path):
     """On other observations than those that it was compared on when it was written, past the longest demonstration."""
-    fit, onnx = FITS[name], name in ("per_timestep", "conv", "lstm", "trunk", "read by all", "σ of the state")
-    found = export(fit, tmp_path, onnx)
+    forms(name, tmp_path, onnx=name in ("conv", "lstm", "trunk", "read by all", "σ of the state"))
+
+
+@pytest.mark.slow
+def test_a_network_for_each_step_acts_alike_as_onnx(tmp_path):
+    forms("per_timestep", tmp_path, onnx=True)
+
+
+def forms(name, folder, onnx):
+    """Export and compare each form."""
+    fit, found = FITS[name], export(FITS[name], folder, onnx)
     assert list(found) == ["numpy", "torch", *(["onnx"] if onnx else [])]
     assert all(difference < TOLERANCE for difference, _ in found.values())
     for form in found:
-        active = compare(runner.Runner(tmp_path, form), fit.controller(), fit.hierarchy.steps + 4)
+        active = compare(runner.Runner(folder, form), fit.controller(), fit.hierarchy.steps + 4)
         assert len(active) > 1 or name == "flat"
 
 

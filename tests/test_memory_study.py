@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import json
-
 import memory
-import memory_results
 import pytest
-from memory import Asked, Cell, Measured, cells_of, missing, read, work
+from memory import Asked, Cell, Measured, cells_of, compared, missing, work
 from memory_results import ACTED, checks, comparisons, draw, everything, of_pages, over_tasks, page, short, with_table
-from provenance import ROOT
-
-MADE_BY = {"command": "python studies/memory.py needle", "commit": "abcdef0", "dirty": False, "code": "x", "files": 1}
+from table import RESULTS, ROOT, read
 
 
 def rows(method, values, study="needle", measure="success", acting="marginal", task=None, count=20):
@@ -84,32 +79,32 @@ def test_a_cell_is_kept_as_soon_as_it_is_done_and_not_done_again(tmp_path, monke
         ("mixture", 1),
         ("mixture", 2),
     ]
+    table = tmp_path / "memory.csv"
     with pytest.raises(KeyboardInterrupt):
-        work(cells, tmp_path, tmp_path, MADE_BY)
-    assert [row["value"] for row in read(tmp_path / "cells.csv")] == [1.5, 0.0] * 2
+        work(cells, tmp_path, table)
+    assert [row.value for row in read(table)] == [1.5, 0.0] * 2
     done.clear()
-    assert work(cells, tmp_path, tmp_path, MADE_BY | {"code": "y"}) == "2 of 4 cells were not there"
+    assert work(cells, tmp_path, table) == "2 of 4 cells were not there"
     assert done == cells[2:]
-    last = read(tmp_path / "cells.csv")[-1]
-    assert Cell(*(last[name] for name in ("study", "task", "method", "demonstrations", "seed"))) == cells[-1]
-    assert last["value"] == 0.2
-    assert [one["code"] for one in json.loads((tmp_path / "cells.json").read_text())["provenance"]] == ["x", "y"]
+    last = read(table)[-1]
+    assert Cell(*last[:5]) == cells[-1]
+    assert last[5:] == ("success, acting by marginal", 0.2)
     (line,) = (one for one in missing(set(cells)) if "needle --counts 20 " in one)
     assert line.endswith("7 of mixture, 1 of options, of 12 cells")
 
 
-def test_the_pages_of_the_studies_are_read_by_seed():
+NEEDLE = ("needle", "needle", "ddco", 100, "nats")
+
+
+def test_the_tables_of_the_studies_are_read_by_seed():
     found = of_pages()
     assert {row["study"] for row in found} == set(memory.STUDIES)
     named = [tuple(value for key, value in row.items() if key != "value") for row in found]
     assert len(set(named)) == len(named)
-    summary = json.loads((memory_results.RESULTS / "needle" / "summary.json").read_text())["results"]
-    (difference,) = comparisons(
-        [row | {"method": "mixture"} for row in found if (row["study"], row["method"], row["demonstrations"],
-         row["measure"]) == ("needle", "options", 100, "nats")], found,
-    )  # fmt: skip
-    kept = summary["differences"]["flat"]["log_likelihood_valid"]["by_seed"]
-    assert difference["difference"]["mixture - flat"]["by_seed"] == pytest.approx(kept)
+    kept = {row.seed: row.value for row in read(RESULTS / "needle.csv") if row[:4] + row[5:6] == NEEDLE}
+    own = ("needle", "options", 100, "nats")
+    assert kept == {one["seed"]: one["value"] for one in found
+                    if tuple(one[key] for key in ("study", "method", "demonstrations", "measure")) == own}  # fmt: skip
 
 
 def test_the_page_and_the_figure_have_every_study(tmp_path):
@@ -117,7 +112,7 @@ def test_the_page_and_the_figure_have_every_study(tmp_path):
     mixtures = [row for study, measure in measured for row in rows("mixture", {0: 0.5, 1: 0.6}, study, measure)]
     pages = [row for study, measure in measured for row in rows("options", {0: 0.8, 1: 0.9}, study, measure)]
     found = comparisons(mixtures, pages)
-    text = page(found, checks(rows("options", {0: 0.8}), pages), ["`a command`: 3 of mixture"], "Made.")
+    text = page(found, checks(rows("options", {0: 0.8}), pages), ["`a command`: 3 of mixture"])
     assert "| needle | 20 | success | - | - | 55% | 85% | - | - | - | **+30% [+30%, +30%]** | - | 2 |" in text
     assert "- needle, 1 cell of options again: success reproduced: 1 of 1." in text
     assert text.endswith("- `a command`: 3 of mixture\n")
@@ -126,7 +121,7 @@ def test_the_page_and_the_figure_have_every_study(tmp_path):
 
 
 def test_the_table_of_readme_is_that_of_the_page():
-    found = json.loads((ROOT / "docs" / "results" / "memory.json").read_text())["results"]
+    found, _ = compared()
     readme = (ROOT / "README.md").read_text()
     assert with_table(readme, short(found)) == readme
     assert short(found).count("\n") == 1 + len(ACTED)

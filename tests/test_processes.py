@@ -324,17 +324,31 @@ def test_a_process_that_is_killed_is_not_said_to_have_failed(whole, tmp_path):
     assert first.err.startswith("ddco-pyro: a process that trained together with this one was ended from outside")
 
 
-@pytest.mark.slow
-def test_two_processes_of_torchrun(whole, tmp_path):
-    spec, run = whole
-    folder = tmp_path / "run"
+def torchrun(spec, folder, *more):
+    """How two processes that torchrun starts end a fit."""
     command = [*TORCHRUN, "--standalone", "--nproc-per-node", "2", "-m", "ddco_pyro.cli", "fit", spec, "--out", folder]
-    for more in ([], ["--resume"]):  # it is finished then
-        ended = subprocess.run([*command, *more], cwd=tmp_path, capture_output=True, text=True, timeout=600)
-        assert ended.returncode == 0, ended.stderr
-        assert ended.stdout.count("report: ") == 1
-        assert_same_run(folder, run)
-    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
+    return subprocess.run([*command, *more], cwd=folder.parent, capture_output=True, text=True, timeout=600)
+
+
+def test_two_processes_of_torchrun_give_the_bits_of_one(demos, tmp_path):
+    demos.write(tmp_path / "demos.hdf5")
+    short = make_spec(tmp_path / "demos.hdf5", patience=None, epochs=4, restarts=1)
+    (tmp_path / "spec.yaml").write_text(dump_spec(short))
+    ended = torchrun(tmp_path / "spec.yaml", tmp_path / "run")
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.count("report: ") == 1
+    fit(tmp_path / "spec.yaml", out=tmp_path / "alone")
+    assert_same_run(tmp_path / "run", tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_torchrun_goes_on_and_refuses_as_one_process_does(whole, tmp_path):
+    spec, run = whole
+    folder = shutil.copytree(run, tmp_path / "run")
+    ended = torchrun(spec, folder, "--resume")  # it is finished
+    assert (ended.returncode, ended.stdout.count("report: ")) == (0, 1), ended.stderr
+    assert_same_run(folder, run)
+    ended = torchrun(spec, folder)
     assert (ended.returncode, ended.stdout) == (1, "")
     assert ended.stderr.count("ddco-pyro: ") == 1
     assert f"ddco-pyro: {folder}: holds a run of this spec already; show it with --resume" in ended.stderr

@@ -5,10 +5,10 @@ import pytest
 from made_metrics import compared, made_metrics
 from moving_demonstrations import made, reaches, recorded
 
+from ddco_pyro.drawing.shown import movement, position_key, view
 from ddco_pyro.report.activity import Activity, LevelActivity, bins
 from ddco_pyro.report.likelihood import draw
 from ddco_pyro.report.options import row_order, shares, terminations
-from ddco_pyro.report.trajectories import movement, position_key, view
 
 
 def test_bins_are_steps_where_demonstrations_are_equally_long():

@@ -69,6 +69,14 @@ def test_the_command_says_how_much_they_differ(written):
     )
 
 
+def test_draws_have_a_chain_for_each_training_seed(written):
+    fit = ddco_pyro.load(written[1])
+    draws = fit.draws(fit.demonstrations, 3)
+    assert (draws.seeds, draws.options["option"].shape[:3]) == ((0, 1, 2), (3, 3, 8))
+    likelihoods = [again.log_likelihood(fit.demonstrations) for again in (fit, *fit.repetitions)]
+    np.testing.assert_array_equal(draws.log_likelihood, likelihoods)
+
+
 def test_what_is_done_is_not_done_again(written):
     spec, run, _ = written
     before = {path: path.stat().st_mtime_ns for path in (run / "seeds").rglob("model.safetensors")}

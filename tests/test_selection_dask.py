@@ -28,9 +28,9 @@ class Killing(Told):
         super().__init__()
         self.process, self.after = process, after
 
-    def scored(self, candidate, fold, failed):
-        super().scored(candidate, fold, failed)
-        if len(self.pairs) == self.after:
+    def __call__(self, event):
+        super().__call__(event)
+        if len(self.pairs) == self.after and self.process.poll() is None:
             self.process.kill()
             self.process.wait()
 
@@ -60,7 +60,6 @@ def cluster(tmp_path_factory):
         process.wait()
 
 
-@pytest.mark.slow
 def test_a_worker_that_is_killed_changes_nothing(cluster, tmp_path):
     address, workers = cluster
     spec = spec_at(tmp_path)

@@ -115,7 +115,7 @@ def specs(draw: st.DrawFn) -> dict[str, Any]:
     }
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(specs())
 def test_what_is_written_is_read_as_it_was(tmp_path_factory: pytest.TempPathFactory, data: dict[str, Any]) -> None:
     spec = parse_spec(data)

@@ -1,16 +1,18 @@
-"""A study of toy cells: what is done, kept and written, and by which words that can be had again."""
+"""A study of toy cells: what is done, kept and written; intervals against simulation and cases worked by hand."""
 
 from __future__ import annotations
 
+import csv
 import json
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
+import cells
+import numpy as np
 import pytest
+import study
 from cells import Cell, Settings, described
-from study import Study
+from table import RESULTS, Row, add, over_seeds, read, shown, spread
 
 from ddco_pyro.errors import BadInput, Failed
 
@@ -21,7 +23,7 @@ DEFAULTS = Settings({"episodes": 3, "noise": 0.5}, Path("unused"))
 class Toy(Cell):
     """Says what it was given."""
 
-    script = "provenance.py"  # any that there is
+    script = "toy.py"
 
     task: str
     seed: int
@@ -35,43 +37,34 @@ class Toy(Cell):
         done.parent.mkdir(parents=True, exist_ok=True)
         with done.open("a") as file:
             file.write(f"{self.name}\n")
-        return {"product": self.seed * settings.values["noise"], "folder": folder.name}
+        return {"product": self.seed * settings.values["noise"]}
 
-
-SHOWN = SimpleNamespace(
-    summarize=lambda cells: {cell["task"]: cell["product"] for cell in cells},
-    page=lambda summary, made_by: f"{made_by}\n{summary}\n",
-    draw=lambda summary, path: path.write_text("a picture"),
-)
+    def rows(self, results):
+        yield Row("toy", self.task, "ddco", None, self.seed, "product", results["product"])
 
 
 def run(monkeypatch, tmp_path, words):
     """Run it with these words; what has been done so far."""
-    monkeypatch.setattr("sys.argv", ["toy.py", *words, "--runs", f"{tmp_path}/runs", "--out", f"{tmp_path}/out"])
+    monkeypatch.setattr("sys.argv", ["toy.py", *words, "--runs", f"{tmp_path}/runs", "--out", f"{tmp_path}/toy.csv"])
     parser = described("A toy.")
     parser.add_argument("--tasks", nargs="*", default=["a", "b"])
-    parser.add_argument("--seed", type=int, default=4)
-    simulator = SimpleNamespace(made=lambda: None)
-
-    def chosen(own):
-        return [Toy(task, own.seed) for task in own.tasks]
-
-    Study("toy", ("tasks", "seed"), chosen, lambda _: simulator, SHOWN, DEFAULTS, jobs=1).main(parser)
+    study.main("toy", parser, DEFAULTS, lambda own: [Toy(task, seed) for task in own.tasks for seed in (2, 4)])
     return (tmp_path / "runs" / "done").read_text().split()
 
 
-def test_cells_are_done_once_and_by_the_words_on_the_page_again(tmp_path, monkeypatch):
-    assert run(monkeypatch, tmp_path, ["--noise", "0.25", "--set", "a=1"]) == ["a-4", "b-4"]
-    written = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert written["results"] == {"a": 1.0, "b": 1.0}
-    page = (tmp_path / "out" / "summary.md").read_text()
-    command = "python studies/toy.py --tasks a b --seed 4 --episodes 3 --noise 0.25 --set 'a=1'"
-    assert page.startswith(f"Made by `{command}` at commit")
-    assert (tmp_path / "out" / "toy.png").exists()
-    assert run(monkeypatch, tmp_path, shlex.split(command)[2:]) == ["a-4", "b-4"]
-    assert (tmp_path / "out" / "summary.md").read_text() == page
-    assert run(monkeypatch, tmp_path, ["--noise", "0.5"]) == ["a-4", "b-4"] * 2
-    assert len(list((tmp_path / "runs" / "cells").iterdir())) == 2
+def test_cells_are_done_once_and_their_numbers_are_in_the_table(tmp_path, monkeypatch, capsys):
+    add(tmp_path / "toy.csv", [Row("toy", "old", "ddco", 10, 0, "product", 7.0)])
+    whole = ["a-2", "a-4", "b-2", "b-4"]
+    assert run(monkeypatch, tmp_path, ["--noise", "0.25", "--set", "a=1"]) == whole
+    assert [row[1:] for row in read(tmp_path / "toy.csv")] == [
+        ("old", "ddco", 10, 0, "product", 7.0),
+        *((task, "ddco", None, seed, "product", 0.25 * seed) for task in "ab" for seed in (2, 4)),
+    ]
+    # t(0.975, 1) = 12.7062 times the standard error 0.25
+    assert "| toy | a | ddco |  | 0.75 [-2.43, 3.93] |" in capsys.readouterr().out
+    assert run(monkeypatch, tmp_path, ["--noise", "0.25", "--set", "a=1"]) == whole
+    assert run(monkeypatch, tmp_path, ["--tasks", "a"]) == [*whole, "a-2", "a-4"]  # other settings
+    assert [row.value for row in read(tmp_path / "toy.csv")] == [7.0, 1.0, 2.0, 0.5, 1.0]
 
 
 @pytest.mark.parametrize(("task", "line", "status"), [("impossible", "it cannot be done", 1), ("bad", "bad input", 2)])
@@ -79,7 +72,7 @@ def test_what_cannot_be_done_is_one_line(tmp_path, monkeypatch, capsys, task, li
     with pytest.raises(SystemExit) as ended:
         run(monkeypatch, tmp_path, ["--tasks", task])
     assert (ended.value.code, capsys.readouterr().err.splitlines()[-1]) == (status, line)
-    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "toy.csv").exists()
 
 
 def test_a_study_without_cells_says_so(tmp_path, monkeypatch, capsys):
@@ -92,9 +85,36 @@ def test_a_study_without_cells_says_so(tmp_path, monkeypatch, capsys):
 def test_a_cell_by_itself_is_the_studys(tmp_path, monkeypatch, capsys):
     run(monkeypatch, tmp_path, ["--tasks", "a", "--noise", "0.25"])
     capsys.readouterr()
-    command = Toy("a", 4).command(Settings({"episodes": 3, "noise": 0.25}, tmp_path))
-    assert command == "python studies/provenance.py a 4 --episodes 3 --noise 0.25"
-    monkeypatch.setattr("sys.argv", [*shlex.split(command)[1:], "--runs", f"{tmp_path}/runs"])
+    monkeypatch.setattr("sys.argv", ["toy.py", "a", "4", "--noise", "0.25", "--runs", f"{tmp_path}/runs"])
     Toy.main("A cell.", DEFAULTS)
-    assert json.loads(capsys.readouterr().out)["results"]["product"] == 1.0
-    assert (tmp_path / "runs" / "done").read_text() == "a-4\n"
+    assert json.loads(capsys.readouterr().out)["product"] == 1.0
+    assert (tmp_path / "runs" / "done").read_text() == "a-2\na-4\n"
+
+
+def test_a_result_named_like_a_setting_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="results are named like settings: seed"):  # it would be done each time
+        cells.kept(tmp_path / "cell.json", {"seed": 3}, lambda: {"seed": [1.0]})
+
+
+def test_intervals_hold_the_mean_in_95_percent_of_studies():
+    random, draws = np.random.default_rng(0), 4000
+    found = [over_seeds(values.tolist())["interval"] for values in random.normal(3.0, 0.5, (draws, 5))]
+    held = np.mean([low <= 3.0 <= high for low, high in found])
+    assert abs(held - 0.95) < 3 * np.sqrt(0.95 * 0.05 / draws)
+
+
+def test_a_single_seed_has_no_interval():
+    assert spread(over_seeds([0.25]), "{:.0%}") == "25%"
+    assert spread(over_seeds([]), "{:.0%}") == "-"
+    assert shown([Row("a", "b", "c", 5, 0, "d", 0.5)]).endswith("| a | b | c | 5 | 0.5 |\n")
+
+
+@pytest.mark.parametrize("path", sorted(RESULTS.glob("*.csv")), ids=lambda path: path.stem)
+def test_a_table_is_tidy_and_is_written_as_it_is_read(path, tmp_path):
+    rows = read(path)
+    assert len({row[:-1] for row in rows}) == len(rows)
+    add(tmp_path / "again.csv", rows)
+    assert (tmp_path / "again.csv").read_text() == path.read_text()
+    with path.open() as file:
+        assert tuple(next(csv.reader(file))) == Row._fields
+    assert path.with_suffix(".md").exists()

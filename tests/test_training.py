@@ -198,12 +198,12 @@ def test_a_budget_that_is_smaller_than_the_stages_is_the_last_ones(tmp_path):
 @pytest.mark.parametrize("model", [(2,), (2, 2), "flat", "per_timestep"])
 def test_every_model_has_the_same_budget(tmp_path, model):
     """Whatever the number of its stages: 1, 4 or 6 here. The steps are those of minibatches of 3 out of 8."""
-    training = {"epochs": 26, "patience": None, "batch_size": 3, "restarts": 2}
+    training = {"epochs": 14, "patience": None, "batch_size": 3, "restarts": 2}
     spec = flat(model, **training) if isinstance(model, str) else make_spec(model, **training)
     trainer = make_trainer(spec, random_demonstrations(), tmp_path)
     trainer.run()
-    assert sum(epochs_of(trainer, 0).values()) == sum(epochs_of(trainer, 1).values()) == 26
-    assert trainer.summary["budget"] == trainer.summary["spent"] == {"epochs": 26, "gradient_steps": 26 * 3}
+    assert sum(epochs_of(trainer, 0).values()) == sum(epochs_of(trainer, 1).values()) == 14
+    assert trainer.summary["budget"] == trainer.summary["spent"] == {"epochs": 14, "gradient_steps": 14 * 3}
 
 
 def test_the_training_that_is_told_is_that_of_the_best_restart(tmp_path):
@@ -289,7 +289,7 @@ def test_resuming_gives_the_same_bits(tmp_path, optimizer, training, rows):
     expected = whole.run().state_dict()
     assert rows in (None, len(whole.history))
     rows = len(whole.history)
-    for stop in range(1, rows, max(4, rows // 5)):
+    for stop in range(1, rows, max(4, rows // 3)):
         folder = tmp_path / f"stop-{stop}"
         seen = []
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.planted import pick_and_place
 
 HIDDEN = ("cv2", "dm_control", "dm_env", "gymnasium", "mujoco", "ompl")
 WITHOUT = f"""
@@ -50,28 +51,47 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_from_a_file_to_an_export(folder):
+@pytest.fixture(scope="module")
+def said(folder):
+    """What the commands say, of one's own file and of a task that needs a simulator."""
+    (folder / "task.yaml").write_text(
+        "task: needle\ndemonstrations: {count: 2}\nobservations: [gripper_pose]\nhierarchy: {levels: [{count: 2}]}\n"
+    )
     quick = ("--set", "training.epochs=2", "--set", "training.restarts=1", "--set", "compare_with=[]")
-    said = call(
+    return call(
         folder,
         ("init", "mine.hdf5", "--out", "mine.yaml"),
         ("fit", "mine.yaml", "--out", "run", *quick),
         ("segment", "run", "mine.hdf5", "--html", "segments.html"),
         ("export", "run", "--out", "controller"),
         ("report", "run"),
+        *((command, "task.yaml", "--out", f"{command}.out") for command in ("collect", "fit")),
     )
-    assert [line for line in said if line.startswith("status ")] == ["status 0"] * 5, said
+
+
+def test_from_a_file_to_an_export(folder, said):
+    assert [line for line in said if line.startswith("status ")] == [*["status 0"] * 5, *["status 2"] * 2], said
     assert (folder / "segments.html").exists()
     assert (folder / "run" / "report.html").exists()
     assert (folder / "controller" / "weights.npz").exists()
 
 
-def test_a_task_names_the_missing_package(folder):
-    (folder / "task.yaml").write_text(
-        "task: needle\ndemonstrations: {count: 2}\nobservations: [gripper_pose]\nhierarchy: {levels: [{count: 2}]}\n"
-    )
-    said = call(folder, *((command, "task.yaml", "--out", f"{command}.out") for command in ("collect", "fit")))
-    assert said[1::2] == ["status 2"] * 2
-    for line in said[::2]:
+@pytest.mark.slow
+def test_the_demo_has_generated_demonstrations(folder):
+    """A spec that is there already, here one with a small budget, is kept."""
+    out, small = folder / "demo", "\ntraining: {epochs: 2}\n"
+    pick_and_place(8).write(out / "pick_and_place.hdf5")
+    known = "demonstrations: {path: demo/pick_and_place.hdf5}\nobservations: [gripper, jaw]\n"
+    levels = "hierarchy: {levels: [{count: 2, policy: {network: linear}}], meta_policy: {network: linear}}"
+    (out / "spec.yaml").write_text(known + levels + small)
+    said = call(folder, ("demo", "--out", "demo"))
+    assert said[-1] == "status 0", said
+    assert (out / "segments.html").exists()
+
+
+def test_a_task_names_the_missing_package(said):
+    refused = [line for line in said if "the package" in line]
+    assert len(refused) == 2
+    for line in refused:
         assert "task 'needle' needs the package" in line
         assert "which is not installed here" in line

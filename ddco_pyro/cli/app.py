@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ddco_pyro.cli import demos, fits, runs
+from ddco_pyro.cli import demos, fits, runs, starting, study
 from ddco_pyro.errors import BadInput, Failed
 
 app = typer.Typer(
@@ -29,6 +29,8 @@ app = typer.Typer(
     epilog="--debug, anywhere on the line, shows the traceback of an error.",
 )
 EXAMPLES: dict[Callable[..., None], str] = {
+    starting.demo: "demo --out runs/demo",
+    starting.new: "new mine.hdf5 --out runs/mine",
     fits.check: "check specs/needle.yaml --set hierarchy.levels.0.count=3",
     demos.collect: "collect specs/needle.yaml --out needle.hdf5",
     fits.fit: "fit specs/needle.yaml --set training.epochs=50 --out runs/short",
@@ -44,6 +46,7 @@ EXAMPLES: dict[Callable[..., None], str] = {
     demos.encode: "encode demos.hdf5 --observation camera --encoder random_conv --out encoded.hdf5",
     runs.segment: "segment runs/mine mine.hdf5 --html segments.html",
     runs.export: "export runs/mine --out controller --onnx",
+    study.study: "study run studies/mine.yaml --jobs 2",
 }
 """Every command, in the order of ``--help``."""
 

@@ -19,6 +19,7 @@ from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.events import (
     CandidateGivenUp,
+    CellDone,
     DemonstrationsDone,
     EpisodeEnded,
     EpochEnded,
@@ -28,6 +29,7 @@ from ddco_pyro.events import (
     RestartStopped,
     SeedFitted,
     SelectionBegan,
+    StudyBegan,
     TrainingBegan,
     TrainingEnded,
     UpdatesDone,
@@ -111,6 +113,12 @@ class Progress:
                 self._advance("fitting with other training seeds", total)
             case EpisodeEnded(method, total):
                 self._advance("rolling out", total, note=method)
+            case StudyBegan(total, kept):
+                self._begin(f"study{f' ({kept} of {total} kept)' if kept else ''}", total - kept)
+            case CellDone(cell, failed):
+                if failed:
+                    self._say(f"{cell} failed: {failed}")
+                self._advance(note=cell)
 
     def _begin(self, label: str, total: int | None) -> None:
         """Begin to count up to ``total``, or without an end for None."""

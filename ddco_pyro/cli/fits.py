@@ -5,18 +5,24 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ddco_pyro.cli import AllowCode, Overrides, RunPath, SpecPath, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import command
+from ddco_pyro.events import Event
+from ddco_pyro.logs import Logged, MakeLog, find_log
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
+
+if TYPE_CHECKING:
+    from ddco_pyro.fitting.fitted import Fit
 
 
 class Backend(StrEnum):
@@ -76,6 +82,14 @@ def fit(
         int | None,
         typer.Option(min=2, help="Fit with so many training seeds in all, and report their variation."),
     ] = None,
+    log: Annotated[
+        list[str],
+        typer.Option(
+            "--log",
+            metavar="NAME",
+            help="Log training, too: tensorboard, mlflow, wandb-offline, or module:Class (--allow-code); repeatable.",
+        ),
+    ] = [],  # noqa: B006
     resume: Annotated[
         bool, typer.Option("--resume", help="Where --out holds this run, finished, show it again.")
     ] = False,
@@ -96,11 +110,18 @@ def fit(
         return
     with leading(ranks):
         loaded = load_spec(spec, overrides, allow_code)
-        _fit(loaded, spec, out, (jobs, requested(processes, ranks)), seeds, resume)
+        logs = {name: find_log(name, allow_code) for name in log}
+        _fit(loaded, spec, out, (jobs, requested(processes, ranks)), seeds, resume, logs)
 
 
 def _fit(
-    loaded: Spec, spec: Path, out: Path | None, workers: tuple[int | None, int], seeds: int | None, resume: bool
+    loaded: Spec,
+    spec: Path,
+    out: Path | None,
+    workers: tuple[int | None, int] = (None, 1),
+    seeds: int | None = None,
+    resume: bool = False,
+    logs: Mapping[str, MakeLog] = MappingProxyType({}),
 ) -> None:
     """The fit once the spec is read.
 
@@ -118,9 +139,21 @@ def _fit(
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     _check_folder(folder, spec, loaded)
     repeated = () if seeds is None else ("--seeds", str(seeds))
-    again = command("fit", folder / "spec.yaml", "--out", folder, "--resume", *repeated, *_allowed(loaded))
-    with _continued(again, folder), console.Progress() as progress:
-        fitted = ddco_pyro.fit(loaded, None, folder, progress, jobs, processes, resume)
+    own = any(":" in name for name in logs) and not user_code(loaded)
+    more = [word for name in logs for word in ("--log", name)] + (["--allow-code"] if own else [])
+    again = command("fit", folder / "spec.yaml", "--out", folder, "--resume", *repeated, *more, *_allowed(loaded))
+    with _continued(again, folder), console.Progress() as progress, ExitStack() as stack:
+        plain = loaded.model_dump(mode="json")
+        logged = [stack.enter_context(Logged(make, folder, plain)) for make in logs.values()]
+
+        def listen(event: Event) -> None:
+            progress(event)
+            for log in logged:
+                log(event)
+
+        fitted = ddco_pyro.fit(loaded, None, folder, listen, jobs, processes, resume)
+        for log in logged:
+            log.scalars(_held_out(fitted))
         if seeds is not None:
             fitted = repeat(fitted, seeds, progress, jobs)
     from ddco_pyro.report import write_report  # imports matplotlib, after the fit
@@ -135,6 +168,14 @@ def _fit(
     if loaded.hierarchy and loaded.demonstrations.path:
         file = loaded.demonstrations.path
         print(f"next: {command('segment', folder, file, '--html', 'segments.html', *_allowed(loaded))}")
+
+
+def _held_out(fitted: Fit) -> dict[str, float]:
+    """The held-out log-likelihood of each model, nats per step, by its name in a log."""
+    metrics = fitted.metrics
+    each = {metrics.model: metrics.log_likelihood_per_step.valid}
+    each |= {name: found.log_likelihood_per_step.valid for name, found in metrics.comparison.items()}
+    return {f"{name}/held_out": value for name, value in each.items() if value is not None}
 
 
 def select(

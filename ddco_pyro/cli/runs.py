@@ -199,12 +199,13 @@ def segment(
         raise BadInput(f"{demos}: labels go into whole files only; first: {again}")
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
+    from ddco_pyro.drawing.shown import stored_pictures
     from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.segmenting import beside_baselines, chosen_names, segments
+    from ddco_pyro.segmenting import beside_baselines, chosen_names, recorded, segments
     from ddco_pyro.segmenting.agreement import agreement_table, level_agreements
     from ddco_pyro.segmenting.baselines import BASELINES, check_installed
     from ddco_pyro.segmenting.files import check_copy, check_labels, write_csv, write_labels, write_parquet
-    from ddco_pyro.segmenting.page import write_page
+    from ddco_pyro.segmenting.page import followed, write_page
 
     named = {"--csv": csv, "--parquet": parquet, "--html": html}
     files = [Output(option, path) for option, path in named.items() if path]
@@ -233,6 +234,9 @@ def segment(
         if baselines:
             segmented = beside_baselines(segmented, fit, source, gripper)
         agreements = level_agreements(segmented) if html or baselines else {}
+        if html:
+            pictures = stored_pictures(source, {demo.name: len(demo) for demo in segmented.segments})
+            follows = list(followed(recorded(segmented, fit, source), pictures, segmented, fit))
     if baselines:
         for name, found in agreements.items():
             console.show(agreement_table(found.scores, f"level {name}: agreement with the label {found.labels}"))
@@ -243,7 +247,7 @@ def segment(
             write(path, segmented)
             print(path)
     if html:
-        write_page(html, segmented, str(run), str(demos), agreements)
+        write_page(html, segmented, str(run), str(demos), agreements, follows)
         print(html)
     if labelled:
         write_labels(demos, labelled, segmented)

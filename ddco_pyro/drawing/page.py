@@ -10,6 +10,9 @@ from typing import Any, Self
 import jinja2
 import rich.table
 import rich.text
+from markupsafe import Markup
+
+from ddco_pyro.drawing.timeline import Timelines
 
 
 class Cell(str):
@@ -97,11 +100,19 @@ class Folded:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure on a page: PNG as a data URI, its alternative text and its caption."""
+    """A figure on a page: PNG as a data URI, its alternative text and its caption.
+
+    :param file: the file beside the page that Markdown shows; empty for none.
+    """
 
     uri: str
     alt: str
     caption: str
+    file: str = ""
+
+    def markdown(self) -> str:
+        """The figure and its caption in Markdown."""
+        return f"![{self.alt}]({self.file})\n\n{self.caption}".rstrip() if self.file else ""
 
 
 @dataclass(frozen=True)
@@ -143,33 +154,22 @@ class Films:
 
 
 @dataclass(frozen=True)
-class Strip:
-    """One segment of a :class:`Timeline`: its place in percent of the longest demonstration, colours and text."""
+class Drawing:
+    """A drawing in SVG inside the page, and its caption."""
 
-    left: str
-    width: str
-    colour: str
-    ink: str
-    text: str
-    title: str
+    svg: Markup
+    caption: str
 
 
 @dataclass(frozen=True)
-class Timeline:
-    """The segments of one demonstration: a row of strips for each name.
+class Card:
+    """Blocks side by side under a title, such as all about one option."""
 
-    :param anchor: the ``id`` by which links lead here.
-    :param facts: a line on the demonstration, such as its length.
-    """
-
-    name: str
-    anchor: str
-    facts: str
-    held_out: bool
-    rows: Sequence[tuple[str, Sequence[Strip]]]
+    title: str
+    blocks: Sequence[Block]
 
 
-Block = Text | Table | Picture | Facts | Folded | Columns | Code | Warned | Films | Timeline
+Block = Text | Table | Picture | Facts | Folded | Columns | Code | Warned | Films | Drawing | Card | Timelines
 
 
 @dataclass(frozen=True)
@@ -190,6 +190,11 @@ class Page:
     sections: Sequence[Section | None]
     _: KW_ONLY
     subtitle: str = ""
+
+    @property
+    def has_timelines(self) -> bool:
+        """Whether the page needs the script of time lines."""
+        return any(isinstance(block, Timelines) for section in self.sections if section for block in section.blocks)
 
     def html(self) -> str:
         """One self-contained file. Text is escaped unless it is ``markupsafe.Markup``."""
@@ -216,8 +221,8 @@ def _kind(block: Any) -> str:
 def _markdown(blocks: Sequence[Block]) -> str:
     flat = chain.from_iterable(block.blocks if isinstance(block, Folded) else [block] for block in blocks)
     shown = (
-        block.markdown() if isinstance(block, Table) else block.text
+        block.text if isinstance(block, Text) else block.markdown()
         for block in flat
-        if isinstance(block, Table | Text)
+        if isinstance(block, Table | Text | Picture)
     )
-    return "\n\n".join(shown)
+    return "\n\n".join(filter(None, shown))

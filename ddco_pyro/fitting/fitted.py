@@ -16,8 +16,10 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing.words import choice_names
+from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import Inferred, infer
 from ddco_pyro.fitting.digest import record, recorded
+from ddco_pyro.fitting.draws import Draws, draw
 from ddco_pyro.fitting.names import Named, checked, read_names, write_names
 from ddco_pyro.fitting.run import RunError, is_finished, read_model
 from ddco_pyro.inference import Posterior
@@ -116,6 +118,15 @@ class Fit:
         return {folder.name: load(folder, allow_code) for folder in folders if is_finished(folder)}
 
     @cached_property
+    def repetitions(self) -> tuple[Fit, ...]:
+        """The fits with other training seeds, of ``fit --seeds``."""
+        if self.metrics is None or self.metrics.seeds is None:
+            return ()
+        allow_code = bool(user_code(self.spec))
+        seeds = self.metrics.seeds.training_seeds[1:]
+        return tuple(load(self.run_folder / "seeds" / str(seed), allow_code) for seed in seeds)
+
+    @cached_property
     def without(self) -> Mapping[str, Hierarchy]:
         """The model without each demonstration, by its name; empty without ``demonstrations.leave_one_out``."""
         if self.apart is not None or self.folder is None or not self.spec.demonstrations.leave_one_out:
@@ -178,6 +189,27 @@ class Fit:
         """
         parts = [piece.path.choices for piece in self.infer(demos)]
         return tuple(_stacked(level, -1).numpy() for level in zip(*parts, strict=True))
+
+    def draws(self, demos: Sequence[Demonstration], draws: int = 100, seed: int = 0) -> Draws:
+        """Draws of the options from their posterior p(ζ | ξ), from this fit and its :attr:`repetitions`.
+
+        >>> draws = fit.draws(demos, draws=50)
+        >>> draws.options["option"].shape  # chain, draw, demonstration, step
+        (1, 50, 6, 10)
+        >>> path, *_ = fit.segment(demos)[0]
+        >>> [boundary.step for boundary in draws.boundaries("option", 0, path)] == (
+        ...     np.flatnonzero(np.diff(path)) + 1
+        ... ).tolist()
+        True
+
+        :param draws: from each model.
+        :raises BadInput: the model has no options.
+        """
+        if not self.names:
+            raise BadInput(f"{self}: is a {self.name} policy without options; name a run with a hierarchy")
+        fits = (self, *self.repetitions)
+        seeds = [fit.spec.seed if (own := fit.spec.training.seed) is None else own for fit in fits]
+        return draw([fit.infer(demos) for fit in fits], self.names, seeds, draws, seed)
 
     def controller(self, seed: int = 0) -> Controller:
         """The model as a policy that acts, as the spec's ``rollout`` says."""

@@ -79,8 +79,7 @@ def roll_out_repetitions(first: Fit, on_event: OnEvent = ignore, jobs: int = -1)
     if seeds is None or rollouts is None:
         return
     each = [rollouts]
-    for seed in seeds.training_seeds[1:]:
-        again = load(first.run_folder / "seeds" / str(seed), bool(user_code(first.spec)))
+    for again in first.repetitions:
         alone = replace(again, spec=with_overrides(again.spec, {"rollout.policies": []}))  # scripts have no seeds
         each.append(roll_out(alone, rollouts.episodes, 0, on_event, jobs, resume=True))
     rates = {name: [one.success_rates[name].rate for one in each] for name in each[-1].success_rates}

@@ -7,6 +7,7 @@ takes the maximum over predecessors, or their sum. The backward pass then takes 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numba
@@ -53,10 +54,11 @@ def most_likely_path(tables: Tables, lengths: Tensor) -> Path:
     return Path(tuple(h[0] for h in path.choices), tuple(b[0] for b in path.terminations))
 
 
-def sample_paths(tables: Tables, lengths: Tensor, samples: int = 1, seed: int = 0) -> Path:
+def sample_paths(tables: Tables, lengths: Tensor, samples: int = 1, seed: int | Sequence[int] = 0) -> Path:
     """Independent draws from p(ζ | ξ), [samples, N, T] for every level.
 
     :param lengths: steps of each trajectory, int64 [N].
+    :param seed: a number from 0 on, or several.
     :raises BadTables: a trajectory has probability 0.
 
     >>> import torch

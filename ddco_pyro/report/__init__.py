@@ -8,15 +8,18 @@ from markupsafe import Markup
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
+from ddco_pyro.data.pictures import Observed
+from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import style
 from ddco_pyro.drawing.page import Block, Facts, Page, Text, note
+from ddco_pyro.drawing.shown import pictures, stored_pictures
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Metrics, Rate
-from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, training, worth
+from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, skills, training, worth
 from ddco_pyro.report.activity import activity
 from ddco_pyro.report.training import degeneracies
-from ddco_pyro.segmenting.page import timelines
+from ddco_pyro.segmenting.page import followed, timelines
 
 
 def write_report(fit: Fit, demos: Demonstrations) -> Path:
@@ -29,12 +32,18 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
     path, metrics = fit.run_folder / "report.html", fit.metrics
     active = activity(fit, demos) if fit.spec.hierarchy else None
     segmented = options.segmented(fit, demos, active) if active else None
-    drawn = timelines(segmented, options.MOST_SEGMENTS) if segmented else []
+    if segmented:
+        ordered = demos.select([demo.name for demo in segmented.segments])
+        shown = pictures(ordered) or _stored(fit, ordered)
+        follows = followed(ordered, shown, segmented, fit, options.MOST_STEPS)
+        drawn = timelines(segmented, follows, options.MOST_STEPS)
     with style():
         sections = [
+            skills.section(fit, ordered, shown, segmented) if segmented else None,
+            options.segments(drawn, len(metrics.demonstrations_by_likelihood)) if segmented else None,
             worth.section(metrics),
             likelihood.section(fit),
-            likelihood.demonstrations(metrics, {timeline.anchor for timeline in drawn}),
+            likelihood.demonstrations(metrics, {track.anchor for track in drawn.tracks} if segmented else ()),
             likelihood.dimensions(fit),
             rollouts.success(fit),
             training.learning(fit),
@@ -45,11 +54,19 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             training.warnings(fit),
             rollouts.films(fit),
             training.particulars(fit),
-            options.segments(drawn, len(metrics.demonstrations_by_likelihood)) if drawn else None,
         ]
     name = fit.run_folder.resolve().name
     write_text(path, Page(words.method(fit.name), header(fit, metrics), sections, subtitle=name).html())
     return path
+
+
+def _stored(fit: Fit, demos: Demonstrations) -> list[Observed]:
+    """Pictures of these demonstrations in the fit's file that the fit does not observe; empty where there are none."""
+    path = fit.spec.demonstrations.path
+    if path is None or not Path(path).is_file():
+        return []
+    with open_source(path) as source:
+        return stored_pictures(source, dict(zip(demos.names, demos.lengths, strict=True)))
 
 
 def header(fit: Fit, metrics: Metrics) -> list[Block]:

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+import torch
 from markupsafe import Markup
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from ddco_pyro.acting.saliency import Saliency
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.colours import option_colour, with_heat
 from ddco_pyro.drawing.figures import FAINT, WIDTH, blank, save
 from ddco_pyro.drawing.page import Section, Table, note
-from ddco_pyro.drawing.words import name_in_level, number, option_name
+from ddco_pyro.drawing.words import name_in_level, number, option_name, percent
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import BranchUse
+from ddco_pyro.model.networks import Inputs
 from ddco_pyro.training.data import parts
 
 COLUMNS, ROWS = 4, 3
+
+GRADIENT_DEMONSTRATIONS, GRADIENT_STEPS = 8, 1000
+"""Demonstrations and steps, padding included, over which gradients with respect to observations are averaged."""
 
 SHADES = ("#1f3b73", "#6f8fc9", "#c9a227", "#8c4a32", "#5b8c5a", "#7d6b91")
 """One for each branch, in turn."""
@@ -66,6 +72,72 @@ def saliency(fit: Fit, demos: Demonstrations) -> Section | None:
     ).format(command)
     picture = save(figure, fit.run_folder / "figures" / "looks.png", alt, caption)
     return Section("looks", "What it looks at", [picture, note(limits)])
+
+
+def deciding(fit: Fit, demos: Demonstrations) -> dict[str, dict[str, dict[int, str]]]:
+    """For each level, what the policy and the termination of each option depend on, in words, by choice.
+
+    With branches, these are the nats per step lost without the branch. Otherwise they are shares of the gradient's
+    size, Σ_i (∂y/∂x_i · σ_i)², with σ_i the standard deviation of feature i of an observation. Here y are all numbers
+    of the policy, or the termination's logit, at the steps where the option is active. With pictures without branches
+    nothing is said.
+    """
+    found: dict[str, dict[str, dict[int, str]]] = {level: {} for level in fit.names}
+    levels = list(fit.names)
+    for use in fit.metrics.branches:
+        if use.level < len(levels):
+            found[levels[use.level]]["Policy needs, nats lost without"] = {
+                choice: _largest(dict(zip(use.branches, loss, strict=True)), number)
+                for choice, loss in enumerate(use.loss, start=1)
+                if None not in loss
+            }
+    if fit.metrics.branches or fit.hierarchy.encoder.images:
+        return found
+    few = demos[: max(1, min(GRADIENT_DEMONSTRATIONS, GRADIENT_STEPS // max(demos.lengths)))]
+    for piece in fit.infer(Demonstrations(tuple(few))):
+        seen, time = piece.batch.inputs.vectors, piece.batch.inputs.time
+        alive = time < piece.batch.lengths[:, None].to(time.device)
+        spread = {key: array[alive].std(0) for key, array in seen.items()}
+        vectors = {key: array.detach().clone().requires_grad_() for key, array in seen.items()}
+        with torch.enable_grad():
+            outputs = fit.hierarchy(Inputs(vectors, {}, time))
+        for level, u, caller, ends in zip(
+            levels, piece.posterior.u, outputs.callers, outputs.termination_logits, strict=False
+        ):
+            said = {"Policy reads": caller.numbers if caller.numbers is not None else caller.logits}
+            said |= {"Ending reads": None if ends is None else ends.unsqueeze(-1)}
+            for what, numbers in said.items():
+                if numbers is not None and numbers.requires_grad:
+                    found[level][what] = {
+                        option: _largest(_shares(numbers[:, :, option - 1], weight, vectors, spread), percent)
+                        for option, weight in enumerate(u.unbind(-1)[1:], start=1)
+                        if weight.sum() >= 1
+                    }
+        break
+    return found
+
+
+def _shares(
+    numbers: Tensor, weight: Tensor, vectors: Mapping[str, Tensor], spread: Mapping[str, Tensor]
+) -> dict[str, float]:
+    """The share of each observation in the size of the gradient of ``numbers`` [N, T, P], weighted by ``weight``."""
+    sizes = dict.fromkeys(vectors, 0.0)
+    for each in numbers.unbind(-1):
+        if not each.requires_grad:
+            continue
+        slopes = torch.autograd.grad(each.sum(), [*vectors.values()], retain_graph=True, allow_unused=True)
+        for key, slope in zip(vectors, slopes, strict=True):
+            if slope is not None:
+                size = (slope * spread[key]).square().sum(-1).double().cpu()
+                sizes[key] += float((weight * size).sum())
+    total = sum(sizes.values()) or 1.0
+    return {key: size / total for key, size in sizes.items()}
+
+
+def _largest(values: Mapping[str, float | None], words: Callable[[float | None], str]) -> str:
+    """The three largest values in words, without those that round to nothing."""
+    first = [key for key in sorted(values, key=lambda key: -(values[key] or 0.0))[:3] if (values[key] or 0.0) >= 0.005]
+    return ", ".join(f"{key} {words(values[key])}" for key in first)
 
 
 def branches(fit: Fit) -> Section | None:

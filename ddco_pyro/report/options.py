@@ -16,12 +16,14 @@ from matplotlib.ticker import MaxNLocator
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.colours import add_legend, option_colour
 from ddco_pyro.drawing.figures import FAINT, GRID, blank, hide_frame, save
-from ddco_pyro.drawing.page import Block, Cell, Picture, Section, Table, Text, Timeline, note
+from ddco_pyro.drawing.page import Block, Cell, Picture, Section, Table, Text, note
+from ddco_pyro.drawing.timeline import Timelines
 from ddco_pyro.drawing.words import number, numbered_name, percent
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.report import trajectories
 from ddco_pyro.report.activity import Activity, Bins, LevelActivity, bins
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
+from ddco_pyro.segmenting.page import HOW
 
 EXAMPLES = 4
 """Demonstrations whose posterior is shown step by step."""
@@ -32,8 +34,8 @@ MOST_POINTS = 400
 LEAST_SHARE = 0.01
 """A termination is drawn where its option is active in at least this share of the demonstrations."""
 
-MOST_SEGMENTS = 20_000
-"""Segments on the page, about; ``ddco-pyro segment --html`` makes a page of more."""
+MOST_STEPS = 1_000_000
+"""Steps of all levels in time lines, about; ``ddco-pyro segment --html`` makes a page of more."""
 
 LABEL_SHADES = ("#ffffff", "#d4d4d4")
 """Shades of ground-truth segments, in turn: colours belong to options."""
@@ -315,15 +317,11 @@ def segmented(fit: Fit, demos: Demonstrations, activity: Activity) -> Segmented:
     return Segmented(tuple(segments), counts, None, names=fit.names)
 
 
-def segments(timelines: Sequence[Timeline], demonstrations: int) -> Section:
-    """The timelines; a note on the others where not all of so many demonstrations have one."""
-    explained = Markup(
-        'In the order of the <a href="#demonstrations">list</a>, on one scale of time. Colours are options; a white '
-        "line is a new choice. Grey rows are ground-truth labels. Rest the pointer on a segment for its steps and its "
-        "probability."
-    )
-    blocks: list[Block] = [note(explained), *timelines]
-    if len(timelines) < demonstrations:
+def segments(drawn: Timelines, demonstrations: int) -> Section:
+    """The time lines; a note on the others where not all of so many demonstrations have one."""
+    explained = Markup('{} The order is that of the <a href="#demonstrations">list</a>.').format(HOW)
+    blocks: list[Block] = [note(explained), drawn]
+    if len(drawn.tracks) < demonstrations:
         command = Markup("<code>ddco-pyro segment RUN FILE --html PAGE</code>")
         blocks.append(note(Markup("The others would make this page slow; {} makes a page of them.").format(command)))
     return Section("segments", "Segments of every demonstration", blocks)

@@ -14,18 +14,13 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.colours import add_legend, option_colour
 from ddco_pyro.drawing.figures import FAINT, INK, blank, save
 from ddco_pyro.drawing.page import Picture
+from ddco_pyro.drawing.shown import MOST_STRETCHED, position_key, spans, view
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.report.activity import Activity, LevelActivity
 
 MOST_TRAJECTORIES = 40
 MOST_POINTS = 300
 TURN = 70.0
-LEAST_OBLIQUE = 15.0
-"""Degrees between the view and an axis, at least; a view along an axis hides the axis' scale."""
-
-MOST_STRETCHED = 4.0
-"""Axes whose ranges differ by more than this factor are not drawn to one scale."""
-
 CHOSEN = (
     "Among observations of three numbers or more, it moves the most within demonstrations; report.trajectory in the "
     "spec names another. "
@@ -46,38 +41,6 @@ def picture(fit: Fit, demos: Demonstrations, activity: Activity) -> Picture | No
     figure = draw(activity, [np.asarray(demo.observations[key])[:, :3] for demo in demos], key)
     alt = f"Trajectories of {key} in three dimensions, coloured by option"
     return save(figure, fit.run_folder / "figures" / "trajectories.png", alt, caption)
-
-
-def position_key(demos: Demonstrations) -> str | None:
-    """The vector of three numbers or more with the most :func:`movement`; None where none moves."""
-    keys = [key for key, shape in demos.observation_shapes.items() if len(shape) == 1 and shape[0] >= 3]
-    moves = {key: movement([np.asarray(demo.observations[key]) for demo in demos]) for key in keys}
-    best = max(moves, key=moves.__getitem__, default=None)
-    return best if best is not None and moves[best] > 0 else None
-
-
-def movement(values: Sequence[np.ndarray]) -> float:
-    """How much the first three of n numbers [T, n] move like a position, 0 to 1. The product of three factors:
-
-    - Standard deviation within demonstrations over the total one: 0 for a goal that is constant in a demonstration.
-    - Diagonal of the box around a demonstration over the length of T steps of its root mean square step: 1 along a
-      straight line at one speed, near 0 for a velocity or noise.
-    - The share of the numbers that is drawn, 3 / n.
-    """
-    points = [array[:, :3].astype(float) for array in values]
-    reach = float(np.mean([_reach(path) for path in points]))
-    if reach == 0:
-        return 0.0
-    within = np.mean([path.var(0).sum() for path in points])
-    between = np.array([path.mean(0) for path in points]).var(0).sum()
-    return float(np.sqrt(within / (within + between))) * reach * 3 / values[0].shape[1]
-
-
-def _reach(points: np.ndarray) -> float:
-    """The diagonal of the box around positions [T, 3], over T - 1 times the root mean square of their steps."""
-    steps = np.diff(points, axis=0)
-    length = np.sqrt(np.square(steps).sum() * len(steps))
-    return float(np.linalg.norm(np.ptp(points, axis=0)) / length) if length > 0 else 0.0
 
 
 def draw(activity: Activity, positions: Sequence[np.ndarray], key: str) -> Figure:
@@ -121,8 +84,7 @@ def _trajectory(axes: Axes3D, positions: np.ndarray, path: np.ndarray) -> None:
 
 
 def _frame(axes: Axes3D, points: np.ndarray, key: str, turn: float) -> None:
-    low, high = points.min(0), points.max(0)
-    span = np.where(high > low, high - low, 1.0)
+    low, span = points.min(0), spans(points)
     axes.set(xlim=(low[0], low[0] + span[0]), ylim=(low[1], low[1] + span[1]), zlim=(low[2], low[2] + span[2]))
     if span.max() <= MOST_STRETCHED * span.min():
         axes.set_box_aspect(span / span.max(), zoom=0.88)
@@ -134,15 +96,3 @@ def _frame(axes: Axes3D, points: np.ndarray, key: str, turn: float) -> None:
         axis.line.set_color(FAINT)
     axes.locator_params(nbins=5)
     axes.tick_params(labelsize=7)
-
-
-def view(points: np.ndarray, span: np.ndarray) -> tuple[float, float]:
-    """Elevation and azimuth (degrees) of a view along the direction in which positions [M, 3] spread the least.
-
-    The third axis stays upright: the elevation is between 15 and 45 degrees. No view is along an axis.
-    """
-    normal = np.linalg.eigh(np.cov((points / span).T))[1][:, 0] if len(points) > 1 else np.array([1.0, 1.0, 1.0])
-    normal = -normal if normal[2] < 0 else normal
-    elevation = float(np.clip(np.degrees(np.arcsin(normal[2])), 15, 45))
-    quarter, rest = divmod(float(np.degrees(np.arctan2(normal[1], normal[0]))), 90)
-    return elevation, 90 * quarter + float(np.clip(rest, LEAST_OBLIQUE, 90 - LEAST_OBLIQUE))

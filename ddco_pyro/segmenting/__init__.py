@@ -21,7 +21,10 @@ from ddco_pyro.segmenting import baselines
 from ddco_pyro.spec import LevelSpec
 from ddco_pyro.training.data import parts
 
-__all__ = ["LevelLabels", "Segmented", "Segments", "beside_baselines", "segments"]
+TAIL = 0.05
+"""The posterior probability beyond each end of a boundary's interval."""
+
+__all__ = ["LevelLabels", "Segmented", "Segments", "beside_baselines", "recorded", "segments"]
 
 
 @dataclass(frozen=True)
@@ -32,11 +35,14 @@ class LevelLabels:
     :param boundaries: whether the path makes a new choice at this step [T], which may be the same option; true at the
         first step. Where options end after every step: whether the option differs from the step before.
     :param probability: posterior probability of the chosen option at each step [T].
+    :param intervals: the 90 % interval of each segment's first step [segments, 2], of :func:`boundary_intervals`; None
+        where unknown.
     """
 
     options: np.ndarray
     boundaries: np.ndarray
     probability: np.ndarray
+    intervals: np.ndarray | None = None
 
     @classmethod
     def of(cls, options: np.ndarray, terminations: np.ndarray, active: np.ndarray, *, lasts: bool) -> LevelLabels:
@@ -47,12 +53,42 @@ class LevelLabels:
         boundaries = terminations == 1 if lasts else np.diff(options, prepend=-1) != 0
         boundaries[0] = True
         probability = np.minimum(active[np.arange(len(options)), options], 1.0)  # rounding can exceed it
-        return cls(options, boundaries, probability)
+        return cls(options, boundaries, probability, boundary_intervals(options, boundaries, active))
 
     def runs(self) -> list[tuple[int, int, int]]:
         """Each segment as (option, first step, step after the last)."""
         starts = np.flatnonzero(self.boundaries).tolist()
         return [(int(self.options[a]), a, b) for a, b in zip(starts, [*starts[1:], len(self.options)], strict=True)]
+
+
+def boundary_intervals(options: np.ndarray, boundaries: np.ndarray, active: np.ndarray) -> np.ndarray:
+    """The equal-tailed 90 % interval of the first step of each segment, both ends included, [segments, 2].
+
+    Between the middles of two neighbouring segments with options a and b, the boundary is at or before step t with
+    probability u_t(b) / (u_t(a) + u_t(b)). This is exact if only a, then b are active there. Both ends are the
+    boundary where the option stays the same, and at the first step.
+
+    >>> active = np.array([[0, 1, 0], [0, 1, 0], [0, 0.8, 0.2], [0, 0.3, 0.7], [0, 0.1, 0.9], [0, 0, 1]])
+    >>> options, boundaries = np.array([1, 1, 1, 2, 2, 2]), np.array([True, False, False, True, False, False])
+    >>> boundary_intervals(options, boundaries, active).tolist()
+    [[0, 0], [2, 4]]
+
+    :param options: of each step [T].
+    :param boundaries: whether a segment begins at each step [T].
+    :param active: the posterior u [T, 1 + k].
+    """
+    starts = np.flatnonzero(boundaries)
+    edges = np.append(starts, len(options))
+    found = np.stack([starts, starts], axis=1)
+    for place in range(1, len(starts)):
+        before, own = options[edges[place - 1]], options[edges[place]]
+        first, last = edges[place - 1 : place + 1].sum() // 2 + 1, edges[place : place + 2].sum() // 2
+        pair = active[first : last + 1][:, [before, own]]
+        total = pair.sum(1)
+        if before != own and len(pair) and total.all():
+            begun = np.maximum.accumulate(pair[:, 1] / total)
+            found[place] = np.minimum(first + np.searchsorted(begun, [TAIL, 1 - TAIL]), last)
+    return found
 
 
 @dataclass(frozen=True)
@@ -140,7 +176,7 @@ def beside_baselines(segmented: Segmented, fit: Fit, source: Source, gripper: in
     :raises BadInput: there is no such control dimension, or a package is not installed.
     """
     train = parts(fit.spec, fit.demonstrations)["train"]
-    demos = Demonstrations(tuple(_demonstration(source.recording(demo.name), fit) for demo in segmented.segments))
+    demos = Demonstrations(tuple(recorded(segmented, fit, source)))
     found = {
         f"{level}_{name}": baselines.segment(name, train, demos, count, fit.spec.seed, fit.spec.observations, gripper)
         for level, count in segmented.counts.items()
@@ -151,6 +187,11 @@ def beside_baselines(segmented: Segmented, fit: Fit, source: Source, gripper: in
         for row, demo in enumerate(segmented.segments)
     )
     return replace(segmented, segments=tuple(each))
+
+
+def recorded(segmented: Segmented, fit: Fit, source: Source) -> Iterator[Demonstration]:
+    """The demonstrations of these segments in order, with the observations of the run's networks."""
+    return (_demonstration(source.recording(demo.name), fit) for demo in segmented.segments)
 
 
 def chosen_names(source: Source, fit: Fit) -> list[str]:

@@ -1,47 +1,56 @@
-"""Segments on a page: how each option is used, and the timeline of every demonstration."""
+"""Segments on a page: how each option is used, and the time line of every demonstration."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import accumulate, pairwise
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import accumulate, chain, islice, zip_longest
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import write_text
+from ddco_pyro.data.pictures import Observed
 from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.drawing.page import Block, Cell, Page, Section, Strip, Table, Text, Timeline, note
+from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, note
+from ddco_pyro.drawing.shown import position_key
+from ddco_pyro.drawing.timeline import Lane, Runs, Timelines, Track, following
 from ddco_pyro.drawing.words import NAT, number, numbered_name, option_name
-from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
+from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.segmenting import Segmented, Segments
 from ddco_pyro.segmenting.agreement import EXPLAINED, LevelAgreement, agreement_table
 
-SHADES = ("#f2f2f2", "#d4d4d4")
-"""Shades of ground-truth segments, in turn: colours belong to options."""
+FIRST = 10
+"""Demonstrations among which an observation that moves like a position is sought."""
 
-ROOM = 0.03
-"""A segment carries its number if it is longer than this share of the longest demonstration."""
+HOW = (
+    "Time runs to the right. Colours are options; the height of a band is the posterior probability of its option. A "
+    "bar below a boundary is the 90 % interval of its step, from the posterior of the two options beside it. Grey rows "
+    "are labels. Numbers, the trajectory and pictures below follow the cursor."
+)
 
-LETTER = 0.011
-"""The share of the longest demonstration that a letter of a name takes."""
 
-
-def write_page(path: Path, segmented: Segmented, run: str, file: str, agreements: Mapping[str, LevelAgreement]) -> None:
+def write_page(
+    path: Path,
+    segmented: Segmented,
+    run: str,
+    file: str,
+    agreements: Mapping[str, LevelAgreement],
+    follows: Iterable[Mapping[str, Any]] = (),
+) -> None:
     """Write the page, whole or not at all.
 
     :param agreements: agreement of each level with labels.
+    :param follows: of :func:`followed`.
     """
     count, held_out = len(segmented), sum(demo.held_out for demo in segmented.segments)
-    longest = duration(max(len(demo) for demo in segmented.segments), segmented.frequency)
     intro = f"{held_out} of {count} demonstrations were held out when the run was fitted. They are marked “held out”."
     sections = [_level(name, segmented, agreements.get(name)) for name in segmented.counts]
-    drawn = note(
-        f"Time runs to the right on one scale; the full width is {longest}. Colours are options; a white line is a new "
-        "choice. Grey rows are labels in the file and baselines. Rest the pointer on a segment for its steps and its "
-        f"probability. Nats per step: the log-likelihood of the demonstration's controls under the model; {NAT}."
-    )
-    sections.append(Section("segments", "Every demonstration", [drawn, *timelines(segmented)]))
+    drawn = note(f"{HOW} Nats per step: the log-likelihood of the demonstration's controls under the model; {NAT}.")
+    sections.append(Section("segments", "Every demonstration", [drawn, timelines(segmented, follows)]))
     page = Page(file, [Text(intro)] if held_out else [], sections, subtitle=f"segmented by {run}")
     write_text(path, page.html())
 
@@ -78,58 +87,67 @@ def duration(steps: float, frequency: float | None) -> str:
     return f"{steps:g} steps" + (f", {steps / frequency:.3g} s" if frequency else "")
 
 
-def timelines(segmented: Segmented, most_segments: float = math.inf) -> list[Timeline]:
-    """Timelines of the first demonstrations on one scale: about ``most_segments`` segments, at least one of them."""
-    counts = [sum(len(level.runs()) for level in demo.levels.values()) for demo in segmented.segments]
-    before = accumulate(counts, initial=0)
-    shown = [demo for demo, count in zip(segmented.segments, before, strict=False) if count < most_segments]
-    longest = max(len(demo) for demo in shown)
-    return [
-        Timeline(
+def timelines(
+    segmented: Segmented, follows: Iterable[Mapping[str, Any]] = (), most_steps: float = math.inf
+) -> Timelines:
+    """Time lines of the first demonstrations: about ``most_steps`` steps of all levels, at least one of them.
+
+    :param follows: what follows the cursor, of :func:`~ddco_pyro.drawing.timeline.following`.
+    """
+    lanes = {name: _level_lane(name, segmented) for name in reversed(segmented.counts)}
+    for demo in segmented.segments:
+        for name in (*demo.labels, *demo.baselines):
+            if name not in segmented.counts and not name.endswith("_boundary"):
+                lanes.setdefault(name, Lane(name))
+    before = accumulate((len(demo) * len(segmented.counts) for demo in segmented.segments), initial=0)
+    shown = [demo for demo, steps in zip(segmented.segments, before, strict=False) if steps < most_steps]
+    tracks = [
+        Track(
             demo.name,
             anchor(demo.name),
             f"{duration(len(demo), segmented.frequency)}, {number(demo.log_likelihood)} nats/step",
             demo.held_out,
-            list(_rows(demo, segmented, longest)),
+            len(demo),
+            [_runs(demo, name) for name in lanes],
+            followed or {},
         )
-        for demo in shown
+        for demo, followed in zip_longest(shown, islice(follows, len(shown)))
     ]
+    return Timelines(list(lanes.values()), tracks, segmented.frequency)
 
 
-def _rows(demo: Segments, segmented: Segmented, longest: int) -> Iterator[tuple[str, list[Strip]]]:
-    """The levels, the highest first, the baselines and the labels of a demonstration."""
-    for name, level in reversed(demo.levels.items()):
-        names = segmented.names.get(name, ())
-        yield name, [_option(level, run, names, segmented.frequency, longest) for run in level.runs()]
-    for name, values in {**demo.labels, **demo.baselines}.items():
-        if name not in demo.levels and not name.endswith("_boundary"):
-            yield name, list(_labels(name, values, longest))
+def followed(
+    demos: Iterable[Demonstration],
+    pictures: Sequence[Observed],
+    segmented: Segmented,
+    fit: Fit,
+    most_steps: float = math.inf,
+) -> Iterator[Mapping[str, Any]]:
+    """What follows the cursor along demonstrations in the order of their segments.
+
+    :param pictures: of each demonstration; empty for none.
+    :param most_steps: as in :func:`timelines`.
+    """
+    steps = min(sum(map(len, segmented.segments)), most_steps / len(segmented.counts))
+    ordered = iter(demos)
+    first = list(islice(ordered, FIRST))
+    position = fit.spec.report.trajectory or position_key(Demonstrations(tuple(first)))
+    return following(chain(first, ordered), pictures, int(steps), position)
 
 
-def _option(
-    level: LevelLabels, run: tuple[int, int, int], names: Sequence[str], frequency: float | None, longest: int
-) -> Strip:
-    option, start, end = run
-    seconds = f" ({start / frequency:.3g} to {end / frequency:.3g} s)" if frequency else ""
-    probability = float(level.probability[start:end].mean())
-    name = option_name(option, names)
-    title = f"{name}, steps {start} to {end - 1}{seconds}, probability {probability:.2f}"
-    short = name == option_name(option) or end - start < LETTER * len(name) * longest
-    text = (str(option) if short else name) if option else ""
-    return _strip(start, end, longest, option_colour(option), text, title)
+def _level_lane(name: str, segmented: Segmented) -> Lane:
+    choices = range(segmented.counts[name] + 1)
+    names = segmented.names.get(name, ())
+    return Lane(name, [option_name(choice, names) for choice in choices], [option_colour(choice) for choice in choices])
 
 
-def _labels(name: str, values: np.ndarray, longest: int) -> Iterator[Strip]:
-    edges = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
-    for place, (start, end) in enumerate(pairwise(edges)):
-        value = str(values[start])
-        yield _strip(start, end, longest, SHADES[place % 2], value, f"{name} {value}, steps {start} to {end - 1}")
-
-
-def _strip(start: int, end: int, longest: int, colour: str, text: str, title: str) -> Strip:
-    from matplotlib.colors import to_rgb  # most commands draw no page
-
-    shown = text if end - start > ROOM * longest else ""
-    red, green, blue = to_rgb(colour)
-    ink = "#000" if 0.299 * red + 0.587 * green + 0.114 * blue > 0.55 else "#fff"  # the one that can be read
-    return Strip(f"{100 * start / longest:.3f}", f"{100 * (end - start) / longest:.3f}", colour, ink, shown, title)
+def _runs(demo: Segments, name: str) -> Runs | None:
+    """The segments of a demonstration in a lane; None where the demonstration lacks it."""
+    if level := demo.levels.get(name):
+        options, starts, _ = zip(*level.runs(), strict=True)
+        return Runs(starts, options, level.intervals, level.probability)
+    values = demo.labels.get(name, demo.baselines.get(name))
+    if values is None:
+        return None
+    found = np.flatnonzero(np.diff(values, prepend=values[0] - 1))
+    return Runs(found.tolist(), values[found].tolist())

@@ -34,7 +34,12 @@ class Candidate:
     @property
     def name(self) -> str:
         """The candidate's name in tables, such as ``count = 3``."""
-        return ", ".join(f"{_short(path, self.values)} = {_value(value)}" for path, value in self.values.items())
+        return point_name(self.values)
+
+
+def point_name(values: Mapping[str, Any]) -> str:
+    """Values by key path as a name in tables, such as ``count = 3, std = 0.1``."""
+    return ", ".join(f"{_short(path, values)} = {_value(value)}" for path, value in values.items())
 
 
 def _short(path: str, paths: Iterable[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,15 +24,23 @@ def write_film(path: Path, episode: Episode, names: Sequence[Sequence[str]] = ()
 
     :param names: the name of each choice of each level, lowest first.
     """
+    frames = [captioned(episode, t, names) for t in range(len(episode.frames))]
+    with whole_file(path) as temporary:
+        temporary.write_bytes(encoded(frames, FRAMES_PER_SECOND))
+
+
+def encoded(frames: Sequence[np.ndarray] | np.ndarray, rate: int) -> bytes:
+    """Frames uint8 [H, W, 3] as mp4 (H.264), ``rate`` of them a second, cut to an even height and width."""
     import av
 
-    frames = [_even(captioned(episode, t, names)) for t in range(len(episode.frames))]
-    with whole_file(path) as temporary, av.open(temporary, "w", format="mp4") as film:
-        stream = film.add_stream("libx264", FRAMES_PER_SECOND, options={"crf": QUALITY})
-        stream.height, stream.width = frames[0].shape[:2]
+    content = io.BytesIO()
+    with av.open(content, "w", format="mp4") as film:
+        stream = film.add_stream("libx264", rate, options={"crf": QUALITY})
+        stream.height, stream.width = _even(frames[0]).shape[:2]
         for frame in frames:
-            film.mux(stream.encode(av.VideoFrame.from_ndarray(frame)))
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(_even(frame)))))
         film.mux(stream.encode())
+    return content.getvalue()
 
 
 def captioned(episode: Episode, t: int, names: Sequence[Sequence[str]] = ()) -> np.ndarray:

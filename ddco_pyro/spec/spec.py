@@ -89,6 +89,27 @@ class Spec(Model):
         return self.model_copy(update={"hierarchy": alone.as_hierarchy, "baseline": None})
 
     @model_validator(mode="after")
+    def _linear_by_em(self) -> Spec:
+        """Linear networks are trained by EM, where the spec does not say otherwise."""
+        training = self.training
+        versions = any(observation.augment and observation.augment.versions for observation in self.observations)
+        if training.optimizer.name == "em" or training.takes_gradient_steps or versions or not self._is_linear:
+            return self
+        optimizer = training.optimizer.model_copy(update={"name": "em"})
+        return self.model_copy(update={"training": training.model_copy(update={"optimizer": optimizer})})
+
+    @property
+    def _is_linear(self) -> bool:
+        """Whether every network is declared ``linear`` or constant."""
+        if self.hierarchy is None:
+            alone = self.baseline
+            return alone is not None and alone.kind == "flat" and alone.policy.network == "linear"
+        if self.hierarchy.trunk is not None or any(level.trunk is not None for level in self.hierarchy.levels):
+            return False
+        networks = [network for level in self.hierarchy.levels for _, network in level.readers]
+        return all(network.network == "linear" for network in (*networks, self.hierarchy.meta_policy))
+
+    @model_validator(mode="after")
     def _consistent(self) -> Spec:
         checks = (self._choices, self._baselines, self._observed, self._labelled, self._durations, self._segments)
         problems = [problem for check in checks for problem in check()]

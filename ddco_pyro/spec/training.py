@@ -25,7 +25,8 @@ class OptimizerSpec(Model):
 
     name: Literal["adam", "adamw", "momentum", "em"] = "adam"
     """``adam``, ``adamw``, ``momentum`` for gradient descent with momentum, or ``em``: expectation-maximisation where
-    every network of a model is linear, ``adam`` for other models."""
+    every network of a model is linear, ``adam`` for other models. A spec whose networks are all linear, and that gives
+    no other setting of gradient steps, has ``em`` if it names none."""
     ridge: RidgeSpec = RidgeSpec()
     """Ridges (``em`` only)."""
     lr: Positive = 1e-3
@@ -157,6 +158,12 @@ class TrainingSpec(Model):
     """Labels that fix active options in some demonstrations; null: none."""
     duration: DurationSpec | None = None
     """A prior on option durations; null: none."""
+
+    @property
+    def takes_gradient_steps(self) -> bool:
+        """Whether the spec names an optimiser, or gives a setting that gradient steps alone have."""
+        given = self.optimizer.model_fields_set - {"ridge"} or {"average", "clip_gradient"} & self.model_fields_set
+        return bool(given) and self.optimizer.name != "em"
 
     @model_validator(mode="after")
     def _em_has_no_gradient_steps(self) -> TrainingSpec:

@@ -70,25 +70,36 @@ def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool 
     :raises SpecError: the file cannot be read, is not YAML, is not a valid spec, or names code that is not allowed; one
         line for each problem.
     """
+    data = read_mapping(path, "spec")
     try:
-        about = Path(path).stat()
-        if not stat.S_ISREG(about.st_mode) or about.st_size > MOST_BYTES:
-            raise SpecError(f"{path}: is no file of at most {MOST_BYTES // 1024} kB; a spec is a YAML file")
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise SpecError(f"{path}: cannot be read: {error.strerror}; check the path") from error
-    try:
-        data = read_yaml(content)
-        if data is None:
-            raise SpecError("the file is empty; it has to hold a spec")
-        if not isinstance(data, dict):
-            raise SpecError(f"the file holds {show(data)}, not a mapping (key: value)")
         spec = parse_spec(data, dict(_parse_override(text) for text in overrides))
     except SpecError as error:
         raise SpecError(*(f"{path}: {problem}" for problem in error.problems)) from None
     if not allow_code:
         _refuse_user_code(spec, path)
     return spec
+
+
+def read_mapping(path: str | Path, kind: str) -> dict[str, Any]:
+    """The mapping in a YAML file.
+
+    :param kind: what the file has to hold, for messages, such as ``spec``.
+    :raises SpecError: the file cannot be read, is not YAML, or holds something else.
+    """
+    try:
+        about = Path(path).stat()
+        if not stat.S_ISREG(about.st_mode) or about.st_size > MOST_BYTES:
+            raise SpecError(f"is no file of at most {MOST_BYTES // 1024} kB; a {kind} is a YAML file")
+        data = read_yaml(Path(path).read_bytes())
+    except OSError as error:
+        raise SpecError(f"{path}: cannot be read: {error.strerror}; check the path") from error
+    except SpecError as error:
+        raise SpecError(*(f"{path}: {problem}" for problem in error.problems)) from None
+    if data is None:
+        raise SpecError(f"{path}: the file is empty; it has to hold a {kind}")
+    if not isinstance(data, dict):
+        raise SpecError(f"{path}: the file holds {show(data)}, not a mapping (key: value)")
+    return data
 
 
 def dump_spec(spec: Spec) -> str:
@@ -178,7 +189,7 @@ def _parse_override(text: str) -> tuple[str, Any]:
 # --- user code --------------------------------------------------------------------------------------------------------
 
 
-def user_code(spec: Spec) -> dict[str, str]:
+def user_code(spec: Model) -> dict[str, str]:
     """Key path to ``module:name`` of the code that using the spec imports, its grid excluded.
 
     Names registered by installed packages are not user code.

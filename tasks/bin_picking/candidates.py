@@ -1,7 +1,8 @@
 """Grasp candidates in a mask: points on what is seen, each with a direction, and a classifier that scores them.
 
 The classifier is a logistic regression over how the mask looks in the frame of the gripper, so its weights are a few
-numbers. ``grasp_classifier.json`` holds them; ``studies/bin_picking_candidates.py`` made it from 40 labelled images.
+numbers. ``grasp_classifier.json`` holds them; ``studies/bin_picking_candidates.py`` of commit 6b4a34a made it from 40
+labelled images.
 """
 
 from __future__ import annotations

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bin_picking_variants import VARIANTS
 from ddco_tasks.bin_picking import task
 from ddco_tasks.bin_picking.supervisor import JAW_OPEN
 
@@ -49,9 +48,11 @@ def test_specs_are_checked_against_the_task(path: Path) -> None:
     assert check_networks(spec, known).depth == 1
 
 
-@pytest.mark.parametrize(("variant", "numbers"), [(name, 7 + 6 * (name == "controls-matrix")) for name in VARIANTS])
-def test_variants_are_checked_against_their_tasks(variant: str, numbers: int) -> None:
-    spec = load_spec(SPECS[0], VARIANTS[variant])
+@pytest.mark.parametrize(("form", "angles", "numbers"), [("pose", 6, 7), ("matrix", 12, 13)])
+def test_other_controls_are_checked_against_their_tasks(form: str, angles: int, numbers: int) -> None:
+    pose = f"{{name: pose, dims: {list(range(angles))}, kind: gaussian}}"
+    parts = f"control.parts=[{pose}, {{name: jaw, dims: [{angles}], kind: binary}}]"
+    spec = load_spec(SPECS[0], ["compare_with=[]", f"task=bin_picking_{form}", parts])
     known = dimensions(spec)
     assert known.control_size == numbers
     assert check_networks(spec, known).depth == 1

@@ -4,40 +4,22 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-import numpy as np
-import pytest
-from bin_picking import OURS, beside, summarize
-from bin_picking_recovery import counted
-from bin_picking_trials import ENDINGS, Bin, Load, Trial
-from bin_picking_trials import trials as trials_of
-from bin_picking_unseen import place
-from ddco_tasks.bin_picking.trials import Attempt, End, Trials
-from rates import shown
-
-from ddco_pyro.data.demonstrations import Demonstration
-from ddco_pyro.simulation.episodes import Episode, rate
-
-DEMONSTRATION = Demonstration("demo_0", {"kin": np.zeros((10, 7))}, np.zeros((10, 7)))
+from bin_picking import criteria
+from bin_picking_recovery import Load, Trial, counted
+from bin_picking_recovery import trials as trials_of
+from ddco_tasks.bin_picking.trials import Attempt, Trials
 
 
-def test_methods_are_paired_by_seed() -> None:
-    def bins(cleared: list[int]) -> dict[str, list[dict[str, float]]]:
-        return {"bins": [Trials(()).measures() | {"cleared": one, "objects": 3, "attempts": 1} for one in cleared]}
-
-    cells = [{"methods": {OURS: bins([1, 1, 1]), "flat": bins([0, 1, 0])}}] * 2
-    found = summarize([*cells, {"methods": {OURS: bins([0]), "flat": bins([1])}}])
-    assert found["flat"]["cleared by seed"] == [1, 1, 1]
-    # Two bins more, two more and one fewer: the mean of three is 1, and its standard error 1; t(0.975, 2) is 4.3027.
-    assert found["flat"]["paired"]["by_seed"] == [2, 2, -1]
-    assert found["flat"]["paired"]["interval"] == pytest.approx([1 - 4.3027, 1 + 4.3027], abs=1e-4)
-    assert beside(found["flat"]["paired"]) == "+2, +2, -1: +1.0 [-3.3, +5.3]"
-    assert found[OURS]["paired"] is None
-
-
-def test_rates_have_counts_and_wilson_interval() -> None:
-    # Wilson's interval for 8 of 10 by hand: centre (0.8 + 0.192073) / 1.384146 = 0.71674, half width 0.22658.
-    assert shown(rate(8, 10)) == "80.0% (8 of 10; 49.0% to 94.3%)"
-    assert shown(rate(0, 0)) == "-"
+def test_criteria_are_sums_over_bins() -> None:
+    nothing = Trials(()).measures() | dict.fromkeys(("cleared", "success"), 0.0)
+    first = nothing | {"cleared": 1, "attempts": 4, "single": 3, "due_recoveries": 2, "nothing": 1, "recovered": 2}
+    second = nothing | {"attempts": 2, "single": 0, "due_recoveries": 2, "recovered": 1, "nothing_recovered": 0}
+    found = criteria([first | {"nothing_recovered": 1}, second])
+    assert found["success"] == (1, 2)
+    assert found["grasp of exactly one"] == (3, 6)
+    assert found["recovery, recall"] == (3, 4)
+    assert found["recall where nothing is held"] == (1, 1)
+    assert found["recall where several are"] == (2, 3)
 
 
 NONE, FIRST, BOTH = frozenset[int](), frozenset({0}), frozenset({0, 1})
@@ -52,27 +34,6 @@ ATTEMPTS = {
     "none or several to a cup": Attempt(2, BOTH, BOTH, ("accept", "accept"), 10),
     "not let go": Attempt(2, FIRST, FIRST, (), 20),
 }
-
-
-def a_bin(trial: Trial, end: End) -> Bin:
-    """A bin with a pin and a wire, and one trial."""
-    empty = Episode(0, DEMONSTRATION, {}, np.zeros((10, 1), int))
-    return Bin(empty, Trials(["pin", "wire"], end=end), [trial])
-
-
-@pytest.mark.parametrize("name", ATTEMPTS)
-def test_trials_are_called_by_how_they_end(name: str) -> None:
-    trial = Trial(STEPS, ATTEMPTS[name].lifted, ATTEMPTS[name])
-    assert a_bin(trial, End.MISSED).ending(trial) == name
-
-
-def test_a_bin_that_ends_before_the_jaws_open_names_its_last_trial() -> None:
-    assert [*ATTEMPTS, "lost"] == list(ENDINGS)
-    for attempt in (None, ATTEMPTS["slipped"]):
-        trial = Trial(STEPS, FIRST, attempt)
-        assert a_bin(trial, End.LOST).ending(trial) == "lost"
-    unfinished = Trial(STEPS, NONE, None)
-    assert a_bin(unfinished, End.FOAM).ending(unfinished) == "foam"
 
 
 def test_recoveries_are_of_what_is_held_where_it_is_shown() -> None:
@@ -112,21 +73,3 @@ def test_a_load_is_shown_where_the_gripper_shows_it_be_it_late() -> None:
     assert never.load is None
     assert open_ended.load is showing
     assert open_ended.attempt is None
-
-
-@pytest.mark.parametrize(
-    ("lifted", "attempt", "expected"),
-    [
-        (FIRST, Attempt(1, FIRST, FIRST, ("accept",), 10), "accept"),
-        (FIRST, Attempt(1, FIRST, FIRST, ("bin",), 10), "bin"),
-        (FIRST, Attempt(1, FIRST, FIRST, ("outside",), 10), "lost"),
-        (FIRST, Attempt(1, FIRST, NONE, ("reject",), 10), "lost"),  # the gripper was over the cup, the object not
-        (FIRST, Attempt(1, FIRST, FIRST, (), 20), "not let go"),
-        (FIRST, None, "lost"),
-        (NONE, Attempt(1, NONE, NONE, ("bin",), 10), "nothing"),
-    ],
-)
-def test_an_object_alone_is_where_it_was_dropped(
-    lifted: frozenset[int], attempt: Attempt | None, expected: str
-) -> None:
-    assert place(Trial(STEPS, lifted, attempt)) == expected

@@ -12,9 +12,13 @@ from ddco_pyro.simulation.task import Policy, Task, find_task
 from ddco_pyro.spec.base import TASKS
 
 NAMES = sorted(point.name for point in entry_points(group=TASKS))
+QUICK = ("needle", "pushing_goal", "bin_picking")
+"""The others differ from them in what is observed or in when they end."""
 
 
-@pytest.fixture(scope="module", params=NAMES)
+@pytest.fixture(
+    scope="module", params=[name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in NAMES]
+)
 def task(request: pytest.FixtureRequest) -> Task:
     """Each registered task in turn."""
     return find_task(request.param)

@@ -1,0 +1,236 @@
+"""Drawings of options in SVG: transitions, likeness, and trajectories of instances."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from ddco_pyro.drawing.colours import option_colour
+
+WIDTH = 900
+"""Units across a drawing as wide as the page."""
+
+RAREST = 0.01
+"""Transitions that make up a smaller share of all are not drawn."""
+
+LETTERS = 16
+"""Of a name beside a node, at most."""
+
+
+def svg(width: float, height: float, label: str, parts: Sequence[str], **looks: str) -> Markup:
+    """An SVG element of this size in its own units.
+
+    :param parts: its contents, escaped already.
+    :param looks: further attributes.
+    """
+    return Markup('<svg viewBox="0 0 {:.0f} {:.0f}" role="img" aria-label="{}"{}>{}</svg>').format(
+        width, height, label, _attributes(looks), Markup("\n").join(map(Markup, parts))
+    )
+
+
+def _attributes(looks: Mapping[str, Any]) -> Markup:
+    return Markup("").join(
+        Markup(' {}="{}"').format(name.rstrip("_").replace("_", "-"), value) for name, value in looks.items()
+    )
+
+
+def _text(x: float, y: float, text: str, anchor: str = "middle", kind: str = "") -> Markup:
+    shape = Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}" class="{}">{}</text>')
+    return shape.format(x, y, anchor, kind, text)
+
+
+def shortened(name: str) -> str:
+    """A name of at most :data:`LETTERS` letters."""
+    return name if len(name) <= LETTERS else name[: LETTERS - 1] + "…"
+
+
+def transition_graph(counts: np.ndarray, shares: Sequence[float], names: Sequence[str], order: Sequence[int]) -> Markup:
+    """Options in a row between start and end; arcs above the row lead to the right, arcs below to the left.
+
+    :param counts: of transitions between segments [1 + k + 1, 1 + k + 1]; the last row is the start of demonstrations
+        and the last column their end.
+    :param shares: of steps, of each choice; the areas of nodes.
+    :param order: the choices that are drawn, from left to right.
+    """
+    outside = len(counts) - 1
+    gap = WIDTH / (2 + len(order))
+    at = {choice: (place + 0.5) * gap for place, choice in enumerate(order, start=1)}
+    starts, ends = at | {outside: 0.5 * gap}, at | {outside: WIDTH - 0.5 * gap}
+    named = [*names, "start"]
+    edges = [
+        (first, second, int(counts[first, second]))
+        for first in starts
+        for second in ends
+        if counts[first, second] >= max(1, RAREST * counts.sum())
+    ]
+    up = max((_rise(ends[b] - starts[a], gap) for a, b, _ in edges if ends[b] > starts[a]), default=0.0) + 34
+    down = max((_rise(starts[a] - ends[b], gap) for a, b, _ in edges if ends[b] < starts[a]), default=0.0) + 58
+    parts: list[str] = []
+    for first, second, count in sorted(edges, key=lambda edge: edge[2]):
+        target = "end" if second == outside else named[second]
+        title = f"{named[first]} → {target}: {count} of {int(counts[first].sum())}"
+        share = count / counts[first].sum()
+        parts.append(_edge(starts[first], ends[second], up, gap, share, title, str(count)))
+    for choice, x in at.items():
+        radius = 7 + 26 * np.sqrt(shares[choice])
+        title = f"{names[choice]}: {shares[choice]:.1%} of all steps"
+        parts.append(
+            Markup(
+                '<g><title>{}</title><circle cx="{:.1f}" cy="{:.1f}" r="{:.1f}" fill="{}" stroke="var(--line)"/></g>'
+            ).format(title, x, up, radius, option_colour(choice))
+        )
+        parts.append(_text(x, up + radius + 14, shortened(names[choice])))
+    for x, word in ((starts[outside], "start"), (ends[outside], "end")):
+        parts.append(
+            Markup('<circle cx="{:.1f}" cy="{:.1f}" r="5" fill="var(--paper)" stroke="var(--ink)"/>').format(x, up)
+        )
+        parts.append(_text(x, up + 20, word, kind="soft"))
+    return svg(WIDTH, up + down, "Transitions between options", parts)
+
+
+def _rise(distance: float, gap: float) -> float:
+    """The height of an arc over so great a distance."""
+    return 0 if abs(distance) < 1.5 * gap and distance > 0 else 22 + 0.16 * abs(distance)
+
+
+def _edge(start: float, end: float, y: float, gap: float, share: float, title: str, count: str) -> Markup:
+    """An arc with its arrow head and its count; ``share`` of the transitions from its start."""
+    width, side = 0.8 + 5 * share, 1 if end > start else -1
+    if start == end:
+        path = f"M{start - 9:.1f},{y - 8:.1f} c-25,-54 43,-54 18,0"
+        middle, top = start, y - 48.5
+    else:
+        rise = side * _rise(end - start, gap)
+        middle, top = (start + end) / 2, y - rise * 1.0
+        path = f"M{start:.1f},{y:.1f} Q{middle:.1f},{y - 2 * rise:.1f} {end:.1f},{y:.1f}"
+    head = f"M{middle - side * 5:.1f},{top - 4:.1f} l{side * 8:.1f},4 l{-side * 8:.1f},4 z"
+    return Markup(
+        '<g opacity="{:.2f}"><title>{}</title><path class="edge" d="{}" stroke-width="{:.1f}"/>'
+        '<path d="{}" fill="var(--soft)"/>{}</g>'
+    ).format(0.45 + 0.55 * share, title, path, width, head, _text(middle, top - 7, count))
+
+
+def dendrogram(merges: np.ndarray, choices: Sequence[int], names: Sequence[str]) -> Markup:
+    """Options joined at their distance, from left (alike) to right, on a square-root scale.
+
+    :param merges: the result of :func:`scipy.cluster.hierarchy.linkage` for the options ``choices``.
+    """
+    from scipy.cluster.hierarchy import dendrogram as laid_out  # most commands draw none
+
+    found = laid_out(merges, no_plot=True)
+    left, row, most = 170.0, 26.0, float(merges[:, 2].max()) or 1.0
+    height = row * len(choices) + 34
+
+    def right(distance: float) -> float:
+        return left + (WIDTH - left - 60) * float(np.sqrt(distance / most))
+
+    parts: list[str] = []
+    for distances, rows in zip(found["dcoord"], found["icoord"], strict=True):
+        points = " ".join(f"{right(x):.1f},{row * y / 10:.1f}" for x, y in zip(distances, rows, strict=True))
+        parts.append(Markup('<polyline class="edge" points="{}"/>').format(points))
+        parts.append(
+            _text(right(distances[1]) + 4, row * (rows[1] + rows[2]) / 20 + 4, f"{distances[1]:.2f}", "start", "soft")
+        )
+    for place, leaf in enumerate(found["leaves"]):
+        choice, y = choices[leaf], row * (place + 0.5)
+        parts.append(Markup('<circle cx="{}" cy="{}" r="6" fill="{}"/>').format(left - 12, y, option_colour(choice)))
+        parts.append(_text(left - 24, y + 4, shortened(names[choice]), "end"))
+    parts.append(_text(left, height - 8, "0", kind="soft"))
+    parts.append(_text(WIDTH - 60, height - 8, f"{most:.2f} nats per step", kind="soft"))
+    return svg(WIDTH, height, "How alike options are", parts)
+
+
+# --- instances of an option -------------------------------------------------------------------------------------------
+
+CELL = 110.0
+"""Units across a cell of the grid of instances."""
+
+MARGIN = 8.0
+
+
+def fitted(paths: Sequence[np.ndarray], width: float, height: float) -> list[np.ndarray]:
+    """Paths in the plane [T, 2], moved and scaled together into a box."""
+    every = np.concatenate(paths)
+    low, span = every.min(0), np.ptp(every, axis=0)
+    room = np.array([width, height]) - 2 * MARGIN
+    scale = min(room / np.where(span > 0, span, 1e-9))
+    return [(path - low - span / 2) * scale + np.array([width, height]) / 2 for path in paths]
+
+
+def line(points: np.ndarray, **looks: Any) -> Markup:
+    """A line through points [T, 2], at most 60 of them."""
+    chosen = points[np.unique(np.linspace(0, len(points) - 1, min(len(points), 60)).round().astype(int))]
+    drawn = " ".join(f"{x:.1f},{y:.1f}" for x, y in chosen)
+    return Markup('<polyline points="{}" fill="none"{}/>').format(drawn, _attributes(looks))
+
+
+def typical_paths(paths: Sequence[np.ndarray], segments: Sequence[tuple[int, int, int]], colour: str) -> Markup:
+    """Segments in colour over whole demonstrations; circle, square and triangle: first, middle and last step.
+
+    :param paths: of demonstrations in the plane [T, 2].
+    :param segments: (demonstration, first step, step after the last).
+    """
+    width, height = 2.4 * CELL, 2 * CELL
+    placed = fitted(paths, width, height)
+    parts: list[str] = [line(path, class_="faint") for path in placed]
+    for row, start, end in segments:
+        parts.append(line(placed[row][start:end], stroke=colour, stroke_width=2))
+        (x, y), (x1, y1), (x2, y2) = (placed[row][step] for step in (start, (start + end - 1) // 2, end - 1))
+        mark = f'fill="{colour}" stroke="var(--paper)" stroke-width="1"'
+        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4.5" {mark}/>')
+        parts.append(f'<rect x="{x1 - 3.5:.1f}" y="{y1 - 3.5:.1f}" width="7" height="7" {mark}/>')
+        parts.append(f'<path d="M{x2:.1f},{y2 - 5:.1f} l5,9 l-10,0 z" {mark}/>')
+    return svg(width, height, "Trajectories of typical segments", parts)
+
+
+def path_film(paths: Sequence[np.ndarray], steps: np.ndarray, seconds: float, colour: str) -> Markup:
+    """A grid of cells in each of which a point moves along one instance; all begin at their onset together.
+
+    :param paths: the demonstration of each instance in the plane [T, 2].
+    :param steps: the step of each frame in each instance, [F, instances].
+    :param seconds: of the whole film.
+    """
+    columns = min(3, len(paths))
+    placed = fitted(paths, CELL, CELL)
+    parts: list[str] = []
+    for cell, path in enumerate(placed):
+        shown = path[steps[:, cell]]
+        parts.append(f'<g transform="translate({CELL * (cell % columns):.0f},{CELL * (cell // columns):.0f})">')
+        parts.append(f'<rect x="1" y="1" width="{CELL - 2:.0f}" height="{CELL - 2:.0f}" class="faint"/>')
+        parts += [line(path, class_="faint"), line(shown, stroke=colour, stroke_width=1.5)]
+        parts.append(
+            f'<circle r="4.5" cx="{shown[0, 0]:.1f}" cy="{shown[0, 1]:.1f}" fill="{colour}" stroke="var(--ink)">'
+        )
+        for axis, name in enumerate(("cx", "cy")):
+            values = ";".join(f"{value:.1f}" for value in shown[:, axis])
+            parts.append(
+                f'<animate attributeName="{name}" values="{values}" dur="{seconds:.2f}s" repeatCount="indefinite"/>'
+            )
+        parts.append("</circle></g>")
+    rows = -(-len(placed) // columns)
+    return svg(columns * CELL, rows * CELL, "Instances from their onset on", parts, class_="film", tabindex="0")
+
+
+def curves(values: Mapping[str, Sequence[np.ndarray]], colour: str) -> Markup:
+    """A panel for each name: lines over the steps since the onset.
+
+    :param values: of each instance [T_n].
+    """
+    columns, width, height = min(2, len(values)), 1.5 * CELL, 0.8 * CELL
+    parts: list[str] = []
+    for place, (name, each) in enumerate(values.items()):
+        low, high = min(array.min() for array in each), max(array.max() for array in each)
+        longest = max(max(map(len, each)) - 1, 1)
+        parts.append(f'<g transform="translate({width * (place % columns):.0f},{height * (place // columns):.0f})">')
+        parts.append(f'<rect x="2" y="16" width="{width - 6:.0f}" height="{height - 20:.0f}" class="faint"/>')
+        parts.append(_text(4, 11, f"{name} ({low:.3g} to {high:.3g})", "start"))
+        for array in each:
+            across = 5 + (width - 12) * np.arange(len(array)) / longest
+            down = height - 8 - (height - 28) * (array - low) / ((high - low) or 1)
+            parts.append(line(np.stack([across, down], axis=1), stroke=colour, stroke_width=1.2, opacity=0.75))
+        parts.append("</g>")
+    rows = -(-len(values) // columns)
+    return svg(columns * width, rows * height, "Numbers since the onset", parts)

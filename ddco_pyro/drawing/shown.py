@@ -1,0 +1,145 @@
+"""What is shown of a demonstration: its trajectory in space, its pictures, and its numbers over time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed
+from ddco_pyro.data.sources import Source
+
+LEAST_OBLIQUE = 15.0
+"""Degrees between the view and an axis, at least; a view along an axis hides the axis' scale."""
+
+MOST_STRETCHED = 4.0
+"""Axes whose ranges differ by more than this factor are not drawn to one scale."""
+
+QUALITY = 70
+"""Of JPEG pictures, 0 to 100."""
+
+MOST_SKIPPED = 4
+"""Steps of a stretch that is read whole, for each of its pictures that is shown."""
+
+
+# --- trajectories in space --------------------------------------------------------------------------------------------
+
+
+def position_key(demos: Demonstrations) -> str | None:
+    """The vector of three numbers or more with the most :func:`movement`; None where none moves."""
+    keys = [key for key, shape in demos.observation_shapes.items() if len(shape) == 1 and shape[0] >= 3]
+    moves = {key: movement([np.asarray(demo.observations[key]) for demo in demos]) for key in keys}
+    best = max(moves, key=moves.__getitem__, default=None)
+    return best if best is not None and moves[best] > 0 else None
+
+
+def movement(values: Sequence[np.ndarray]) -> float:
+    """How much the first three of n numbers [T, n] move like a position, 0 to 1. The product of three factors:
+
+    - Standard deviation within demonstrations over the total one: 0 for a goal that is constant in a demonstration.
+    - Diagonal of the box around a demonstration over the length of T steps of its root mean square step: 1 along a
+      straight line at one speed, near 0 for a velocity or noise.
+    - The share of the numbers that is drawn, 3 / n.
+    """
+    points = [array[:, :3].astype(float) for array in values]
+    reach = float(np.mean([_reach(path) for path in points]))
+    if reach == 0:
+        return 0.0
+    within = np.mean([path.var(0).sum() for path in points])
+    between = np.array([path.mean(0) for path in points]).var(0).sum()
+    return float(np.sqrt(within / (within + between))) * reach * 3 / values[0].shape[1]
+
+
+def _reach(points: np.ndarray) -> float:
+    """The diagonal of the box around positions [T, 3], over T - 1 times the root mean square of their steps."""
+    steps = np.diff(points, axis=0)
+    length = np.sqrt(np.square(steps).sum() * len(steps))
+    return float(np.linalg.norm(np.ptp(points, axis=0)) / length) if length > 0 else 0.0
+
+
+def view(points: np.ndarray, span: np.ndarray) -> tuple[float, float]:
+    """Elevation and azimuth (degrees) of a view along the direction in which positions [M, 3] spread the least.
+
+    The third axis stays upright: the elevation is between 15 and 45 degrees. No view is along an axis.
+    """
+    normal = np.linalg.eigh(np.cov((points / span).T))[1][:, 0] if len(points) > 1 else np.array([1.0, 1.0, 1.0])
+    normal = -normal if normal[2] < 0 else normal
+    elevation = float(np.clip(np.degrees(np.arcsin(normal[2])), 15, 45))
+    quarter, rest = divmod(float(np.degrees(np.arctan2(normal[1], normal[0]))), 90)
+    return elevation, 90 * quarter + float(np.clip(rest, LEAST_OBLIQUE, 90 - LEAST_OBLIQUE))
+
+
+def spans(points: np.ndarray) -> np.ndarray:
+    """The range of each coordinate of positions [M, 3]; 1 where all are equal."""
+    span: np.ndarray = np.ptp(points, axis=0)
+    return np.where(span > 0, span, 1.0)
+
+
+def projection(points: np.ndarray) -> np.ndarray:
+    """The map [2, 3] from positions [M, 3] to a plane, right and down, as :func:`view` sees them."""
+    span = spans(points)
+    scale = span if span.max() > MOST_STRETCHED * span.min() else np.full(3, span.max())
+    up, turned = np.radians(view(points, scale / scale.max()))
+    right = [-np.sin(turned), np.cos(turned), 0.0]
+    down = [np.sin(up) * np.cos(turned), np.sin(up) * np.sin(turned), -np.cos(up)]
+    return np.array([right, down]) / scale
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def pictures(demos: Sequence[Demonstration]) -> list[Observed]:
+    """The first observation of each demonstration that is a picture; empty where one has none."""
+    found = (
+        next((array for array in demo.observations.values() if len(array.shape) == 1 + PICTURE_DIMENSIONS), None)
+        for demo in demos
+    )
+    return _every(found)
+
+
+def stored_pictures(source: Source, lengths: Mapping[str, int]) -> list[Observed]:
+    """The first pictures of each recording, which are read when shown, observed by a fit or not.
+
+    :param lengths: steps of each recording by name.
+    :returns: pictures in this order; empty where a recording has none or has other steps.
+    """
+    if not set(lengths) <= set(source.names):
+        return []
+    columns = (source.recording(name).observations.values() for name in lengths)
+    lazy = (
+        next((column.kept for column in each if column.image and len(column.kept or ()) == steps), None)
+        for each, steps in zip(columns, lengths.values(), strict=True)
+    )
+    return _every(lazy)
+
+
+def _every(found: Iterable[Observed | None]) -> list[Observed]:
+    listed = list(found)
+    there = [array for array in listed if array is not None]
+    return there if len(there) == len(listed) else []
+
+
+def frames(observed: Observed, steps: Sequence[int] | np.ndarray, height: int) -> np.ndarray:
+    """The pictures of these steps, uint8 [F, height, W, 3] in red, green and blue."""
+    import cv2  # one's own vectors need none of it
+
+    chosen = np.unique(steps)
+    first, last = int(chosen[0]), int(chosen[-1])
+    if last - first < MOST_SKIPPED * len(chosen):
+        read = np.asarray(observed[first : last + 1])[chosen - first]
+    else:
+        read = np.stack([np.asarray(observed[int(step)]) for step in chosen])
+    coloured = read[..., :3] if read.shape[-1] > 1 else np.repeat(read, 3, axis=-1)
+    width = max(1, round(height * read.shape[2] / read.shape[1]))
+    how = cv2.INTER_AREA if height < read.shape[1] else cv2.INTER_NEAREST
+    sized = [cv2.resize(np.ascontiguousarray(picture), (width, height), interpolation=how) for picture in coloured]
+    return np.stack(sized)[np.searchsorted(chosen, steps)]
+
+
+def jpeg(picture: np.ndarray) -> bytes:
+    """A picture uint8 [H, W, 3] as JPEG."""
+    import cv2
+
+    _, content = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return bytes(content)

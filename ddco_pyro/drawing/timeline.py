@@ -1,0 +1,171 @@
+"""Time lines: the segments of many demonstrations under one axis of time, drawn by ``timeline.html.j2``.
+
+Segments are run-length coded. Posterior probabilities and observed numbers are bytes in base64.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import zip_longest
+from typing import Any
+
+import numpy as np
+
+from ddco_pyro.data.demonstrations import Demonstration
+from ddco_pyro.data.pictures import Observed
+from ddco_pyro.drawing.shown import frames, jpeg, projection
+
+MOST_NUMBERS = 12
+"""Observed numbers that follow the cursor."""
+
+MOST_BYTES = 1_000_000
+"""Bytes of observed numbers on a page, about; longer demonstrations are thinned out in time."""
+
+MOST_PICTURES, FEWEST_PICTURES = 320, 8
+"""Pictures on a page, and the fewest of a demonstration that has any."""
+
+PICTURE_HEIGHT = 96
+"""Rows of a picture that follows the cursor."""
+
+
+@dataclass(frozen=True)
+class Lane:
+    """A row of every demonstration: a level of options, or labels.
+
+    :param names: of each choice of a level, control first; empty for labels.
+    :param colours: of each choice; empty for labels.
+    """
+
+    name: str
+    names: Sequence[str] = ()
+    colours: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Runs:
+    """The segments of one demonstration in one lane.
+
+    :param starts: first steps.
+    :param values: the option or the label of each segment.
+    :param intervals: of each first step, [segments, 2]; None for labels.
+    :param probability: of the option at each step [T]; None for labels.
+    """
+
+    starts: Sequence[int]
+    values: Sequence[int]
+    intervals: np.ndarray | None = None
+    probability: np.ndarray | None = None
+
+    def data(self) -> dict[str, Any]:
+        """The segments for JSON; the interval of a first step is left out where its ends are that step."""
+        found: dict[str, Any] = {"s": list(self.starts), "v": list(self.values)}
+        if self.intervals is not None:
+            pairs = zip(self.starts, self.intervals.tolist(), strict=True)
+            found["i"] = {place: ends for place, (start, ends) in enumerate(pairs) if ends != [start, start]}
+        if self.probability is not None:
+            found["p"] = text(np.rint(255 * self.probability))
+        return found
+
+
+@dataclass(frozen=True)
+class Track:
+    """One demonstration.
+
+    :param anchor: the ``id`` by which links lead here.
+    :param facts: a line on the demonstration, such as its length.
+    :param runs: of each lane; None where the demonstration lacks it.
+    :param follows: what follows the cursor, of :func:`following`.
+    """
+
+    name: str
+    anchor: str
+    facts: str
+    held_out: bool
+    steps: int
+    runs: Sequence[Runs | None]
+    follows: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Timelines:
+    """Demonstrations under one axis of time.
+
+    :param frequency: steps per second (Hz); None where unknown.
+    """
+
+    lanes: Sequence[Lane]
+    tracks: Sequence[Track]
+    frequency: float | None = None
+
+    @property
+    def json(self) -> str:
+        """The data of the script; without ``<``, so that no text ends the element that holds them."""
+        data = {
+            "frequency": self.frequency,
+            "longest": max(track.steps for track in self.tracks),
+            "lanes": [{"name": lane.name, "names": lane.names, "colours": lane.colours} for lane in self.lanes],
+            "tracks": [
+                {
+                    "name": track.name,
+                    "steps": track.steps,
+                    "lanes": [None if runs is None else runs.data() for runs in track.runs],
+                    **track.follows,
+                }
+                for track in self.tracks
+            ],
+        }
+        return json.dumps(data, separators=(",", ":"), ensure_ascii=False).replace("<", "\\u003c")
+
+
+def text(values: np.ndarray) -> str:
+    """Numbers from 0 to 255 as bytes in base64."""
+    return base64.b64encode(values.astype(np.uint8).tobytes()).decode("ascii")
+
+
+def following(
+    demos: Iterable[Demonstration], pictures: Sequence[Observed], steps: int, position: str | None
+) -> Iterator[dict[str, Any]]:
+    """What follows the cursor along each demonstration: numbers, a trajectory, pictures.
+
+    :param pictures: of each demonstration; empty for none.
+    :param steps: of all demonstrations together.
+    :param position: the observation whose first three numbers are a trajectory.
+    """
+    left, view = MOST_PICTURES, None
+    for demo, observed in zip_longest(demos, pictures):
+        values = _numbers(demo, position)
+        every = -(-len(values) * steps // MOST_BYTES) or 1
+        low = np.array([array.min() for array in values.values()])
+        span = np.array([np.ptp(array) for array in values.values()])
+        scaled = [255 * (array - a) / (b or 1) for array, a, b in zip(values.values(), low, span, strict=True)]
+        found: dict[str, Any] = {}
+        if values:
+            coded = text(np.rint([array[::every] for array in scaled]))
+            ranges = {"low": np.round(low, 6).tolist(), "span": np.round(span, 6).tolist()}
+            found["n"] = {"names": list(values), "every": every, "bytes": coded, **ranges}
+        if position is not None:
+            view = projection(demo.observations[position][:, :3]) if view is None else view
+            found["view"] = np.round(view, 5).tolist()
+        if observed is not None and left >= FEWEST_PICTURES:
+            count = min(len(demo), max(FEWEST_PICTURES, MOST_PICTURES * len(demo) // steps), left)
+            chosen = np.unique(np.linspace(0, len(demo) - 1, count).round().astype(int))
+            left -= len(chosen)
+            strip = np.hstack(list(frames(observed, chosen, PICTURE_HEIGHT)))
+            content = base64.b64encode(jpeg(strip)).decode("ascii")
+            found["k"] = {"steps": chosen.tolist(), "strip": f"data:image/jpeg;base64,{content}"}
+        yield found
+
+
+def _numbers(demo: Demonstration, position: str | None) -> dict[str, np.ndarray]:
+    """The observed numbers and controls over time by name, the position first, at most :data:`MOST_NUMBERS`."""
+    keys = sorted(demo.observations, key=lambda key: key != position)
+    vectors = {key: np.asarray(demo.observations[key]) for key in keys if len(demo.observations[key].shape) == 2}
+    named = {
+        f"{key}[{place}]" if array.shape[1] > 1 else key: array[:, place].astype(float)
+        for key, array in {**vectors, "control": demo.actions.reshape(len(demo), -1)}.items()
+        for place in range(array.shape[1])
+    }
+    return dict(list(named.items())[:MOST_NUMBERS])

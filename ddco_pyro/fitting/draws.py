@@ -1,0 +1,202 @@
+"""Draws of options from their posterior, and intervals of segment boundaries from draws."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+from ddco_pyro.errors import BadInput
+from ddco_pyro.evaluation.inferred import Inferred
+from ddco_pyro.inference.paths import sample_paths
+
+if TYPE_CHECKING:
+    from xarray import DataTree
+
+
+class Boundary(NamedTuple):
+    """A boundary of the most likely path, and where draws have it.
+
+    :param step: the first step of the new segment.
+    :param low: the first step of the interval; ``high`` is its last. Both are ``step`` if no draw has the boundary.
+    :param probability: the share of draws that have the boundary.
+    """
+
+    step: int
+    low: int
+    high: int
+    probability: float
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Draws from p(ζ | ξ) of each demonstration, independent of each other, by forward filtering, backward sampling.
+
+    :param options: choices by level, int8 [chain, draw, N, T]; −1 past a demonstration's end. A chain is a model: the
+        fit, then those of ``fit --seeds``, whose options are numbered like the fit's (:func:`matched`).
+    :param starts: whether an option is selected at a step, which may be the same as before, bool [chain, draw, N, T].
+    :param log_likelihood: log p(ξ), nats, [chain, N].
+    :param demonstrations: their names.
+    :param names: the names of the choices by level, control first.
+    :param seeds: the training seed of each chain.
+    """
+
+    options: Mapping[str, np.ndarray]
+    starts: Mapping[str, np.ndarray]
+    log_likelihood: np.ndarray
+    demonstrations: tuple[str, ...]
+    names: Mapping[str, Sequence[str]]
+    seeds: tuple[int, ...]
+
+    def boundaries(
+        self, level: str, demonstration: int, path: np.ndarray, starts: np.ndarray | None = None, mass: float = 0.9
+    ) -> list[Boundary]:
+        """The boundaries of a path of one demonstration, with their intervals over all draws of all chains.
+
+        A boundary is a step at which option a ends and option b begins. A draw has the boundary where it has a step
+        with the same a and b between the two neighbouring boundaries of the path; its nearest such step counts.
+
+        :param path: the options of the path [T], such as of ``fit.segment``.
+        :param starts: the first steps of its segments, bool [T]; None: where the option changes.
+        :param mass: the share of these draws whose step is within the interval, at least; half of the rest is on
+            either side.
+        """
+        steps = len(path) if (path >= 0).all() else int(np.argmax(path < 0))
+        options, chosen = (
+            each[level][:, :, demonstration, :steps].reshape(-1, steps) for each in (self.options, self.starts)
+        )
+        begins = np.diff(path[:steps], prepend=-1) != 0 if starts is None else np.asarray(starts[:steps], dtype=bool)
+        if starts is None:
+            chosen = np.diff(options, prepend=-1, axis=1) != 0
+        edges = [0, *(np.flatnonzero(begins[1:]) + 1).tolist(), steps]
+        found = []
+        for before, step, after in zip(edges, edges[1:-1], edges[2:], strict=False):
+            window = np.arange(before + 1, after)
+            here = (options[:, window - 1] == path[step - 1]) & (options[:, window] == path[step]) & chosen[:, window]
+            distance = np.where(here, np.abs(window - step), steps)
+            having = here.any(1)
+            low = high = step
+            if having.any():
+                at = np.sort(window[distance.argmin(1)][having])
+                tail = int((1 - mass) / 2 * len(at))
+                low, high = int(at[tail]), int(at[-1 - tail])
+            found.append(Boundary(step, low, high, float(having.mean())))
+        return found
+
+    def to_datatree(self) -> DataTree:
+        """The draws as xarray's ``DataTree``, which ArviZ takes as inference data.
+
+        ``posterior`` has a variable for each level with the dimensions chain, draw, demonstration and step; int8, −1
+        past a demonstration's end. The coordinate ``<level>_name`` has the names of choices 0 to k. In
+        ``log_likelihood``, ``control`` is log p(ξ) in nats, by chain and demonstration.
+
+        :raises BadInput: xarray is not installed.
+        """
+        try:
+            import xarray
+        except ModuleNotFoundError:
+            raise BadInput("a DataTree needs xarray; install it with: pip install 'ddco-pyro[xarray]'") from None
+        chains, draws, _, steps = next(iter(self.options.values())).shape
+        coordinates = {
+            "chain": np.arange(chains),
+            "draw": np.arange(draws),
+            "demonstration": list(self.demonstrations),
+            "step": np.arange(steps),
+            "training_seed": ("chain", list(self.seeds)),
+            **{f"{level}_name": (f"{level}_choice", list(names)) for level, names in self.names.items()},
+        }
+        dimensions = ("chain", "draw", "demonstration", "step")
+        variables = {level: (dimensions, drawn) for level, drawn in self.options.items()}
+        known = {key: coordinates[key] for key in ("chain", "demonstration", "training_seed")}
+        likelihood = {"control": (("chain", "demonstration"), self.log_likelihood, {"units": "nats"})}
+        return xarray.DataTree.from_dict(
+            {"posterior": xarray.Dataset(variables, coordinates), "log_likelihood": xarray.Dataset(likelihood, known)}
+        )
+
+
+class Chain(NamedTuple):
+    """The draws from one model for N demonstrations.
+
+    :param paths: choices and terminations of each demonstration, [2, D, draw, T].
+    :param active: the posterior u of each demonstration, the levels' choices beside each other, [T, Σ (1 + k_d)].
+    """
+
+    demonstrations: tuple[str, ...]
+    log_likelihood: np.ndarray
+    paths: list[np.ndarray]
+    active: list[torch.Tensor]
+
+
+def draw(
+    models: Sequence[Iterable[Inferred]],
+    names: Mapping[str, Sequence[str]],
+    seeds: Sequence[int],
+    draws: int,
+    seed: int,
+) -> Draws:
+    """Draws for the same demonstrations from each of several models.
+
+    The draws of a demonstration depend on ``seed``, its place and the chain, not on the other demonstrations.
+
+    :param models: the inference of each model.
+    :param seeds: the training seed of each model.
+    """
+    chains = [_chain(model, draws, (seed, number)) for number, model in enumerate(models)]
+    first = chains[0]
+    shape = len(names), len(chains), draws, len(first.paths), max(path.shape[-1] for path in first.paths)
+    options = np.full(shape, -1, dtype=np.int8 if max(map(len, names.values())) <= 128 else np.int16)
+    starts = np.zeros(shape, dtype=bool)
+    for number, chain in enumerate(chains):
+        for level, order in enumerate(matched(first.active, chain.active, [len(own) for own in names.values()])):
+            for n, (choices, ends) in enumerate(chain.paths):
+                options[level, number, :, n, : choices.shape[-1]] = order[choices[level]]
+                starts[level, number, :, n, : choices.shape[-1]] = ends[level] == 1
+    return Draws(
+        dict(zip(names, options, strict=True)),
+        dict(zip(names, starts, strict=True)),
+        np.stack([chain.log_likelihood for chain in chains]),
+        first.demonstrations,
+        dict(names),
+        tuple(seeds),
+    )
+
+
+def _chain(model: Iterable[Inferred], draws: int, seed: tuple[int, int]) -> Chain:
+    names: list[str] = []
+    paths: list[np.ndarray] = []
+    values, active = [], []
+    for piece in model:
+        names += piece.names
+        values.append(piece.log_likelihood)
+        for n, length in enumerate(piece.lengths):
+            one = piece.tables.trajectory(n, length)
+            path = sample_paths(one, torch.tensor([length]), draws, (*seed, len(paths)))
+            paths.append(torch.stack([torch.stack(kind)[:, :, 0] for kind in path]).numpy())
+            active.append(torch.cat([level[n, :length] for level in piece.posterior.u], dim=1))
+    return Chain(tuple(names), np.concatenate(values), paths, active)
+
+
+def matched(ours: Sequence[torch.Tensor], theirs: Sequence[torch.Tensor], sizes: Sequence[int]) -> list[np.ndarray]:
+    """For each level, our number for each choice of another model.
+
+    Options are matched one to one, so that the expected number of steps in which both models have the matched options
+    is largest (Hungarian assignment). Choice 0 stays.
+
+    :param ours: the posterior u of each demonstration, the levels' choices beside each other, [T, Σ (1 + k_d)].
+    :param sizes: 1 + k_d of each level.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    together = torch.cat(list(ours)).T @ torch.cat(list(theirs))
+    found, first = [], 0
+    for size in sizes:
+        both = together[first + 1 : first + size, first + 1 : first + size].numpy()
+        order = np.zeros(size, dtype=np.int64)
+        rows, columns = linear_sum_assignment(both, maximize=True)
+        order[1 + columns] = 1 + rows
+        found.append(order)
+        first += size
+    return found

@@ -1,0 +1,276 @@
+"""Skills in the report: each option with its use, pictures and films of its typical segments, and their order."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.pictures import Observed
+from ddco_pyro.drawing.colours import option_colour, option_rgb
+from ddco_pyro.drawing.diagrams import curves, dendrogram, path_film, transition_graph, typical_paths
+from ddco_pyro.drawing.figures import data_uri
+from ddco_pyro.drawing.page import Block, Card, Cell, Code, Drawing, Facts, Film, Films, Picture, Section, Text, note
+from ddco_pyro.drawing.shown import frames, jpeg, position_key, projection
+from ddco_pyro.drawing.words import number, numbered_name, percent
+from ddco_pyro.errors import command
+from ddco_pyro.evaluation.options import SMALLEST_DIVERGENCE
+from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.report.inputs import deciding
+from ddco_pyro.segmenting import Segmented
+from ddco_pyro.simulation.film import encoded
+
+INSTANCES = 9
+"""Instances in a film."""
+
+SHOWN = 3
+"""Segments on a contact sheet."""
+
+FRAMES, FRAMES_PER_SECOND = 32, 10
+"""Frames of a film, at most, and their rate; longer instances skip steps."""
+
+SHEET_HEIGHT, FILM_HEIGHT = 96, 104
+"""Rows of a picture on a contact sheet and in a film."""
+
+MOST_FILMS = 12
+"""Films of pictures on a page; further options have a contact sheet alone."""
+
+MOST_PATHS = 25
+"""Demonstrations behind the segments in a drawing."""
+
+
+@dataclass(frozen=True)
+class Instance:
+    """A segment of an option.
+
+    :param row: its demonstration in :attr:`~ddco_pyro.segmenting.Segmented.segments`.
+    :param end: the step after its last one.
+    :param probability: the mean posterior probability of its option.
+    """
+
+    row: int
+    start: int
+    end: int
+    probability: float
+
+    def __len__(self) -> int:
+        return self.end - self.start
+
+
+def instances(segmented: Segmented, level: str, option: int) -> list[Instance]:
+    """The segments of an option, the most typical first, different demonstrations before the same one again.
+
+    A segment is the more typical, the larger its mean posterior probability (to two digits), then the nearer its length
+    to the median length.
+    """
+    found = [
+        Instance(row, start, end, float(demo.levels[level].probability[start:end].mean()))
+        for row, demo in enumerate(segmented.segments)
+        for choice, start, end in demo.levels[level].runs()
+        if choice == option
+    ]
+    if not found:
+        return []
+    median = float(np.median([len(one) for one in found]))
+    ranked = sorted(found, key=lambda one: (-round(one.probability, 2), abs(np.log(len(one) / median))))
+    times = Counter[int]()
+    again = []
+    for one in ranked:
+        again.append(times[one.row])
+        times[one.row] += 1
+    return [ranked[place] for place in np.argsort(again, kind="stable")]
+
+
+def transitions(segmented: Segmented, level: str) -> np.ndarray:
+    """Counts of transitions between segments [1 + k + 1, 1 + k + 1]: from a row's choice to a column's.
+
+    The last row is the start of demonstrations, the last column their end.
+    """
+    outside = segmented.counts[level] + 1
+    counts = np.zeros((outside + 1, outside + 1), int)
+    for demo in segmented.segments:
+        choices = [outside, *(choice for choice, _, _ in demo.levels[level].runs()), outside]
+        np.add.at(counts, (choices[:-1], choices[1:]), 1)
+    return counts
+
+
+def aligned(chosen: Sequence[Instance], most: int = FRAMES) -> np.ndarray:
+    """The step of each frame of a film in each instance [F, instances]: all begin at their onset together.
+
+    An instance that has ended rests at its last step.
+    """
+    longest = max(map(len, chosen))
+    stride = -(-longest // most)
+    after = np.arange(0, longest, stride)[:, None]
+    starts, ends = np.array([one.start for one in chosen]), np.array([one.end for one in chosen])
+    steps: np.ndarray = np.minimum(starts + after, ends - 1)
+    return steps
+
+
+def section(fit: Fit, demos: Demonstrations, pictures: Sequence[Observed], segmented: Segmented) -> Section:
+    """Every option of every level, the highest level first, then the order and the likeness of the options.
+
+    :param demos: in the order of their segments.
+    :param pictures: of each demonstration; empty for none.
+    """
+    shown = _Shown(fit, demos, pictures)
+    reads = deciding(fit, demos)
+    blocks: list[Block] = [note(shown.explained())]
+    for place, (level, names) in reversed(list(enumerate(fit.names.items()))):
+        if len(fit.names) > 1:
+            blocks.append(Text(f"Level “{level}”", "heading"))
+        counts = transitions(segmented, level)
+        steps = np.bincount(
+            np.concatenate([demo.levels[level].options for demo in segmented.segments]), minlength=len(names)
+        )
+        every = {choice: instances(segmented, level, choice) for choice in range(len(names))}
+        present = [choice for choice, found in every.items() if found]
+        for choice in present:
+            facts = _facts(steps[choice] / steps.sum(), every[choice], counts, choice, names)
+            facts |= {what: values[choice] for what, values in reads.get(level, {}).items() if choice in values}
+            title = Cell(numbered_name(choice, names), colour=option_colour(choice))
+            blocks.append(Card(title, [Facts(facts), *shown.blocks(every[choice], choice)]))
+        if unused := [numbered_name(choice, names) for choice in range(1, len(names)) if not every[choice]]:
+            blocks.append(note(f"Never active on a most likely path: {', '.join(unused)}."))
+        onset = {
+            choice: np.mean([one.start / len(segmented.segments[one.row]) for one in every[choice]])
+            for choice in present
+        }
+        order = sorted(present, key=onset.__getitem__)
+        caption = (
+            "Order of the options: numbers count transitions between segments; the width of an arc is the share of its "
+            "start's transitions. Arcs above lead to the right, arcs below back. Transitions below 1 % of all are left "
+            "out. The area of a circle is the share of steps. From left to right, by mean onset: "
+            f"{', '.join(names[choice] for choice in order)}."
+        )
+        blocks.append(Drawing(transition_graph(counts, steps / steps.sum(), names, order), caption))
+        blocks += _alike(fit, place, level, names)
+    return Section("skills", "Skills", blocks)
+
+
+def _facts(
+    share: float, found: Sequence[Instance], counts: np.ndarray, choice: int, names: Sequence[str]
+) -> dict[str, str]:
+    low, median, high = np.percentile([len(one) for one in found], [25, 50, 75])
+    return {
+        "Share of steps": percent(share, 1),
+        "Segments": str(len(found)),
+        "Duration, steps": f"{median:g} (quartiles {low:g} to {high:g})",
+        "Comes after": _frequent(counts[:, choice], [*names, "start"]),
+        "Comes before": _frequent(counts[choice], [*names, "end"]),
+    }
+
+
+def _frequent(counts: np.ndarray, names: Sequence[str], most: int = 2) -> str:
+    """The most frequent neighbours with their shares."""
+    first = np.argsort(-counts, kind="stable")[:most]
+    return ", ".join(f"{names[place]} {percent(counts[place] / counts.sum())}" for place in first if counts[place])
+
+
+def _alike(fit: Fit, place: int, level: str, names: Sequence[str]) -> list[Block]:
+    """The dendrogram of a level's options, and the command that merges the closest pair."""
+    known = {row.options: row.divergence for row in fit.metrics.divergences[place] if row.divergence is not None}
+    used = [row.choice for row in fit.metrics.options[place] if row.choice and row.share > 0]
+    pairs = [(a, b) for n, a in enumerate(used) for b in used[n + 1 :]]
+    if not pairs or not known.keys() >= set(pairs):
+        return []
+    blocks: list[Block] = []
+    if len(used) > 2:
+        from scipy.cluster.hierarchy import linkage  # most commands draw none
+
+        merges = linkage([known[pair] for pair in pairs], "average")
+        caption = (
+            "How alike options act: the divergence of their policies, the mean of both Kullback–Leibler divergences in "
+            "nats per step, averaged over the pairs of two groups; square-root scale."
+        )
+        blocks.append(Drawing(dendrogram(merges, used, names), caption))
+    held = fit.spec.training.labels is not None and fit.spec.training.labels.hold
+    if not held:
+        a, b = min(pairs, key=known.__getitem__)
+        alike = "act alike" if known[a, b] < SMALLEST_DIVERGENCE else "are the closest pair"
+        text = f"{names[a]} and {names[b]} {alike}: {number(known[a, b])} nats per step. To fit again with both as one:"
+        named = ("--level", level) if len(fit.names) > 1 else ()
+        blocks += [Text(text), Code(command("merge", fit.run_folder, *named, "--options", a, b))]
+    return blocks
+
+
+class _Shown:
+    """Pictures and films of the segments of one fit, from what its demonstrations have."""
+
+    def __init__(self, fit: Fit, demos: Demonstrations, pictures: Sequence[Observed]) -> None:
+        self.demos, self.pictures = demos, pictures
+        self.position = None if pictures else fit.spec.report.trajectory or position_key(demos)
+        self.films = 0
+        self.paths: list[np.ndarray] = []
+        if self.position is not None:
+            places = [np.asarray(demo.observations[self.position])[:, :3].astype(float) for demo in self.demos]
+            turned = projection(np.concatenate(places))
+            self.paths = [place @ turned.T for place in places]
+
+    def explained(self) -> str:
+        """What the drawings of each option are."""
+        typical = (
+            "Typical segments have the largest mean posterior probability; different demonstrations come first. "
+            "Instances in a film are aligned at their onset; one that has ended rests."
+        )
+        if self.pictures:
+            return f"Contact sheet: first, middle and last picture of a segment, a row each. {typical}"
+        if self.position is None:
+            return f"Lines: controls from the onset of each segment on. {typical}"
+        return (
+            f"Drawings: observation “{self.position}” in space, from one side. Circle, square and triangle: first, "
+            f"middle and last step of a segment. {typical} Click a film to stop it."
+        )
+
+    def blocks(self, found: Sequence[Instance], choice: int) -> list[Block]:
+        """A contact sheet and a film of the most typical segments of an option."""
+        chosen, colour = found[:INSTANCES], option_colour(choice)
+        caption = f"{len(chosen)} instances from their onset on"
+        where = ", ".join(f"{self.demos[one.row].name} {one.start}–{one.end - 1}" for one in chosen[:SHOWN])
+        if self.pictures:
+            self.films += 1
+            film = [Films([_film(self.pictures, chosen, choice)])] if self.films <= MOST_FILMS else []
+            return [_sheet(self.pictures, chosen[:SHOWN], where), *film]
+        if self.position is not None:
+            shown = list(dict.fromkeys([*(one.row for one in chosen[:SHOWN]), *range(len(self.demos))]))[:MOST_PATHS]
+            segments = [(shown.index(one.row), one.start, one.end) for one in chosen[:SHOWN]]
+            steps = aligned(chosen)
+            film_paths = [self.paths[one.row] for one in chosen]
+            seconds = max(len(steps) / FRAMES_PER_SECOND, 1.5)
+            return [
+                Drawing(typical_paths([self.paths[row] for row in shown], segments, colour), where),
+                Drawing(path_film(film_paths, steps, seconds, colour), caption),
+            ]
+        controls = [
+            self.demos[one.row].actions.reshape(len(self.demos[one.row]), -1)[one.start : one.end] for one in chosen
+        ]
+        each = {f"control[{n}]": [array[:, n].astype(float) for array in controls] for n in range(controls[0].shape[1])}
+        return [Drawing(curves(dict(list(each.items())[:6]), colour), caption)]
+
+
+def _sheet(pictures: Sequence[Observed], chosen: Sequence[Instance], where: str) -> Picture:
+    """First, middle and last picture of each instance, a row each."""
+    steps = [(one.start, (one.start + one.end - 1) // 2, one.end - 1) for one in chosen]
+    strips = [frames(pictures[one.row], three, SHEET_HEIGHT) for one, three in zip(chosen, steps, strict=True)]
+    rows = [np.hstack(list(strip)) for strip in strips]
+    return Picture(data_uri(jpeg(np.vstack(rows)), "image/jpeg"), f"First, middle and last pictures of {where}", where)
+
+
+def _film(pictures: Sequence[Observed], chosen: Sequence[Instance], choice: int) -> Film:
+    """A grid of instances aligned at their onset, in H.264; an instance that has ended is paler."""
+    steps = aligned(chosen)
+    cells = [frames(pictures[one.row], steps[:, cell], FILM_HEIGHT) for cell, one in enumerate(chosen)]
+    columns = int(np.ceil(np.sqrt(len(cells))))
+    height, width = cells[0].shape[1:3]
+    film = np.full((len(steps), -(-len(cells) // columns) * height, columns * width, 3), 255, np.uint8)
+    for cell, seen in enumerate(cells):
+        ended = np.diff(steps[:, cell], prepend=-1) == 0
+        shown = np.where(ended[:, None, None, None], 128 + seen // 2, seen)
+        shown[:, :3] = option_rgb(choice)
+        top, left = height * (cell // columns), width * (cell % columns)
+        film[:, top : top + height, left : left + width] = shown
+    caption = f"{len(chosen)} instances from their onset on"
+    return Film(data_uri(encoded(film, FRAMES_PER_SECOND), "video/mp4"), "", caption)

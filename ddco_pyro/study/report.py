@@ -1,0 +1,339 @@
+"""What a study found: tables and figures of a page, and the numbers that other pages quote."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ddco_pyro.data.files import write_text
+from ddco_pyro.drawing import words
+from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.drawing.figures import GRID, WIDTH, Interval, Panel, interval_plot, save, style
+from ddco_pyro.drawing.page import Block, Page, Picture, Section, Table, Text, note
+from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
+from ddco_pyro.metrics import write_table
+from ddco_pyro.segmenting.agreement import measure_names
+from ddco_pyro.study.cells import COLUMNS, Folder, Row, State, earlier, tidy
+from ddco_pyro.study.declaration import NATS, ContrastSpec, Study
+from ddco_pyro.study.statistics import LEVEL, BySeed, Estimate, bootstrap, estimate, holm, p_value, paired
+
+FILES = ("table.csv", "page.md", "page.html", "contrasts.png", "methods.png")
+"""The files of a study's report."""
+
+COLUMNS_OF_PANELS = 4
+
+
+def values(rows: Iterable[Row], what: str, measure: str, demonstrations: int, task: str | None = None) -> BySeed:
+    """The values of a method, or the paired differences of ``ours - theirs``, by task and training seed."""
+    found: dict[str, dict[str, dict[int, float]]] = {}
+    for row in rows:
+        if (row.measure, row.demonstrations) == (measure, demonstrations) and task in (None, row.task):
+            found.setdefault(row.method, {}).setdefault(row.task, {})[row.seed] = row.value
+    if what in found or " - " not in what:
+        return found.get(what, {})
+    ours, _, theirs = what.partition(" - ")
+    return paired(found.get(ours.strip(), {}), found.get(theirs.strip(), {}))
+
+
+@dataclass(frozen=True)
+class Tested:
+    """A primary contrast with its estimate (None without any cell), its p-value and Holm's adjusted one."""
+
+    spec: ContrastSpec
+    demonstrations: int
+    found: Estimate | None
+    p: float
+    adjusted: float
+    differences: BySeed
+
+    @property
+    def verdict(self) -> str:
+        """Whether the contrast holds; inconclusive where neither that nor its contrary is significant."""
+        if self.found is None or not self.found.freedom:
+            return "not tested"
+        if self.adjusted <= LEVEL:
+            return "holds"
+        return "does not hold" if self.found.interval[1] < self.spec.bound else "inconclusive"
+
+    @property
+    def name(self) -> str:
+        """The contrast with its number of demonstrations."""
+        return f"{self.spec.contrast}, {self.demonstrations}"
+
+
+def tested(study: Study, rows: Sequence[Row]) -> list[Tested]:
+    """The primary contrasts of a study, in their order."""
+    found = []
+    for contrast in study.declared.contrasts:
+        count = contrast.demonstrations or study.declared.demonstrations.counts[0]
+        differences = values(rows, contrast.contrast, contrast.measure, count)
+        estimated = estimate(differences) if differences else None
+        p = math.nan if estimated is None else p_value(estimated, contrast.bound)
+        found.append(Tested(contrast, count, estimated, p, math.nan, differences))
+    adjusted = holm([one.p for one in found])
+    return [replace(one, adjusted=p) for one, p in zip(found, adjusted, strict=True)]
+
+
+def write(folder: Folder, state: State, to: Path) -> Path:
+    """Write the table, the page and the figures of a study into a folder.
+
+    :returns: the path of the page.
+    :raises BadInput: no cell is done, or no cell has a declared measure.
+    """
+    rows = list(tidy(folder, state))
+    if not rows:
+        raise BadInput(f"{folder.path}: no cell is done; do some with: ddco-pyro study run {folder.study.path}")
+    for measure in folder.study.declared.measures:
+        if not any(row.measure == measure for row in rows):
+            there = {name for done in state.done.values() for name in done.values}
+            text = f"{folder.study.path}: measures: no cell has {measure!r}{nearest(measure, there)}; there is: "
+            raise BadInput(text + ", ".join(sorted(there)))
+    write_table(to / "table.csv", COLUMNS, map(asdict, rows))
+    whole = page(folder.study, rows, state, to)
+    write_text(to / "page.md", f"# {whole.title}\n\n{whole.markdown()}")
+    write_text(to / "page.html", whole.html())
+    return to / "page.html"
+
+
+def page(study: Study, rows: Sequence[Row], state: State, to: Path) -> Page:
+    """The page of a study; its figures are written into a folder."""
+    found = tested(study, rows)
+    top: list[Block] = [Text(verdict(found), "verdict")] if found else []
+    sections = [Section("methods", "Every method", _methods(study, rows, to))]
+    if any(one.found for one in found):
+        sections.insert(0, Section("contrasts", "Primary contrasts", _contrasts(found, to)))
+    sections.append(Section("design", "Design", [note(line) for line in design(study, rows, state)]))
+    return Page(f"Study {study.name}", top, sections, subtitle=study.declared.question)
+
+
+def verdict(found: Sequence[Tested]) -> str:
+    """How many of the primary contrasts hold."""
+    counts = Counter(one.verdict for one in found)
+    return (
+        f"Of {len(found)} primary contrasts, {words.listed(f'{n} {_plural(name, n)}' for name, n in counts.items())}."
+    )
+
+
+def _plural(name: str, count: int) -> str:
+    one = {"holds": "hold", "does not hold": "do not hold", "inconclusive": "are inconclusive"}
+    many = {"inconclusive": "is inconclusive", "not tested": "is not tested"}
+    return one.get(name, "are not tested") if count > 1 else many.get(name, name)
+
+
+def _contrasts(found: Sequence[Tested], to: Path) -> list[Block]:
+    head = ["contrast", "measure", "demos", "has to exceed", "difference [95 % t]", "bootstrap", "p (Holm)", "verdict"]
+    table = []
+    for one in found:
+        first = [one.spec.contrast, name_of(one.spec.measure), str(one.demonstrations), words.signed(one.spec.bound)]
+        numbers = ["–"] * 3
+        if one.found:
+            p = "–" if math.isnan(one.p) else words.p_value(one.adjusted)
+            numbers = [shown(one.found, "+.2f"), words.interval(bootstrap(one.differences)), p]
+        table.append([*first, *numbers, one.verdict])
+    text = (
+        "Differences are paired by task and training seed. The test of each contrast is one-sided, at 2.5 %. For "
+        "superiority the difference has to exceed the margin, for non-inferiority minus the margin. Holm's correction "
+        "is over these contrasts; intervals are not corrected. With several tasks the units are tasks, so an interval "
+        "speaks of further tasks. The bootstrap draws tasks, and seeds within each."
+    )
+    known = [one for one in found if one.found]
+    measures = dict.fromkeys(one.spec.measure for one in known)
+    panels = [
+        Panel(
+            name_of(measure),
+            "difference",
+            [
+                _drawn(one.found, one.differences, one.spec.bound) if one.spec.measure == measure else None
+                for one in known
+            ],
+            line=0,
+        )
+        for measure in measures
+    ]
+    caption = (
+        "Mean difference and 95 % t interval. Grey points: single tasks, or seeds where there is one task. Hollow: the "
+        "bound that the difference has to exceed."
+    )
+    with style():
+        figure = interval_plot([one.name for one in known], panels)
+        picture = _saved(figure, to / "contrasts.png", verdict(found), caption)
+    return [Table(head, table, {0, 1, 7}), picture, note(text)]
+
+
+def _drawn(found: Estimate | None, by_seed: BySeed, bound: float | None = None) -> Interval | None:
+    if found is None:
+        return None
+    own = list(by_seed.values())
+    points = [float(np.mean([*one.values()])) for one in own] if len(own) > 1 else [*own[0].values()]
+    return Interval(found.value, *found.interval, points=points, hollow=bound)
+
+
+def _methods(study: Study, rows: Sequence[Row], to: Path) -> list[Block]:
+    """A table for each measure, and one figure."""
+    counts, labels = study.declared.demonstrations.counts, study.declared.labels
+    blocks: list[Block] = []
+    for measure in study.declared.measures:
+        table = []
+        for label in labels:
+            cells = [_estimated(values(rows, label, measure, count)) for count in counts]
+            if any(cells):
+                table.append([label, *(shown(cell) if cell else "–" for cell in cells)])
+        head = [name_of(measure), *(f"{count} demonstrations" for count in counts)]
+        blocks.append(Table(head, table))
+    single = "Single tasks: means and ranges over training seeds." if len(study.tasks) > 1 and len(counts) > 1 else ""
+    caption = "Means with 95 % t intervals, over tasks where there are several, else over training seeds."
+    alt = f"{', '.join(study.declared.measures)} of {', '.join(labels)}"
+    picture = _saved(draw(study, rows), to / "methods.png", alt, f"{caption} {single}".rstrip())
+    return [*blocks, picture]
+
+
+def _saved(figure: Figure, path: Path, alt: str, caption: str) -> Picture:
+    return replace(save(figure, path, alt, caption), file=path.name)
+
+
+def draw(study: Study, rows: Sequence[Row]) -> Figure:
+    """Curves over demonstrations: a panel for each measure, and for each task by the first measure.
+
+    With a single number of demonstrations, intervals of every method, a panel for each measure.
+    """
+    counts, labels, measures = study.declared.demonstrations.counts, study.declared.labels, study.declared.measures
+    if len(counts) == 1:
+        by_method = {(m, label): values(rows, label, m, counts[0]) for m in measures for label in labels}
+        panels = [
+            Panel("", name_of(m), [_drawn(_estimated(by_method[m, one]), by_method[m, one]) for one in labels])
+            for m in measures
+        ]
+        with style():
+            return interval_plot(labels, panels)
+    several = len(study.tasks) > 1
+    wanted: list[tuple[str, str | None]] = [(measure, None) for measure in measures]
+    wanted += [(measures[0], task) for task in study.tasks] if several else []
+    columns = min(COLUMNS_OF_PANELS, len(wanted))
+    lines = math.ceil(len(wanted) / columns)
+    with style():
+        figure = Figure(figsize=(WIDTH, 2.2 * lines + 0.4), layout="constrained")
+        all_axes = figure.subplots(lines, columns, squeeze=False).flat
+        for axes, (measure, task) in zip(all_axes, wanted, strict=False):
+            for number, label in enumerate(labels, start=1):
+                points = [(n, _estimated(values(rows, label, measure, n, task))) for n in counts]
+                known = [(n, one) for n, one in points if one]
+                middle = [one.value for _, one in known]
+                both = [one.interval if task is None else one.range for _, one in known]
+                ends = np.abs(np.array(both).reshape(-1, 2).T - middle)
+                axes.errorbar(
+                    [n * 1.02 ** (number - 1) for n, _ in known], middle, np.nan_to_num(ends), marker="o",
+                    markersize=3.5, capsize=2, linewidth=1.2, color=option_colour(number), label=label,
+                )  # fmt: skip
+            axes.set(xscale="log", title=task or name_of(measure) + (", mean of tasks" if several else ""))
+            axes.set_xticks(counts, map(str, counts))
+            axes.set_xticks([], minor=True)
+            axes.grid(axis="y", color=GRID)
+        for axes in list(all_axes)[len(wanted) :]:
+            axes.set_visible(False)
+        figure.supxlabel("demonstrations", fontsize=9)
+        handles, names = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside upper center", ncols=min(len(labels), 6))
+    return figure
+
+
+def _estimated(by_seed: BySeed) -> Estimate | None:
+    return estimate(by_seed) if by_seed else None
+
+
+def design(study: Study, rows: Sequence[Row], state: State) -> list[str]:
+    """The data and seeds of a study, missing cells, and fits that have not converged, a line each."""
+    declared, data = study.declared, study.declared.demonstrations
+    several = f"Tasks: {', '.join(study.tasks)}. " if study.tasks[0] else ""
+    if study.source is None:
+        drawn = "Each training seed has its own demonstrations."
+    else:
+        drawn = (
+            f"Every training seed draws its demonstrations from {declared.demonstrations.path}, so seeds share some."
+        )
+    seeds = declared.seeds.test
+    lines = [
+        f"{several}{', '.join(map(str, data.counts))} demonstrations to train on, {data.held_out} held out. {drawn}",
+        f"{seeds.count} training seeds from {seeds.first} on. Spec: {declared.spec}.",
+    ]
+    if declared.starts is not None:
+        lines.append(f"Every method acts from the same {declared.starts.test.count} starts, others for every seed.")
+    if declared.kept:
+        tables = dict.fromkeys(one.table for one in declared.kept)
+        lines.append(f"Kept results may be older than the contrasts: {', '.join(tables)}.")
+    if declared.choose is not None:
+        lines.append(f"Each method's point of the grid has the highest {declared.choose} on the development seeds.")
+    test = [number for number, cell in enumerate(state.cells) if cell.part == "test"]
+    done = [number for number in test if number in state.done]
+    if len(done) < len(test):
+        lines.append(f"{len(test) - len(done)} of {len(test)} cells are missing; contrasts leave their pairs out.")
+    rising = Counter(state.cells[number].method for number in done if not state.done[number].converged)
+    if rising:
+        fits = words.listed(f"{count} of {method}" for method, count in rising.items())
+        lines.append(f"Fits that have not converged: {fits}. More epochs may change their results.")
+    return lines
+
+
+def name_of(measure: str) -> str:
+    """The name of a measure in tables and figures."""
+    if measure == NATS:
+        return "held-out nats/step"
+    return measure_names([measure])[0] if measure in (*UNMATCHED, *MATCHED) else words.measure(measure)
+
+
+def shown(found: Estimate, form: str = ".2f") -> str:
+    """A mean and its 95 % t interval, such as ``0.82 [0.75, 0.89]``."""
+    ends = "" if math.isnan(found.error) else f" [{', '.join(format(end, form) for end in found.interval)}]"
+    return f"{found.value:{form}}{ends}".replace("-", "−")
+
+
+# --- numbers that other pages quote -----------------------------------------------------------------------------------
+
+_QUOTED = re.compile(r"<!-- study (?P<study>[\w-]+): (?P<what>.*?) -->(?P<text>.*?)<!-- / -->", re.DOTALL)
+
+
+def render(text: str, studies: Path) -> str:
+    """A page's text with every quoted number as the tables of the studies have it.
+
+    A quotation is ``<!-- study NAME: options - flat; success; 50 -->…<!-- / -->``: a method or a contrast, a measure,
+    and a number of demonstrations. ``task=NAME`` takes one task, and ``form=+.0%`` formats as Python does. A difference
+    is bold where its interval excludes 0.
+
+    :param studies: the folder of the declarations, whose tables ``kept`` have the numbers.
+    :raises BadInput: a quotation is wrong, or its study keeps no such value.
+    """
+    known: dict[str, list[Row]] = {}
+
+    def quoted(match: re.Match[str]) -> str:
+        name, what = match["study"], match["what"]
+        if name not in known:  # nothing of a study is imported for its numbers
+            known[name] = earlier(Study.load(studies / f"{name}.yaml", allow_code=True))
+        return f"<!-- study {name}: {what} -->{_quoted(known[name], name, what)}<!-- / -->"
+
+    return _QUOTED.sub(quoted, text)
+
+
+def _quoted(rows: Sequence[Row], name: str, quotation: str) -> str:
+    fields = [part.strip() for part in quotation.split(";")]
+    named: Mapping[str, str] = dict(part.split("=", 1) for part in fields if "=" in part)
+    plain = [part for part in fields if "=" not in part]
+    if len(plain) != 3 or not plain[2].isdecimal() or named.keys() - {"task", "form"}:
+        raise BadInput(
+            f"study {name}: {quotation!r}: write a method or contrast, a measure and a number of demonstrations, such "
+            "as: options - flat; success; 50"
+        )
+    what, measure, count = plain
+    found = _estimated(values(rows, what, measure, int(count), named.get("task")))
+    if found is None:
+        raise BadInput(f"study {name}: its tables have no {quotation!r}; check its names, and kept in the study")
+    difference = " - " in what
+    percent = measure == "success"
+    text = shown(found, named.get("form", ("+z" if difference else "z") + (".0%" if percent else ".2f")))
+    return f"**{text}**" if difference and found.interval[0] * found.interval[1] > 0 else text

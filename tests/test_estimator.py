@@ -1,0 +1,185 @@
+"""The estimator: the numbers of ``ddco_pyro.fit``, the conventions of scikit-learn, and the model of hmmlearn."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hmmlearn.hmm import GaussianHMM
+from sklearn.model_selection import GridSearchCV, cross_val_score
+from sklearn.utils.estimator_checks import parametrize_with_checks
+
+import ddco_pyro
+from ddco_pyro import OptionSegmenter
+from ddco_pyro.errors import BadInput
+
+QUICK = {"training.epochs": 12}
+
+
+def two_options(number: int = 5, steps: int = 16, seed: int = 0) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Sequences whose control leads to the origin, later away from it."""
+    random = np.random.default_rng(seed)
+    X = [random.normal(size=(steps, 2)) for _ in range(number)]
+    signs = np.repeat([[-1.0], [1.0]], steps // 2, 0)
+    return X, [signs * x + 0.05 * random.normal(size=x.shape) for x in X]
+
+
+def hidden_markov_model() -> GaussianHMM:
+    """A hidden Markov model whose states last, and are then selected anew."""
+    model = GaussianHMM(3, "diag")
+    model.startprob_, ending = np.array([0.5, 0.3, 0.2]), np.array([[0.1], [0.2], [0.15]])
+    model.transmat_ = np.diag(1 - ending[:, 0]) + ending * model.startprob_
+    model.means_, model.covars_ = np.array([[0, 0], [3, 1], [-2, 4.0]]), np.array([[0.5, 0.2], [0.3, 0.4], [0.6, 0.6]])
+    return model
+
+
+# --- the same fit -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fitted() -> OptionSegmenter:
+    return OptionSegmenter(2, random_state=3).fit(*two_options())
+
+
+def test_it_is_the_fit_of_its_spec(fitted: OptionSegmenter) -> None:
+    X, U = two_options()
+    demos = ddco_pyro.Demonstrations(
+        tuple(ddco_pyro.Demonstration(f"sequence_{n}", {"x": x}, u) for n, (x, u) in enumerate(zip(X, U, strict=True)))
+    )
+    fit = ddco_pyro.fit(fitted.spec_, demos)
+    assert fitted.spec_.seed == 3
+    assert fitted.score(X, U) == fit.log_likelihood(demos).sum()
+    np.testing.assert_array_equal(fitted.predict(X, U), fit.segment(demos)[0].ravel() - 1)
+    np.testing.assert_array_equal(fitted.predict_proba(X, U), fit.posterior(demos).u[0].flatten(0, 1)[:, 1:])
+
+
+def test_planted_options_are_found(fitted: OptionSegmenter) -> None:
+    X, U = two_options(seed=1)
+    halves = np.tile(np.repeat([0, 1], 8), 5)
+    found = fitted.predict(X, U)
+    assert max((found == halves).mean(), (found != halves).mean()) > 0.95
+    assert ((fitted.predict_proba(X, U).argmax(1) == found).mean()) > 0.95
+
+
+def test_a_list_is_an_array_with_lengths(fitted: OptionSegmenter) -> None:
+    X, U = two_options(3, seed=1)
+    X[1], U[1] = X[1][:9], U[1][:9]
+    lengths = [16, 9, 16]
+    for ask in (fitted.predict, fitted.predict_proba, fitted.score):
+        np.testing.assert_array_equal(ask(X, U), ask(np.concatenate(X), np.concatenate(U), lengths))
+    assert fitted.score(X, U) == pytest.approx(sum(fitted.score(x, u) for x, u in zip(X, U, strict=True)))
+
+
+def test_sampled_controls_lead_where_the_options_do(fitted: OptionSegmenter) -> None:
+    X = np.random.default_rng(5).normal(size=(200, 2))
+    U, options = fitted.sample(X, random_state=0)
+    (again, _), (other, _) = fitted.sample(X, random_state=0), fitted.sample(X, random_state=1)
+    np.testing.assert_array_equal(U, again)
+    assert not np.array_equal(U, other)
+    slopes = sorted((U * X)[options == option].sum() / (X * X)[options == option].sum() for option in (0, 1))
+    assert slopes == pytest.approx([-1, 1], abs=0.1)
+    assert set(fitted.predict(X, U)) == {0, 1}
+
+
+def test_perceptrons_and_other_settings() -> None:
+    X, U = two_options()
+    settings = {**QUICK, "hierarchy.levels.0.policy.hidden": [4], "compare_with": ["mixture"]}
+    settings |= {"demonstrations.valid_fraction": 0.2}
+    model = OptionSegmenter(2, policy="mlp", differences=False, random_state=None, settings=settings).fit(X, U)
+    assert model.fit_.spec.hierarchy.levels[0].policy.hidden == (4,)
+    assert set(model.fit_.baselines) == {"mixture"}
+    assert model.fit_.metrics.demonstrations.valid == 1
+
+
+@pytest.mark.parametrize(
+    ("ask", "says"),
+    [
+        (lambda model, X, U: model.predict(X), "fitted with controls U; give U"),
+        (lambda model, X, U: model.predict(X[0], U[0], [3, 3]), "whose sum is 16"),
+        (lambda model, X, U: model.predict(X[0], U[0][:5]), "X has 16 steps, and U has 5"),
+        (lambda model, X, U: model.predict(X, U[:3]), "equal numbers of steps"),
+        (lambda model, X, U: model.predict(X, U, [16] * 5), "leave lengths out"),
+        (lambda model, X, U: model.fit(X[0], U[0][:, 0], [16]), "one dimension"),
+        (lambda model, X, U: model.set_params(settings={"training.epoch": 3}).fit(X, U), "training.epochs"),
+    ],
+)
+def test_wrong_arrays_are_refused_in_a_line(ask: Any, says: str, fitted: OptionSegmenter) -> None:
+    before = fitted.get_params()
+    with pytest.raises(BadInput, match=says) as refused:
+        ask(fitted, *two_options())
+    fitted.set_params(**before)
+    assert "\n" not in str(refused.value)
+
+
+# --- hmmlearn ---------------------------------------------------------------------------------------------------------
+
+
+def test_without_controls_it_is_a_hidden_markov_model() -> None:
+    """hmmlearn with the fitted parameters gives the same likelihood, posterior and decoded log-probability."""
+    lengths = [150, 90, 60]
+    X = np.concatenate([hidden_markov_model().sample(n, random_state=n)[0] for n in lengths])
+    ours = OptionSegmenter(3, control="gaussian").fit(X, lengths)
+    theirs = GaussianHMM(3, "diag")
+    (piece,) = ours.fit_.infer(ours.fit_.demonstrations[:1])
+    emission, scaling = piece.outputs.emissions[0], ours.fit_.hierarchy.scaling
+    theirs.startprob_, theirs.transmat_ = ours.startprob_, ours.transmat_
+    theirs.means_ = scaling.unscaled(emission.mode[0, 0])
+    theirs.covars_ = (emission.std.detach().numpy() * X.std(0)) ** 2
+    assert ours.score(X, lengths) == pytest.approx(theirs.score(X, lengths), abs=2e-3)
+    np.testing.assert_allclose(ours.predict_proba(X, lengths), theirs.predict_proba(X, lengths), atol=1e-4)
+    value, states = ours.decode(X, lengths)
+    best, best_states = theirs.decode(X, lengths)
+    assert (states == best_states).mean() > 0.98  # ours are the most likely together with terminations
+    assert best - 1.0 < value < best + 2e-3
+    np.testing.assert_array_equal(ours.predict(X, lengths), states)
+
+
+def test_it_fits_a_hidden_markov_model_as_well_as_hmmlearn() -> None:
+    """Held out, in nats per step; the truth is within the family of both."""
+    truth = hidden_markov_model()
+    X, held_out = (truth.sample(n, random_state=n)[0] for n in (900, 600))
+    ours = OptionSegmenter(3, control="gaussian").fit(X)
+    theirs = GaussianHMM(3, "diag", n_iter=200, random_state=0).fit(X)
+    values = [model.score(held_out) / len(held_out) for model in (ours, theirs, truth)]
+    assert values[0] > max(values[1:]) - 0.03
+    drawn, states = ours.sample(1000, random_state=0)
+    assert drawn.shape == (1000, 2)
+    order = np.argsort(ours.startprob_)
+    shares = np.bincount(states, minlength=3) / 1000
+    long_run = np.linalg.matrix_power(ours.transmat_, 500)[0]
+    np.testing.assert_allclose(shares[order], long_run[order], atol=0.1)
+
+
+# --- scikit-learn -----------------------------------------------------------------------------------------------------
+
+
+def test_sequences_are_the_samples_of_model_selection() -> None:
+    X, U = two_options(6)
+    scores = cross_val_score(OptionSegmenter(2, settings=QUICK), X, U, cv=3)
+    model = OptionSegmenter(2, settings=QUICK).fit(X[2:], U[2:])
+    assert scores[0] == pytest.approx(model.score(X[:2], U[:2]), rel=1e-6)
+    found = GridSearchCV(OptionSegmenter(settings=QUICK), {"n_options": [1, 2]}, cv=2).fit(X, U)
+    assert found.best_params_ == {"n_options": 2}
+
+
+class RowsAlone(OptionSegmenter):
+    """Without controls; scikit-learn's checks pass labels of rows as the second argument, which this ignores."""
+
+    def fit(self, X: Any, y: Any = None) -> RowsAlone:
+        super().fit(X)
+        return self
+
+    def score(self, X: Any, y: Any = None) -> float:
+        return super().score(X)
+
+
+NOT_OF_SEQUENCES = {
+    "check_methods_sample_order_invariance": "rows are steps: their order matters",
+    "check_methods_subset_invariance": "rows are steps: a step's posterior depends on the other steps",
+}
+
+
+@parametrize_with_checks([RowsAlone(2, settings=QUICK)], expected_failed_checks=lambda _: NOT_OF_SEQUENCES)
+def test_the_checks_of_scikit_learn(estimator: Any, check: Any) -> None:
+    check(estimator)

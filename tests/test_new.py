@@ -1,0 +1,98 @@
+"""From a file to a page in one command, on generated demonstrations whose skills are known."""
+
+from __future__ import annotations
+
+import re
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import call
+from sklearn.metrics import normalized_mutual_info_score
+
+import ddco_pyro
+from ddco_pyro.data.planted import PHASES, pick_and_place
+from ddco_pyro.spec import load_spec
+from ddco_pyro.training.data import parts
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("new") / "mine.hdf5"
+    pick_and_place(12).write(path)
+    return path
+
+
+def quick(folder: Path, file: Path) -> None:
+    """A spec as ``init`` writes it, with a budget of few epochs."""
+    folder.mkdir()
+    assert call("init", file, "--out", folder / "spec.yaml").status == 0
+    text = (folder / "spec.yaml").read_text()
+    text = re.sub(r"(?m)^compare_with:\n(  .*\n)*", "", re.sub(r"epochs: \d+", "epochs: 6", text))
+    (folder / "spec.yaml").write_text(text)
+
+
+def test_the_object_goes_to_the_goal() -> None:
+    demos = pick_and_place(5, seed=2)
+    for demo in demos:
+        observed, phase = demo.observations, demo.labels["phase"]
+        assert phase[np.flatnonzero(np.diff(phase, prepend=-1))].tolist() == [0, 1, 2, 3]
+        assert np.linalg.norm(observed["object"][-1] - observed["goal"][-1]) < 0.06
+        assert np.array_equal(
+            observed["object"][phase < 2], np.broadcast_to(observed["object"][0], (sum(phase < 2), 3))
+        )
+        np.testing.assert_allclose(np.diff(observed["gripper"], axis=0), demo.actions[:-1, :3])
+        assert set(demo.actions[:, 3]) == {-1.0, 1.0}
+    np.testing.assert_array_equal(pick_and_place(5, seed=2)[3].actions, demos[3].actions)
+    assert not np.array_equal(pick_and_place(1, seed=3)[0].actions, demos[0].actions)
+
+
+def test_one_command_makes_what_four_make(file: Path, tmp_path: Path) -> None:
+    quick(tmp_path / "one", file)
+    ended = call("new", file, "--out", tmp_path / "one")
+    assert ended.status == 0, ended.err
+    said = [line.split()[2] for line in ended.out.splitlines() if line.startswith("$ ddco-pyro ")]
+    assert said == ["inspect", "fit", "segment"]  # the spec is there
+    quick(tmp_path / "four", file)
+    run = tmp_path / "four" / "run"
+    assert call("fit", tmp_path / "four" / "spec.yaml", "--out", run).status == 0
+    assert call("segment", run, file, "--html", tmp_path / "four" / "segments.html").status == 0
+    one, four = (ddco_pyro.load(tmp_path / name / "run") for name in ("one", "four"))
+    assert one.metrics.model_dump(exclude={"seconds"}) == four.metrics.model_dump(exclude={"seconds"})
+    pages = [
+        (tmp_path / name / "segments.html").read_text().replace(str(tmp_path / name), "") for name in ("one", "four")
+    ]
+    assert pages[0] == pages[1]
+    before = (tmp_path / "one" / "run" / "model.safetensors").stat().st_mtime_ns
+    assert call("new", file, "--out", tmp_path / "one").status == 0
+    assert (tmp_path / "one" / "run" / "model.safetensors").stat().st_mtime_ns == before
+
+
+def test_a_folder_of_another_file_is_refused(file: Path, tmp_path: Path) -> None:
+    quick(tmp_path / "out", file)
+    other = tmp_path / "other.hdf5"
+    pick_and_place(4).write(other)
+    ended = call("new", other, "--out", tmp_path / "out")
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert f"spec.yaml: is for {file}; choose another --out" in ended.err
+    ended = call("new", tmp_path / "none.hdf5", "--out", tmp_path / "new")
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_demo_of_the_needle_task_has_its_spec() -> None:
+    assert load_spec(Path(str(files("ddco_tasks.needle") / "demo.yaml"))).task == "needle"
+
+
+@pytest.mark.slow
+def test_the_skills_are_found_and_named(tmp_path: Path) -> None:
+    pick_and_place().write(tmp_path / "mine.hdf5")
+    ended = call("new", tmp_path / "mine.hdf5", "--out", tmp_path / "out")
+    assert ended.status == 0, ended.err
+    fit = ddco_pyro.load(tmp_path / "out" / "run")
+    held_out = parts(fit.spec, fit.demonstrations)["valid"]
+    (segments,) = fit.segment(held_out)
+    phases = np.concatenate([demo.labels["phase"] for demo in held_out])
+    assert normalized_mutual_info_score(phases, segments[segments >= 0]) > 0.8
+    assert len(set(fit.names["option"]) & set(PHASES)) >= 3

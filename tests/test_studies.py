@@ -1,0 +1,507 @@
+"""Studies: refused declarations, cells that are kept, killed, moved and shared, and what the report says of them."""
+
+from __future__ import annotations
+
+import csv
+import doctest
+import json
+import re
+import shutil
+import signal
+from pathlib import Path
+
+import arena_playing
+import numpy as np
+import pytest
+import sawyer
+import toy_task
+import yaml
+from command_line import call
+from killing import struck
+
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.files import only_one
+from ddco_pyro.errors import BadInput
+from ddco_pyro.fitting.fitted import load
+from ddco_pyro.selection import Workers
+from ddco_pyro.simulation.episodes import run_episode
+from ddco_pyro.spec import SpecError
+from ddco_pyro.study import cells, declaration, report, statistics
+from ddco_pyro.study.cells import Folder, read_tidy
+from ddco_pyro.study.declaration import Study
+from ddco_pyro.study.report import render, values, write
+
+ROOT = Path(__file__).parents[1]
+SPEC = {
+    "demonstrations": {"path": "unused.hdf5", "labels": "phase"},
+    "observations": ["place"],
+    "control": {"std": 0.5},
+    "hierarchy": {
+        "levels": [{"count": 2, "policy": {"network": "linear"}, "termination": {"network": "linear"}}],
+        "meta_policy": {"network": "linear"},
+    },
+    "compare_with": [{"kind": "flat", "policy": {"network": "linear"}}],
+    "training": {"epochs": 3, "optimizer": {"name": "em"}, "layerwise": False},
+}
+STUDY = {
+    "question": "Do options help?",
+    "spec": "spec.yaml",
+    "methods": {"options": {}, "flat": {"baseline": "flat"}},
+    "seeds": {"test": {"count": 2}},
+    "demonstrations": {"path": "mine.hdf5", "counts": [4, 6], "held_out": 3},
+    "measures": ["nats", "nmi"],
+    "contrasts": [{"contrast": "options - flat", "measure": "nats", "demonstrations": 6}],
+}
+HERE = Workers(jobs=1)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    """Demonstrations of a place that is left and then sought; two linear policies explain them, one does not."""
+    random, turn = np.random.default_rng(0), np.repeat([[-2.0], [2.0]], 5, 0)
+    places = [random.normal(size=(10, 2)) for _ in range(12)]
+    path = tmp_path_factory.mktemp("file") / "mine.hdf5"
+    Demonstrations(
+        tuple(
+            Demonstration(f"demo_{n}", {"place": x}, turn * x, {"phase": np.repeat([0, 1], 5)})
+            for n, x in enumerate(places)
+        )
+    ).write(path)
+    return path
+
+
+@pytest.fixture
+def made(file, tmp_path):
+    """Makes a folder's ``study.yaml``, with other values at some keys, and gives the study and its folder."""
+    shutil.copy(file, tmp_path)
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(SPEC, sort_keys=False))
+
+    def make(spec=None, **changes):
+        if spec:
+            (tmp_path / "spec.yaml").write_text(yaml.safe_dump({**SPEC, **spec}, sort_keys=False))
+        path = tmp_path / "study.yaml"
+        path.write_text(yaml.safe_dump({**STUDY, **changes}, sort_keys=False))
+        return Folder(Study.load(path), tmp_path / "out")
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def done(file, tmp_path_factory):
+    """The folder of a finished study."""
+    place = tmp_path_factory.mktemp("done")
+    shutil.copy(file, place)
+    (place / "spec.yaml").write_text(yaml.safe_dump(SPEC, sort_keys=False))
+    (place / "study.yaml").write_text(yaml.safe_dump(STUDY, sort_keys=False))
+    folder = Folder(Study.load(place / "study.yaml"), place / "out")
+    folder.run(HERE)
+    return folder
+
+
+RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"seed": {}}, "seed: unknown key; did you mean seeds?"),
+        (
+            {"seeds": {"test": {"count": 3}, "development": {"first": 2, "count": 1}}},
+            "seeds.development: 2 to 2 overlaps",
+        ),
+        (
+            {"demonstrations": RECORDED, "tasks": ["needle"], "starts": {"test": {"first": 39, "count": 10}}},
+            "starts.test: 39 to 58 overlaps demonstrations.test (0 to 39)",
+        ),
+        ({"demonstrations": {**RECORDED, "test": {"count": 14}}, "tasks": ["needle"]}, "must be at least 15"),
+        ({"demonstrations": {"counts": [4]}, "tasks": ["needle"]}, "demonstrations.test: missing"),
+        ({"measures": ["nat"]}, "there is no measure 'nat' (did you mean 'nats'?)"),
+        (
+            {"contrasts": [{"contrast": "options - flt", "measure": "nats", "demonstrations": 6}]},
+            "did you mean 'flat'?",
+        ),
+        ({"contrasts": [{"contrast": "options - flat", "measure": "nats"}]}, "must be one of 4, 6"),
+        ({"contrasts": [{"contrast": "options - flat", "measure": "ari", "demonstrations": 6}]}, "not among measures"),
+        ({"overrides": {"training.epoch": 3}}, "training.epoch: unknown key; did you mean training.epochs?"),
+        ({"methods": {"options": {}, "mine": {"by": "mine"}}}, "methods.mine.by: names a method of an adapter"),
+        ({"choose": "nats"}, "choose: and seeds.development go together"),
+        ({"starts": {"test": {"count": 3}}}, "tasks: missing; name the task in which methods act"),
+        ({"tasks": ["needle", "pushing"]}, "tasks: are several, but demonstrations.path names one file"),
+        ({"world": "os:system", "tasks": ["a"], "demonstrations": RECORDED, "contrasts": []}, "would import user code"),
+    ],
+)
+def test_a_declaration_that_cannot_be_meant_is_refused_in_words(made, changes, said):
+    with pytest.raises(SpecError) as refused:
+        made(**changes)
+    assert said in str(refused.value)
+
+
+def test_the_examples_of_the_docstrings_run(done, monkeypatch):
+    monkeypatch.chdir(done.study.path.parent)
+    for module in (declaration, statistics, sawyer):
+        found = doctest.testmod(module)
+        assert (found.failed, found.attempted > 0) == (0, True)
+
+
+def test_the_page_names_every_key():
+    page = (ROOT / "docs" / "studies.md").read_text()
+    models = [one for one in vars(declaration).values() if getattr(one, "__module__", "") == declaration.__name__]
+    keys = {key for one in models for key in getattr(one, "model_fields", {})}
+    assert "margin" in keys
+    assert not {key for key in keys if f"`{key}`" not in page}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"demonstrations": {**STUDY["demonstrations"], "path": "other.hdf5"}}, "other.hdf5"),
+        (
+            {"demonstrations": {**STUDY["demonstrations"], "held_out": 7}},
+            "has 12 demonstrations for test, but",
+        ),
+        ({"kept": [{"table": "none.csv"}]}, "none.csv: cannot be read"),
+        ({"kept": [{"table": "spec.yaml"}]}, "spec.yaml: is damaged"),
+        ({"starts": {"test": {"count": 3}}, "tasks": ["nedle"]}, "no task is registered as 'nedle'"),
+    ],
+)
+def test_data_and_tasks_that_cannot_be_used_are_refused_before_any_work(made, changes, said):
+    folder = made(**changes)
+    with pytest.raises(BadInput, match=re.escape(said)):
+        folder.run(HERE)
+    assert not (folder.path / "cells").exists()
+
+
+def test_in_a_registered_task_every_training_seed_has_its_own_episodes(tmp_path):
+    spec = yaml.safe_load(toy_task.SPEC) | {"compare_with": [], "training": {"epochs": 1}}
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(spec))
+    study = {
+        "methods": {"options": {}},
+        "demonstrations": {"counts": [4], "held_out": 2, "test": {"first": 10, "count": 8}},
+        "starts": {"test": {"first": 500, "count": 5}},
+        "measures": ["error", "success", "nats"],
+        "contrasts": [],
+    }
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump({**STUDY, **study}))
+    folder = Folder(Study.load(tmp_path / "study.yaml"), tmp_path / "out")
+    state = folder.run(HERE)
+    assert not state.failed
+    for seed, cell in enumerate(folder.cells("test")):
+        recorded = Demonstrations.read(folder.path / "demonstrations" / f"toy-{10 + 8 * seed}-6.hdf5")
+        assert recorded.names == tuple(f"demo_{n}" for n in range(10 + 8 * seed, 16 + 8 * seed))
+        controller = load(folder.path / "work" / folder.key(cell) / "fit").controller()
+        outcomes = [run_episode(toy_task.task, controller, 500 + 5 * seed + n).outcome for n in range(5)]
+        assert state.done[seed].values["success"] == np.mean([one["success"] for one in outcomes])
+        errors = [one["error"] for one in outcomes if not np.isnan(one["error"])]
+        assert state.done[seed].values["error"] == (pytest.approx(np.mean(errors)) if errors else None)
+
+
+def test_an_adapter_collects_plays_and_has_methods_of_its_own(made, file, tmp_path):
+    (tmp_path / "world_of_tests.py").write_text(ADAPTER)
+    study = {
+        "spec": "init",
+        "world": "world_of_tests:WORLD",
+        "tasks": ["there", "back"],
+        "overrides": {"training.epochs": 3},
+        "methods": {"options": {}, "own": {"by": "own"}},
+        "demonstrations": {"counts": [5], "held_out": 2, "test": {"first": 100, "count": 7}},
+        "starts": {"test": {"first": 500, "count": 4}},
+        "seeds": {"test": {"count": 2}},
+        "measures": ["success", "nats"],
+        "contrasts": [{"contrast": "options - own", "measure": "success"}],
+    }
+    path = tmp_path / "study.yaml"
+    path.write_text(yaml.safe_dump({**STUDY, **study}))
+    folder = Folder(Study.load(path, allow_code=True), tmp_path / "out")
+    state = folder.run(HERE)
+    assert not state.failed
+    found = {cell.row: state.done[number].values for number, cell in enumerate(state.cells)}
+    for (task, method, _, seed), own in found.items():
+        first, start = 100 + 7 * seed, 500 + 4 * seed
+        assert own["success"] == {"there": 1, "back": 0}[task] if method == "options" else start / 1000
+        assert method == "options" or own["demonstrations"] == first
+    write(folder, state, tmp_path / "report")  # of two tasks
+    path.write_text(yaml.safe_dump({**STUDY, **study, "methods": {"on": {"by": "on"}}, "contrasts": []}))
+    wrong = Folder(Study.load(path, allow_code=True), tmp_path / "out")
+    with pytest.raises(BadInput, match=r"has no method 'on' \(did you mean 'own'\?\)"):
+        wrong.run(HERE)
+
+
+ADAPTER = """
+import numpy as np
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+
+class World:
+    def __init__(self):
+        self.methods = {"own": self.own}
+
+    def collect(self, task, seeds, count, path):
+        places = [np.random.default_rng(seed).normal(size=(10, 2)) for seed in seeds]
+        turn = np.repeat([[-2.0], [2.0]], 5, 0)
+        demos = (Demonstration(f"demo_{n}", {"place": x}, turn * x, attributes={"seed": seed})
+                 for n, (seed, x) in enumerate(zip(seeds, places)))
+        Demonstrations(tuple(demos)[:count]).write(path)
+
+    def play(self, task, fitted, starts, folder):
+        return [{"success": float(task == "there")} for _ in starts]
+
+    def own(self, job):
+        assert set(job.demos.masks["train"]) | set(job.demos.masks["valid"]) == set(job.demos.names)
+        first = min(demo.attributes["seed"] for demo in job.demos)
+        return {"success": job.starts[0] / 1000, "demonstrations": float(first)}
+
+WORLD = World()
+"""
+
+
+def test_every_declaration_of_the_project_is_valid():
+    for path in (ROOT / "studies").glob("*.yaml"):
+        assert Study.load(path, allow_code=True).declared.contrasts
+
+
+def test_the_frozen_test_is_fresh():
+    """Its tasks and seeds are no other study's, and no page names one of the tasks."""
+    frozen = Study.load(ROOT / "studies" / "frozen.yaml", allow_code=True)
+    pages = [path.read_text() for path in (ROOT / "docs").rglob("*.md")]
+    assert len(set(frozen.tasks)) == 15
+    named = re.compile(rf"(?<![\w-])({'|'.join(task.removesuffix('-v3') for task in frozen.tasks)})(-v3)?(?![\w-])")
+    assert not [found for page in pages for found in named.findall(page)]
+    for path in (ROOT / "studies").glob("*.yaml"):
+        other = Study.load(path, allow_code=True)
+        if other.name != "frozen":
+            assert not {*frozen.tasks} & {*other.tasks}
+            for key in ("seeds", "demonstrations", "starts"):
+                ours, theirs = (
+                    {n for numbers in one.declared.ranges(key).values() for n in numbers}
+                    for one in (frozen, other)
+                    if getattr(one.declared, key)
+                )
+                assert not ours & theirs
+
+
+def test_a_training_seed_draws_its_own_demonstrations(done):
+    divided = {(c.seed, c.demonstrations): done._divided(c) for c in done.cells("test")}
+    for (train, valid), count in ((divided[seed, count], count) for seed in (0, 1) for count in (4, 6)):
+        assert (len(train), len(valid)) == (count, 3)
+        assert not {*train} & {*valid}
+    assert {*divided[0, 4][0]} < {*divided[0, 6][0]}
+    assert divided[0, 4][1] == divided[0, 6][1] != divided[1, 6][1]
+
+
+def test_planted_options_win_in_the_table_and_the_contrast(done, tmp_path, drawn_here):
+    state = done.state()
+    assert not state.failed
+    assert not state.missing
+    write(done, state, tmp_path)
+    rows = read_tidy(tmp_path / "table.csv")
+    assert len(rows) == 2 * 2 * 2 + 2 * 2  # nats of both methods, nmi of options
+    (contrast,) = report.tested(done.study, rows)
+    by_hand = [
+        one.value - other.value
+        for one in rows
+        for other in rows
+        if (one.method, other.method) == ("options", "flat")
+        and (one.measure, one.demonstrations, one.seed) == ("nats", 6, other.seed)
+        and (other.measure, other.demonstrations) == ("nats", 6)
+    ]
+    assert contrast.found.value == pytest.approx(np.mean(by_hand))
+    assert min(by_hand) > 0.3
+    page = (tmp_path / "page.md").read_text()
+    assert "| options - flat | held-out nats/step | 6 |" in page
+    assert "![" in page
+    assert all((tmp_path / name).exists() for name in ("page.html", "contrasts.png", "methods.png"))
+
+
+def test_nothing_is_done_twice_and_a_copy_elsewhere_goes_on(done, tmp_path, monkeypatch):
+    shutil.copytree(done.study.path.parent, tmp_path / "moved")
+    moved = Folder(Study.load(tmp_path / "moved" / "study.yaml"), tmp_path / "moved" / "out")
+    gone = moved.cells("test")[3]
+    moved.place(gone).unlink()  # its fit stays
+    fitted = []
+    monkeypatch.setattr(cells, "fit", lambda *given, **named: fitted.append(1) or fit(*given, **named))
+    before = {path: path.stat().st_mtime_ns for path in (moved.path / "cells").iterdir()}
+    state = moved.run(HERE)
+    assert (len(fitted), len(state.done)) == (1, 8)
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert read_record(moved, gone)["values"] == read_record(done, gone)["values"]
+
+
+fit = cells.fit
+
+
+def read_record(folder, cell):
+    return json.loads(folder.place(cell).read_text())
+
+
+def test_another_key_for_whatever_a_result_depends_on(done, made):
+    same, keys = made(), {done.key(cell) for cell in done.cells("test")}
+    assert {same.key(cell) for cell in same.cells("test")} == keys
+    assert len(keys) == 8
+    noted = made(spec={"report": {"trajectory": None}, "selection": {"folds": 3}}, measures=["nats"])
+    assert {noted.key(cell) for cell in noted.cells("test")} == keys
+    for change in (
+        {"spec": {"seed": 3, "training": {**SPEC["training"], "epochs": 4}}},
+        {"seeds": {"test": {"first": 2, "count": 2}}},
+        {"demonstrations": {**STUDY["demonstrations"], "held_out": 4}},
+        {"overrides": {"control.std": 0.4}},
+    ):
+        other = made(**change)
+        assert not {other.key(cell) for cell in other.cells("test")} & keys, change
+    more = made(
+        spec=SPEC, demonstrations={**STUDY["demonstrations"], "counts": [4, 5, 6]}, seeds={"test": {"count": 3}}
+    )
+    assert {more.key(cell) for cell in more.cells("test")} > keys
+
+
+def test_a_setting_of_a_later_version_keeps_a_cell_and_another_default_does_not(done):
+    cell = done.cells("test")[0]
+    path, text = done.place(cell), done.place(cell).read_text()
+    content = json.loads(text)
+    try:
+        del content["depends"]["spec"]["training"]["patience"]
+        path.write_text(json.dumps(content))
+        assert done.kept(cell)
+        content["depends"]["spec"]["training"]["batch_size"] += 1
+        path.write_text(json.dumps(content))
+        assert done.kept(cell) is None
+    finally:
+        path.write_text(text)
+
+
+def test_a_cell_that_another_process_works_on_is_left_to_it(made):
+    folder = made(demonstrations={**STUDY["demonstrations"], "counts": [6]}, seeds={"test": {"count": 1}})
+    first, second = folder.cells("test")
+    with only_one(folder.path / "work" / folder.key(first)):
+        state = folder.run(HERE)
+    assert state.missing == [first]
+    assert folder.kept(second)
+
+
+def test_a_failed_cell_says_why_and_is_tried_again(made, monkeypatch):
+    folder = made(demonstrations={**STUDY["demonstrations"], "counts": [6]}, seeds={"test": {"count": 1}})
+    monkeypatch.setattr(cells, "fit", lambda *_, **__: 1 / 0)
+    assert set(folder.run(HERE).failed.values()) == {"unexpected ZeroDivisionError: division by zero"}
+    monkeypatch.undo()
+    state = folder.run(HERE)
+    assert (len(state.done), len(state.failed)) == (2, 0)
+
+
+def test_a_killed_study_goes_on_with_what_is_done(made):
+    folder = made(demonstrations={**STUDY["demonstrations"], "counts": [6]})
+    where = folder.study.path.parent
+    arguments = ["study", "run", "study.yaml", "--out", "out", "--jobs", 1]
+    strike = "os.kill(os.getpid(), signal.SIGKILL)"
+    status, _ = struck(arguments, where, "CellDone", 2, strike)
+    assert status == -signal.SIGKILL
+    kept = {path: path.read_bytes() for path in (folder.path / "cells").glob("*.json")}
+    assert len(kept) == 2
+    state = folder.run(HERE)
+    assert len(state.done) == 4
+    assert {path: path.read_bytes() for path in kept} == kept
+
+
+def test_the_best_point_on_development_seeds_is_tested(made):
+    """With σ of 50 every method explains the demonstrations worse than with 0.5."""
+    folder = made(
+        grid={"control.std": [50.0, 0.5]},
+        choose="nats",
+        seeds={"test": {"count": 1}, "development": {"first": 7, "count": 1}},
+        demonstrations={"path": "mine.hdf5", "counts": [3], "held_out": 2, "test": {"count": 6},
+                        "development": {"first": 6, "count": 6}},
+        contrasts=[],
+    )  # fmt: skip
+    state = folder.run(HERE)
+    parts = [cell.part for cell in state.cells]
+    assert (parts.count("development"), parts.count("test"), len(state.done)) == (4, 2, 6)
+    assert {(cell.method, cell.point["control.std"]) for cell in state.cells if cell.part == "test"} == {
+        ("options", 0.5),
+        ("flat", 0.5),
+    }
+    train, valid = folder._divided(folder.cells("development")[0])
+    assert {*train, *valid} <= {f"demo_{n}" for n in range(6, 12)}
+
+
+def test_a_measure_of_nothing_is_better_than_less(made):
+    """Means over development cells: −1 and 0 at the first point, −0.4 at the second; the best is the second."""
+    folder = made(
+        grid={"control.std": [0.5, 1.0]}, choose="nats", contrasts=[], methods={"options": {}},
+        seeds={"test": {"count": 1}, "development": {"first": 7, "count": 2}},
+        demonstrations={"path": "mine.hdf5", "counts": [3], "held_out": 2, "test": {"count": 6},
+                        "development": {"first": 6, "count": 6}},
+    )  # fmt: skip
+    values = {(7, 0.5): -1.0, (8, 0.5): 0.0, (7, 1.0): -0.4, (8, 1.0): -0.4}
+    places = folder.cells("development")
+    results = [cells.Done(depends={}, values={"nats": values[one.seed, one.point["control.std"]]}) for one in places]
+    state = cells.State(places, dict(enumerate(results)), {})
+    assert folder.chosen(state) == {"options": {"control.std": 1.0}}
+    results[0] = cells.Done(depends={}, values={"nats": -0.7})
+    assert folder.chosen(cells.State(places, dict(enumerate(results)), {})) == {"options": {"control.std": 0.5}}
+
+
+def test_cells_of_an_earlier_table_are_not_done(made, done, tmp_path):
+    write(done, done.state(), tmp_path)
+    folder = made(kept=[{"table": "table.csv"}])
+    assert not folder.state().missing
+    with (tmp_path / "table.csv").open() as table:
+        rows = [row for row in csv.DictReader(table) if (row["method"], row["seed"]) != ("flat", "1")]
+    with (tmp_path / "table.csv").open("w") as table:
+        writer = csv.DictWriter(table, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    folder = made(kept=[{"table": "table.csv"}])
+    assert {(cell.method, cell.seed) for cell in folder.state().missing} == {("flat", 1)}
+
+
+def test_pages_quote_the_tables_by_the_names_of_the_study(made, done, tmp_path):
+    write(done, done.state(), tmp_path)
+    rows = read_tidy(tmp_path / "table.csv")
+    own = values(rows, "options", "nats", 6)[""]
+    methods = {"mine": {}, "flat": {"baseline": "flat"}}
+    kept = [{"table": "table.csv", "study": "study", "methods": {"mine": "options"}, "measures": {"nats/step": "nats"}}]
+    made(kept=kept, methods=methods, contrasts=[])
+    quoted = "It is <!-- study study: mine; nats/step; 6; form=.3f -->?<!-- / -->."
+    now = render(quoted, tmp_path)
+    assert f"-->{(own[0] + own[1]) / 2:.3f} [".replace("-->-", "-->−") in now
+    assert render(now, tmp_path) == now
+    assert render("nothing", tmp_path) == "nothing"
+    for wrong, said in (("mine; nats", "write a method"), ("flat; nats/step; 6", "no"), ("mine; nats; 5", "no")):
+        with pytest.raises(BadInput, match=said):
+            render(f"<!-- study study: {wrong} --><!-- / -->", tmp_path)
+    with pytest.raises(SpecError, match="cannot be read"):
+        render("<!-- study other: mine; nats; 6 --><!-- / -->", tmp_path)
+
+
+class Told:
+    """A controller of chunks of three: at time t it gives 10 t, 10 t + 1 and 10 t + 2 for three steps."""
+
+    def reset(self, seed):
+        self.time = -1
+
+    def act(self, observation):
+        self.time += 1
+        return 10.0 * self.time + np.arange(3.0)
+
+
+def test_chunks_of_actions_are_averaged_over_what_was_given_for_a_step():
+    """By hand: step 2 was given 2 at time 0, 11 at time 1 and 20 at time 2; the oldest has the largest weight."""
+    chunks, weights = arena_playing.Chunks(Told(), 3), np.exp([0, -0.01, -0.02])
+    given = [[0.0], [1.0, 10.0], [2.0, 11.0, 20.0], [12.0, 21.0, 30.0]]
+    for _ in range(2):  # nothing is left of an episode
+        chunks.reset(0)
+        acted = [float(chunks.act({})[0]) for _ in given]
+        assert acted == pytest.approx([np.average(one, weights=weights[: len(one)]) for one in given])
+
+
+def test_the_command_says_what_is_left(made, tmp_path, monkeypatch):
+    made()
+    monkeypatch.chdir(tmp_path)
+    said = call("study", "status", "study.yaml")
+    assert "0 of 8 cells are done; next: ddco-pyro study run study.yaml" in said.out
+    assert not (tmp_path / "runs").exists()
+    said = call("study", "report", "study.yaml")
+    assert (said.status, "no cell is done" in said.err) == (2, True)
+
+
+def test_pages_of_the_project_agree_with_the_tables():
+    for page in ("README.md", "docs/results/README.md"):
+        text = (ROOT / page).read_text()
+        assert render(text, ROOT / "studies") == text
