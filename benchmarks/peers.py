@@ -124,8 +124,9 @@ def em_steps(hierarchy: Hierarchy, batch: Batch) -> tuple[Callable[[], object], 
     import jax
     from dynamax.hidden_markov_model import LinearRegressionHMM
 
-    seen = jax.numpy.asarray(torch.cat(list(batch.inputs.vectors.values()), -1).numpy())
-    controls = jax.numpy.asarray(batch.actions.numpy())
+    jax.config.update("jax_enable_x64", True)
+    seen = jax.numpy.asarray(torch.cat(list(batch.inputs.vectors.values()), -1).double().numpy())
+    controls = jax.numpy.asarray(batch.actions.double().numpy())
     model = LinearRegressionHMM(hierarchy.levels[0].count, seen.shape[-1], controls.shape[-1])
     parameters, properties = model.initialize(jax.random.PRNGKey(0))
 

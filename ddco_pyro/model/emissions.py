@@ -153,7 +153,7 @@ class Gaussian(Emission):
         std = self._std(alive)
         constant = np.log(std) + (0.5 * LOG_2PI + self.log_scale.detach().numpy())
         low, high = self._bounds()
-        given = alive.take(self.mean), 1 / std, low, high, alive.take(actions)
+        given: tuple[Any, ...] = alive.take(self.mean), 1 / std, low, high, alive.take(actions)
         return given, _add_normal(*given, constant, rows, first)
 
     def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
