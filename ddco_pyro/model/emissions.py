@@ -149,18 +149,32 @@ class Gaussian(Emission):
         return (error.square() * weight).sum(-1) - constant.to(self.mean.dtype)
 
     def add(self, actions: Tensor, alive: Alive, rows: Array, first: int) -> Any:
-        """The density; kept are the controls on bounds and φ / Φ of their masses."""
+        """The density; kept are the arguments of the pass, and the controls on bounds with φ / Φ of their masses."""
         std = self._std(alive)
         constant = np.log(std) + (0.5 * LOG_2PI + self.log_scale.detach().numpy())
         low, high = self._bounds()
-        given: tuple[Any, ...] = alive.take(self.mean), 1 / std, low, high, alive.take(actions)
-        return given, _add_normal(*given, constant, rows, first)
+        given = alive.take(self.mean), 1 / std, low, high, alive.take(actions)
+        return *given, *_add_normal(*given, constant, rows, first)
 
     def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
         """The gradients of μ, σ and the units, and those of bounds."""
-        given, masses = kept
-        mean, of_std, sums = alive.empty(self.mean), np.zeros(given[1].shape), np.zeros((3, *self.mean.shape[-2:]))
-        _normal_gradient(*given, *masses, posterior.found, posterior.weight, first, mean, of_std, sums)
+        means, inverse, low, high, acts, places, masses = kept
+        mean, of_std, sums = alive.empty(self.mean), np.zeros(inverse.shape), np.zeros((3, *self.mean.shape[-2:]))
+        _normal_gradient(
+            means,
+            inverse,
+            low,
+            high,
+            acts,
+            places,
+            masses,
+            posterior.found,
+            posterior.weight,
+            first,
+            mean,
+            of_std,
+            sums,
+        )
         by_step, fixed = ([mean, of_std], [*sums]) if self.std.dim() > 2 else ([mean], [of_std[0], *sums])
         tensors = self.tensors()
         found: list[Tensor | None] = [alive.gradient(own, of) for own, of in zip(by_step, tensors, strict=False)]
