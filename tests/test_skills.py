@@ -12,7 +12,7 @@ import torch
 from scipy.cluster.hierarchy import linkage
 
 from ddco_pyro.drawing.diagrams import dendrogram, path_film, transition_graph
-from ddco_pyro.drawing.shown import projection
+from ddco_pyro.drawing.shown import frames, projection
 from ddco_pyro.report.inputs import _shares
 from ddco_pyro.report.skills import Instance, aligned, film_of, instances, sheet_of, transitions
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
@@ -125,3 +125,11 @@ def test_shares_are_those_of_the_weights_of_a_linear_policy():
     spread = {"a": torch.ones(1), "b": 5 * torch.ones(1), "unread": torch.ones(1)}
     found = _shares(numbers, torch.rand(2, 4).double(), vectors, spread)
     assert found == pytest.approx({"a": 25 / 125, "b": 100 / 125, "unread": 0})
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_pictures_of_any_number_of_channels_are_shown_in_colour(channels):
+    pictures = np.random.default_rng(0).integers(0, 256, (5, 8, 6, channels), dtype=np.uint8)
+    shown = frames(pictures, [1, 1, 4], height=8)
+    kept = [0, 1, 2] if channels >= 3 else [0, 0, 0]
+    assert np.array_equal(shown, pictures[[1, 1, 4]][..., kept])
