@@ -7,6 +7,9 @@ import time
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
+TURN = 0.02
+"""Seconds of a turn in a pair."""
+
 
 class Row(NamedTuple):
     """Two measurements and their ratio.
@@ -34,14 +37,22 @@ def side_by_side(
     first: Callable[[], object],
     second: Callable[[], object],
     rounds: int = 7,
-    clock: Callable[[], float] = time.perf_counter,
+    clock: Callable[[], float] = time.process_time,
     warm: bool = True,
 ) -> Row:
-    """Both calls in turns, after each has run once. ``warm`` says whether the first call needs that."""
+    """Both calls in turns, after each has run once. ``warm`` says whether the first call needs that.
+
+    A turn repeats a short call for :data:`TURN` seconds.
+    """
     if warm:
         first()
     second()
-    return of_pairs(names, [(1e3 * seconds(first, clock), 1e3 * seconds(second, clock)) for _ in range(rounds)])
+    calls = [(call, max(1, int(TURN / seconds(call, clock))) if warm else 1) for call in (first, second)]
+
+    def turn(call: Callable[[], object], times: int) -> float:
+        return 1e3 / times * seconds(lambda: [call() for _ in range(times)], clock)
+
+    return of_pairs(names, [(turn(*calls[0]), turn(*calls[1])) for _ in range(rounds)])
 
 
 def of_pairs(names: tuple[str, str], pairs: Iterable[tuple[float, float]], unit: str = "ms") -> Row:

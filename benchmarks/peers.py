@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.inference import log_likelihood
+from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Chain, Tables
@@ -124,8 +124,9 @@ def em_steps(hierarchy: Hierarchy, batch: Batch) -> tuple[Callable[[], object], 
     import jax
     from dynamax.hidden_markov_model import LinearRegressionHMM
 
-    seen = jax.numpy.asarray(torch.cat(list(batch.inputs.vectors.values()), -1).numpy())
-    controls = jax.numpy.asarray(batch.actions.numpy())
+    jax.config.update("jax_enable_x64", True)
+    seen = jax.numpy.asarray(torch.cat(list(batch.inputs.vectors.values()), -1).double().numpy())
+    controls = jax.numpy.asarray(batch.actions.double().numpy())
     model = LinearRegressionHMM(hierarchy.levels[0].count, seen.shape[-1], controls.shape[-1])
     parameters, properties = model.initialize(jax.random.PRNGKey(0))
 

@@ -30,8 +30,9 @@ from provenance import is_kept, record, sentence, text
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import EpochEnded, Event
-from ddco_pyro.inference import Engine, fused, log_likelihood
-from ddco_pyro.inference.kernel import Rows, Structure, any_levels, match_torch_threads, one_level
+from ddco_pyro.inference import Engine, fused
+from ddco_pyro.inference.engines import log_likelihood
+from ddco_pyro.inference.kernel import Rows, Structure, any_levels, on_threads, one_level
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables, complete
@@ -177,10 +178,10 @@ def kernel(tables: Tables, lengths: torch.Tensor) -> Callable[[], float]:
     run = one_level if tables.depth == 1 else any_levels
 
     def call() -> float:
-        match_torch_threads()
         value, exact = np.empty(len(lengths)), np.empty(len(lengths), dtype=np.bool_)
         posteriors = Rows(*(np.empty_like(row) for row in rows), nothing)
-        run(Rows(*rows, nothing), starts, lengths.numpy(), value, exact, posteriors, structure)
+        others = Rows(*rows, nothing), starts, lengths.numpy(), value, exact, posteriors, structure
+        on_threads(lambda first, last: run(first, last, *others), lengths.numpy())
         return float(value.sum())
 
     return call
@@ -244,7 +245,7 @@ def threads() -> Iterator[Row]:
         torch.set_num_threads(number)
         ours()
 
-    yield side_by_side(("pass, one thread", "all threads"), partial(on, 1), partial(on, every), 15)
+    yield side_by_side(("pass, one thread", "all threads"), partial(on, 1), partial(on, every), 15, time.perf_counter)
     torch.set_num_threads(1)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,24 +59,33 @@ class Apart:
         path = self.runs / "demonstrations" / task / f"{digest}.hdf5"
         with only_one(path.parent, wait=True):
             if not path.exists():
-                python = self.made()
-                words = [word for key, value in options.items() for word in (f"--{key.replace('_', '-')}", str(value))]
-                arena_venv.run(python, HERE / self.script, "collect", task, path, *words)
+                self.collect(task, path, **options)
         return path
+
+    def collect(self, task: str, path: Path, **options: float) -> None:
+        """Record demonstrations of a task into a file, with options as :meth:`collected`."""
+        arena_venv.run(self.made(), HERE / self.script, "collect", task, path, *_words(options))
+
+    def played(self, task: str, methods: dict[str, Fit], chunk: int = 1, **options: Any) -> dict[str, Any]:
+        """What the script's command ``play`` writes about exported methods.
+
+        :param chunk: steps that a control of every method has.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            for name, one in methods.items():
+                (Path(folder) / name).mkdir()
+                write_numpy(one, Path(folder) / name)
+                (Path(folder) / name / "chunk.json").write_text(json.dumps(chunk))
+            out, named = Path(folder) / "played.json", [f"{name}={folder}/{name}" for name in methods]
+            arena_venv.run(self.made(), HERE / self.script, "play", task, out, *named, *_words(options))
+            return dict(json.loads(out.read_text()))
 
     def play(self, task: str, methods: dict[str, Fit], source: Path, episodes: int) -> dict[str, Any]:
         """Episodes of each exported method, and by how much its controls differ from its fit's on a demonstration.
 
         :raises Failed: the simulator cannot be used.
         """
-        with tempfile.TemporaryDirectory() as folder:
-            for name, one in methods.items():
-                (Path(folder) / name).mkdir()
-                write_numpy(one, Path(folder) / name)
-            out, named = Path(folder) / "played.json", [f"{name}={folder}/{name}" for name in methods]
-            options = ("--episodes", str(episodes), "--recorded", source.resolve())
-            arena_venv.run(self.made(), HERE / self.script, "play", task, out, *named, *options)
-            played: dict[str, Any] = json.loads(out.read_text())
+        played = self.played(task, methods, episodes=episodes, recorded=source.resolve())
         keys = {key for one in methods.values() for key in one.spec.observed}
         demo = Demonstrations.read(source, sorted(keys)).select([played["demonstration"]])[0]
         played["differences"] = {
@@ -83,6 +93,11 @@ class Apart:
             for name, one in methods.items()
         }
         return played
+
+
+def _words(options: Mapping[str, Any]) -> list[str]:
+    """Options as words of a command."""
+    return [word for key, value in options.items() for word in (f"--{key.replace('_', '-')}", str(value))]
 
 
 def expert(source: Path) -> dict[str, Any]:

@@ -122,14 +122,19 @@ def main() -> None:
     parser = described(__doc__)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--ways", nargs="+", choices=NAMES, default=[*WAYS, *LIMITS])
+    parser.add_argument("--memoryless", action="store_true", help="options end after every step; into memory.csv")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=RESULTS / "segments.csv")
     own = parser.parse_args()
     cells = [(way, seed) for way in own.ways for seed in range(own.seeds)]
     found = []
-    for one in Parallel(n_jobs=own.jobs, return_as="generator_unordered")(delayed(one_fit)(*cell) for cell in cells):
-        found += rows_of(one)
-        add(own.out, found)
+    work = Parallel(n_jobs=own.jobs, return_as="generator_unordered")
+    for one in work(delayed(one_fit)(*cell, not own.memoryless) for cell in cells):
+        rows = list(rows_of(one))
+        if own.memoryless:
+            rows = [row._replace(study="planted", method="mixture") for row in rows if row.method == one["way"]]
+        found += rows
+        add(RESULTS / "memory.csv" if own.memoryless else own.out, rows)
     print(shown(found))
 
 

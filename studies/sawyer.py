@@ -6,25 +6,22 @@ The environment is made in ``runs/metaworld/venv`` from ``arena_requirements.txt
 
 from __future__ import annotations
 
-import json
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import arena_venv
 import numpy as np
+from apart import Apart
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.exporting import write_numpy
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.spec import BaselineSpec, with_overrides
 from ddco_pyro.study.cells import Job
 from ddco_pyro.training.networks import Dimensions, baseline_spec
 
-HERE = Path(__file__).parent
-SCRIPT = HERE / "arena_metaworld.py"
+RUNS = Path(__file__).parents[1] / "runs" / "metaworld"
+SIMULATOR = Apart("arena_metaworld.py", "arena_requirements.txt", RUNS)
 NOISE = 0.1
 """Standard deviation of the noise on the expert's controls."""
 
@@ -48,33 +45,17 @@ class MetaWorld:
     def __init__(self) -> None:
         self.methods = {"bc_chunks": self.bc_chunks}
 
-    @property
-    def python(self) -> Path:
-        """The Python of the environment, which is made where it is not there.
-
-        :raises Failed: it cannot be made.
-        """
-        return arena_venv.made(HERE.parent / "runs" / "metaworld" / "venv", HERE / "arena_requirements.txt")
-
     def collect(self, task: str, seeds: range, count: int, path: Path) -> None:
         """Record the first successful episodes of the expert with noise on its controls."""
-        numbers = ("--number", count, "--held-out", 1, "--first", seeds.start, "--attempts", len(seeds))
-        arena_venv.run(self.python, SCRIPT, "collect", task, path, *map(str, numbers), "--noise", str(NOISE))
+        SIMULATOR.collect(task, path, number=count, held_out=1, first=seeds.start, attempts=len(seeds), noise=NOISE)
 
     def play(self, task: str, fitted: Fit, starts: range, folder: Path) -> Sequence[Mapping[str, float]]:
         """Episodes of the exported policy: success, and its steps."""
         return self._play(task, fitted, starts, 1)
 
     def _play(self, task: str, fitted: Fit, starts: range, chunk: int) -> list[dict[str, float]]:
-        with tempfile.TemporaryDirectory() as place:
-            exported, out = Path(place) / "policy", Path(place) / "played.json"
-            exported.mkdir()
-            write_numpy(fitted, exported)
-            (exported / "chunk.json").write_text(json.dumps(chunk))
-            numbers = ("--first", starts.start, "--episodes", len(starts))
-            arena_venv.run(self.python, SCRIPT, "play", task, out, f"policy={exported}", *map(str, numbers))
-            episodes = json.loads(out.read_text())["episodes"]["policy"]
-        return [{name: float(value) for name, value in episode.items()} for episode in episodes]
+        played = SIMULATOR.played(task, {"policy": fitted}, chunk, first=starts.start, episodes=len(starts))
+        return [{name: float(value) for name, value in one.items()} for one in played["episodes"]["policy"]]
 
     def bc_chunks(self, job: Job) -> dict[str, float]:
         """Behaviour cloning of chunks of actions, acting by temporal ensembling (ACT, Zhao et al. 2023)."""

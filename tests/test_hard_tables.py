@@ -116,5 +116,5 @@ def exact(tables):
     posteriors = kernel.Rows(*(np.empty_like(row) for row in rows), nothing)
     starts, lengths = np.arange(number) * steps, np.full(number, steps)
     structure = kernel.Structure.of(tables.sizes)
-    run(kernel.Rows(*rows, nothing), starts, lengths, np.empty(number), found, posteriors, structure)
+    run(0, number, kernel.Rows(*rows, nothing), starts, lengths, np.empty(number), found, posteriors, structure)
     return bool(found.all())

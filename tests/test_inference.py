@@ -10,6 +10,7 @@ import torch
 from oracle import brute_force, random_tables
 
 from ddco_pyro.inference import log_likelihood, posterior, segment
+from ddco_pyro.inference.kernel import STEPS_A_THREAD, on_threads
 from ddco_pyro.model.tables import NEVER, Tables
 
 CASES = [
@@ -121,3 +122,20 @@ def test_permuting_options_changes_nothing():
 
 def _parts(tables):
     return tables.selection, tables.termination, tables.control
+
+
+@pytest.mark.parametrize(("counts", "hybrid"), [((2,), (True,)), ((2, 1), (False, True))])
+def test_threads_change_no_bit(counts, hybrid):
+    tables = random_tables(counts, hybrid, trajectories=5, steps=STEPS_A_THREAD // 2, seed=3)
+    lengths, found, parts = torch.tensor([STEPS_A_THREAD // 2, 1, 7, 1500, 2000]), [], []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        try:
+            value, own = log_likelihood(tables, lengths), posterior(tables, lengths)
+            found.append([value, *own.u, *own.v, *own.w, *segment(tables, lengths)])
+            on_threads(lambda first, last: parts.append((first, last)), lengths.numpy())
+        finally:
+            torch.set_num_threads(1)
+    assert sorted(parts) == [(0, 2), (0, 2), (0, 5), (2, 5), (2, 5)]  # 7604 steps are worth two threads
+    for others in found[1:]:
+        assert all(torch.equal(one, other) for one, other in zip(found[0], others, strict=True))

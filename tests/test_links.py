@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import special
-from torch.nn.functional import log_softmax, pad
+from torch.nn.functional import log_softmax, one_hot, pad
 
 from ddco_pyro.model.elementary import exponentials, log_normal_cdf, logarithms
 from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Density, Gaussian, Hurdle, Product
@@ -49,6 +49,8 @@ EMISSIONS = [
     *(gaussian(positive(*shape)) for shape in STDS),
     *(clipped(positive(*shape)) for shape in STDS),
     hurdle(),
+    Hurdle(normal(NUMBER, STEPS, CALLERS, 1), gaussian(positive(NUMBER, STEPS, CALLERS, 2))),
+    binary(),
     Product((((1, 2), gaussian(positive(2))), ((0, 3), clipped(positive(CALLERS, 2))))),
     Product((((3, 0), binary()), ((2, 1), gaussian(positive(2))))),
 ]
@@ -63,7 +65,19 @@ def controls(emission):
         values[:, ::2] = 0.0
     if isinstance(emission, Product):
         values[..., [0, 3]] = (values[..., [0, 3]] > 0).double()
+    if isinstance(emission, Binary):
+        values = (values > 0).double()
+        values[0, 0, 0] = 0.5  # impossible
     return values
+
+
+def categorical(rows):
+    return Categorical(normal(NUMBER, STEPS, CALLERS, 3), torch.tensor(rows))
+
+
+INDICES = torch.arange(21).reshape(3, 7) % 4 % 3  # actions of three kinds
+ROWS = one_hot(INDICES, 3)
+ROWS[1, 0] = 1  # impossible
 
 
 CASES = [
@@ -73,10 +87,8 @@ CASES = [
     Termination(normal(NUMBER, STEPS, CALLERS, scale=40.0)),
     LogTable(normal(NUMBER, STEPS, CALLERS)),
     *(Density(emission, controls(emission)) for emission in EMISSIONS),
-    Density(
-        Categorical(normal(NUMBER, STEPS, CALLERS, 3), torch.tensor(False)),
-        torch.arange(21).reshape(3, 7, 1) % 3,
-    ),
+    Density(categorical(False), torch.where(INDICES == 2, 7, INDICES).unsqueeze(-1)),  # 7 is impossible
+    Density(categorical(True), ROWS.double()),
 ]
 
 
@@ -92,14 +104,36 @@ def test_compiled_passes_are_the_formula_and_its_gradient(link, lengths):
     expected = (table if logs else table.exp())[steps].flatten(1).detach()
     torch.testing.assert_close(torch.from_numpy(rows[:, columns]), expected, rtol=1e-12, atol=1e-12)
     posterior, weight = normal(*rows.shape).detach().numpy(), normal(len(rows)).detach().numpy()
+    posterior[:, columns] *= (table[steps] > NEVER).flatten(1).numpy()  # as the elimination gives it
     found = link.gradients(alive, Posterior(rows, posterior, weight), 2, kept)
     upstream = torch.from_numpy(posterior[:, columns] * weight[:, None]).reshape(-1, *link.shape[2:])
-    upstream = torch.where(table[steps] > NEVER, upstream, 0.0)
     wanted = [tensor for tensor in link.inputs if tensor.requires_grad]
     truth = torch.autograd.grad(table[steps], wanted, upstream, allow_unused=True)
     ours = [own for own, tensor in zip(found, link.inputs, strict=True) if tensor.requires_grad]
     for own, theirs in zip(ours, truth, strict=True):
         torch.testing.assert_close(own, theirs, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("scale", [1.0, 300.0])
+def test_switches_and_categories_are_those_of_torch(scale):
+    """Log-probabilities and the gradients of logits, however large the logits are."""
+    alive = Alive.of(LENGTHS[0], STEPS)
+    upstream, weight = normal(21, CALLERS).detach(), normal(21).detach()
+    switches, choices = (normal(NUMBER, STEPS, CALLERS, size, scale=scale) for size in (2, 3))
+    on = (normal(NUMBER, STEPS, 2).detach() > 0).double()
+    bernoulli = torch.distributions.Bernoulli(logits=switches).log_prob(on.unsqueeze(2)).sum(-1)
+    drawn = torch.distributions.Categorical(logits=choices).log_prob(INDICES.unsqueeze(-1))
+    for emission, actions, logits, truth in (
+        (Binary(switches), on, switches, bernoulli),
+        (Categorical(choices, torch.tensor(False)), INDICES.unsqueeze(-1), choices, drawn),
+    ):
+        link, rows = Density(emission, actions), np.empty((21, CALLERS))
+        kept = link.fill(alive, rows, 0)
+        expected = truth.detach().flatten(0, 1).numpy()
+        np.testing.assert_allclose(rows, expected, rtol=1e-12, atol=1e-12)
+        (found,) = link.gradients(alive, Posterior(rows, upstream.numpy(), weight.numpy()), 0, kept)
+        (slope,) = torch.autograd.grad(truth, logits, (upstream * weight[:, None]).reshape(truth.shape))
+        torch.testing.assert_close(found, slope, rtol=1e-10, atol=1e-12)
 
 
 def test_single_precision_loses_only_the_rounding_of_the_outputs():

@@ -1,12 +1,10 @@
-"""The study of memory: what is paired with what, against cases worked by hand, and what is done after a kill."""
+"""The study of memory: what is paired with what, against cases worked by hand."""
 
 from __future__ import annotations
 
-import memory
 import pytest
-from memory import Asked, Cell, Measured, cells_of, compared, missing, work
-from memory_results import ACTED, checks, comparisons, draw, everything, of_pages, over_tasks, page, short, with_table
-from table import RESULTS, ROOT, read
+from memory import SOURCES, checks, comparisons, draw, everything, of_pages, over_tasks, page
+from table import RESULTS, read
 
 
 def rows(method, values, study="needle", measure="success", acting="marginal", task=None, count=20):
@@ -62,43 +60,12 @@ def test_several_tasks_have_intervals_over_tasks():
     assert own["interval"] == pytest.approx([0.25 - 12.7062 * 0.15, 0.25 + 12.7062 * 0.15], abs=1e-4)
 
 
-def test_a_cell_is_kept_as_soon_as_it_is_done_and_not_done_again(tmp_path, monkeypatch):
-    done = []
-
-    def fitted(cell, runs):
-        if len(done) == 2:
-            raise KeyboardInterrupt
-        done.append(cell)
-        return [Measured("", "nats", 1.5), Measured("marginal", "success", cell.seed / 10)]
-
-    monkeypatch.setitem(memory.STUDIES, "needle", fitted)
-    cells = cells_of("needle", Asked((20,), 3, 1, ("needle",)))
-    assert [(cell.method, cell.seed) for cell in cells] == [
-        ("mixture", 0),
-        ("options", 0),
-        ("mixture", 1),
-        ("mixture", 2),
-    ]
-    table = tmp_path / "memory.csv"
-    with pytest.raises(KeyboardInterrupt):
-        work(cells, tmp_path, table)
-    assert [row.value for row in read(table)] == [1.5, 0.0] * 2
-    done.clear()
-    assert work(cells, tmp_path, table) == "2 of 4 cells were not there"
-    assert done == cells[2:]
-    last = read(table)[-1]
-    assert Cell(*last[:5]) == cells[-1]
-    assert last[5:] == ("success, acting by marginal", 0.2)
-    (line,) = (one for one in missing(set(cells)) if "needle --counts 20 " in one)
-    assert line.endswith("7 of mixture, 1 of options, of 12 cells")
-
-
 NEEDLE = ("needle", "needle", "ddco", 100, "nats")
 
 
 def test_the_tables_of_the_studies_are_read_by_seed():
     found = of_pages()
-    assert {row["study"] for row in found} == set(memory.STUDIES)
+    assert {row["study"] for row in found} == set(SOURCES)
     named = [tuple(value for key, value in row.items() if key != "value") for row in found]
     assert len(set(named)) == len(named)
     kept = {row.seed: row.value for row in read(RESULTS / "needle.csv") if row[:4] + row[5:6] == NEEDLE}
@@ -112,20 +79,8 @@ def test_the_page_and_the_figure_have_every_study(tmp_path):
     mixtures = [row for study, measure in measured for row in rows("mixture", {0: 0.5, 1: 0.6}, study, measure)]
     pages = [row for study, measure in measured for row in rows("options", {0: 0.8, 1: 0.9}, study, measure)]
     found = comparisons(mixtures, pages)
-    text = page(found, checks(rows("options", {0: 0.8}), pages), ["`a command`: 3 of mixture"])
+    text = page(found, checks(rows("options", {0: 0.8}), pages))
     assert "| needle | 20 | success | - | - | 55% | 85% | - | - | - | **+30% [+30%, +30%]** | - | 2 |" in text
     assert "- needle, 1 cell of options again: success reproduced: 1 of 1." in text
-    assert text.endswith("- `a command`: 3 of mixture\n")
     draw(everything(found), tmp_path / "memory.png")
     assert (tmp_path / "memory.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_table_of_readme_is_that_of_the_page():
-    found, _ = compared()
-    readme = (ROOT / "README.md").read_text()
-    assert with_table(readme, short(found)) == readme
-    assert short(found).count("\n") == 1 + len(ACTED)
-    other = with_table(readme, "other")
-    assert other == readme.replace(short(found), "other") != readme  # what stands around the table stays
-    with pytest.raises(ValueError, match="substring not found"):
-        with_table("no table", "other")

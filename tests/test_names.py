@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from command_line import call
+from time_lines import embedded
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
@@ -108,7 +109,7 @@ def test_names_are_shown_wherever_options_are(files):
     for page in (run / "report.html", outputs["--html"]):
         text = page.read_text()
         assert "&lt;go&gt; (option 1)" in text
-        assert 'title="pick &amp; place, steps ' in text
+        assert embedded(text)["lanes"][0]["names"] == ["control", "<go>", "pick & place", "on"]
         assert "<go>" not in text
     fit = ddco_pyro.load(run)
     truth = [fit.names["skill"][option] for row in fit.segment(fit.demonstrations)[0] for option in row]

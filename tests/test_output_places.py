@@ -141,8 +141,8 @@ def test_a_file_of_the_run_is_no_output(inputs: Path, monkeypatch, name: str) ->
 def test_two_outputs_of_one_name_are_refused(inputs: Path, tmp_path: Path, monkeypatch, second: str) -> None:
     monkeypatch.chdir(tmp_path)
     Path("link").symlink_to("a")
-    ended = call("segment", inputs / "run", inputs / "demos.hdf5", "--csv", "a", "--html", second)
-    refused(ended, f"--html {Path(second)}: is also where --csv is written; choose another place")
+    ended = call("segment", inputs / "run", inputs / "demos.hdf5", "--html", "a", "--csv", second)
+    refused(ended, f"--csv {Path(second)}: is also where --html is written; choose another place")
     ended = call("segment", inputs / "run", inputs / "demos.hdf5", "--csv", "new/a", "--lerobot", "new")
     refused(ended, "--lerobot new: and --csv new/a lie in one another")
     assert [path.name for path in tmp_path.iterdir()] == ["link"]
@@ -183,7 +183,7 @@ def file(toy_spec, tmp_path: Path) -> Path:
 def test_devices_stay_and_a_link_is_kept(toy_run, file: Path, tmp_path: Path) -> None:
     (tmp_path / "link.csv").symlink_to(tmp_path / "there.csv")
     ended = call("segment", toy_run.folder, file, "--csv", "/dev/null", "--html", tmp_path / "link.csv")
-    assert (ended.status, ended.out) == (0, f"/dev/null\n{tmp_path / 'link.csv'}\n")
+    assert (ended.status, ended.out) == (0, f"{tmp_path / 'link.csv'}\n/dev/null\n")
     assert Path("/dev/null").is_char_device()
     assert (tmp_path / "link.csv").is_symlink()
     assert (tmp_path / "there.csv").read_text().startswith("<!doctype html>")

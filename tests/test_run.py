@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import shutil
-import subprocess
-import sys
 from dataclasses import asdict
 
 import numpy as np
@@ -93,23 +90,6 @@ def test_whoever_watches_is_told_what_goes_on(toy_run, watched):
     assert watched.of(TrainingBegan, TrainingEnded) == [event for pair in models for event in pair]
     collected = [DemonstrationsDone(n, 12) for n in range(1, 13)]
     assert watched.of(DemonstrationsDone) in (collected, [])  # nothing where they are in the cache
-
-
-FIRST_ELIMINATION = """
-import torch
-from oracle import random_tables
-from ddco_pyro.inference import log_likelihood
-torch.set_num_threads(1)
-log_likelihood(random_tables((2,), (False,)), torch.tensor([4]))
-print(torch.get_num_threads())
-"""
-
-
-def test_the_compiled_engine_leaves_the_number_of_threads_alone():
-    """Its first call in a process sets OpenMP's; torch then used every core, tenfold slower on a busy machine."""
-    environment = os.environ | {"NUMBA_NUM_THREADS": "2"}
-    ended = subprocess.run([sys.executable, "-c", FIRST_ELIMINATION], env=environment, capture_output=True, text=True)
-    assert ended.stdout == "1\n"
 
 
 def test_versions_and_seconds_are_kept(toy_run):

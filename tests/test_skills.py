@@ -8,10 +8,12 @@ import av
 import cv2
 import numpy as np
 import pytest
+import torch
 from scipy.cluster.hierarchy import linkage
 
 from ddco_pyro.drawing.diagrams import dendrogram, path_film, transition_graph
-from ddco_pyro.drawing.shown import projection
+from ddco_pyro.drawing.shown import frames, projection
+from ddco_pyro.report.inputs import _shares
 from ddco_pyro.report.skills import Instance, aligned, film_of, instances, sheet_of, transitions
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
 
@@ -114,3 +116,20 @@ def test_a_dendrogram_joins_the_alike_first():
     assert re.findall(r">(\d+\.\d\d)<", drawn) == ["1.00", "12.50"]
     names = re.findall(r">(reach|grasp|lift)<", drawn)
     assert abs(names.index("reach") - names.index("grasp")) == 1
+
+
+def test_shares_are_those_of_the_weights_of_a_linear_policy():
+    """y = (3 a, 4 a + 2 b) with standard deviations 1 of a and 5 of b: 3² + 4² beside (2 × 5)²."""
+    vectors = {key: torch.randn(2, 4, 1).requires_grad_() for key in ("a", "b", "unread")}
+    numbers = torch.cat([3 * vectors["a"], 4 * vectors["a"] + 2 * vectors["b"]], dim=-1)
+    spread = {"a": torch.ones(1), "b": 5 * torch.ones(1), "unread": torch.ones(1)}
+    found = _shares(numbers, torch.rand(2, 4).double(), vectors, spread)
+    assert found == pytest.approx({"a": 25 / 125, "b": 100 / 125, "unread": 0})
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_pictures_of_any_number_of_channels_are_shown_in_colour(channels):
+    pictures = np.random.default_rng(0).integers(0, 256, (5, 8, 6, channels), dtype=np.uint8)
+    shown = frames(pictures, [1, 1, 4], height=8)
+    kept = [0, 1, 2] if channels >= 3 else [0, 0, 0]
+    assert np.array_equal(shown, pictures[[1, 1, 4]][..., kept])

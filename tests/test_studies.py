@@ -18,6 +18,7 @@ import toy_task
 import yaml
 from command_line import call
 from killing import struck
+from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import only_one
@@ -124,9 +125,13 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
         ({"contrasts": [{"contrast": "options - flat", "measure": "ari", "demonstrations": 6}]}, "not among measures"),
         ({"overrides": {"training.epoch": 3}}, "training.epoch: unknown key; did you mean training.epochs?"),
         ({"methods": {"options": {}, "mine": {"by": "mine"}}}, "methods.mine.by: names a method of an adapter"),
-        ({"choose": "nats"}, "choose: and seeds.development go together"),
+        ({"choose": "nats"}, "choose: goes together with seeds.development"),
         ({"starts": {"test": {"count": 3}}}, "tasks: missing; name the task in which methods act"),
         ({"tasks": ["needle", "pushing"]}, "tasks: are several, but demonstrations.path names one file"),
+        (
+            {"overrides": {"hierarchy.levels.0.policy.network": "os:system"}},
+            "options: would import user code (os:system)",
+        ),
         ({"world": "os:system", "tasks": ["a"], "demonstrations": RECORDED, "contrasts": []}, "would import user code"),
     ],
 )
@@ -502,6 +507,29 @@ def test_the_command_says_what_is_left(made, tmp_path, monkeypatch):
 
 
 def test_pages_of_the_project_agree_with_the_tables():
-    for page in ("README.md", "docs/results/README.md"):
-        text = (ROOT / page).read_text()
-        assert render(text, ROOT / "studies") == text
+    text = (ROOT / "README.md").read_text()
+    assert render(text, ROOT / "studies") == text
+    assert len(report._QUOTED.findall(text)) == 9
+
+
+@pytest.mark.parametrize("name", ["needle", "pushing", "arena", "bins"])
+def test_kept_results_are_not_done_again(name, tmp_path):
+    folder = Folder(Study.load(ROOT / "studies" / f"{name}.yaml", allow_code=True), tmp_path)
+    assert not folder.state().missing
+
+
+def test_a_quoted_difference_is_that_of_both_tables():
+    """The needle's row of README: mixtures of one table minus flat policies of another one, paired by seed."""
+    found = {}
+    for table, method in (("needle", "flat"), ("memory", "mixture")):
+        with (ROOT / "docs" / "results" / f"{table}.csv").open() as file:
+            for row in csv.DictReader(file):
+                named = (row["study"], row["method"], row["demonstrations"], row["measure"].partition(",")[0])
+                if named == ("needle", method, "100", "success"):
+                    found.setdefault(method, {})[row["seed"]] = float(row["value"])
+    test = stats.ttest_rel([found["mixture"][seed] for seed in found["flat"]], [*found["flat"].values()])
+    low, high = test.confidence_interval(0.95)
+    mean = np.mean([found["mixture"][seed] - found["flat"][seed] for seed in found["flat"]])
+    assert f"<!-- study needle: mixture - flat; success; 100 -->**{mean:+.0%} [{low:+.0%}, {high:+.0%}]**" in (
+        ROOT / "README.md"
+    ).read_text().replace("−", "-")

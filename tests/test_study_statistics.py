@@ -70,6 +70,15 @@ def test_intervals_cover_the_mean_of_bimodal_results():
     assert 0.88 <= covered[1] / studies <= 0.98  # a percentile interval of twelve units is somewhat short
 
 
+@pytest.mark.parametrize(("seeds", "covered"), [(5, 0.67), (10, 0.88)])
+def test_few_seeds_that_may_collapse_are_too_few(seeds, covered):
+    """One task: a fit collapses in one of five seeds, so none of five does so with probability 0.8⁵ = 0.33."""
+    random, studies = np.random.default_rng(6), 500
+    rates = np.where(random.random((studies, seeds)) < 0.2, 0.3, 0.95)
+    found = [estimate({"push": by_seed(own)}).interval for own in random.binomial(50, rates) / 50]
+    assert sum(low <= 0.82 <= high for low, high in found) / studies == pytest.approx(covered, abs=0.05)
+
+
 def test_a_test_errs_as_often_as_its_level_says():
     random, wrong = np.random.default_rng(5), 0
     for _ in range(1000):

@@ -121,7 +121,10 @@ def _every(found: Iterable[Observed | None]) -> list[Observed]:
 
 
 def frames(observed: Observed, steps: Sequence[int] | np.ndarray, height: int) -> np.ndarray:
-    """The pictures of these steps, uint8 [F, height, W, 3] in red, green and blue."""
+    """The pictures of these steps, uint8 [F, height, W, 3] in red, green and blue.
+
+    Of fewer than three channels the first is shown, in grey; of more, the first three.
+    """
     import cv2  # one's own vectors need none of it
 
     chosen = np.unique(steps)
@@ -130,7 +133,7 @@ def frames(observed: Observed, steps: Sequence[int] | np.ndarray, height: int) -
         read = np.asarray(observed[first : last + 1])[chosen - first]
     else:
         read = np.stack([np.asarray(observed[int(step)]) for step in chosen])
-    coloured = read[..., :3] if read.shape[-1] > 1 else np.repeat(read, 3, axis=-1)
+    coloured = read[..., :3] if read.shape[-1] >= 3 else np.repeat(read[..., :1], 3, axis=-1)
     width = max(1, round(height * read.shape[2] / read.shape[1]))
     how = cv2.INTER_AREA if height < read.shape[1] else cv2.INTER_NEAREST
     sized = [cv2.resize(np.ascontiguousarray(picture), (width, height), interpolation=how) for picture in coloured]

@@ -77,8 +77,7 @@ class Elimination(NamedTuple):
         return Tables(selection, termination, (*levels, meta_policy))
 
     def _table(self, part: Part) -> Tensor:
-        own = torch.from_numpy(self.posteriors[part.group])[:, part.columns]
-        return self.alive.put(own, part.link.shape)
+        return self.alive.put(self.posteriors[part.group][:, part.columns], part.link.shape)
 
 
 class Eliminate(torch.autograd.Function):
@@ -130,7 +129,7 @@ def _gradients(found: Elimination, weight: Array, needed: Sequence[bool]) -> lis
             gradients.append(None)
         else:
             weighted = found.posteriors[part.group][:, part.columns] * weight[:, None]
-            gradients.append(found.alive.put(torch.from_numpy(weighted), part.link.shape))
+            gradients.append(found.alive.put(weighted, part.link.shape))
     return gradients
 
 
@@ -138,9 +137,9 @@ def _evidence_gradients(tables: Tables, found: Elimination, weight: Array) -> li
     """The marginals of the levels with evidence; None where they were not asked for."""
     if not found.posteriors.choice.shape[1]:
         return [None] * tables.depth
-    weighted = torch.from_numpy(found.posteriors.choice * weight[:, None]).split(tables.sizes, dim=-1)
+    weighted = np.split(found.posteriors.choice * weight[:, None], np.cumsum(tables.sizes)[:-1], axis=1)
     return [
-        None if own is None else found.alive.put(part.to(own.dtype), own.shape)
+        None if own is None else found.alive.gradient(part, own)
         for part, own in zip(weighted, tables.evidence, strict=True)
     ]
 
@@ -193,9 +192,9 @@ def eliminate(tables: Tables, lengths: Tensor, marginals: bool = False, parts: l
     choices = np.empty((steps, sum(tables.sizes) if marginals and not one_level else 0))
     given = Rows(rows[0], rows[1], rows[2], np.exp(choice))
     posteriors = Rows(found[0], found[1], found[2], choices)
-    kernel.match_torch_threads()
     run = kernel.one_level if one_level else kernel.any_levels
-    run(given, starts, lengths.numpy(), value.numpy(), exact, posteriors, structure)
+    others = given, starts, lengths.numpy(), value.numpy(), exact, posteriors, structure
+    kernel.on_threads(lambda first, last: run(first, last, *others), lengths.numpy())
     if one_level and marginals:
         posteriors = posteriors._replace(choice=posteriors.control)
     elimination = Elimination(value.add_(shift), given, posteriors, kept, alive, parts)

@@ -11,7 +11,8 @@ spread by the selections, and the kept mass.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -27,11 +28,14 @@ IMPOSSIBLE = -1
 TOLERANCE = 1e-9
 """Allowed error of Σ_s α_t(s) β_t(s) = 1. Rounding changes the sum by less than 1e-12 over 10 000 steps."""
 
+STEPS_A_THREAD = 4096
+"""Steps of trajectories that are worth a thread of their own."""
+
 SMALL = 1e-150
 """Logarithms of products are taken before the product of two such numbers underflows."""
 
 jit = numba.njit(cache=True, error_model="numpy", forceinline=True)
-parallel = numba.njit(cache=True, error_model="numpy", parallel=True)
+releasing = numba.njit(cache=True, error_model="numpy", nogil=True)
 
 
 class Structure(NamedTuple):
@@ -116,14 +120,16 @@ class Rows(NamedTuple):
     choice: Array
 
 
-def match_torch_threads() -> None:
-    """Let compiled loops run on ``torch.get_num_threads()`` threads."""
-    threads = torch.get_num_threads()
-    own = min(threads, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-    if numba.get_num_threads() != own:
-        numba.set_num_threads(own)
-    if torch.get_num_threads() != threads:  # numba's first call sets OpenMP's number for the whole process
-        torch.set_num_threads(threads)
+def on_threads(run: Callable[[int, int], object], lengths: Array) -> None:
+    """Call ``run(first, last)`` for parts of the trajectories, on at most ``torch.get_num_threads()`` threads."""
+    number = len(lengths)
+    threads = min(torch.get_num_threads(), number, 1 + int(lengths.sum()) // STEPS_A_THREAD)
+    if threads == 1:
+        run(0, number)
+        return
+    bounds = [number * part // threads for part in range(threads + 1)]
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(run, bounds[:-1], bounds[1:]))
 
 
 @jit
@@ -326,21 +332,22 @@ def _backward(rows: Rows, messages: Array, spread: Array, scale: Array, posterio
     return exact
 
 
-@parallel
+@releasing
 def any_levels(
-    rows: Rows, starts: Array, lengths: Array, value: Array, exact: Array, posteriors: Rows, of: Structure
-) -> None:
-    """Fill log-likelihoods ``value`` [N], whether they are ``exact`` [N], and the posteriors of the rows.
+    first: int, last: int, rows: Rows, starts: Array, lengths: Array, value: Array, exact: Array, posteriors: Rows,
+    of: Structure,
+) -> None:  # fmt: skip
+    """Of trajectories ``first`` to ``last``, fill log-likelihoods ``value`` [N], whether they are ``exact`` [N], and
+    the posteriors of the rows.
 
     :param starts: the first row of each trajectory, [N].
     """
-    sizes, firsts, ends, callers, actors, choices = of  # a parallel loop takes no tuple within a tuple
-    for n in numba.prange(len(lengths)):
-        steps, own_structure = lengths[n], Structure(sizes, firsts, ends, callers, actors, choices)
-        messages, spread = np.empty((1 + steps, firsts[-1])), np.empty((steps, firsts[-1]))
-        scale, own = np.empty(steps), trajectory(rows, starts[n], steps)
-        value[n] = _forward(own, messages, spread, scale, own_structure)
-        exact[n] = _backward(own, messages, spread, scale, trajectory(posteriors, starts[n], steps), own_structure)
+    for n in range(first, last):
+        steps, own = lengths[n], trajectory(rows, starts[n], lengths[n])
+        messages, spread = np.empty((1 + steps, of.starts[-1])), np.empty((steps, of.starts[-1]))
+        scale = np.empty(steps)
+        value[n] = _forward(own, messages, spread, scale, of)
+        exact[n] = _backward(own, messages, spread, scale, trajectory(posteriors, starts[n], steps), of)
 
 
 # One level is the common case, and four times faster on its own: nothing goes up or comes down. Its ``messages``
@@ -412,12 +419,13 @@ def _backward_one(rows: Rows, messages: Array, ended: Array, scale: Array, poste
     return exact
 
 
-@parallel
+@releasing
 def one_level(
-    rows: Rows, starts: Array, lengths: Array, value: Array, exact: Array, posteriors: Rows, _: Structure
-) -> None:
+    first: int, last: int, rows: Rows, starts: Array, lengths: Array, value: Array, exact: Array, posteriors: Rows,
+    _: Structure,
+) -> None:  # fmt: skip
     """:func:`any_levels` for one level, whose factors of choices are in the controls."""
-    for n in numba.prange(len(lengths)):
+    for n in range(first, last):
         steps, own = lengths[n], trajectory(rows, starts[n], lengths[n])
         messages, ended, scale = np.empty((1 + steps, own.selection.shape[1])), np.empty(steps), np.empty(steps)
         value[n] = _forward_one(own, messages, ended, scale)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ddco_pyro.inference.arguments import refuse_impossible
 from ddco_pyro.inference.fused import choice_factors
-from ddco_pyro.inference.kernel import Array, Rows, Structure, match_torch_threads, parallel, trajectory
+from ddco_pyro.inference.kernel import Array, Rows, Structure, on_threads, releasing, trajectory
 from ddco_pyro.model.links import Alive
 from ddco_pyro.model.tables import Tables
 
@@ -101,8 +101,8 @@ def _trace(tables: Tables, lengths: Tensor, best: bool, uniforms: np.ndarray) ->
     )
     rows = Rows(selection, termination, control, choice_factors(tables, alive))
     starts = (lengths.cumsum(0) - lengths).numpy()
-    match_torch_threads()
-    _trace_all(rows, starts, lengths.numpy(), best, uniforms, joint, terminated, possible, structure)
+    others = rows, starts, lengths.numpy(), best, uniforms, joint, terminated, possible, structure
+    on_threads(lambda first, last: _trace_all(first, last, *others), lengths.numpy())
     refuse_impossible(torch.from_numpy(possible))
     within = joint >= 0
     return Path(
@@ -205,6 +205,16 @@ def _pick(values: Array, best: bool, uniform: float) -> int:
 
 
 @jit
+def _keeps(kept: float, selected: float, best: bool, uniform: float) -> bool:
+    """:func:`_pick` of two logarithms: whether the first is picked."""
+    if best:
+        return kept >= selected
+    larger = max(kept, selected)
+    first, second = np.exp(kept - larger), np.exp(selected - larger)
+    return uniform * (first + second) < first
+
+
+@jit
 def _before(t: int, d: int, index: int, rows: Rows, messages: Array, best: bool, uniforms: Array, of: Structure) -> int:
     """The joint choice at t - 1, given entry ``index`` of level d + 1's message and termination of all levels to d."""
     for level in range(d, -1, -1):
@@ -231,26 +241,27 @@ def _back(
     possible = messages[steps, index] > -np.inf
     for t in range(steps - 1, -1, -1):
         joint[t] = index
-        d = 0
-        while d < depth:
+        ended = depth
+        for d in range(depth):
             kept = _kept(t, d, index, rows, messages, of) if t > 0 else -np.inf
             selected = _selected(t, d, index, rows, spread, of)
-            if _pick(np.array([kept, selected]), best, uniforms[t, d]) == 0 and kept > -np.inf:
+            if kept > -np.inf and _keeps(kept, selected, best, uniforms[t, d]):
+                ended = d
                 break
             index = _above(d, index, of)
-            d += 1
-        terminated[t] = d
+        terminated[t] = ended
         if t > 0:
-            index = _before(t, d - 1, index, rows, messages, best, uniforms[t], of)
+            index = _before(t, ended - 1, index, rows, messages, best, uniforms[t], of)
     return bool(possible)
 
 
-@parallel
+@releasing
 def _trace_all(
-    rows: Rows, starts: Array, lengths: Array, best: bool, uniforms: Array, joint: Array, terminated: Array,
-    possible: Array, of: Structure,
+    first: int, last: int, rows: Rows, starts: Array, lengths: Array, best: bool, uniforms: Array, joint: Array,
+    terminated: Array, possible: Array, of: Structure,
 ) -> None:  # fmt: skip
-    """Fill the ``joint`` choices [M, N, T] of M paths, and how many levels ``terminated`` before each.
+    """Of trajectories ``first`` to ``last``, fill the ``joint`` choices [M, N, T] of M paths, and how many levels
+    ``terminated`` before each.
 
     ``possible`` [N] says which trajectories have a probability above 0; the paths of others mean nothing.
 
@@ -258,13 +269,9 @@ def _trace_all(
     :param best: the most likely path instead of a draw from the posterior.
     :param uniforms: numbers uniform in [0, 1), [M, N, 1 + T, 2·D].
     """
-    sizes, firsts, ends, callers, actors, choices = of  # a parallel loop takes no tuple within a tuple
-    for n in numba.prange(len(lengths)):
-        structure = Structure(sizes, firsts, ends, callers, actors, choices)
+    for n in range(first, last):
         own = trajectory(rows, starts[n], lengths[n])
-        messages, spread = np.empty((1 + lengths[n], firsts[-1])), np.empty((lengths[n], firsts[-1]))
-        _forward(own, best, messages, spread, structure)
+        messages, spread = np.empty((1 + lengths[n], of.starts[-1])), np.empty((lengths[n], of.starts[-1]))
+        _forward(own, best, messages, spread, of)
         for m in range(len(joint)):
-            possible[n] = _back(
-                own, messages, spread, best, uniforms[m, n], joint[m, n], terminated[m, n], structure
-            )  # fmt: skip
+            possible[n] = _back(own, messages, spread, best, uniforms[m, n], joint[m, n], terminated[m, n], of)

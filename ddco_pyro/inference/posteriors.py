@@ -53,7 +53,7 @@ def posterior(tables: Tables, lengths: Tensor) -> Posterior:
     found = fused.eliminate(tables, lengths, marginals=True)
     refuse_impossible(found.value > NEVER)
     posteriors, shape = found.tables, torch.Size([len(lengths), tables.steps, sum(tables.sizes)])
-    u = found.alive.put(torch.from_numpy(found.posteriors.choice), shape).split(tables.sizes, dim=-1)
+    u = found.alive.put(found.posteriors.choice, shape).split(tables.sizes, dim=-1)
     v = tuple(
         torch.cat([u_d[..., :1], selected.sum(2)[..., 1:]], dim=-1)  # choice 0 lasts one step: it is always selected
         for u_d, selected in zip(u, posteriors.selection, strict=True)

@@ -59,24 +59,33 @@ class Alive(NamedTuple):
         alive = np.arange(steps) < lengths.numpy()[:, None]
         return cls(np.flatnonzero(alive), alive.size)
 
+    def only(self, some: Array) -> Alive:
+        """These of the M steps, int64 [...]."""
+        return Alive(self.rows[some], self.number)
+
     def take(self, table: Tensor) -> Array:
-        """The rows of a table [N, T, ...], contiguous: [M, ...]."""
+        """The rows of a table [N, T, ...], contiguous float64 [M, ...], so that a pass is compiled for one type."""
         rows = table.detach().reshape(self.number, *table.shape[2:])
         if len(self.rows) < self.number:
             rows = rows[torch.from_numpy(self.rows)]
-        return np.ascontiguousarray(rows.numpy())
+        return np.ascontiguousarray(rows.numpy(), dtype=np.float64)
 
-    def empty(self, table: Tensor) -> Tensor:
-        """Room for the rows of a table [N, T, ...], [M, ...]."""
-        return torch.empty(len(self.rows), *table.shape[2:], dtype=table.dtype)
+    def empty(self, table: Tensor) -> Array:
+        """Room for the rows of a table [N, T, ...], float64 [M, ...]."""
+        return np.empty((len(self.rows), *table.shape[2:]))
 
-    def put(self, rows: Tensor, shape: torch.Size) -> Tensor:
+    def put(self, rows: Array, shape: torch.Size, dtype: torch.dtype = torch.float64) -> Tensor:
         """The table of rows [M, ...]; 0 past the trajectories."""
+        own = torch.from_numpy(rows).to(dtype)
         if len(self.rows) == self.number:
-            return rows.reshape(shape)
-        table = rows.new_zeros(self.number, *rows.shape[1:])
-        table[torch.from_numpy(self.rows)] = rows
+            return own.reshape(shape)
+        table = own.new_zeros(self.number, *own.shape[1:])
+        table[torch.from_numpy(self.rows)] = own
         return table.reshape(shape)
+
+    def gradient(self, rows: Array, of: Tensor) -> Tensor:
+        """The gradient of a tensor [N, T, ...] from its rows [M, ...]."""
+        return self.put(rows, of.shape, of.dtype)
 
 
 class Posterior(NamedTuple):
@@ -146,16 +155,23 @@ class LogTable(Link):
 
     def fill(self, alive: Alive, rows: Array, first: int) -> None:
         """Copy the table, or its exponentials."""
-        own = torch.from_numpy(rows)[:, first : first + self.columns]
-        own.copy_(torch.from_numpy(alive.take(self.inputs[0])).flatten(1))
-        if not self.log:
-            own.exp_()
+        own = torch.from_numpy(alive.take(self.inputs[0])).flatten(1)
+        torch.from_numpy(rows)[:, first : first + self.columns].copy_(own if self.log else own.exp())
 
     def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
         """The posterior itself."""
-        own = torch.from_numpy(posterior.found)[:, first : first + self.columns]
-        weighted = own * torch.from_numpy(posterior.weight).unsqueeze(-1)
-        return (alive.put(weighted.to(self.inputs[0].dtype), self.shape),)
+        gradient = torch.empty(len(posterior.weight), self.columns, dtype=self.inputs[0].dtype).numpy()
+        _weigh(posterior.found, posterior.weight, first, gradient)
+        return (alive.gradient(gradient, self.inputs[0]),)
+
+
+@jit
+def _weigh(posterior: Array, weight: Array, first: int, gradient: Array) -> None:
+    steps, columns = gradient.shape
+    own = posterior[:, first : first + columns]
+    for m in range(steps):
+        for c in range(columns):
+            gradient[m, c] = weight[m] * own[m, c]
 
 
 class Selection(Link):
@@ -171,19 +187,22 @@ class Selection(Link):
 
     def fill(self, alive: Alive, rows: Array, first: int) -> None:
         """η."""
-        _softmax(alive.take(self.inputs[0]), rows, first, self.control)
+        softmax(alive.take(self.inputs[0]), rows, first, self.control)
 
     def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
         """Posterior minus η times the posterior of its caller."""
         logits = self.inputs[0]
         gradient = alive.empty(logits)
-        _softmax_gradient(*posterior, first, self.control, gradient.numpy())
-        return (alive.put(gradient, logits.shape),)
+        softmax_gradient(*posterior, first, self.control, gradient)
+        return (alive.gradient(gradient, logits),)
 
 
 @jit
-def _softmax(logits: Array, rows: Array, first: int, control: int) -> None:
-    """Blocks of steps lie side by side in memory, so that all but the copies vectorises."""
+def softmax(logits: Array, rows: Array, first: int, control: int) -> None:
+    """The softmax of logits [M, K, C] to K groups of columns of ``rows`` from ``first`` on, each after ``control`` 0s.
+
+    Blocks of steps lie side by side in memory, so that all but the copies vectorises.
+    """
     steps, callers, choices = logits.shape
     block = max(8, BLOCK // choices)
     shares, top, total = np.empty((choices, block)), np.empty(block), np.empty(block)
@@ -209,15 +228,17 @@ def _softmax(logits: Array, rows: Array, first: int, control: int) -> None:
                     total[i] += shares[j, i]
             for i in range(len(own)):
                 total[i] = 1.0 / total[i]
-            out[:, :control] = 0.0
             chosen = out[:, control:]
             for i in range(len(own)):
+                for j in range(control):
+                    out[i, j] = 0.0
                 for j in range(choices):
                     chosen[i, j] = shares[j, i] * total[i]
 
 
 @jit
-def _softmax_gradient(rows: Array, posterior: Array, weight: Array, first: int, control: int, gradient: Array) -> None:
+def softmax_gradient(rows: Array, posterior: Array, weight: Array, first: int, control: int, gradient: Array) -> None:
+    """The gradient of logits [M, K, C] whose :func:`softmax` stands in ``rows``."""
     steps, callers, choices = gradient.shape
     for c in range(callers):
         column = first + c * (control + choices) + control
@@ -251,8 +272,8 @@ class Termination(Link):
         """(q_1 (1 - ψ) - q_0 ψ) times the slope of the bound, for posteriors q."""
         logits = self.inputs[0]
         gradient = alive.empty(logits)
-        _terminate_gradient(*posterior, first, kept, gradient.numpy())
-        return (alive.put(gradient, logits.shape),)
+        _terminate_gradient(*posterior, first, kept, gradient)
+        return (alive.gradient(gradient, logits),)
 
 
 @jit
@@ -262,7 +283,7 @@ def _terminate(logits: Array, tanh: Array, rows: Array, first: int, options: int
     for begin in range(0, len(logits), block):
         own, bound = logits[begin : begin + block], tanh[begin : begin + block]
         for i in range(len(own)):
-            v = np.float64(own[i]) * (2.0 / TERMINATION_BOUND)
+            v = own[i] * (2.0 / TERMINATION_BOUND)
             x[i] = 700.0 if v > 700.0 else v  # NaN stays
         exponentials(x[: len(own)])
         for i in range(len(own)):

@@ -93,8 +93,9 @@ def deciding(fit: Fit, demos: Demonstrations) -> dict[str, dict[str, dict[int, s
             }
     if fit.metrics.branches or fit.hierarchy.encoder.images:
         return found
-    few = demos[: max(1, min(GRADIENT_DEMONSTRATIONS, GRADIENT_STEPS // max(demos.lengths)))]
-    for piece in fit.infer(Demonstrations(tuple(few))):
+    count = max(1, min(GRADIENT_DEMONSTRATIONS, GRADIENT_STEPS // max(demos.lengths), len(demos)))
+    few = demos.select([demos.names[row] for row in np.linspace(0, len(demos) - 1, count).astype(int)])
+    for piece in fit.infer(few):
         seen, time = piece.batch.inputs.vectors, piece.batch.inputs.time
         alive = time < piece.batch.lengths[:, None].to(time.device)
         spread = {key: array[alive].std(0) for key, array in seen.items()}

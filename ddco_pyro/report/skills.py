@@ -63,13 +63,15 @@ class Instance:
 def instances(segmented: Segmented, level: str, option: int) -> list[Instance]:
     """The segments of an option, the most typical first, different demonstrations before the same one again.
 
+    The same option chosen anew stays one segment.
+
     A segment is the more typical, the larger its mean posterior probability (to two digits), then the nearer its length
     to the median length.
     """
     found = [
         Instance(row, start, end, float(demo.levels[level].probability[start:end].mean()))
         for row, demo in enumerate(segmented.segments)
-        for choice, start, end in demo.levels[level].runs()
+        for choice, start, end in demo.levels[level].runs(anew=False)
         if choice == option
     ]
     if not found:
@@ -92,7 +94,7 @@ def transitions(segmented: Segmented, level: str) -> np.ndarray:
     outside = segmented.counts[level] + 1
     counts = np.zeros((outside + 1, outside + 1), int)
     for demo in segmented.segments:
-        choices = [outside, *(choice for choice, _, _ in demo.levels[level].runs()), outside]
+        choices = [outside, *(choice for choice, _, _ in demo.levels[level].runs(anew=False)), outside]
         np.add.at(counts, (choices[:-1], choices[1:]), 1)
     return counts
 

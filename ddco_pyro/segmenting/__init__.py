@@ -55,9 +55,12 @@ class LevelLabels:
         probability = np.minimum(active[np.arange(len(options)), options], 1.0)  # rounding can exceed it
         return cls(options, boundaries, probability, boundary_intervals(options, boundaries, active))
 
-    def runs(self) -> list[tuple[int, int, int]]:
-        """Each segment as (option, first step, step after the last)."""
-        starts = np.flatnonzero(self.boundaries).tolist()
+    def runs(self, anew: bool = True) -> list[tuple[int, int, int]]:
+        """Each segment as (option, first step, step after the last).
+
+        :param anew: whether a segment ends where the same option is chosen anew.
+        """
+        starts = np.flatnonzero(self.boundaries if anew else np.diff(self.options, prepend=-1)).tolist()
         return [(int(self.options[a]), a, b) for a, b in zip(starts, [*starts[1:], len(self.options)], strict=True)]
 
 

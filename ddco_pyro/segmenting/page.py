@@ -57,7 +57,7 @@ def write_page(
 
 def _level(name: str, segmented: Segmented, agreement: LevelAgreement | None) -> Section:
     """How much of the time each option of a level takes, how often, and for how long."""
-    per_demo = [demo.levels[name].runs() for demo in segmented.segments]
+    per_demo = [demo.levels[name].runs(anew=False) for demo in segmented.segments]
     runs = [run for each in per_demo for run in each]
     total = sum(end - start for _, start, end in runs)
     rows = []

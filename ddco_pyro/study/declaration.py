@@ -243,7 +243,7 @@ class Declaration(Model):
 
     def _chosen(self) -> Iterator[tuple[str, str]]:
         if (self.choose is None) != (self.seeds.development is None):
-            yield "choose", "and seeds.development go together; give both or neither"
+            yield "choose", "goes together with seeds.development; give both or neither"
         if self.choose is not None and not self.grid:
             yield "grid", "is empty; name what to choose from"
 
@@ -295,16 +295,14 @@ class Study:
             raise SpecError(*(f"{path}: {line}" for line in lines(error, Declaration))) from None
         own = None if declared.spec == INIT else load_spec(path.parent / declared.spec, (), allow_code)
         study = cls(path, declared, own)
-        code = user_code(declared) | {f"tasks.{n}": task for n, task in enumerate(declared.tasks) if ":" in task}
-        if code and not allow_code:
-            raise SpecError(
-                *(f"{path}: {place}: would import user code ({name}); pass --allow-code if you trust it"
-                  for place, name in code.items())
-            )  # fmt: skip
         if not study.tasks[0] and (declared.starts or declared.demonstrations.path is None):
             where = "the task in which methods act" if declared.starts else "tasks, or a file in demonstrations.path"
             raise SpecError(f"{path}: tasks: missing; name {where}")
-        study.check_overrides()
+        code = user_code(declared) | {f"tasks.{n}": task for n, task in enumerate(declared.tasks) if ":" in task}
+        code |= {f"overrides of {where}": name for where, name in study.overridden_code().items()}
+        if code and not allow_code:
+            text = "pass --allow-code if you trust it"
+            raise SpecError(*(f"{path}: {at}: would import user code ({name}); {text}" for at, name in code.items()))
         return study
 
     @property
@@ -322,18 +320,22 @@ class Study:
         own = {**self.declared.overrides, **point, **self.declared.methods[method].overrides}
         return {"demonstrations.leave_one_out": False, "selection.grid": {}, **own}
 
-    def check_overrides(self) -> None:
-        """Check that the overrides of every method fit the spec.
+    def overridden_code(self) -> dict[str, str]:
+        """The user code that the spec of a method names, by method.
 
-        :raises SpecError: a key path or a value does not.
+        :raises SpecError: the overrides of a method do not fit the spec.
         """
         given: Any = SKELETON if self.base is None else self.base.model_dump(exclude_unset=True)
+        found: dict[str, str] = {}
         for method, point in itertools.product(self.declared.methods, self.declared.points):
+            where = self.declared.label(method, point)
             try:
-                parse_spec(given, self.changes(method, point))
+                spec = parse_spec(given, self.changes(method, point))
             except SpecError as error:
-                where = self.declared.label(method, point)
                 raise SpecError(*(f"{self.path}: {where}: {problem}" for problem in error.problems)) from None
+            if code := user_code(spec):
+                found[where] = ", ".join(code.values())
+        return found
 
     @cached_property
     def source(self) -> Path | None:

@@ -129,15 +129,15 @@ def _plural(name: str, count: int) -> str:
 
 
 def _contrasts(found: Sequence[Tested], to: Path) -> list[Block]:
-    head = ["contrast", "measure", "demos", "has to exceed", "difference [95 % t]", "bootstrap", "p (Holm)", "verdict"]
+    head = ["contrast", "measure", "demos", "verdict", "has to exceed", "difference [95 % t]", "bootstrap", "p (Holm)"]
     table = []
     for one in found:
-        first = [one.spec.contrast, name_of(one.spec.measure), str(one.demonstrations), words.signed(one.spec.bound)]
+        named = [one.spec.contrast, name_of(one.spec.measure), str(one.demonstrations), one.verdict]
         numbers = ["–"] * 3
         if one.found:
             p = "–" if math.isnan(one.p) else words.p_value(one.adjusted)
             numbers = [shown(one.found, "+.2f"), words.interval(bootstrap(one.differences)), p]
-        table.append([*first, *numbers, one.verdict])
+        table.append([*named, words.signed(one.spec.bound), *numbers])
     text = (
         "Differences are paired by task and training seed. The test of each contrast is one-sided, at 2.5 %. For "
         "superiority the difference has to exceed the margin, for non-inferiority minus the margin. Holm's correction "
@@ -165,7 +165,7 @@ def _contrasts(found: Sequence[Tested], to: Path) -> list[Block]:
     with style():
         figure = interval_plot([one.name for one in known], panels)
         picture = _saved(figure, to / "contrasts.png", verdict(found), caption)
-    return [Table(head, table, {0, 1, 7}), picture, note(text)]
+    return [Table(head, table, {0, 1, 3}), picture, note(text)]
 
 
 def _drawn(found: Estimate | None, by_seed: BySeed, bound: float | None = None) -> Interval | None:
@@ -267,7 +267,8 @@ def design(study: Study, rows: Sequence[Row], state: State) -> list[str]:
         lines.append(f"Every method acts from the same {declared.starts.test.count} starts, others for every seed.")
     if declared.kept:
         tables = dict.fromkeys(one.table for one in declared.kept)
-        lines.append(f"Kept results may be older than the contrasts: {', '.join(tables)}.")
+        text = "have the data and seeds of their own studies, and may be older than the contrasts"
+        lines.append(f"Results that are kept in {', '.join(tables)} {text}.")
     if declared.choose is not None:
         lines.append(f"Each method's point of the grid has the highest {declared.choose} on the development seeds.")
     test = [number for number, cell in enumerate(state.cells) if cell.part == "test"]
@@ -335,5 +336,5 @@ def _quoted(rows: Sequence[Row], name: str, quotation: str) -> str:
         raise BadInput(f"study {name}: its tables have no {quotation!r}; check its names, and kept in the study")
     difference = " - " in what
     percent = measure == "success"
-    text = shown(found, named.get("form", ("+z" if difference else "z") + (".0%" if percent else ".2f")))
+    text = shown(found, named.get("form", ("+" if difference else "") + (".0%" if percent else ".2f")))
     return f"**{text}**" if difference and found.interval[0] * found.interval[1] > 0 else text

@@ -73,9 +73,7 @@ class Writer(ABC):
 
     def runs(self, demo: Segments) -> list[Run]:
         """The subtasks of a demonstration: its level's options, where the same option chosen anew stays one run."""
-        options = demo.levels[self.asked.level].options
-        starts = np.flatnonzero(np.diff(options, prepend=-1)).tolist()
-        return [(int(options[a]), a, b) for a, b in zip(starts, [*starts[1:], len(options)], strict=True)]
+        return demo.levels[self.asked.level].runs(anew=False)
 
     def order(self, segmented: Segmented) -> list[int]:
         """The options that are active at all, by how far through a demonstration they are active on average."""

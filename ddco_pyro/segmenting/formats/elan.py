@@ -39,14 +39,14 @@ class ELAN(Writer):
         ElementTree.SubElement(root, "HEADER", MEDIA_FILE="", TIME_UNITS="milliseconds")
         times = ElementTree.SubElement(root, "TIME_ORDER")
         levels = dict(reversed(demo.levels.items()))
-        edges = {0, len(demo)}.union(*(run[1:] for level in levels.values() for run in level.runs()))
+        edges = {0, len(demo)}.union(*(run[1:] for level in levels.values() for run in level.runs(anew=False)))
         for step in sorted(edges):
             value = str(round(step * milliseconds))
             ElementTree.SubElement(times, "TIME_SLOT", TIME_SLOT_ID=f"ts{step}", TIME_VALUE=value)
         number = 0
         for name, level in levels.items():
             tier = ElementTree.SubElement(root, "TIER", TIER_ID=name, LINGUISTIC_TYPE_REF="segments")
-            for option, start, stop in level.runs():
+            for option, start, stop in level.runs(anew=False):
                 number += 1
                 annotation = ElementTree.SubElement(ElementTree.SubElement(tier, "ANNOTATION"), "ALIGNABLE_ANNOTATION")
                 annotation.attrib |= {

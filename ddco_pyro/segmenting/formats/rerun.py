@@ -51,7 +51,7 @@ class Rerun(Writer):
             stream.send_columns(entity, times, columns)
 
         for name, level in demo.levels.items():
-            runs = level.runs()
+            runs = level.runs(anew=False)
             states = [name_in_level(option, name, self.asked.fit.names[name]) for option, _, _ in runs]
             starts = np.array([start for _, start, _ in runs])
             log(f"segments/{_entity(name)}", starts, rerun.StateChange.columns(state=states))
