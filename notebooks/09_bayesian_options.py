@@ -278,13 +278,13 @@ plt.show()
 
 # %% [markdown]
 # The policies of options 1 and 2 are known well, and the three approximations agree on them. Terminations and the
-# meta-policy are known less well: a demonstration has few switches. A guide describes one mode, and its intervals for
-# the policy of option 3 are narrower than those of NUTS. Where the chain has few effective draws, its intervals are
-# rough.
+# meta-policy are known less well: a demonstration has few switches. `AutoNormal` knows no correlations, and most of its
+# intervals for ψ and η of options 1 and 2 are narrower than those of NUTS. Where the chain has few effective draws, its
+# intervals are rough.
 #
 # ## How many options are used?
 #
-# The paths that were drawn with the weights say it.
+# One path was drawn with each draw of weights. The options on it are the used ones.
 
 # %%
 shares = (paths[..., None] == [1, 2, 3]).mean((1, 2))
