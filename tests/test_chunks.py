@@ -140,6 +140,7 @@ def test_the_gradient_of_chunks_is_the_slope(monkeypatch: pytest.MonkeyPatch) ->
     assert float(gradient @ direction) == pytest.approx(slope, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_gradient_takes_the_memory_of_a_chunk() -> None:
     """In a process of its own that gives back at once what it frees: what is left on a heap would be taken again."""
     giving = os.environ | {"MALLOC_MMAP_THRESHOLD_": "100000"}

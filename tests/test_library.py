@@ -169,6 +169,7 @@ fit.fit(sys.argv[1], out=out, on_event=strike, jobs=2)
 """
 
 
+@pytest.mark.slow
 def test_baselines_in_other_processes_are_the_same_also_after_a_kill(commanded: Path, tmp_path: Path, monkeypatch):
     """The first run is killed, with its worker, once the worker has written a checkpoint."""
     data = spec_for(commanded / "demos.hdf5", compare_with=[FLAT, BESIDE])

@@ -66,6 +66,7 @@ def test_priors_and_guides_see_the_same_as_with_enumeration(counts, guide):
         torch.testing.assert_close(gradient, expected[name], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_svi_reaches_the_posterior_mode():
     """There the gradient of the prior and that of the likelihood cancel."""
     pyro.clear_param_store()

@@ -134,6 +134,7 @@ def test_a_folder_is_of_one_pair_and_one_run(planted, tmp_path):
         merge(quick, chosen(quick, options=(2, 3)), out=tmp_path / "merged")
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_run_and_goes_on_where_it_was(toy_run, tmp_path):
     arguments = ("merge", toy_run.folder, "--out", tmp_path / "merged", "--jobs", 1)
     ended = call(*arguments)

@@ -71,6 +71,7 @@ def test_demonstrations_show_what_the_person_saw(demonstrations: Path) -> None:
         assert demo.labels["left"][0] == 3
 
 
+@pytest.mark.slow
 def test_demonstrations_are_fitted_and_rolled_out(demonstrations: Path, tmp_path: Path) -> None:
     fitted = fit(load_spec(SPECS[0], [f"demonstrations.path={demonstrations}", *TINY]), out=tmp_path / "run")
     assert fitted.metrics.engine_check.value < 1e-6
