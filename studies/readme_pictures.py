@@ -38,8 +38,9 @@ COLOURS = 96
 DPI = 100
 SIZE = (560, 420)
 STYLES = {
-    "report": "body > :not(#worth) { display: none } h2 { margin-top: 0 }",
-    "segments": "body > :not(#segments), #segments > p, .demonstration:nth-of-type(n+5) { display: none }",
+    "report": "body > :not(#skills), #skills > :not(.card), .card ~ .card ~ .card { display: none }",
+    "segments": "body > :not(#segments), #segments > :not(.timeline), .bar, .readout, .tracks > :nth-child(n+7) "
+    "{ display: none }",
 }
 """What is left of a page, and so fills a picture of :data:`SIZE`."""
 
@@ -97,7 +98,7 @@ def pages(run: Path, segments: Path) -> None:
     whole = Image.open(run / "figures" / "trajectories.png").convert("RGB")
     small["space"] = trimmed(whole.crop((0, 60, whole.width // 2, whole.height - 60)))
     for name, picture in small.items():
-        ImageOps.pad(picture, SIZE, color="white").quantize(64).save(OUT / f"{name}.png", optimize=True)
+        ImageOps.pad(picture, SIZE, color="white").quantize(224).save(OUT / f"{name}.png", optimize=True)
 
 
 def screen(page: Path, style: str) -> Image.Image:
@@ -105,8 +106,14 @@ def screen(page: Path, style: str) -> Image.Image:
     with tempfile.TemporaryDirectory() as folder:
         styled, shot = Path(folder, "page.html"), Path(folder, "shot.png")
         styled.write_text(page.read_text().replace("</head>", f"<style>{style}</style></head>"))
-        options = ["--headless", "--no-sandbox", "--hide-scrollbars", "--window-size=500,1000"]
-        command = ["chromium", *options, "--force-device-scale-factor=1.25", f"--screenshot={shot}", styled.as_uri()]
+        options = [
+            "--headless",
+            "--no-sandbox",
+            "--hide-scrollbars",
+            "--window-size=820,1000",
+            "--virtual-time-budget=4000",
+        ]
+        command = ["chromium", *options, "--force-device-scale-factor=1", f"--screenshot={shot}", styled.as_uri()]
         subprocess.run(command, check=True, capture_output=True, timeout=120)
         return trimmed(Image.open(shot).convert("RGB"))
 
