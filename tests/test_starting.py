@@ -51,10 +51,27 @@ def two_skills(path: Path, number: int = 12) -> None:
     Demonstrations(tuple(records)).write(path)
 
 
+def short_of_the_truth(fit: ddco_pyro.Fit) -> float:
+    """Held-out nats per step that a fit to :func:`two_skills` lacks, beside the policy that they were drawn from."""
+    held_out = fit.demonstrations.select([one.name for one in fit.metrics.valid])
+    side = [np.where(demo.labels["skill"] == 5, 1, -1)[:, None] * demo.observations["place"] for demo in held_out]
+    truth = stats.norm.logpdf(np.concatenate([demo.actions for demo in held_out]), np.concatenate(side), NOISE).mean()
+    return float(truth - fit.metrics.log_likelihood_per_step.valid)
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="of 156 steps, ridges of 1 take 0.2 nats per step")
+def test_what_it_writes_is_as_likely_by_em_as_the_truth(path: Path, tmp_path: Path) -> None:
+    two_skills(path)
+    spec = tmp_path / "spec.yaml"
+    assert call("init", path, "--out", spec).status == 0
+    assert short_of_the_truth(ddco_pyro.fit(load_spec(spec, ["compare_with=[]"]))) < 0.1
+
+
 @pytest.mark.slow
 def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Path) -> None:
-    """Segments are the planted ones. Held out they are as likely as under the policy that they were drawn from, to 0.1
-    nats per step by Adam. EM's ridges take 0.2 more here, of 156 steps.
+    """Segments are the planted ones. By Adam they are as likely, held out and to 0.1 nats per step, as under the policy
+    that they were drawn from.
     """
     two_skills(path)
     spec = tmp_path / "spec.yaml"
@@ -66,12 +83,8 @@ def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Pa
     assert looked == f"next: ddco-pyro init '{path}' --out 'my demos: 1.yaml'"
     fit = ddco_pyro.load(tmp_path / "run")
     assert fit.spec == load_spec(spec)
-    held_out = Demonstrations.read(path, labels=["skill"]).select([one.name for one in fit.metrics.valid])
-    side = [np.where(demo.labels["skill"] == 5, 1, -1)[:, None] * demo.observations["place"] for demo in held_out]
-    truth = stats.norm.logpdf(np.concatenate([demo.actions for demo in held_out]), np.concatenate(side), NOISE).mean()
-    assert fit.metrics.log_likelihood_per_step.valid > truth - 0.3
     adam = ["compare_with=[]", "training.optimizer={name: adam, lr: 3.0e-3}"]
-    assert ddco_pyro.fit(load_spec(spec, adam)).metrics.log_likelihood_per_step.valid > truth - 0.1
+    assert short_of_the_truth(ddco_pyro.fit(load_spec(spec, adam))) < 0.1
     assert list(fit.baselines) == ["mixture", "flat", "flat_equal"]
     assert fit.metrics.agreement.valid[0].nmi > 0.95  # with the labels in the file
 
