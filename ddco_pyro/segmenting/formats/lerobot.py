@@ -58,6 +58,10 @@ class Form(ABC):
     def write(self, dataset: LeRobot, subtasks: Subtasks) -> None:
         """Write the subtasks into a dataset of our own."""
 
+
+class FrameColumns(Form):
+    """Subtasks as further columns of frames."""
+
     def write_columns(self, dataset: LeRobot, subtasks: Subtasks) -> None:
         """Add columns of frames to the data files, one row group for each episode, as LeRobot does."""
         for path in dataset.data_files:
@@ -91,6 +95,7 @@ class Form(ABC):
                 raise BadInput(f"the data files have rows of episode {episode} that meta/episodes does not name")
             yield rows, self.columns(rows, subtasks.options(episode), subtasks.names)
 
+    @abstractmethod
     def columns(self, rows: pyarrow.Table, options: np.ndarray, names: list[str]) -> dict[str, pyarrow.Array]:
         """The new columns of an episode.
 
@@ -98,14 +103,13 @@ class Form(ABC):
         :param options: the option of each row [T].
         :param names: the subtask of each option.
         """
-        raise NotImplementedError
 
     def metadata(self, known: Mapping[bytes, bytes]) -> dict[bytes, bytes]:
         """The metadata of the data files, from the metadata before."""
         return dict(known)
 
 
-class Language(Form):
+class Language(FrameColumns):
     """LeRobot 0.6 and newer: each row holds all subtasks of its episode in ``language_persistent``.
 
     A subtask lasts from its ``timestamp``, the time of its first frame, to the next subtask. The page on which
@@ -149,7 +153,7 @@ class Language(Form):
         }
 
 
-class SubtaskIndex(Form):
+class SubtaskIndex(FrameColumns):
     """LeRobot 0.4 and 0.5: ``subtask_index`` of each frame, and the names in ``meta/subtasks.parquet``."""
 
     features: ClassVar = {SUBTASK: {"dtype": "int64", "shape": [1], "names": None}}
