@@ -20,6 +20,7 @@
 # %%
 import os
 import warnings
+from functools import partial
 from pathlib import Path
 
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
@@ -41,6 +42,7 @@ from torch.func import functional_call
 from ddco_pyro import Demonstration, Demonstrations, EliminatedAHMM, fit
 from ddco_pyro.fitting.draws import matched
 from ddco_pyro.inference import log_likelihood, most_likely_path, posterior, sample_paths
+from ddco_pyro.inference.marginal import bayesian_ahmm
 from ddco_pyro.model.ahmm import Acting, ahmm, choose
 from ddco_pyro.model.batch import encode
 from ddco_pyro.model.emissions import Gaussian
@@ -183,16 +185,7 @@ priors = {
 }
 site = {name: name.replace(".", "_") for name in priors}
 start = {site[name]: weight.detach().clone() for name, weight in hierarchy.named_parameters()}
-
-
-def bayesian(batch):
-    weights = {name: pyro.sample(site[name], prior) for name, prior in priors.items()}
-    # log-probabilities are float64, so NUTS has float64 weights; networks are float32
-    outputs = functional_call(hierarchy, {name: weight.float() for name, weight in weights.items()}, (batch.inputs,))
-    with pyro.plate("demonstrations", len(batch)):
-        pyro.sample("controls", EliminatedAHMM(outputs, batch.lengths), obs=batch.actions)
-    return outputs
-
+bayesian = partial(bayesian_ahmm, hierarchy, priors)
 
 # %% [markdown]
 # EM stops where a step gains less than 1e-5 nats for each step of the demonstrations. From there, gradient ascent of

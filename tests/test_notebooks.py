@@ -41,8 +41,7 @@ def test_a_notebook_holds_outputs_and_no_logic(path):
     assert any("image/png" in output.get("data", {}) for cell in code for output in cell.outputs)
     assert not any(output.output_type == "error" for cell in code for output in cell.outputs)
     tree = ast.parse("\n".join(cell.source for cell in code))
-    own = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Lambda)]
-    assert all("pyro.sample(" in ast.unparse(node) for node in own), "a Pyro model is the only function of a notebook"
+    assert not any(isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Lambda) for node in ast.walk(tree))
     assert not re.search(r"/(home|root|tmp|work)/", path.read_text())
 
 

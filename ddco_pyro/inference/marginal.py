@@ -1,8 +1,8 @@
-"""The AHMM with its latents eliminated, as a Pyro distribution for models with priors and guides."""
+"""The AHMM with its latents eliminated: a Pyro distribution, and a Pyro program with priors on the weights."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, cast
 
 import pyro
@@ -10,10 +10,13 @@ import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
+from torch.func import functional_call
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.arguments import BadTables, check_lengths
 from ddco_pyro.model.ahmm import run
+from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.model.tables import complete
 
@@ -24,7 +27,7 @@ class EliminatedAHMM(TorchDistribution):
     In a plate over demonstrations it replaces the enumerated model :func:`ddco_pyro.model.ahmm.ahmm`:
     ``pyro.sample("controls", EliminatedAHMM(hierarchy(batch.inputs), batch.lengths), obs=batch.actions)``.
     Its gradient is the posterior; second derivatives raise an error. The batch shape is [N], the event shape [T, A].
-    ``log_prob`` is float64, which NUTS makes the type of all weights: give networks ``weight.float()``.
+    ``log_prob`` is float64, which NUTS makes the type of all weights: :func:`bayesian_ahmm` gives networks their own.
 
     >>> from ddco_pyro.model.batch import encode
     >>> batch = encode(demos, fit.hierarchy.encoder, fit.hierarchy.scaling)
@@ -73,3 +76,30 @@ class EliminatedAHMM(TorchDistribution):
             steps = range(self.event_shape[0])
             controls = torch.stack([cast(Tensor, drawn.trace.nodes[f"a_{t}"]["value"]) for t in steps], dim=1)
             return torch.where(chain.alive.unsqueeze(-1), controls, 0.0)
+
+
+def bayesian_ahmm(hierarchy: Hierarchy, priors: Mapping[str, TorchDistribution], batch: Batch) -> Outputs:
+    """The AHMM with priors on its weights, as a Pyro program: options and terminations are eliminated (§4.1).
+
+    Bind hierarchy and priors with :func:`functools.partial` for a guide, SVI or NUTS. Each prior is a site with the
+    parameter's name, in which ``_`` replaces each dot. Other parameters are the hierarchy's own.
+
+    >>> import pyro, pyro.distributions as dist
+    >>> from ddco_pyro.inference.marginal import bayesian_ahmm
+    >>> from ddco_pyro.model.batch import encode
+    >>> batch = encode(demos, fit.hierarchy.encoder, fit.hierarchy.scaling)
+    >>> weights = dict(fit.hierarchy.named_parameters())
+    >>> priors = {name: dist.Normal(0, 1).expand(weight.shape).to_event() for name, weight in weights.items()}
+    >>> trace = pyro.poutine.trace(bayesian_ahmm).get_trace(fit.hierarchy, priors, batch)
+    >>> len(trace.stochastic_nodes) == len(weights), trace.nodes["controls"]["value"].shape
+    (True, torch.Size([6, 10, 2]))
+
+    :param priors: a distribution of each parameter by its name, with the parameter's shape as event shape.
+    :return: the networks' outputs under the drawn weights.
+    """
+    drawn = {name: pyro.sample(name.replace(".", "_"), prior) for name, prior in priors.items()}
+    weights = {name: weight.to(hierarchy.get_parameter(name).dtype) for name, weight in drawn.items()}
+    outputs: Outputs = functional_call(hierarchy, weights, (batch.inputs,))
+    with pyro.plate("demonstrations", len(batch), dim=-1):
+        pyro.sample("controls", EliminatedAHMM(outputs, batch.lengths), obs=batch.actions)
+    return outputs
