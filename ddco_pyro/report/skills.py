@@ -133,6 +133,7 @@ def section(fit: Fit, demos: Demonstrations, pictures: Sequence[Observed], segme
         for choice in present:
             facts = _facts(steps[choice] / steps.sum(), every[choice], counts, choice, names)
             facts |= {what: values[choice] for what, values in reads.get(level, {}).items() if choice in values}
+            facts = {what: said.replace(" %", "\N{NO-BREAK SPACE}%") for what, said in facts.items()}
             title = Cell(numbered_name(choice, names), colour=option_colour(choice))
             blocks.append(Card(title, [Facts(facts), *shown.blocks(every[choice], choice)]))
         if unused := [numbered_name(choice, names) for choice in range(1, len(names)) if not every[choice]]:
