@@ -70,7 +70,7 @@ def fit(
     jobs: Annotated[
         int | None,
         typer.Option(
-            help="Processes that train restarts, or long baselines beside the model; -1, the default, is one for each "
+            help="Processes that train restarts, or baselines beside the model; -1, the default, is one for each "
             "core, 1 is this process alone."
         ),
     ] = None,

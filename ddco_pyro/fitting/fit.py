@@ -81,7 +81,7 @@ def fit(
     :param out: the run folder, as ``ddco-pyro fit`` makes it, with a copy of demonstrations from memory; None to write
         nothing. An unfinished run is continued; a finished one is loaded.
     :param on_event: called with progress events (:mod:`ddco_pyro.events`).
-    :param jobs: processes that train restarts, or long baselines beside the model, -1 for one on each core; 1 for this
+    :param jobs: processes that train restarts, or baselines beside the model, -1 for one on each core; 1 for this
         process alone. The result is the same for any number. In a script, more than one needs the usual
         ``if __name__ == "__main__":``.
     :param processes: processes that share the work of each gradient step instead, at most ``training.shards``; the
