@@ -38,20 +38,6 @@ def test_stacked_networks_are_separate_networks(settings):
     assert_close(network(inputs)[0], expected)
 
 
-def test_a_linear_network_is_affine():
-    network, one, other = make(network="linear"), make_inputs(), make_inputs()
-    other.vector[:] = torch.randn(other.vector.shape, generator=torch.Generator().manual_seed(2))
-    between = Inputs({"state": 0.3 * one.vector + 0.7 * other.vector}, {}, one.time)
-    assert_close(network(between)[0], 0.3 * network(one)[0] + 0.7 * network(other)[0])
-
-
-def test_an_mlp_is_not_affine():
-    network, one = make(hidden=[8]), make_inputs()
-    twice = Inputs({"state": 2 * one.vector}, {}, one.time)
-    nothing = Inputs({"state": 0 * one.vector}, {}, one.time)
-    assert not torch.allclose(network(twice)[0] + network(nothing)[0], 2 * network(one)[0], atol=1e-3)
-
-
 ACTIVATIONS = {
     "relu": nn.functional.relu,
     "leaky_relu": lambda x: nn.functional.leaky_relu(x, 0.01),
@@ -103,17 +89,6 @@ def test_a_picture_of_one_colour_is_standardised_to_nothing():
     assert gradient.isfinite().all()
 
 
-@pytest.mark.parametrize("name", ACTIVATIONS)
-def test_a_unit_below_0_for_all_that_is_observed_is_dead_only_where_it_is_rectified(name):
-    network = make(hidden=[8], activation=name)
-    first = network.layers[0]
-    with torch.no_grad():
-        first.weight[:, :, 0], first.bias[:, :, 0] = 0, -3
-    network(make_inputs())[0].sum().backward()
-    dead = first.bias.grad[:, 0, 0] == 0
-    assert dead.tolist() == [name == "relu"] * COPIES
-
-
 def test_dropout_drops_only_while_training():
     network, inputs = make(hidden=[64], dropout=0.5), make_inputs()
     quiet = network(inputs)[0]
@@ -160,14 +135,6 @@ def one_at_a_time(network, inputs):
 def test_every_step_has_its_own_network(steps, start):
     network, inputs = make(network="per_timestep", hidden=[6]), make_inputs(steps=steps, start=start)
     assert_close(network(inputs)[0], one_at_a_time(network, inputs))
-
-
-def test_networks_of_different_steps_differ():
-    network = make(network="per_timestep", hidden=[])
-    inputs = make_inputs()
-    inputs.vector[:] = inputs.vector[:, :1]
-    found = network(inputs)[0]
-    assert all(not torch.allclose(found[:, t], found[:, 0]) for t in range(1, LONGEST))
 
 
 @pytest.mark.parametrize(

@@ -366,16 +366,3 @@ def test_a_damaged_picture_is_one_line(kept: Path, tmp_path: Path) -> None:
     ended = call("fit", spec, "--out", tmp_path / "run")
     assert (ended.status, ended.err.count("ddco-pyro:")) == (2, 1)
     assert f"ddco-pyro: {path}: demo_2: obs/camera cannot be read" in ended.err.splitlines()[-1]
-
-
-def test_pictures_of_another_size_are_one_line(kept: Path, tmp_path: Path) -> None:
-    path = tmp_path / "uneven.hdf5"
-    path.write_bytes(kept.read_bytes())
-    with h5py.File(path, "r+") as file:
-        del file["data/demo_3/obs/camera"]
-        file["data/demo_3/obs/camera"] = np.zeros((9, 12, 11, 3), np.uint8)
-    spec = tmp_path / "spec.yaml"
-    spec.write_text(yaml.safe_dump(spec_of(path, "camera")))
-    ended = call("fit", spec, "--out", tmp_path / "run")
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-    assert "demo_3: obs/camera has shape (12, 11, 3) at each step, but (12, 10, 3) in demo_0" in ended.err

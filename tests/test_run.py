@@ -15,7 +15,7 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import Damaged
-from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan, TrainingEnded
+from ddco_pyro.events import EpochEnded
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.run import RunError, claim, claimed
 from ddco_pyro.metrics import Counts
@@ -83,21 +83,6 @@ def test_the_history_has_every_epoch(toy_run, watched):
         {**row, "train": float(row["train"]), "tune": float(row["tune"])} for row in rows
     ]
     assert [row["stage"] for row in rows] == ["vq-1"] * 6 + ["level-1"] * 6 + ["meta-policy"] * 6 + ["joint"] * 6
-
-
-def test_whoever_watches_is_told_what_goes_on(toy_run, watched):
-    models = [(TrainingBegan(name, 24), TrainingEnded(name)) for name in ("ddco", "flat", "per_timestep")]
-    assert watched.of(TrainingBegan, TrainingEnded) == [event for pair in models for event in pair]
-    collected = [DemonstrationsDone(n, 12) for n in range(1, 13)]
-    assert watched.of(DemonstrationsDone) in (collected, [])  # nothing where they are in the cache
-
-
-def test_versions_and_seconds_are_kept(toy_run):
-    metrics = toy_run.metrics
-    assert set(metrics.seconds) == {"demonstrations", "training", "baselines", "evaluation"}
-    assert metrics.versions["ddco-pyro"] == "0.1.0"
-    assert metrics.engine_check.value < 1e-9
-    assert metrics.engine_check.gradient < 1e-9
 
 
 # --- the numbers again ------------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import re
-import shutil
 from pathlib import Path
 
 import h5py
@@ -54,15 +53,6 @@ def test_they_are_the_fits_own(toy_run, toy_spec, file, at_once, monkeypatch):
         assert level.boundaries[1:][np.diff(level.options) != 0].all()
         assert [option for option, a, b in level.runs() for _ in range(a, b)] == level.options.tolist()
         np.testing.assert_array_equal(one.labels["phase"], demo.labels["phase"])
-
-
-@pytest.mark.parametrize("option", ["--html", "--csv", "--parquet"])
-def test_a_page_or_a_table_leaves_the_file_alone(toy_run, file, tmp_path, option):
-    before, time = file.read_bytes(), file.stat().st_mtime_ns
-    out = tmp_path / "segments"
-    assert call("segment", toy_run.folder, file, option, out)[:2] == (0, f"{out}\n")
-    assert (file.read_bytes(), file.stat().st_mtime_ns) == (before, time)
-    assert {path.name for path in tmp_path.iterdir()} == {"demos.hdf5", "segments"}
 
 
 NOTHING = (
@@ -286,15 +276,6 @@ def test_baselines_are_written_as_the_options_are_with_labels_or_without(toy_run
     assert ended.status == 0, ended.err  # the labels that are there are its own
 
 
-def test_baselines_without_labels_and_without_a_place_are_refused_before_the_work(toy_run, file, monkeypatch):
-    without_labels(file)
-    monkeypatch.setattr("ddco_pyro.segmenting.segments", None)
-    ended = call("segment", toy_run.folder, file, "--baselines")
-    assert (ended.status, ended.out) == (2, "")
-    message = "--baselines: the demonstrations have no labels/phase; name what to write, such as --html PAGE"
-    assert ended.err == f"ddco-pyro: {message}\n"
-
-
 def test_other_demonstrations_of_the_same_names_are_not_marked(toy_run, toy_spec, file, tmp_path):
     with h5py.File(file, "r+") as opened:
         for group in opened["data"].values():
@@ -305,17 +286,6 @@ def test_other_demonstrations_of_the_same_names_are_not_marked(toy_run, toy_spec
     assert marked(text) == set()
     assert re.search(r"<td>options, 12 in all</td><td>\d\.\d\d</td>", text)
     assert "were held out" not in text
-
-
-def test_without_labels_the_page_says_nothing_of_agreement(toy_run, file, tmp_path):
-    with h5py.File(file, "r+") as opened:
-        for group in opened["data"].values():
-            del group["labels/phase"]
-    page = tmp_path / "segments.html"
-    assert call("segment", toy_run.folder, file, "--html", page).status == 0
-    assert "Agreement" not in page.read_text()
-    assert "mutual information" not in page.read_text()
-    assert marked(page.read_text())
 
 
 def test_the_page_escapes_what_it_shows(toy_run, tmp_path, toy_spec):
@@ -375,9 +345,3 @@ def test_a_policy_without_options_is_refused(toy_run, file):
     ended = call("segment", toy_run.folder / "baselines" / "flat", file, "--in-place")
     assert ended.status == 2
     assert "is a flat policy without options; name a run with a hierarchy" in ended.err
-
-
-def test_a_copied_run_names_nothing_of_this_machine(toy_run, file, tmp_path):
-    """A run that was moved segments as before."""
-    moved = shutil.copytree(toy_run.folder, tmp_path / "moved")
-    assert call("segment", moved, file, "--csv", tmp_path / "a.csv").status == 0
