@@ -40,7 +40,6 @@ def run(folder, demos, **changes):
     return found, demonstrations(spec)
 
 
-
 @pytest.fixture(scope="module")
 def labelled(tmp_path_factory):
     found, demos = run(tmp_path_factory.mktemp("labelled"), made())

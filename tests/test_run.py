@@ -195,7 +195,9 @@ def planted(tmp_path_factory):
     return path
 
 
-LINEAR = {"hierarchy.levels.0.policy.network": "linear", "hierarchy.levels.0.termination.network": "linear"}
+LINEAR = {
+    f"hierarchy.{place}.network": "linear" for place in ("levels.0.policy", "levels.0.termination", "meta_policy")
+}
 
 
 def test_planted_skills_are_found(planted, tmp_path, toy_spec):
@@ -204,7 +206,8 @@ def test_planted_skills_are_found(planted, tmp_path, toy_spec):
         "demonstrations": {"path": str(planted), "labels": "skill"},
         "observations": ["side", "place"],
     }
-    spec = with_overrides(toy_spec, given | {"compare_with": [], "training.epochs": 240} | LINEAR)
+    training = {"training.epochs": 60, "training.optimizer": {"name": "em"}}
+    spec = with_overrides(toy_spec, given | {"compare_with": []} | training | LINEAR)
     found = fit(spec, out=tmp_path / "run")
     (scores,) = found.metrics.agreement.valid
     assert (scores.nmi, scores.boundary_f1_1) == (pytest.approx(1), 1)
@@ -217,9 +220,9 @@ def test_planted_skills_are_found(planted, tmp_path, toy_spec):
 # --- going on ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("epochs", [6, 17, 29])
+@pytest.mark.parametrize("epochs", [6, 29])
 def test_an_interrupted_run_goes_on_to_the_same_bytes(toy_run, toy_spec, tmp_path, epochs):
-    """In the first stage, at its end, in later ones, in a baseline."""
+    """At the end of the first stage, and in a baseline."""
     folder = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
         fit(toy_spec, out=folder, on_event=Interrupting(epochs))

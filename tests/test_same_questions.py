@@ -13,7 +13,7 @@ from ddco_pyro.data.demonstrations import DemonstrationsError
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
 
-FITTED = ("grey alone", "integers of two columns", "demonstrations of one step")
+FITTED = ("grey alone", "demonstrations of one step")
 """Rows that are fitted, too."""
 
 

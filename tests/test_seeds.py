@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-import toy_task
 import yaml
 from command_line import call
-from random_demonstrations import demonstrations
 from scipy import stats
 
 import ddco_pyro
@@ -20,7 +19,9 @@ from ddco_pyro.metrics import Rollouts, Seeds
 from ddco_pyro.spec import load_spec, with_overrides
 
 SPEC = {
-    "observations": ["pose"],
+    "task": "toy",
+    "demonstrations": {"count": 8},
+    "observations": ["offsets", "visited"],
     "hierarchy": {"levels": [{"count": 2, "policy": {"network": "linear"}}], "meta_policy": {"network": "linear"}},
     "compare_with": [{"kind": "flat", "policy": {"network": "linear"}}, "mixture"],
     "training": {"epochs": 4, "initialize": "random", "layerwise": False},
@@ -31,9 +32,8 @@ SPEC = {
 def written(tmp_path_factory):
     """A spec and a run of it with three training seeds, by the command, and how that ended."""
     folder = tmp_path_factory.mktemp("seeds")
-    demonstrations(8).write(folder / "demos.hdf5")
     spec = folder / "spec.yaml"
-    spec.write_text(yaml.safe_dump(SPEC | {"demonstrations": {"path": str(folder / "demos.hdf5")}}))
+    spec.write_text(yaml.safe_dump(SPEC))
     return spec, folder / "run", call("fit", spec, "--out", folder / "run", "--seeds", 3, "--jobs", 1)
 
 
@@ -120,13 +120,9 @@ def test_where_seeds_give_the_same_fit_held_out_demonstrations_decide(error, sai
     assert f"{low:.2f} to {high:.2f}".replace("-", "−") in text
 
 
-def test_rollouts_have_the_same_two_parts_and_the_same_seeds(tmp_path):
+def test_rollouts_have_the_same_two_parts_and_the_same_seeds(written, tmp_path):
     """The parts are counted again from ``rollouts.csv`` of each repetition."""
-    spec = yaml.safe_load(toy_task.SPEC) | {"compare_with": ["flat", "mixture"]}
-    spec["training"] = {"epochs": 2, "initialize": "random", "layerwise": False}
-    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(spec))
-    run = tmp_path / "run"
-    assert call("fit", tmp_path / "spec.yaml", "--out", run, "--seeds", 3, "--jobs", 1).status == 0
+    run = shutil.copytree(written[1], tmp_path / "run")
     ended = call("rollout", run, "--episodes", 6, "--jobs", 1)
     assert ended.status == 0, ended.err
     found = json.loads((run / "metrics.json").read_text())["rollouts"]
