@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import h5py
-import numpy as np
 import pytest
 import toy_task
 from command_line import Ended, call
@@ -244,19 +243,6 @@ def test_a_name_that_is_a_formula_is_quoted_in_csv(toy_run, file: Path, tmp_path
     first = {line.split(",")[0] for line in table.read_text().splitlines()}
     assert {"'+1", "'-2", "'@SUM(A1)", "plain", "'=cmd|' %C calc'!A0"} <= first
     assert not [cell for cell in first if cell.startswith(("=", "+", "-", "@"))]
-
-
-def test_demonstrations_that_no_option_explains_are_refused(toy_run, file: Path, tmp_path: Path, monkeypatch) -> None:
-    from ddco_pyro.evaluation.inferred import Inferred
-
-    monkeypatch.setattr(Inferred, "log_likelihood", np.full(12, -np.inf))
-    ended = call("segment", toy_run.folder, file, "--csv", tmp_path / "a.csv")
-    assert ended.status == 2
-    assert ended.err.splitlines()[-1] == (
-        f"ddco-pyro: {file}: demo_0: its log-likelihood is -inf, so no options explain it; see its controls with "
-        "ddco-pyro inspect, and repair it or leave it out"
-    )
-    assert not (tmp_path / "a.csv").exists()
 
 
 # --- what is said and what is asked for -------------------------------------------------------------------------------

@@ -155,16 +155,6 @@ def test_three_processes_give_the_same_bits(demos, tmp_path):
     assert str(shared.value) == str(alone.value)
 
 
-def test_shards_decide_what_dropout_draws_and_processes_do_not(demos):
-    """Another number of shards is another training."""
-    histories = []
-    for shards in (1, 4):
-        trainer = make(make_spec(shards=shards, epochs=4), demos, False)
-        trainer.run()
-        histories.append(trainer.history)
-    assert histories[0] != histories[1]
-
-
 # --- the command line -------------------------------------------------------------------------------------------------
 
 
@@ -364,14 +354,6 @@ def test_torchrun_goes_on_and_refuses_as_one_process_does(whole, tmp_path):
 def test_what_cannot_be_shared_is_refused(given, problem):
     with pytest.raises(BadInput, match=f"^{problem}"):
         check_processes(*given)
-
-
-def test_an_unknown_limit_of_memory_is_said_before_anything_is_done(tmp_path, monkeypatch, toy_spec):
-    """Nothing is collected for a spec whose task has yet to be tried."""
-    monkeypatch.setenv("DDCO_PYRO_MEMORY", "much")
-    with pytest.raises(BadInput, match=r"^DDCO_PYRO_MEMORY=much: has to be a number of GB"):
-        fit(toy_spec, out=tmp_path / "run", on_event=lambda event: pytest.fail(f"{event} was done"))
-    assert not (tmp_path / "run").exists()
 
 
 def test_torchrun_decides_how_many_there_are(monkeypatch):

@@ -71,11 +71,6 @@ def test_the_folder_holds_what_it_promises(toy_run):
     assert files == FILES | beside | {"names.yaml"}
 
 
-def test_the_spec_in_the_folder_is_the_whole_spec(toy_run, toy_spec):
-    assert load_spec(toy_run.folder / "spec.yaml") == toy_spec
-    assert "patience: 20" in (toy_run.folder / "spec.yaml").read_text()
-
-
 def test_the_history_has_every_epoch(toy_run, watched):
     rows = list(csv.DictReader((toy_run.folder / "history.csv").open()))
     told = [asdict(row) for row in watched.of(EpochEnded) if row.stage != "policy"]
@@ -105,23 +100,6 @@ def test_log_likelihoods_can_be_computed_again(toy_run, parts):
         {"name": demo.name, "steps": len(demo), "log_likelihood": pytest.approx(value)}
         for demo, value in zip(parts["valid"], loaded.log_likelihood(parts["valid"]), strict=True)
     ]
-
-
-def test_every_demonstration_is_listed_worst_first(toy_run, demos, parts):
-    listed = toy_run.metrics.demonstrations_by_likelihood
-    methods = {"ddco": toy_run, **toy_run.baselines}
-    steps = dict(zip(demos.names, demos.lengths, strict=True))
-    values = {
-        name: dict(zip(demos.names, fitted.log_likelihood(demos) / demos.lengths, strict=True))
-        for name, fitted in methods.items()
-    }
-    assert [one.name for one in listed] == sorted(demos.names, key=values["ddco"].__getitem__)
-    for one in listed:
-        assert one.part == ("valid" if one.name in parts["valid"].names else "train")
-        assert one.steps == steps[one.name]
-        assert one.log_likelihood_per_step == pytest.approx({m: values[m][one.name] for m in methods})
-    flat = toy_run.baselines["flat"].metrics.demonstrations_by_likelihood
-    assert [one.name for one in flat] == sorted(demos.names, key=values["flat"].__getitem__)
 
 
 def test_comparisons_can_be_computed_again(toy_run, parts):

@@ -68,7 +68,7 @@ def lines(**training):
     """Ten demonstrations along a line, cut into three equal parts, and how they are fitted."""
     line = np.linspace(-1, 1, 12)[:, None] * [1.0, 0.0] + np.random.default_rng(0).normal(0, 0.02, (10, 12, 2))
     demos = Demonstrations(tuple(Demonstration(f"demo_{n}", {"state": one}, one) for n, one in enumerate(line)))
-    own = {"initialize": "equal_parts", "layerwise": False, "optimizer": {"lr": 0.1}, "epochs": 800, "patience": None}
+    own = {"initialize": "equal_parts", "layerwise": False, "optimizer": {"lr": 0.1}, "epochs": 400, "patience": None}
     return make_trainer(make_spec((3,), **own, **training), demos, None).data
 
 
@@ -193,17 +193,6 @@ def test_every_model_has_the_same_budget(tmp_path, model):
     trainer.run()
     assert sum(epochs_of(trainer, 0).values()) == sum(epochs_of(trainer, 1).values()) == 14
     assert trainer.summary["budget"] == trainer.summary["spent"] == {"epochs": 14, "gradient_steps": 14 * 3}
-
-
-def test_the_training_that_is_told_is_that_of_the_best_restart(tmp_path):
-    joint = {"initialize": "random", "layerwise": False, "patience": 2, "restarts": 3}
-    trainer = make_trainer(make_spec((2,), 4, **joint, **QUICK), random_demonstrations(), tmp_path)
-    trainer.run()
-    best = max(trainer.history, key=lambda row: row["tune"])["restart"]
-    counts = [epochs_of(trainer, restart)["joint"] for restart in range(3)]
-    assert best != 2  # not simply the last
-    assert counts.count(counts[best]) == 1
-    assert trainer.summary["spent"]["epochs"] == counts[best]
 
 
 def test_without_a_budget_every_stage_trains_until_its_patience(tmp_path):
@@ -339,9 +328,7 @@ def test_what_is_not_finite_names_the_demonstration(tmp_path):
     [
         ([0.0, 1.0, 2.0, 4.0], 2, 3.0, 2),  # 1 before the last two, 4 with them
         ([0.0, 5.0, 2.0, 4.0], 2, 0.0, 2),  # patience is exhausted
-        ([0.0, 5.0, 2.0, 6.0], 2, 1.0, 2),
         ([3.0, 1.0, 2.0], 5, 0.0, 2),  # it was best before it began
-        ([1.0, 1.5], 5, 0.5, 1),
         ([7.0], 5, 0.0, 0),  # no epochs at all
         ([0.0, *range(30)], None, 20.0, 20),
     ],

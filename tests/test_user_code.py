@@ -50,7 +50,6 @@ PLACES = [
     (f"task={TASK}", "task", TASK),
     (f"demonstrations.task={TASK}", "demonstrations.task", TASK),
     (f"hierarchy.levels.0.policy.network={NETWORK}", "hierarchy.levels.0.policy.network", NETWORK),
-    (f"hierarchy.levels.0.termination.network={NETWORK}", "hierarchy.levels.0.termination.network", NETWORK),
     (f"hierarchy.meta_policy.network={NETWORK}", "hierarchy.meta_policy.network", NETWORK),
     (
         f"hierarchy.meta_policy={{network: branches, of: {{offsets: {{network: '{NETWORK}'}}}}}}",
