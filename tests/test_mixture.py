@@ -128,19 +128,6 @@ def test_a_mixture_beside_is_the_spec_with_terminations_always():
     assert [model_name(own) for own in (spec, first, second)] == ["ddco", "mixture", "mixture"]
 
 
-def test_one_level_of_several_can_be_without_memory():
-    levels = [{"name": "option", "count": 2}, {"name": "phase", "count": 2}]
-    spec = spec_of(
-        hierarchy={"levels": levels},
-        compare_with=[{"kind": "mixture", "levels": ["phase"]}, "mixture"],
-        training={"duration": {"mean": 5}},
-    )
-    partly, wholly = (baseline_spec(spec, baseline, None) for baseline in named_baselines(spec).values())
-    assert [level.lasts for level in partly.hierarchy.levels] == [True, False]
-    assert list(named_baselines(spec)) == [model_name(partly), model_name(wholly)] == ["mixture_phase", "mixture"]
-    assert (partly.training.duration, wholly.training.duration) == (spec.training.duration, None)
-
-
 def test_a_mixture_that_stands_alone_is_a_hierarchy():
     spec = spec_of(hierarchy=None, compare_with=[], baseline={"kind": "mixture", "count": 3, "policy": {"hidden": [4]}})
     (level,) = spec.hierarchy.levels

@@ -70,19 +70,14 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "segment --csv": Command("segment run demos.hdf5 --csv", "demos.hdf5"),
-    "segment --parquet": Command("segment run demos.hdf5 --parquet", "demos.hdf5"),
-    "segment --html": Command("segment run demos.hdf5 --html", "demos.hdf5"),
     "segment --out": Command("segment run demos.hdf5 --overwrite --out", "demos.hdf5"),
     "segment --lerobot": Command("segment run demos.hdf5 --lerobot", "run", folder=True),
     "export": Command("export run --out", "run", folder=True),
-    "merge": Command("merge run --out", "run", folder=True),
     "compare": Command("compare run run/baselines/flat --out", "run", folder=True),
     "fit": Command("fit toy.yaml --out", "toy.yaml", folder=True),
-    "select": Command("select toy.yaml --set selection.grid.seed=[1,2] --out", "toy.yaml", folder=True),
     "collect": Command("collect toy.yaml --out", "toy.yaml"),
     "init": Command("init demos.hdf5 --force --out", "demos.hdf5"),
     "import": Command("import demos.hdf5 --out", "demos.hdf5"),
-    "encode": Command("encode demos.hdf5 --observation camera --out", "demos.hdf5"),
 }
 
 READ = "is what this command reads"

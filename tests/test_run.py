@@ -102,18 +102,6 @@ def test_log_likelihoods_can_be_computed_again(toy_run, parts):
     ]
 
 
-def test_comparisons_can_be_computed_again(toy_run, parts):
-    loaded, valid = ddco_pyro.load(toy_run.folder), parts["valid"]
-    steps = sum(valid.lengths)
-    assert list(loaded.metrics.comparison) == list(loaded.baselines) == ["flat", "per_timestep"]
-    for name, baseline in loaded.baselines.items():
-        assert (baseline.name, loaded.name) == (name, "ddco")
-        difference = (loaded.log_likelihood(valid) - baseline.log_likelihood(valid)).sum() / steps
-        found = loaded.metrics.comparison[name]
-        assert found.difference.nats_per_step == pytest.approx(difference)
-        assert found.log_likelihood_per_step.valid == pytest.approx(baseline.log_likelihood(valid).sum() / steps)
-
-
 def test_baselines_are_trained_on_the_same_split(toy_run):
     metrics = toy_run.metrics
     assert metrics.demonstrations == Counts(train=8, tune=1, valid=3, supervisor=metrics.demonstrations.supervisor)

@@ -60,10 +60,6 @@ networks = st.one_of(
 )
 emissions = st.lists(st.sampled_from(["options", "control"]), min_size=1, unique=True)
 
-trainings = st.fixed_dictionaries({"patience": st.none() | counts, "clip_gradient": st.none() | positive}) | (
-    st.fixed_dictionaries({"epochs": st.none() | counts, "patience": counts})
-)
-
 
 @st.composite
 def hierarchies(draw: st.DrawFn) -> dict[str, Any]:

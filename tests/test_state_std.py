@@ -187,26 +187,6 @@ def beside(*compare_with, **control):
     )
 
 
-def test_a_baseline_has_its_own_wherever_sigma_is_learned():
-    parts = [
-        {"name": "arm", "dims": [0, 1], "std": {**OF_OPTION, "floor": 0.1}},
-        {"name": "wrist", "dims": [2], "std": 0.3},
-        {"name": "jaw", "dims": [3]},
-    ]
-    spec = beside("flat", {"kind": "flat", "std": OF_STATE}, std={**OF_OPTION, "floor": 0.02}, parts=parts)
-    as_it_is, own = (baseline_spec(spec, baseline, None).control for baseline in spec.compare_with)
-    assert as_it_is == spec.control
-    assert own.std.model_dump() == {"learn": True, "floor": 0.02, "per_option": False, "per_state": True}
-    arm, wrist, jaw = own.parts
-    assert (arm.std.floor, arm.std.per_option, arm.std.per_state) == (0.1, False, True)
-    assert (wrist, jaw) == spec.control.parts[1:]
-    (floor,) = (
-        baseline_spec(again, again.compare_with[0], None).control.std.floor
-        for again in [beside({"kind": "mixture", "std": {**OF_STATE, "floor": 0.2}}, std=OF_OPTION)]
-    )
-    assert floor == 0.2
-
-
 def test_flat_equal_counts_the_numbers_for_sigma():
     spec = beside("flat_equal", {"kind": "flat_equal", "std": OF_STATE}, std=OF_OPTION)
     size = Dimensions({"state": (2,)}, 2, 25)

@@ -24,7 +24,6 @@ from ddco_pyro.spec import parse_spec
 CONV = {"network": "conv", "filters": 3, "kernel": 3, "pooled": 2, "hidden": [5]}
 LINEAR = {"network": "linear", "inputs": ["pose"]}
 LEVEL = "skill"
-OPTIONS = {"name": LEVEL, "count": 2, "policy": CONV, "termination": LINEAR}
 
 
 class Both(NamedTuple):

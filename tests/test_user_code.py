@@ -17,7 +17,6 @@ import ddco_pyro
 from ddco_pyro.spec import SpecError, load_spec, parse_spec, user_code, with_overrides
 from ddco_pyro.training.data import demonstrations
 
-HERE = Path(__file__).parent
 MODULE = """
 from pathlib import Path
 
