@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 from pathlib import Path
 
@@ -41,6 +42,14 @@ def test_a_notebook_holds_outputs_and_no_logic(path):
     tree = ast.parse("\n".join(cell.source for cell in code))
     assert not any(isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Lambda) for node in ast.walk(tree))
     assert not re.search(r"/(home|root|tmp|work)/", path.read_text())
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_what_a_notebook_imports_of_the_library_is_there(path):
+    for node in ast.walk(ast.parse(path.with_suffix(".py").read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module.startswith("ddco_pyro"):
+            module = importlib.import_module(node.module)
+            assert [one.name for one in node.names if not hasattr(module, one.name)] == []
 
 
 @pytest.mark.parametrize("path", [

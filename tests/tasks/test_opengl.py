@@ -49,7 +49,11 @@ CHECKING = "sys.argv = ['ddco-pyro', 'check', 'specs/needle.yaml']; from ddco_py
 
 @pytest.mark.parametrize("cause", LIBRARIES)
 @pytest.mark.parametrize(
-    ("script", "head"), [(LOOKING, ""), pytest.param(CHECKING, "ddco-pyro: ", marks=pytest.mark.slow)]
+    ("script", "head"),
+    [
+        pytest.param(LOOKING, "", id="looking"),
+        pytest.param(CHECKING, "ddco-pyro: ", id="checking", marks=pytest.mark.slow),
+    ],
 )
 def test_without_opengl_libraries_one_line_names_the_packages(cause: str, script: str, head: str) -> None:
     found = ended(sys.executable, "-c", WITHOUT.format(missing=LIBRARIES[cause]) + script)

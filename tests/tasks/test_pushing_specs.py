@@ -54,7 +54,8 @@ def test_specs_fit_and_act(path: Path, demonstrations: Path, tmp_path: Path) -> 
     found = fit(short(path, demonstrations), out=tmp_path / "run")
     assert found.metrics.engine_check.value < 1e-6
     brief = replace(pushing.limited, load=lambda seed: pushing.load_single(seed), cameras=CAMERAS)
-    (episode,) = play(brief, Controller.from_spec(found.hierarchy, found.spec.rollout), [0], keep=("tip",))
+    controller = Controller.from_spec(found.hierarchy, found.spec.rollout)
+    (episode,) = play(brief, controller, [0], found.spec.observed, keep=("tip",))
     levels = LEVELS[path.stem.removeprefix("pushing_")]
     assert episode.choices.shape == (len(episode.record.observations["tip"]), levels)
     lowest = 0 if path.stem.endswith("hybrid") else 1
