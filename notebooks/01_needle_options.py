@@ -29,7 +29,8 @@ from ddco_pyro import load_spec
 from ddco_pyro.cli.console import Progress
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.report import tables, write_report
+from ddco_pyro.report import write_report
+from ddco_pyro.report.options import use_table
 from ddco_pyro.training.data import demonstrations
 
 RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))
@@ -71,8 +72,7 @@ Image(figures / "posterior.png")
 # ## How are they used?
 
 # %%
-use = tables.option_use(["option"], needle.metrics.options, len(demos))
-Markdown("\n".join(["|".join(use.head), "|".join("-" * len(use.head)), *("|".join(row) for row in use.rows)]))
+Markdown(use_table(needle).markdown())
 
 # %% [markdown]
 # ## Does the hierarchy explain what it has not seen?

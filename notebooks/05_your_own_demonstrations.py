@@ -16,7 +16,7 @@
 # Anything in robomimic's HDF5 layout can be fitted. Here: 50 demonstrations of Meta-World's scripted expert, which were
 # recorded by somebody else. Their file is not part of this repository; `specs/metaworld_pick_place.yaml` says what it
 # holds and how to record one, and `NOTEBOOK_METAWORLD=FILE` in the environment says where it is. Without it
-# demonstrations of the needle task, written to a file, take their place.
+# generated demonstrations of picking and placing take their place.
 
 # %%
 import os
@@ -29,13 +29,13 @@ warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widg
 
 from ddco_pyro import Demonstrations, load_spec
 from ddco_pyro.cli.console import Progress
+from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.report import write_report
-from ddco_pyro.simulation.collect import collect
-from ddco_pyro.spec import DemonstrationsSpec
 
 RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))
+RUNS.mkdir(parents=True, exist_ok=True)
 SMALLER = os.environ.get("NOTEBOOK_SMALLER", "").split()  # a test makes the fits smaller
 
 # %%
@@ -43,7 +43,8 @@ METAWORLD = Path(os.environ.get("NOTEBOOK_METAWORLD", "../../shared/data/metawor
 if METAWORLD.exists():
     path, observations = METAWORLD, ["hand_pos", "gripper", "object_pos", "goal_pos"]
 else:
-    path, observations = collect("needle", DemonstrationsSpec(count=12)), ["gripper_pose", "jaw", "needle_ellipse"]
+    path, observations = RUNS / "pick_and_place.hdf5", ["gripper", "jaw", "object", "goal"]
+    pick_and_place(12).write(path)
 
 # %% [markdown]
 # What is in the file?
@@ -69,7 +70,6 @@ hierarchy:
 training: {{initialize: vq_controls, optimizer: {{lr: 1.0e-2}}, epochs: 400}}
 compare_with: [flat]
 """
-RUNS.mkdir(parents=True, exist_ok=True)
 (RUNS / "mine.yaml").write_text(SPEC)
 spec = load_spec(RUNS / "mine.yaml", [one for one in SMALLER if not one.startswith("demonstrations.")])
 

@@ -24,7 +24,7 @@ def cued(number, seed):
     return Demonstrations(tuple(demos))
 
 
-def errors(model, epochs=60):
+def errors(model, epochs=40):
     """Root mean square error of a fitted controller after the delay, over new demonstrations."""
     spec = parse_spec(
         {
@@ -36,7 +36,7 @@ def errors(model, epochs=60):
             **model,
         }
     )
-    controller, found = ddco_pyro.fit(spec, cued(60, 0)).controller(), []
+    controller, found = ddco_pyro.fit(spec, cued(30, 0)).controller(), []
     for demo in cued(20, 1):
         controller.reset()
         acted = np.stack([controller.act({"cue": cue}) for cue in demo.observations["cue"]])

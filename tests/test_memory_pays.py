@@ -51,7 +51,7 @@ training:
   optimizer: {{lr: 0.3, schedule: cosine}}
 rollout: {{options: sample, episodes: 100}}
 """
-TASKS = ("there_and_back", "cue_once", "obstacle", "two_goals")
+QUICK, OTHERS = ("there_and_back", "obstacle"), ("cue_once", "two_goals")
 UNLIKELY = 1e-3
 
 
@@ -94,7 +94,7 @@ def successes(outcomes):
     return [outcome["success"] for outcome in outcomes]
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
 def test_options_remember_what_a_mixture_cannot(name):
     """The mixture succeeds no more often than a binomial bound on what the supervisor does without memory."""
     fit, options, mixture = fitted(name, ["seen"])
@@ -113,7 +113,9 @@ def test_options_remember_what_a_mixture_cannot(name):
         assert {outcome["side"] for outcome in options} == {-1.0, 1.0}
 
 
-@pytest.mark.parametrize("name", [TASKS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in TASKS[1:])])
+@pytest.mark.parametrize(
+    "name", [QUICK[0], *(pytest.param(name, marks=pytest.mark.slow) for name in (QUICK[1], *OTHERS))]
+)
 def test_where_the_intention_is_seen_there_is_nothing_to_remember(name):
     fit, options, mixture = fitted(name, ["seen", "intention"])
     mean, low, high = worth(fit)

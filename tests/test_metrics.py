@@ -11,7 +11,6 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import json_text
 from ddco_pyro.drawing import words
-from ddco_pyro.fitting.rollouts import policies
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import parse_spec
@@ -69,12 +68,6 @@ def test_a_baseline_of_the_models_own_kind_has_numbers_of_its_own(tmp_path):
     for name, value, length in zip(valid.names, ours, valid.lengths, strict=True):
         assert listed[name]["flat"] == pytest.approx(value / length)
     assert list(ddco_pyro.load(tmp_path / "run").baselines) == ["flat_2", "flat_3"]
-
-
-def test_methods_of_one_kind_are_rolled_out_each_under_its_name(toy_run):
-    spec = toy_run.spec.model_copy(update={"hierarchy": None, "baseline": toy_run.spec.compare_with[0]})
-    own = ddco_pyro.fitting.fitted.Fit(spec, toy_run.baselines["flat"].hierarchy, beside={"flat_2": toy_run})
-    assert list(policies(own))[-2:] == ["flat_2", "flat"]
 
 
 def test_a_single_held_out_demonstration_has_no_error_and_every_file_is_json(tmp_path):

@@ -45,9 +45,11 @@ def spec_with(folder: Path, place: str, value: float, scaled: bool = True) -> Pa
     return spec
 
 
-@pytest.mark.parametrize("key", ["actions", "obs/pose"])
-@pytest.mark.parametrize("name", ["demo_1", "demo_6"])
-@pytest.mark.parametrize("value", [1e300, -1e160, 2e30])
+@pytest.mark.parametrize(
+    ("name", "key", "value"),
+    [("demo_1", "actions", 1e300), ("demo_6", "actions", 2e30), ("demo_1", "obs/pose", -1e160),
+     ("demo_6", "obs/pose", 2e30)],
+)  # fmt: skip
 def test_numbers_that_nothing_can_hold(tmp_path: Path, name: str, key: str, value: float) -> None:
     """Trained with or held out; their variance is infinite, or float32 cannot hold them."""
     spec = spec_with(tmp_path, f"data/{name}/{key}", value)
@@ -63,9 +65,11 @@ def test_numbers_that_nothing_can_hold(tmp_path: Path, name: str, key: str, valu
     assert "beyond ±1e+30, the first in" in call("inspect", tmp_path / "demos.hdf5").out
 
 
-@pytest.mark.parametrize("key", ["actions", "obs/pose"])
-@pytest.mark.parametrize(("name", "scaled"), [("demo_1", False), ("demo_6", True), ("demo_6", False)])
-@pytest.mark.parametrize("value", [1e25, -1e15])
+@pytest.mark.parametrize(
+    ("key", "name", "scaled", "value"),
+    [("actions", "demo_1", False, 1e25), ("actions", "demo_6", True, -1e15), ("obs/pose", "demo_1", False, -1e15),
+     ("obs/pose", "demo_6", True, 1e25)],
+)  # fmt: skip
 def test_numbers_whose_squares_networks_cannot_hold(
     tmp_path: Path, name: str, key: str, scaled: bool, value: float
 ) -> None:

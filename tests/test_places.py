@@ -13,9 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import selecting
 import toy_task
-import yaml
 from command_line import call
 from killing import HANGS
 from random_demonstrations import demonstrations
@@ -39,12 +37,12 @@ def room(size: int) -> Iterator[None]:
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
     path = tmp_path / "source.hdf5"
-    demonstrations(60).write(path)
+    demonstrations(20).write(path)
     return path
 
 
 @pytest.mark.parametrize(
-    "size", [0, 5000, 60_000, *(pytest.param(size, marks=pytest.mark.slow) for size in (100, 20_000))]
+    "size", [5000, 60_000, *(pytest.param(size, marks=pytest.mark.slow) for size in (0, 100, 20_000))]
 )
 def test_a_full_disk_while_importing(source: Path, tmp_path: Path, size: int) -> None:
     out = tmp_path / "out.hdf5"
@@ -163,17 +161,6 @@ def test_a_second_process_on_a_run_is_refused(tmp_path: Path) -> None:
     spec.write_text(toy_task.SPEC)
     with only_one(folder):
         ended = call("fit", spec, "--out", folder)
-    assert (ended.status, ended.err) == (
-        2, f"ddco-pyro: {folder}: another process is at work on it; wait for it, or choose another place\n",
-    )  # fmt: skip
-    assert not any(folder.iterdir())  # the other may be about to write its own spec
-
-
-def test_a_second_process_on_a_selection_is_refused(tmp_path: Path) -> None:
-    spec, folder = tmp_path / "spec.yaml", tmp_path / "run"
-    spec.write_text(yaml.safe_dump(selecting.data_at(tmp_path)))
-    with only_one(folder):
-        ended = call("select", spec, "--out", folder, "--jobs", "1")
     assert (ended.status, ended.err) == (
         2, f"ddco-pyro: {folder}: another process is at work on it; wait for it, or choose another place\n",
     )  # fmt: skip

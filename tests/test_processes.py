@@ -155,16 +155,6 @@ def test_three_processes_give_the_same_bits(demos, tmp_path):
     assert str(shared.value) == str(alone.value)
 
 
-def test_shards_decide_what_dropout_draws_and_processes_do_not(demos):
-    """Another number of shards is another training."""
-    histories = []
-    for shards in (1, 4):
-        trainer = make(make_spec(shards=shards, epochs=4), demos, False)
-        trainer.run()
-        histories.append(trainer.history)
-    assert histories[0] != histories[1]
-
-
 # --- the command line -------------------------------------------------------------------------------------------------
 
 
@@ -272,23 +262,19 @@ def test_a_finished_run_keeps_no_process_of_torchrun_waiting(whole, tmp_path):
     assert other == (0, "", "")
 
 
-@pytest.mark.parametrize("what", ["another number", "bad spec", "busy folder", "damaged checkpoint"])
+@pytest.mark.parametrize("what", ["busy folder", "damaged checkpoint"])
 def test_what_is_refused_under_torchrun_is_one_line_of_one_process(whole, tmp_path, what):
     spec, run = whole
-    folder, more = shutil.copytree(run, tmp_path / "run"), []
+    folder = shutil.copytree(run, tmp_path / "run")
     with contextlib.ExitStack() as stack:
-        if what == "another number":
-            more, line = ["--processes", "3"], "--processes 3: torchrun started 2; leave it out"
-        elif what == "bad spec":
-            more, line = ["--set", "training.epochs=-1"], f"{spec}: training.epochs: must be at least 1"
-        elif what == "busy folder":
+        if what == "busy folder":
             stack.enter_context(only_one(folder))
             line = f"{folder}: another process is at work on it"
         else:
             (folder / "model.safetensors").unlink()
             (folder / "checkpoints" / "restart-0.safetensors").write_text("damaged")
             line = f"{folder / 'checkpoints' / 'restart-0.safetensors'}: is damaged: "
-        first, other = under_torchrun(tmp_path, "fit", spec, "--out", folder, "--resume", *more)
+        first, other = under_torchrun(tmp_path, "fit", spec, "--out", folder, "--resume")
     assert (first.status, first.err.count("\n")) == (2, 1)
     assert first.err.startswith(f"ddco-pyro: {line}")
     assert other == (0, "", "")
@@ -368,34 +354,6 @@ def test_torchrun_goes_on_and_refuses_as_one_process_does(whole, tmp_path):
 def test_what_cannot_be_shared_is_refused(given, problem):
     with pytest.raises(BadInput, match=f"^{problem}"):
         check_processes(*given)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "problem"),
-    [
-        (["--processes", "0"], "--processes 0: give a number of processes"),
-        (["--processes", "8"], "--processes 8: a minibatch is cut into training.shards=4"),
-        (["--processes", "2", "--jobs", "2"], "--jobs trains restarts side by side"),
-        (["--set", "training.shards=0"], "training.shards: must be at least 1, got 0"),
-        (["--set", "training.workers=-1"], "training.workers: must be at least 0, got -1"),
-        (["--set", "training.upper_levels=nonsense"], "training.upper_levels: must be clusters or segments, got"),
-    ],
-)
-def test_what_cannot_be_asked_for_is_one_line(tmp_path, arguments, problem):
-    spec = tmp_path / "spec.yaml"
-    spec.write_text(dump_spec(make_spec()))
-    ended = call("fit", spec, "--out", tmp_path / "run", *arguments)
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-    assert problem in ended.err
-    assert not (tmp_path / "run").exists()
-
-
-def test_an_unknown_limit_of_memory_is_said_before_anything_is_done(tmp_path, monkeypatch, toy_spec):
-    """Nothing is collected for a spec whose task has yet to be tried."""
-    monkeypatch.setenv("DDCO_PYRO_MEMORY", "much")
-    with pytest.raises(BadInput, match=r"^DDCO_PYRO_MEMORY=much: has to be a number of GB"):
-        fit(toy_spec, out=tmp_path / "run", on_event=lambda event: pytest.fail(f"{event} was done"))
-    assert not (tmp_path / "run").exists()
 
 
 def test_torchrun_decides_how_many_there_are(monkeypatch):

@@ -5,22 +5,9 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
-from pushing_pictures import DEFAULTS, LARGE, SIZE, PictureCell, encoded, spec_of
+from pushing_pictures import SIZE, encoded
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.training.networks import Dimensions, build_hierarchy, parameters
-
-
-def test_pictures_as_the_camera_has_them_end_in_the_same_maps():
-    """So the networks differ by the two convolutions before the others, and by the 16 maps that the third one reads."""
-    small, large = (
-        parameters(build_hierarchy(spec_of(PictureCell(method, 2, 40, 0), DEFAULTS), Dimensions(shapes, 3, 100)))
-        for method, shapes in (("ff", {"camera": (*SIZE, 3)}), ("ff_large", {"camera": (*LARGE, 3)}))
-    )
-    assert large - small == 16 * (75 + 1) + 16 * (16 * 25 + 1) + 16 * 25 * (16 - 3)
-    spec = spec_of(PictureCell("ff_large", 2, 40, 0), DEFAULTS)
-    assert spec.observations[0].augment.shift == 30
-    assert spec.compare_with[0].policy.of["camera"] == spec.hierarchy.trunk.of["camera"]
 
 
 def test_features_have_versions_of_pictures_that_are_moved():

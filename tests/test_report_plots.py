@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from made_metrics import compared, made_metrics
-from moving_demonstrations import made, reaches, recorded
+from moving_demonstrations import reaches, recorded
 
-from ddco_pyro.drawing.shown import movement, position_key, view
+from ddco_pyro.drawing.shown import movement, position_key
 from ddco_pyro.report.activity import Activity, LevelActivity, bins
-from ddco_pyro.report.likelihood import draw
 from ddco_pyro.report.options import row_order, shares, terminations
 
 
@@ -48,19 +46,6 @@ def test_rows_are_sorted_by_length_then_by_the_first_change():
     assert [paths[row] for row in found] == ["1----", "1222-", "1121-", "1111-", "12111", "11222", "11111"]
 
 
-def test_positions_are_seen_from_where_they_spread():
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(200, 3)) * [0.01, 1.0, 1.0]  # a plane across the first axis
-    elevation, azimuth = view(points, np.ones(3))
-    assert elevation == 15
-    assert min(abs(azimuth % 180), 180 - azimuth % 180) <= 15.0001
-
-
-@pytest.mark.parametrize(("size", "key"), [(2, None), (3, "place"), (7, "place")])
-def test_a_position_has_three_numbers_or_more(size, key):
-    assert position_key(made(2, size)) == key
-
-
 def test_what_moves_is_drawn_whatever_comes_first():
     """Before it in the alphabet: what is constant within each demonstration, in all of them, or only measured badly."""
     rng, hands = np.random.default_rng(1), reaches()
@@ -69,17 +54,6 @@ def test_what_moves_is_drawn_whatever_comes_first():
         base=[step * np.array([0.1, 0.2, 0.3]) for step in steps],
         goal=[step * rng.normal(size=3) for step in steps],
         guess=[step * rng.normal(size=3) + 1e-3 * rng.normal(size=(len(step), 3)) for step in steps],
-        hand=hands,
-    )
-    assert position_key(demos) == "hand"
-
-
-def test_what_goes_somewhere_is_drawn_rather_than_its_velocity_or_a_force():
-    rng, hands = np.random.default_rng(1), reaches()
-    demos = recorded(
-        force=[rng.normal(size=hand.shape) for hand in hands],
-        speed=[np.gradient(hand, axis=0) for hand in hands],
-        state=[np.hstack([hand, hand]) for hand in hands],  # the same, but three of its six numbers are not drawn
         hand=hands,
     )
     assert position_key(demos) == "hand"
@@ -98,14 +72,3 @@ def test_movement_by_hand():
     within, between = 9 * 2.0, 3 * 4.0  # the variance of 0 to 4 is 2; that of a mean of -2 and one of 2 is 4
     assert movement([line - 2, line + 2]) == pytest.approx(np.sqrt(within / (within + between)))
     assert movement([np.array([[1.0, 2.0, 3.0]])]) == 0
-
-
-def test_a_model_alone_is_compared_with_nothing():
-    """Each method has a place on the left; there is a panel of differences where there are some."""
-    beside = made_metrics(2, comparison={"flat": compared(1.0, 0.1)})
-    for metrics, panels in (made_metrics(2), 1), (beside, 2):
-        axes = draw(metrics, {"flat": {"demo_0": 0.0, "demo_1": 0.5}}).axes
-        assert len(axes) == panels
-        shown = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes[0].lines]
-        values = [one.log_likelihood_per_step.valid for one in metrics.methods.values()]
-        np.testing.assert_allclose(shown, [(value, place) for place, value in enumerate(values)])

@@ -11,9 +11,7 @@ from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing import words
-from ddco_pyro.errors import BadInput
 from ddco_pyro.events import EpochEnded, RestartDiverged, RestartStopped
-from ddco_pyro.fitting.fit import fit
 from ddco_pyro.inference import segment
 from ddco_pyro.metrics import Training
 from ddco_pyro.spec import parse_spec
@@ -97,12 +95,6 @@ def test_two_processes_give_the_same_bits_also_where_one_had_begun(
     assert len([event for event in told if isinstance(event, EpochEnded)]) == missing > 0
 
 
-@pytest.mark.parametrize("jobs", [0, -2])
-def test_what_is_no_number_of_processes_is_refused(spec, demos, jobs):
-    with pytest.raises(BadInput, match=f"^--jobs {jobs}: give a number of processes"):
-        fit(spec, demos, jobs=jobs)
-
-
 # --- going on ---------------------------------------------------------------------------------------------------------
 
 
@@ -172,7 +164,7 @@ class Scripted:
         return restart
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_the_worse_half_is_stopped_at_each_rung(demos, tmp_path, monkeypatch, seed):
     random = np.random.default_rng(seed)
     number, first = int(random.integers(1, 10)), int(random.integers(1, 4))
@@ -184,11 +176,9 @@ def test_the_worse_half_is_stopped_at_each_rung(demos, tmp_path, monkeypatch, se
     limits = allowed(curves, first)
     made = [min(limit, len(curve) - 1) for limit, curve in zip(limits, curves, strict=True)]
     assert [each["epochs"] for each in trainer.summary["restarts"]["each"]] == made
-    stopped = {n: made[n] for n in range(number) if made[n] < len(curves[n]) - 1}
-    assert {n: each["stopped"] for n, each in enumerate(trainer.summary["restarts"]["each"])} == {
-        n: stopped.get(n) for n in range(number)
+    assert {event.restart: event.epochs for event in told} == {
+        n: made[n] for n in range(number) if made[n] < len(curves[n]) - 1
     }
-    assert {(event.restart, event.epochs) for event in told} == set(stopped.items())
     tops = [max(curve[: count + 1]) for curve, count in zip(curves, made, strict=True)]
     best = trainer.summary["restarts"]["best"]
     assert tops[best] == max(tops)
@@ -340,25 +330,3 @@ def test_each_restart_begins_from_the_next_kind(demos, tmp_path):
         nmi = normalized_mutual_info_score(ours, theirs)
         assert nmi == pytest.approx(1.0 if number == best else one["nmi"])
         assert number == best or f"{words.number(nmi)} of {number}" in said
-
-
-def test_restarts_in_words(undisturbed):
-    training = undisturbed[0].summary
-    training = training | {
-        "restarts": {
-            "best": 1,
-            "spent": {"epochs": 45, "gradient_steps": 90},
-            "each": [{"epochs": 10, "stopped": 8}, {"epochs": 30, "stopped": None}, {"epochs": 5, "stopped": None}],
-        }
-    }
-    alone = Training.model_validate(
-        training | {"restarts": training["restarts"] | {"each": [{"epochs": 1, "stopped": None}]}}
-    )
-    training = Training.model_validate(training)
-    assert words.restarts(training) == (
-        "restart 1 was the best of 3 (0 to 2; stopped early, with their epochs of the last stage: 0 after 8), "
-        "which took 45 epochs (90 gradient steps) together"
-    )
-    assert words.spent(training).endswith("; " + words.restarts(training))
-    assert words.restarts(alone) == ""
-    assert not words.spent(alone).endswith(";")

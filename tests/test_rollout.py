@@ -177,14 +177,6 @@ def test_a_mean_has_students_interval():
     assert summarize(task, [{"error": 0.5}])["error"] == {"mean": 0.5, "std": None, "trials": 1, "interval": None}
 
 
-def test_a_mean_is_a_mean_whatever_its_values_happen_to_be():
-    """Topples that were 0 or 1 in every episode are still counted, not a rate of successes."""
-    found = summarize(task, [{"error": value} for value in (0.0, 1.0, 1.0, 0.0)])["error"]
-    low, high = stats.t.interval(0.95, 3, 0.5, stats.sem([0.0, 1.0, 1.0, 0.0]))
-    assert found == {"mean": 0.5, "std": pytest.approx(3**-0.5), "trials": 4, "interval": pytest.approx([low, high])}
-    assert summarize(task, [{"error": 1.0}] * 2)["error"]["interval"] == [1.0, 1.0]
-
-
 def test_a_measure_that_never_applies_is_unknown_and_of_its_own_kind():
     declared = replace(task, measures={"inserted": "rate", "error": "mean"})
     found = summarize(declared, [{"inserted": math.nan, "error": math.nan}] * 3)

@@ -15,7 +15,7 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import Damaged
-from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan, TrainingEnded
+from ddco_pyro.events import EpochEnded
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.run import RunError, claim, claimed
 from ddco_pyro.metrics import Counts
@@ -71,11 +71,6 @@ def test_the_folder_holds_what_it_promises(toy_run):
     assert files == FILES | beside | {"names.yaml"}
 
 
-def test_the_spec_in_the_folder_is_the_whole_spec(toy_run, toy_spec):
-    assert load_spec(toy_run.folder / "spec.yaml") == toy_spec
-    assert "patience: 20" in (toy_run.folder / "spec.yaml").read_text()
-
-
 def test_the_history_has_every_epoch(toy_run, watched):
     rows = list(csv.DictReader((toy_run.folder / "history.csv").open()))
     told = [asdict(row) for row in watched.of(EpochEnded) if row.stage != "policy"]
@@ -83,21 +78,6 @@ def test_the_history_has_every_epoch(toy_run, watched):
         {**row, "train": float(row["train"]), "tune": float(row["tune"])} for row in rows
     ]
     assert [row["stage"] for row in rows] == ["vq-1"] * 6 + ["level-1"] * 6 + ["meta-policy"] * 6 + ["joint"] * 6
-
-
-def test_whoever_watches_is_told_what_goes_on(toy_run, watched):
-    models = [(TrainingBegan(name, 24), TrainingEnded(name)) for name in ("ddco", "flat", "per_timestep")]
-    assert watched.of(TrainingBegan, TrainingEnded) == [event for pair in models for event in pair]
-    collected = [DemonstrationsDone(n, 12) for n in range(1, 13)]
-    assert watched.of(DemonstrationsDone) in (collected, [])  # nothing where they are in the cache
-
-
-def test_versions_and_seconds_are_kept(toy_run):
-    metrics = toy_run.metrics
-    assert set(metrics.seconds) == {"demonstrations", "training", "baselines", "evaluation"}
-    assert metrics.versions["ddco-pyro"] == "0.1.0"
-    assert metrics.engine_check.value < 1e-9
-    assert metrics.engine_check.gradient < 1e-9
 
 
 # --- the numbers again ------------------------------------------------------------------------------------------------
@@ -120,35 +100,6 @@ def test_log_likelihoods_can_be_computed_again(toy_run, parts):
         {"name": demo.name, "steps": len(demo), "log_likelihood": pytest.approx(value)}
         for demo, value in zip(parts["valid"], loaded.log_likelihood(parts["valid"]), strict=True)
     ]
-
-
-def test_every_demonstration_is_listed_worst_first(toy_run, demos, parts):
-    listed = toy_run.metrics.demonstrations_by_likelihood
-    methods = {"ddco": toy_run, **toy_run.baselines}
-    steps = dict(zip(demos.names, demos.lengths, strict=True))
-    values = {
-        name: dict(zip(demos.names, fitted.log_likelihood(demos) / demos.lengths, strict=True))
-        for name, fitted in methods.items()
-    }
-    assert [one.name for one in listed] == sorted(demos.names, key=values["ddco"].__getitem__)
-    for one in listed:
-        assert one.part == ("valid" if one.name in parts["valid"].names else "train")
-        assert one.steps == steps[one.name]
-        assert one.log_likelihood_per_step == pytest.approx({m: values[m][one.name] for m in methods})
-    flat = toy_run.baselines["flat"].metrics.demonstrations_by_likelihood
-    assert [one.name for one in flat] == sorted(demos.names, key=values["flat"].__getitem__)
-
-
-def test_comparisons_can_be_computed_again(toy_run, parts):
-    loaded, valid = ddco_pyro.load(toy_run.folder), parts["valid"]
-    steps = sum(valid.lengths)
-    assert list(loaded.metrics.comparison) == list(loaded.baselines) == ["flat", "per_timestep"]
-    for name, baseline in loaded.baselines.items():
-        assert (baseline.name, loaded.name) == (name, "ddco")
-        difference = (loaded.log_likelihood(valid) - baseline.log_likelihood(valid)).sum() / steps
-        found = loaded.metrics.comparison[name]
-        assert found.difference.nats_per_step == pytest.approx(difference)
-        assert found.log_likelihood_per_step.valid == pytest.approx(baseline.log_likelihood(valid).sum() / steps)
 
 
 def test_baselines_are_trained_on_the_same_split(toy_run):
@@ -210,7 +161,9 @@ def planted(tmp_path_factory):
     return path
 
 
-LINEAR = {"hierarchy.levels.0.policy.network": "linear", "hierarchy.levels.0.termination.network": "linear"}
+LINEAR = {
+    f"hierarchy.{place}.network": "linear" for place in ("levels.0.policy", "levels.0.termination", "meta_policy")
+}
 
 
 def test_planted_skills_are_found(planted, tmp_path, toy_spec):
@@ -219,7 +172,8 @@ def test_planted_skills_are_found(planted, tmp_path, toy_spec):
         "demonstrations": {"path": str(planted), "labels": "skill"},
         "observations": ["side", "place"],
     }
-    spec = with_overrides(toy_spec, given | {"compare_with": [], "training.epochs": 240} | LINEAR)
+    training = {"training.epochs": 60, "training.optimizer": {"name": "em"}}
+    spec = with_overrides(toy_spec, given | {"compare_with": []} | training | LINEAR)
     found = fit(spec, out=tmp_path / "run")
     (scores,) = found.metrics.agreement.valid
     assert (scores.nmi, scores.boundary_f1_1) == (pytest.approx(1), 1)
@@ -232,9 +186,9 @@ def test_planted_skills_are_found(planted, tmp_path, toy_spec):
 # --- going on ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("epochs", [6, 17, 29])
+@pytest.mark.parametrize("epochs", [6, 29])
 def test_an_interrupted_run_goes_on_to_the_same_bytes(toy_run, toy_spec, tmp_path, epochs):
-    """In the first stage, at its end, in later ones, in a baseline."""
+    """At the end of the first stage, and in a baseline."""
     folder = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
         fit(toy_spec, out=folder, on_event=Interrupting(epochs))

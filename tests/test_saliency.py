@@ -107,8 +107,3 @@ def test_colours_are_where_the_values_are():
     red, green, _ = np.moveaxis(drawn[:, 160:].astype(int), -1, 0)
     assert (red[:120] > green[:120]).all()
     assert (red[120:] > green[120:] + 90).all()
-
-
-def test_nothing_at_all_is_drawn_as_it_is():
-    picture = np.full((12, 16, 1), 255, np.uint8)
-    assert (with_heat(picture, np.zeros((12, 16))) == 255).all()

@@ -108,8 +108,3 @@ def test_a_package_that_is_missing_is_a_line(monkeypatch):
         monkeypatch.setitem(sys.modules, package, None)
         with pytest.raises(BadInput, match=r"needs \w+; install it with: pip install 'ddco-pyro\[segments\]'"):
             segment(name, planted(2), planted(2), 2, 0)
-
-
-def test_no_such_baseline():
-    with pytest.raises(BadInput, match=r"no baseline 'kmean' \(did you mean 'kmeans'\?\); there is: kmeans, gmm"):
-        segment("kmean", planted(2), planted(2), 2, 0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import re
-import shutil
 from pathlib import Path
 
 import h5py
@@ -33,6 +32,21 @@ def file(toy_spec, toy_run, tmp_path):
     return path
 
 
+@pytest.fixture(scope="module")
+def written(toy_spec, toy_run, tmp_path_factory):
+    """The toy task's demonstrations, at 20 Hz, and the places of all that one command writes of them."""
+    path = tmp_path_factory.mktemp("written") / "demos.hdf5"
+    demonstrations(toy_spec).write(path)
+    with h5py.File(path, "r+") as opened:
+        opened.attrs["control_frequency"] = 20.0
+    before, time = path.read_bytes(), path.stat().st_mtime_ns
+    places = {option: path.with_name(option) for option in ("--html", "--csv", "--parquet", "--out")}
+    ended = call("segment", toy_run.folder, path, *(part for pair in places.items() for part in pair))
+    assert ended.status == 0, ended.err
+    assert (path.read_bytes(), path.stat().st_mtime_ns) == (before, time)
+    return path, places
+
+
 def look(run: Path, demos: Path) -> Segmented:
     with open_source(demos) as source:
         return segments(ddco_pyro.load(run), source)
@@ -56,15 +70,6 @@ def test_they_are_the_fits_own(toy_run, toy_spec, file, at_once, monkeypatch):
         np.testing.assert_array_equal(one.labels["phase"], demo.labels["phase"])
 
 
-@pytest.mark.parametrize("option", ["--html", "--csv", "--parquet"])
-def test_a_page_or_a_table_leaves_the_file_alone(toy_run, file, tmp_path, option):
-    before, time = file.read_bytes(), file.stat().st_mtime_ns
-    out = tmp_path / "segments"
-    assert call("segment", toy_run.folder, file, option, out)[:2] == (0, f"{out}\n")
-    assert (file.read_bytes(), file.stat().st_mtime_ns) == (before, time)
-    assert {path.name for path in tmp_path.iterdir()} == {"demos.hdf5", "segments"}
-
-
 NOTHING = (
     "ddco-pyro: name what to write, such as --html PAGE, --csv FILE or --lerobot FOLDER; labels for each step go to "
     "--out FILE (a copy) or with --in-place into DEMOS; --baselines measures agreement with labels\n"
@@ -74,7 +79,6 @@ NOTHING = (
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([], NOTHING),
         (["--level", "option"], NOTHING),
         (["--in-place", "--out", "copy.hdf5"], "ddco-pyro: --out and --in-place exclude each other; keep one\n"),
         (["--out", "FILE"], "ddco-pyro: --out FILE: is what this command reads; choose another place\n"),
@@ -115,12 +119,12 @@ def test_labels_go_into_the_file_and_are_read_from_there(toy_run, file):
     assert file.stat().st_mtime_ns == time  # it has these labels already
 
 
-def test_a_copy_is_labelled_and_the_file_left_alone(toy_run, file, tmp_path):
-    before = file.read_bytes()
-    copy = tmp_path / "labelled.hdf5"
-    assert call("segment", toy_run.folder, file, "--out", copy).status == 0
-    assert file.read_bytes() == before
-    assert Demonstrations.read(copy, labels=["option"]).names == Demonstrations.read(file).names
+def test_a_copy_is_labelled(toy_run, written):
+    file, places = written
+    copy = Demonstrations.read(places["--out"], labels=["option"])
+    for one, demo in zip(look(toy_run.folder, file).segments, copy, strict=True):
+        assert one.name == demo.name
+        np.testing.assert_array_equal(demo.labels["option"], one.levels["option"].options)
 
 
 def test_labels_from_elsewhere_are_never_replaced(toy_run, file):
@@ -133,22 +137,12 @@ def test_labels_from_elsewhere_are_never_replaced(toy_run, file):
     assert file.read_bytes() == before
 
 
-def test_tables_have_a_row_for_each_step(toy_run, file, tmp_path):
-    with h5py.File(file, "r+") as opened:
-        opened.attrs["control_frequency"] = 20.0
-    table, binary = tmp_path / "segments.csv", tmp_path / "segments.parquet"
-    assert call("segment", toy_run.folder, file, "--csv", table, "--parquet", binary).status == 0
+def test_tables_have_a_row_for_each_step(toy_run, written):
+    file, places = written
     found = look(toy_run.folder, file)
-    rows = list(csv.DictReader(table.open()))
-    assert list(rows[0]) == [
-        "demonstration",
-        "step",
-        "seconds",
-        "option",
-        "option_boundary",
-        "option_probability",
-        "option_name",
-    ]
+    rows = list(csv.DictReader(places["--csv"].open()))
+    columns = "demonstration step seconds option option_boundary option_probability option_name"
+    assert list(rows[0]) == columns.split()
     assert len(rows) == sum(len(one) for one in found.segments)
     at = 0
     for one in found.segments:
@@ -159,17 +153,16 @@ def test_tables_have_a_row_for_each_step(toy_run, file, tmp_path):
         assert [float(row["option_probability"]) for row in part] == level.probability.tolist()
         assert [float(row["seconds"]) for row in part] == [step / 20 for step in range(len(one))]
         at += len(one)
-    columns = parquet.read_table(binary).to_pylist()
-    assert [{key: str(value) for key, value in row.items()} for row in columns] == rows
+    binary = parquet.read_table(places["--parquet"]).to_pylist()
+    assert [{key: str(value) for key, value in row.items()} for row in binary] == rows
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_page_shows_every_segment(toy_run, file, tmp_path):
-    page = tmp_path / "segments.html"
-    assert call("segment", toy_run.folder, file, "--html", page).status == 0
-    text, found = page.read_text(), look(toy_run.folder, file)
+def test_the_page_shows_every_segment(toy_run, written):
+    file, places = written
+    text, found = places["--html"].read_text(), look(toy_run.folder, file)
     drawn, data = tracks(text), embedded(text)
     assert list(drawn) == [one.name for one in found.segments]
     (posterior,) = toy_run.posterior(demonstrations(toy_run.spec)).u
@@ -187,10 +180,9 @@ def test_the_page_shows_every_segment(toy_run, file, tmp_path):
     assert not re.search(r"<(link|iframe|img)|src=|@import|url\(\"?http", text)
 
 
-def test_numbers_follow_the_cursor(toy_run, file, tmp_path):
-    page = tmp_path / "segments.html"
-    assert call("segment", toy_run.folder, file, "--html", page).status == 0
-    for demo, track in zip(demonstrations(toy_run.spec), embedded(page.read_text())["tracks"], strict=True):
+def test_numbers_follow_the_cursor(toy_run, written):
+    tracks = embedded(written[1]["--html"].read_text())["tracks"]
+    for demo, track in zip(demonstrations(toy_run.spec), tracks, strict=True):
         numbers = track["n"]
         values = np.array(unpacked(numbers["bytes"])).reshape(len(numbers["names"]), len(demo))
         decoded = np.array(numbers["low"])[:, None] + np.array(numbers["span"])[:, None] * values / 255
@@ -223,10 +215,8 @@ def marked(page):
     return {name for name, (_, held_out, _) in tracks(page).items() if held_out}
 
 
-def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy_spec, file, tmp_path):
-    page = tmp_path / "segments.html"
-    assert call("segment", toy_run.folder, file, "--html", page).status == 0
-    text = page.read_text()
+def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy_spec, written):
+    text = written[1]["--html"].read_text()
     split = split_in_parts(toy_spec, demonstrations(toy_spec))
     assert marked(text) == set(split["valid"].names)
     scores = {}
@@ -240,41 +230,24 @@ def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy
     assert "3 of 12 demonstrations were held out when the run was fitted" in text
 
 
-def test_baselines_stand_beside_the_options_on_what_was_held_out(toy_run, file, tmp_path):
-    parts, page = split_in_parts(toy_run.spec, demonstrations(toy_run.spec)), tmp_path / "segments.html"
-    ended = call("segment", toy_run.folder, file, "--baselines", "--gripper", 0, "--html", page)
-    assert ended.status == 0, ended.err
-    shown = " ".join(ended.out.split())
-    assert "level option: agreement with the label phase" in shown
+def test_baselines_stand_beside_the_options_and_are_written_as_they_are(toy_run, file, tmp_path):
+    """Their agreement is that on what was held out."""
+    parts, seen = split_in_parts(toy_run.spec, demonstrations(toy_run.spec)), demonstrations(toy_run.spec)
     truth = [demo.labels["phase"] for demo in parts["valid"]]
-    for name, words in BASELINES.items():
-        found = agreement(segment(name, parts["train"], parts["valid"], 2, 0, toy_run.spec.observations, 0), truth)
-        assert f"<td>{words}, 3 held out</td><td>{found.nmi:.2f}</td>" in page.read_text()
-        assert f"{words}, 3 held out" in shown
-
-
-def without_labels(file):
-    with h5py.File(file, "r+") as opened:
-        for group in opened["data"].values():
-            del group["labels/phase"]
-
-
-def test_baselines_are_written_as_the_options_are_with_labels_or_without(toy_run, file, tmp_path):
-    train = split_in_parts(toy_run.spec, demonstrations(toy_run.spec))["train"]
-    seen = demonstrations(toy_run.spec)
-    without_labels(file)
     out, table, page = (tmp_path / name for name in ("out.hdf5", "table.csv", "page.html"))
     written = "--out", out, "--csv", table, "--html", page
     ended = call("segment", toy_run.folder, file, "--baselines", "--gripper", 0, *written)
     assert ended.status == 0, ended.err
-    assert "--baselines: the demonstrations have no labels/phase; no agreement is measured\n" in ended.out
     names = [f"option_{name}" for name in BASELINES]
     marks = [f"{name}_boundary" for name in names]
     again = Demonstrations.read(out, labels=[*names, *marks])
     with table.open(newline="") as opened:
         rows = list(csv.DictReader(opened))
     for name in BASELINES:
-        expected = segment(name, train, seen, 2, 0, toy_run.spec.observations, 0)
+        expected = segment(name, parts["train"], seen, 2, 0, toy_run.spec.observations, 0)
+        held_out = segment(name, parts["train"], parts["valid"], 2, 0, toy_run.spec.observations, 0)
+        nmi = agreement(held_out, truth).nmi
+        assert f"<td>{BASELINES[name]}, 3 held out</td><td>{nmi:.2f}</td>" in page.read_text()
         for demo, kinds in zip(again, expected, strict=True):
             np.testing.assert_array_equal(demo.labels[f"option_{name}"], kinds + 1)
             np.testing.assert_array_equal(demo.labels[f"option_{name}_boundary"], np.diff(kinds, prepend=-1) != 0)
@@ -282,17 +255,17 @@ def test_baselines_are_written_as_the_options_are_with_labels_or_without(toy_run
         for row, (_, _, lanes) in enumerate(tracks(page.read_text()).values()):
             steps = [value for value, start, end in lanes[f"option_{name}"] for _ in range(start, end)]
             assert steps == (expected[row] + 1).tolist()
-    ended = call("segment", toy_run.folder, file, "--baselines", "--gripper", 0, "--out", out)
-    assert ended.status == 0, ended.err  # the labels that are there are its own
 
 
-def test_baselines_without_labels_and_without_a_place_are_refused_before_the_work(toy_run, file, monkeypatch):
-    without_labels(file)
-    monkeypatch.setattr("ddco_pyro.segmenting.segments", None)
-    ended = call("segment", toy_run.folder, file, "--baselines")
-    assert (ended.status, ended.out) == (2, "")
-    message = "--baselines: the demonstrations have no labels/phase; name what to write, such as --html PAGE"
-    assert ended.err == f"ddco-pyro: {message}\n"
+def test_without_labels_nothing_is_said_of_agreement(toy_run, file, tmp_path):
+    with h5py.File(file, "r+") as opened:
+        for group in opened["data"].values():
+            del group["labels/phase"]
+    page = tmp_path / "segments.html"
+    ended = call("segment", toy_run.folder, file, "--baselines", "--gripper", 0, "--html", page)
+    assert "--baselines: the demonstrations have no labels/phase; no agreement is measured\n" in ended.out
+    assert "Agreement" not in page.read_text()
+    assert marked(page.read_text())
 
 
 def test_other_demonstrations_of_the_same_names_are_not_marked(toy_run, toy_spec, file, tmp_path):
@@ -305,17 +278,6 @@ def test_other_demonstrations_of_the_same_names_are_not_marked(toy_run, toy_spec
     assert marked(text) == set()
     assert re.search(r"<td>options, 12 in all</td><td>\d\.\d\d</td>", text)
     assert "were held out" not in text
-
-
-def test_without_labels_the_page_says_nothing_of_agreement(toy_run, file, tmp_path):
-    with h5py.File(file, "r+") as opened:
-        for group in opened["data"].values():
-            del group["labels/phase"]
-    page = tmp_path / "segments.html"
-    assert call("segment", toy_run.folder, file, "--html", page).status == 0
-    assert "Agreement" not in page.read_text()
-    assert "mutual information" not in page.read_text()
-    assert marked(page.read_text())
 
 
 def test_the_page_escapes_what_it_shows(toy_run, tmp_path, toy_spec):
@@ -375,9 +337,3 @@ def test_a_policy_without_options_is_refused(toy_run, file):
     ended = call("segment", toy_run.folder / "baselines" / "flat", file, "--in-place")
     assert ended.status == 2
     assert "is a flat policy without options; name a run with a hierarchy" in ended.err
-
-
-def test_a_copied_run_names_nothing_of_this_machine(toy_run, file, tmp_path):
-    """A run that was moved segments as before."""
-    moved = shutil.copytree(toy_run.folder, tmp_path / "moved")
-    assert call("segment", moved, file, "--csv", tmp_path / "a.csv").status == 0

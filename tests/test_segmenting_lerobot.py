@@ -169,8 +169,6 @@ def test_a_copy_with_subtasks(lerobot_run, tmp_path, form, features, more):
     ("arguments", "message"),
     [
         (["--lerobot", "OUT", "--level", "skil"], "there is no level 'skil' (there is: skill"),
-        (["--lerobot", "OUT", "--lerobot-format", "0.5"], "Invalid value for '--lerobot-format'"),
-        (["--in-place"], "is a folder; name a file"),
         (["--html", "OUT", "--out", "OUT2"], "labels go into HDF5 files only; name another format, such as --csv"),
     ],
 )

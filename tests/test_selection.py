@@ -140,15 +140,15 @@ def faked(values, calls=None):
 
 
 def test_a_fold_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch):
-    spec = spec_at(tmp_path, grid={"training.optimizer.lr": [0.05, 1e30], "training.patience": [None]}, folds=3)
+    spec = spec_at(tmp_path, grid={"training.optimizer.lr": [0.05, 1e30], "training.patience": [None]}, folds=2)
     told = Told()
     made = select(spec, tmp_path / "run", told, ONE)
     assert made.choice.chosen.candidate.number == made.choice.best.candidate.number == 0
     failed = made.choice.rows[1].failed
-    assert sorted(failed) == [0, 1, 2]
+    assert sorted(failed) == [0, 1]
     assert all("is not finite" in reason for reason in failed.values())
     data = json.loads((tmp_path / "run" / "selection.json").read_text())
-    assert [(one["candidate"], one["fold"]) for one in data["failed"]] == [(1, 0), (1, 1), (1, 2)]
+    assert [(one["candidate"], one["fold"]) for one in data["failed"]] == [(1, 0), (1, 1)]
     assert {pair[2] for pair in told.pairs if pair[0].startswith("lr = 0.05")} == {""}
 
 
@@ -160,11 +160,12 @@ def test_where_nothing_is_left_the_first_reason_is_told(tmp_path, monkeypatch):
 
 
 def test_an_unexpected_error_is_told_and_tried_again_next_time(tmp_path, monkeypatch):
+    spec = spec_at(tmp_path, grid={"hierarchy.levels.0.count": [2]}, folds=2)
     monkeypatch.setattr(folds, "train_model", lambda *_, **__: 1 / 0)
     with pytest.raises(SelectionFailed, match="unexpected ZeroDivisionError: division by zero"):
-        select(spec_at(tmp_path), tmp_path / "run", Told(), ONE)
+        select(spec, tmp_path / "run", Told(), ONE)
     monkeypatch.undo()
-    assert select(spec_at(tmp_path), tmp_path / "run", Told(), ONE).choice.chosen is not None
+    assert select(spec, tmp_path / "run", Told(), ONE).choice.chosen is not None
 
 
 def hopeless_second(candidate, fold):
@@ -251,6 +252,7 @@ def test_a_killed_selection_goes_on_and_gives_the_same(tmp_path):
     assert ddco_pyro.load(cut / "fit").metrics.demonstrations.train == 11  # and one to tune with
 
 
+@pytest.mark.slow
 def test_a_process_that_is_ended_from_outside_has_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(folds, "score", ending)
     with pytest.raises(Failed, match=r"was ended from outside .* finished folds are kept: continue with --resume"):

@@ -11,7 +11,7 @@ import pytest
 import torch
 from scipy.cluster.hierarchy import linkage
 
-from ddco_pyro.drawing.diagrams import dendrogram, path_film, transition_graph
+from ddco_pyro.drawing.diagrams import dendrogram, transition_graph
 from ddco_pyro.drawing.shown import frames, projection
 from ddco_pyro.report.inputs import _shares
 from ddco_pyro.report.skills import Instance, aligned, film_of, instances, sheet_of, transitions
@@ -93,14 +93,6 @@ def test_a_film_of_pictures_begins_at_onsets(shades):
             assert right[:, 10:-10].mean() == pytest.approx(100 + 10 * (2 + step), abs=8)
         else:
             assert right[:, 10:-10].mean() == pytest.approx(128 + 140 / 2, abs=8)  # ended: paler
-
-
-def test_a_film_of_trajectories_moves_a_point_along_each_instance():
-    path = np.stack([np.arange(10.0), np.zeros(10)], axis=1)
-    drawn = path_film([path], np.array([[2], [4], [6]]), 1.5, "#123456")
-    (across,) = re.findall(r'attributeName="cx" values="([^"]*)"', drawn)
-    places = np.array([float(value) for value in across.split(";")])
-    assert np.diff(places) == pytest.approx(2 * (110 - 16) / 9, abs=0.11)
 
 
 def test_a_projection_keeps_distances_in_the_plane_that_it_looks_at():

@@ -11,12 +11,9 @@ from pathlib import Path
 import pytest
 import yaml
 from example_specs import EXAMPLE, SMALL
-from pydantic import ValidationError
 
 from ddco_pyro.spec import (
     HierarchySpec,
-    LearnedStd,
-    LevelSpec,
     SpecError,
     dump_spec,
     load_spec,
@@ -61,25 +58,6 @@ def test_higher_levels_select_from_below_unless_told_otherwise() -> None:
     ]
 
 
-def test_a_hierarchy_made_in_python_is_completed_too() -> None:
-    hierarchy = HierarchySpec(levels=(LevelSpec(count=2), LevelSpec(name="upper", count=3)))
-    assert [level.policy.emits for level in hierarchy.levels] == [("control",), ("options",)]
-
-
-def test_a_bare_string_stands_for_a_mapping() -> None:
-    data = {"demonstrations": {"path": "demos.hdf5"}, "observations": ["pose"], "baseline": "flat"}
-    spec = parse_spec({**data, "compare_with": ["per_timestep"]})
-    assert spec.baseline is not None
-    assert (spec.baseline.kind, spec.baseline.policy.hidden) == ("flat", (64,))
-    assert [baseline.kind for baseline in spec.compare_with] == ["per_timestep"]
-
-
-def test_std_is_a_number_or_learned() -> None:
-    assert parse_spec(SMALL, {"control.std": 1}).control.std == 1.0
-    assert parse_spec(SMALL, {"control.std": {"learn": True}}).control.std == LearnedStd(learn=True, floor=0.01)
-    assert parse_spec(SMALL, {"control.scale": [1, 0.5]}).control.scale == (1.0, 0.5)
-
-
 @pytest.mark.parametrize(
     ("level", "read"),
     [
@@ -96,28 +74,6 @@ def test_what_the_policies_of_a_level_read(level: dict[str, object], read: tuple
     assert HierarchySpec.model_validate({"levels": [{"count": 2}], "trunk": {"inputs": ["c"]}}).read_by(1) == ("c",)
 
 
-def test_a_network_of_ones_own_takes_options() -> None:
-    network = {"network": "my_package.nets:Net", "options": {"width": 3, "names": ["a", "b"]}}
-    spec = parse_spec(SMALL, {"hierarchy.meta_policy": network})
-    assert spec.hierarchy is not None
-    assert spec.hierarchy.meta_policy.options == {"width": 3, "names": ["a", "b"]}
-
-
-def test_a_spec_is_frozen() -> None:
-    spec = parse_spec(SMALL)
-    with pytest.raises(ValidationError, match="frozen"):
-        spec.seed = 3  # type: ignore[misc]
-
-
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [("1e-3", 1e-3), ("1E5", 1e5), (".5", 0.5), ("1.0e-3", 1e-3), ("5.e-1", 0.5), ("2", 2.0), ("+.5e0", 0.5)],
-)
-def test_numbers_are_read_as_numbers(tmp_path: Path, text: str, value: float) -> None:
-    path = write(tmp_path, EXAMPLE.replace("lr: 1.0e-3", f"lr: {text}"))
-    assert load_spec(path).training.optimizer.lr == value
-
-
 # --- files ------------------------------------------------------------------------------------------------------------
 
 
@@ -125,13 +81,10 @@ def test_numbers_are_read_as_numbers(tmp_path: Path, text: str, value: float) ->
     ("text", "message"),
     [
         ("", "the file is empty; it has to hold a spec"),
-        ("# nothing but a comment\n", "the file is empty; it has to hold a spec"),
         ("- a\n- b\n", "the file holds ['a', 'b'], not a mapping (key: value)"),
         ("seed: 1\ntask: [a\n", "line 3, column 1: not valid YAML: expected ',' or ']', but got '<stream end>'"),
         ("seed: 1\ntask: a\nseed: 2\n", "line 3, column 1: not valid YAML: key 'seed' is given twice"),
-        ("control:\n  std: 1\n  std: 2\n", "line 3, column 3: not valid YAML: key 'std' is given twice"),
         ("a: *b\n", "line 1, column 4: not valid YAML: found undefined alias 'b'"),
-        ("a: &x {b: *x}\n", "not valid YAML: nested too deeply"),
         ("[" * 5000, "not valid YAML: nested too deeply"),
         ("seed: !!python/name:os.system\n", "could not determine a constructor for the tag"),
         (b"\x89HDF\r\n\x1a\n\x00\x00", "not valid YAML: "),
@@ -228,7 +181,6 @@ def test_overrides_are_applied_to_the_file(tmp_path: Path) -> None:
     ("override", "message"),
     [
         ("seed", "override 'seed': write it as key.path=value"),
-        ("=3", "override '=3': write it as key.path=value"),
         ("seed=[1", "override 'seed=[1': line 1, column 3: not valid YAML"),
         (
             "control.std.learn=true",
@@ -238,7 +190,6 @@ def test_overrides_are_applied_to_the_file(tmp_path: Path) -> None:
             "observations.x.key=a",
             "observations.x.key: 'x' is not the number of one of the 2 items there (the first is 0)",
         ),
-        ("seeed=1", "seeed: unknown key; did you mean seed?"),
     ],
 )
 def test_overrides_that_cannot_be_applied(tmp_path: Path, override: str, message: str) -> None:
@@ -280,13 +231,9 @@ def test_a_grid_over_networks_survives_writing() -> None:
         ("09", 9),
         ("1:30", "1:30"),  # and ninety
         ("1:30.5", "1:30.5"),
-        ("1_000", 1000),
-        ("-0x1f", -31),
         ("0o10", "0o10"),
         ("1e-3", 0.001),
         ("+.5e2", 50.0),
-        ("1.", 1.0),
-        ("-.inf", float("-inf")),
     ],
 )
 def test_a_number_is_what_its_decimal_text_says(text: str, value: object) -> None:
@@ -294,7 +241,7 @@ def test_a_number_is_what_its_decimal_text_says(text: str, value: object) -> Non
     assert (found, type(found)) == (value, type(value))
 
 
-@pytest.mark.parametrize("name", ["010", "09", "1:30", "0o10", "1e3", "1_0", "0x1F", "1.", "yes"])
+@pytest.mark.parametrize("name", ["010", "1:30", "1e3", "yes"])
 def test_a_name_that_looks_like_a_number_stays_a_name(name: str) -> None:
     text = dump_spec(parse_spec({**SMALL, "observations": [name]}))
     assert parse_spec(read_yaml(text)).observed == [name]

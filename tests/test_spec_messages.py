@@ -26,20 +26,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         )
         for name, settings in {"lstm": {}, "conv": {}, "branches": {"of": {"pose": {}}}, "module:Net": {}}.items()
     ),
-    (
-        {"hierarchy": None, "baseline": {"kind": "per_timestep", "policy": {"network": "lstm"}}},
-        "baseline.policy.network: per_timestep has a perceptron for each step: use one of linear, mlp, got 'lstm', or "
-        "say kind: flat",
-    ),
-    ({"hierarchy.levels.0.count": 0}, "hierarchy.levels.0.count: must be at least 1, got 0"),
     ({"hierarchy.levels.0.count": "5"}, "hierarchy.levels.0.count: must be a whole number, got '5'"),
-    ({"hierarchy.levels.0.count": 5.0}, "hierarchy.levels.0.count: must be a whole number, got 5.0"),
     ({"hierarchy.levels.0.count": True}, "hierarchy.levels.0.count: must be a whole number, got true"),
-    (
-        {"hierarchy.levels.0": {"name": "a"}},
-        "hierarchy.levels.0.count: missing; it has to be given",
-    ),
-    ({"hierarchy.levels": []}, "hierarchy.levels: must have at least 1 item(s), got []"),
     ({"hierarchy.levels": {"count": 3}}, "hierarchy.levels: must be a list, got {'count': 3}"),
     (
         {"hierarchy.levels.0.cuont": 5},
@@ -57,10 +45,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     (
         {"hierarchy.levels.0.name": "a b"},
         "hierarchy.levels.0.name: must be letters, digits, '_' or '-', a letter first, got 'a b'",
-    ),
-    (
-        {"hierarchy.levels.0.policy.emits": []},
-        "hierarchy.levels.0.policy.emits: must have at least 1 item(s), got []",
     ),
     (
         {"hierarchy.levels.0.policy.emits": ["options", "control"]},
@@ -82,10 +66,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     (
         {"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}},
         "hierarchy.meta_policy.hidden: does not apply to network 'linear'; leave it out",
-    ),
-    (
-        {"hierarchy.meta_policy": {"network": "mlp", "options": {"a": 1}}},
-        "hierarchy.meta_policy.options: does not apply to network 'mlp'; leave it out",
     ),
     (
         {"control.parts": [{"name": "arm", "dims": [0, 1], "scale": [1.0]}]},
@@ -112,38 +92,13 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "hierarchy.meta_policy.kernel: each of layers has its own; leave it out",
     ),
     (
-        {"hierarchy.meta_policy": {"network": "lstm", "hidden": []}},
-        "hierarchy.meta_policy.hidden: must have at least 1 item(s), got []",
-    ),
-    (
-        {"hierarchy.meta_policy": {"network": "lstm", "horizon": 0}},
-        "hierarchy.meta_policy.horizon: must be at least 1, got 0",
-    ),
-    (
-        {"hierarchy.meta_policy": {"network": "lstm", "horizon": 2.5}},
-        "hierarchy.meta_policy.horizon: must be a whole number, got 2.5",
-    ),
-    (
-        {"hierarchy.meta_policy": {"network": "mlp", "horizon": 10}},
-        "hierarchy.meta_policy.horizon: does not apply to network 'mlp'; leave it out",
-    ),
-    (
         {"hierarchy.meta_policy": {"network": "branches"}},
         "hierarchy.meta_policy.of: missing; it has to be given",
-    ),
-    (
-        {"hierarchy.meta_policy": {"network": "lstm", "over": {"network": "mlp", "hiden": [8]}}},
-        "hierarchy.meta_policy.over.hiden: unknown key; did you mean hierarchy.meta_policy.over.hidden?",
-    ),
-    (
-        {"hierarchy.meta_policy": {"network": "branches", "of": {"state": {"network": "mlp", "hiden": [8]}}}},
-        "hierarchy.meta_policy.of.state.hiden: unknown key; did you mean hierarchy.meta_policy.of.state.hidden?",
     ),
     (
         {"hierarchy.levels.0.trunk": {"network": "mlp"}, "hierarchy.levels.0.policy": {"network": "lstm"}},
         "hierarchy.levels.0.policy.network: reads the trunk: use one of linear, mlp, got 'lstm'",
     ),
-    ({"hierarchy.meta_policy.hidden": [8, 0]}, "hierarchy.meta_policy.hidden.1: must be at least 1, got 0"),
     ({"hierarchy.meta_policy.dropout": 1}, "hierarchy.meta_policy.dropout: must be less than 1, got 1"),
     ({"hierarchy": None}, "hierarchy: missing; declare a hierarchy, or a baseline in its place"),
     (
@@ -177,10 +132,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "training.labels.form: unknown key; did you mean training.labels.from?",
     ),
     (
-        {"hierarchy": None, "baseline": "flat", "training.labels": {"level": "option", "from": "phase"}},
-        "training.labels.level: there is no level 'option'; a baseline has none; leave training.labels out",
-    ),
-    (
         {"hierarchy.meta_policy.emits": ["control"], "training.labels": {"level": "option", "from": "phase"}},
         "training.labels.level: no policy selects the options of 'option'; let the policies above emit options",
     ),
@@ -194,12 +145,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "list of them, got 'clusters' (did you mean 'cuts'?)",
     ),
     (
-        {"training": {"initialize": ["vq", "cut"], "restarts": 2}},
-        "training.initialize.1: must be vq or vq_controls or equal_parts or cuts or mixture or random, "
-        "got 'cut' (did you mean 'cuts'?)",
-    ),
-    ({"training.initialize": []}, "training.initialize: must have at least 1 item(s), got []"),
-    (
         {"training.initialize": ["vq", "cuts"]},
         "training.initialize: has 2 kinds, but training.restarts is 1; give as many restarts",
     ),
@@ -207,60 +152,28 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"training": {"initialize": "mixture", "lower_levels": "frozen"}},
         "training.lower_levels: mixture trains all levels together in the end; say fine_tuned",
     ),
-    (
-        {"training.duration.mean": 0.5},
-        "training.duration.mean: must be a number of steps, at least 1, or a list of them, got 0.5",
-    ),
-    ({"training.duration.mean": [20, 0]}, "training.duration.mean.1: must be at least 1, got 0"),
     ({"training.duration.mean": [20, 2]}, "training.duration.mean: has 2 numbers, but the number of levels is 1"),
-    ({"training.duration": {"mean": 20, "weight": -1}}, "training.duration.weight: must be at least 0, got -1"),
     (
         {"hierarchy": None, "baseline": "flat", "training.duration.mean": 20},
         "training.duration: there are no options that last; leave it out",
     ),
-    ({"compare_with": [3]}, "compare_with.0: must be a mapping (key: value), got 3"),
     ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),
-    ({"task": ""}, "task: must not be empty, got ''"),
-    ({"observations": []}, "observations: must have at least 1 item(s), got []"),
-    ({"observations": "pose"}, "observations: must be a list, got 'pose'"),
     ({"observations": ["a", "a"]}, "observations.1.key: 'a' is given twice; keep one"),
     (
         {"observations": ["hand_pos", "goal"], "report.trajectory": "hand_po"},
         "report.trajectory: there is no observation 'hand_po' (did you mean 'hand_pos'?); there is: hand_pos, goal",
     ),
-    ({"report.trajektory": "pose"}, "report.trajektory: unknown key; did you mean report.trajectory?"),
     ({"control.std": -0.1}, "control.std: must be a positive number or {learn: true}, got -0.1"),
-    ({"control.std": "0.1"}, "control.std: must be a positive number or {learn: true}, got '0.1'"),
-    ({"control.std": [0.1]}, "control.std: must be a positive number or {learn: true}, got [0.1]"),
-    ({"control.std": {}}, "control.std.learn: missing; it has to be given"),
-    ({"control.std": {"learn": True, "floor": -1}}, "control.std.floor: must be greater than 0, got -1"),
-    ({"control.std": {"learn": False}}, "control.std.learn: must be true, got false"),
-    (
-        {"control.std": {"learn": True, "flor": 1}},
-        "control.std.flor: unknown key; did you mean control.std.floor?",
-    ),
     (
         {"control.scale": "standardise"},
         "control.scale: must be standardize, none, or a list of positive numbers, got 'standardise' "
         "(did you mean 'standardize'?)",
     ),
-    ({"control.scale": 3}, "control.scale: must be standardize, none, or a list of positive numbers, got 3"),
-    ({"control.scale": []}, "control.scale: must have at least 1 item(s), got []"),
     ({"control.scale": [1.0, 0.0]}, "control.scale.1: must be greater than 0, got 0.0"),
-    (
-        {"training.optimizer.name": "Adam"},
-        "training.optimizer.name: must be adam or adamw or momentum or em, got 'Adam' (did you mean 'adam'?)",
-    ),
     ({"training.optimizer.lr": float("inf")}, "training.optimizer.lr: must be a finite number, got inf"),
     ({"training.layerwise": "yes"}, "training.layerwise: must be true or false, got 'yes'"),
     ({"training": None}, "training: must be a mapping (key: value), got null"),
-    ({"seed": -1}, "seed: must be at least 0, got -1"),
     ({"seed": 2**32}, "seed: must be at most 4294967295, got 4294967296"),
-    ({"demonstrations.valid_fraction": -0.1}, "demonstrations.valid_fraction: must be at least 0, got -0.1"),
-    (
-        {"hierarchy.levels.0.policy.network": None},
-        "hierarchy.levels.0.policy.network: must be text, got null",
-    ),
 ]
 
 
@@ -306,7 +219,6 @@ def test_keys_that_are_not_text_are_refused() -> None:
             {"selection.folds": [3]},
             "selection.grid.selection.folds: the selection cannot be part of its own grid; remove it",
         ),
-        ({"seed": []}, "selection.grid.seed: must have at least 1 item(s), got []"),
         ({"seed": 3}, "selection.grid.seed: must be a list, got 3"),
     ],
 )

@@ -16,7 +16,7 @@ from scipy import stats
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.data.inspection import inspect
-from ddco_pyro.data.starting import PICTURES, VECTORS, Recipe, _batch, _epochs, starting_spec
+from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.spec import Spec, load_spec
 
 
@@ -102,31 +102,6 @@ def test_what_it_writes_lets_every_method_converge(tmp_path: Path) -> None:
     assert len({one.budget.epochs for one in trainings}) == 1
 
 
-@pytest.mark.parametrize(
-    ("recipe", "lengths", "epochs"),
-    [
-        (VECTORS, [22] * 120, 2000),  # 3 gradient steps in an epoch: 6000 in all
-        (VECTORS, [57] * 100, 1000),  # 6
-        (VECTORS, [100] * 1000, 200),  # 100, and 200 epochs at least
-        (VECTORS, [10] * 5, 2000),  # 3, in minibatches of 2
-        (PICTURES, [125] * 80, 100),  # 40, in minibatches of 2: 4000 in all
-        (PICTURES, [600] * 200, 20),  # 200, and 20 epochs at least
-    ],
-)
-def test_epochs_follow_from_the_gradient_steps(recipe: Recipe, lengths: list[int], epochs: int) -> None:
-    found = np.array(lengths)
-    assert _epochs(found, _batch(found, recipe), recipe) == epochs
-
-
-def test_three_demonstrations_are_enough(tmp_path: Path) -> None:
-    demonstrations(3).write(tmp_path / "demos.hdf5")
-    assert call("init", tmp_path / "demos.hdf5", "--out", tmp_path / "spec.yaml").status == 0
-    ended = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--set", "training.epochs=1")
-    assert ended.status == 0, ended.err
-    numbers = ddco_pyro.load(tmp_path / "run").metrics.demonstrations
-    assert [getattr(numbers, part) for part in ("train", "tune", "valid")] == [1, 1, 1]
-
-
 def test_it_says_what_it_leaves_out(path: Path, tmp_path: Path) -> None:
     edit(path, "goal", 3.0)
     edit(path, "1e3", np.nan)
@@ -156,28 +131,13 @@ def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path) ->
     assert [one.key for one in spec.observations] == ["pose"]
     assert "# NaN, infinite or huge values, or damaged; where: ddco-pyro inspect" in text
     assert text.startswith("# A starting spec for 8 demonstrations of 3 to 6 steps.")
-    ended = call(
-        "fit", written, "--out", tmp_path / "run", "--set", "training.epochs=1", "--set", "compare_with=[]"
-    )  # fmt: skip
-    assert ended.status == 0, ended.err
-    numbers = ddco_pyro.load(tmp_path / "run").metrics.demonstrations
+    fit = ddco_pyro.fit(load_spec(written, ["training.epochs=1", "compare_with=[]"]), out=tmp_path / "run")
+    numbers = fit.metrics.demonstrations
     assert numbers.train + numbers.tune + numbers.valid == 8
-    assert call("report", tmp_path / "run").status == 0
     ended = call("segment", tmp_path / "run", path, "--csv", tmp_path / "segments.csv")
     assert ended.status == 0, ended.err
     rows = [line.split(",")[0] for line in (tmp_path / "segments.csv").read_text().splitlines()[1:]]
     assert set(rows) == {f"demo_{number}" for number in range(10)} - {"demo_2", "demo_9"}
-
-
-def test_demonstrations_that_cannot_be_read_are_left_out(path: Path, tmp_path: Path) -> None:
-    demonstrations(7).write(path)
-    with h5py.File(path, "r+") as file:
-        del file["data/demo_1/actions"]
-        file["data/demo_3"].attrs["num_samples"] = 99
-    spec = load_spec(write(tmp_path, text := starting_spec(inspect(path), path)))
-    assert spec.demonstrations.exclude == ("demo_1", "demo_3")
-    assert text.startswith("# A starting spec for 5 demonstrations")
-    assert call("check", tmp_path / "written.yaml").status == 0
 
 
 def test_of_many_broken_demonstrations_the_key_is_left_out(path: Path) -> None:
@@ -198,16 +158,6 @@ def test_a_control_that_never_changes_is_refused(path: Path) -> None:
         starting_spec(inspect(path), path)
 
 
-def test_masks_of_the_file_decide_what_is_held_out(path: Path, tmp_path: Path) -> None:
-    demonstrations(8).write(path)
-    assert load_spec(write(tmp_path, starting_spec(inspect(path), path))).demonstrations.valid_fraction == 0.2
-    demonstrations(6, {"train": ("demo_0", "demo_3"), "valid": ("demo_1",), "better": ("demo_2",)}).write(path)
-    text = starting_spec(inspect(path), path)
-    assert "# held out: as mask/train and mask/valid in the file say" in text
-    assert "# other masks in the file, not used: better" in text
-    assert "valid_fraction" not in text
-
-
 def test_pictures_alone_are_seen_by_one_network(tmp_path: Path) -> None:
     """Two cameras, a small one as it is and a larger one reduced; what is written can be fitted."""
     random, records = np.random.default_rng(2), []
@@ -222,9 +172,8 @@ def test_pictures_alone_are_seen_by_one_network(tmp_path: Path) -> None:
         ("eye", (32, 64), 3),
     ]
     assert set(spec.hierarchy.trunk.of) == set(CAMERAS)
-    ended = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--set", "training.epochs=2")
-    assert ended.status == 0, ended.err
-    assert list(ddco_pyro.load(tmp_path / "run").baselines) == ["mixture", "flat_equal"]
+    fit = ddco_pyro.fit(load_spec(tmp_path / "spec.yaml", ["training.epochs=2"]))
+    assert list(fit.baselines) == ["mixture", "flat_equal"]
 
 
 CAMERAS = {"eye": (40, 80), "2nd eye": (12, 16)}
@@ -258,7 +207,7 @@ def test_a_file_that_is_there_is_not_replaced_unasked(path: Path, tmp_path: Path
     spec = tmp_path / "spec.yaml"
     spec.write_text("mine")
     ended = call("init", path, "--out", spec)
-    assert ended.status == 2
+    assert (ended.status, spec.read_text()) == (2, "mine")
     assert ended.err == f"ddco-pyro: {spec}: exists; choose another --out, or replace it with --force\n"
     assert call("init", path, "--out", spec, "--force").status == 0
     assert spec.read_text() != "mine"

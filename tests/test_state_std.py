@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from command_line import call
 from hierarchies import make_batch, make_hierarchy, varied
 from scipy import stats
 
@@ -14,7 +13,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.controls import INITIAL_STD
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import SpecError, parse_spec, with_overrides
+from ddco_pyro.spec import SpecError, parse_spec
 from ddco_pyro.training.networks import Dimensions, baseline_spec, build_hierarchy, parameters
 
 OF_STATE = {"learn": True, "per_state": True}
@@ -68,11 +67,6 @@ def test_at_first_it_is_the_same_everywhere(network):
             caller.density_link(batch.actions).table.sum(), hierarchy.levels[0].policy.parameters()
         )
         assert all((slope != 0).any() for slope in gradient if slope.shape[-1] == 4)
-
-
-def test_where_networks_read_a_trunk_it_is_the_same_at_first_too():
-    hierarchy = make_hierarchy((2,), network="linear", trunk={"hidden": [5]}, std=OF_STATE)
-    assert (hierarchy(make_batch().inputs).callers[0].emission.std == INITIAL_STD).all()
 
 
 def test_dimensions_with_other_sigmas_stand_beside():
@@ -169,13 +163,6 @@ def test_it_is_counted_saved_and_decomposed(fitted):
     assert sum(each.by_dimension) == pytest.approx(fit.metrics.log_likelihood_per_step.valid, rel=1e-5)
 
 
-def test_sigma_is_no_part_of_the_measure(fitted, tmp_path):
-    fit, demos, _ = fitted
-    other = ddco_pyro.fit(with_overrides(fit.spec, {"control.std": 0.5, "compare_with": []}), demos, tmp_path / "run")
-    ended = call("compare", fit.folder, other.folder)
-    assert ended.status == 0, ended.err
-
-
 def test_without_skill_options_lead_by_their_sigma_alone():
     """Options that each have a σ beat a flat policy with one σ, but not one whose σ depends on the state."""
     demos, _ = noisy()
@@ -200,26 +187,6 @@ def beside(*compare_with, **control):
     )
 
 
-def test_a_baseline_has_its_own_wherever_sigma_is_learned():
-    parts = [
-        {"name": "arm", "dims": [0, 1], "std": {**OF_OPTION, "floor": 0.1}},
-        {"name": "wrist", "dims": [2], "std": 0.3},
-        {"name": "jaw", "dims": [3]},
-    ]
-    spec = beside("flat", {"kind": "flat", "std": OF_STATE}, std={**OF_OPTION, "floor": 0.02}, parts=parts)
-    as_it_is, own = (baseline_spec(spec, baseline, None).control for baseline in spec.compare_with)
-    assert as_it_is == spec.control
-    assert own.std.model_dump() == {"learn": True, "floor": 0.02, "per_option": False, "per_state": True}
-    arm, wrist, jaw = own.parts
-    assert (arm.std.floor, arm.std.per_option, arm.std.per_state) == (0.1, False, True)
-    assert (wrist, jaw) == spec.control.parts[1:]
-    (floor,) = (
-        baseline_spec(again, again.compare_with[0], None).control.std.floor
-        for again in [beside({"kind": "mixture", "std": {**OF_STATE, "floor": 0.2}}, std=OF_OPTION)]
-    )
-    assert floor == 0.2
-
-
 def test_flat_equal_counts_the_numbers_for_sigma():
     spec = beside("flat_equal", {"kind": "flat_equal", "std": OF_STATE}, std=OF_OPTION)
     size = Dimensions({"state": (2,)}, 2, 25)
@@ -228,19 +195,6 @@ def test_flat_equal_counts_the_numbers_for_sigma():
     assert of_state.baseline.policy.hidden < one.baseline.policy.hidden
     for own in (one, of_state):
         assert parameters(build_hierarchy(own, size)) == pytest.approx(whole, rel=0.02)
-
-
-def test_what_is_not_said_changes_no_bit():
-    demos, _ = noisy(6, 8)
-    models = []
-    for std in (OF_OPTION, {**OF_OPTION, "per_state": False}):
-        fit = ddco_pyro.fit(with_overrides(beside("flat", std=std), {"training.epochs": 4}), demos)
-        models.append([one.hierarchy.state_dict() for one in (fit, fit.baselines["flat"])])
-        emission = fit.hierarchy(make_batch(features=2).inputs).callers[0].emission
-        assert emission.std.shape == (3, 2)
-    for ours, theirs in zip(*models, strict=True):
-        assert list(ours) == list(theirs)
-        assert all(torch.equal(tensor, theirs[name]) for name, tensor in ours.items())
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
@@ -256,10 +210,6 @@ BOTH = {"learn": True, "per_option": True, "per_state": True}
             "control.std.per_option: per_state gives each option its own σ already; leave per_option out",
         ),
         (
-            {"control": {"parts": [{"name": "a", "dims": [0], "std": BOTH}]}},
-            "control.parts.0.std.per_option: per_state gives each option its own σ already; leave per_option out",
-        ),
-        (
             {"baseline": {"kind": "flat", "std": OF_STATE}},
             "baseline.std: is for baselines in compare_with; give it in control.std",
         ),
@@ -267,7 +217,6 @@ BOTH = {"learn": True, "per_option": True, "per_state": True}
             {"control": {"std": 0.1}, "compare_with": [{"kind": "flat", "std": OF_STATE}]},
             "compare_with.0.std: no σ in control is learned; say control.std: {learn: true}",
         ),
-        ({"compare_with": [{"kind": "flat", "std": {}}]}, "compare_with.0.std.learn: missing; it has to be given"),
     ],
 )
 def test_what_does_not_fit_together_is_one_line(changes, message):

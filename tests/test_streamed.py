@@ -6,7 +6,6 @@ Fits themselves are compared in ``test_pictures.py``; rollouts see no stored pic
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,18 +15,15 @@ import pytest
 from command_line import call
 
 import ddco_pyro
-from ddco_pyro.comparison import compare
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import Pictures
 from ddco_pyro.exporting import export
-from ddco_pyro.report import write_report
 from ddco_pyro.selection import Workers, select
 from ddco_pyro.spec import parse_spec
 
 CONV = {"network": "conv", "filters": 3, "kernel": 3, "pooled": 2, "hidden": [5]}
 LINEAR = {"network": "linear", "inputs": ["pose"]}
 LEVEL = "skill"
-OPTIONS = {"name": LEVEL, "count": 2, "policy": CONV, "termination": LINEAR}
 
 
 class Both(NamedTuple):
@@ -104,29 +100,6 @@ def test_a_monitor_and_a_controller(both: Both) -> None:
         np.testing.assert_array_equal(*acted)
         control = acted[0]
     assert monitors[0].log_likelihood == monitors[1].log_likelihood != 0
-
-
-def test_runs_are_compared(both: Both) -> None:
-    rows = compare([both.streamed.run_folder, both.whole.run_folder]).rows
-    assert [row.difference for row in rows] == [0.0, 0.0]
-    tables = [compare([run, run / "baselines" / "flat"]).rows for run in (both.streamed.folder, both.whole.folder)]
-    named = [[(row.model, row.total, row.difference) for row in table] for table in tables]
-    assert named[0] == named[1]
-
-
-@pytest.mark.slow
-def test_a_report(both: Both) -> None:
-    """The page, its figures within; of the runs' folders, seconds and file names alone differ."""
-    pages = [write_report(fit, fit.demonstrations).read_text() for fit in (both.streamed, both.whole)]
-    assert isinstance(both.streamed.demonstrations[0].observations["camera"], Pictures)
-    assert isinstance(both.whole.demonstrations[0].observations["camera"], np.ndarray)
-    aside = [str(both.path), *(str(fit.folder / "demonstrations.hdf5") for fit in (both.streamed, both.whole))]
-    for name in aside:
-        pages = [page.replace(name, "FILE") for page in pages]
-    for fit in (both.streamed, both.whole):
-        pages = [page.replace(str(fit.folder), "RUN").replace(fit.folder.name, "RUN") for page in pages]
-    pages = [re.sub(r"<dd>[\d.]+</dd>|<metadata>.*?</metadata>", "", page, flags=re.S) for page in pages]
-    assert pages[0] == pages[1]
 
 
 @pytest.mark.slow

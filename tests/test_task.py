@@ -112,18 +112,3 @@ def test_a_wrong_declaration_is_refused(measures, message):
     with pytest.raises(OutcomeError) as caught:
         with_outcome({}, **measures)
     assert str(caught.value) == message
-
-
-def test_the_toy_task_depends_on_its_seed_alone():
-    one, same, other = (run_episode(toy_task.task, "supervisor", seed).record for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one.observations["offsets"], same.observations["offsets"])
-    assert not np.array_equal(one.observations["offsets"][0], other.observations["offsets"][0])
-
-
-def test_the_toy_tasks_supervisor_is_better_than_its_open_loop():
-    rates = {
-        name: np.mean([run_episode(toy_task.task, name, seed).outcome["success"] for seed in range(30)])
-        for name in toy_task.task.policies
-    }
-    assert rates["supervisor"] > 0.9
-    assert 0.2 < rates["open_loop"] < 0.8

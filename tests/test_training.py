@@ -49,16 +49,12 @@ def flat(kind="flat", network="linear", lr=0.03, **training):
 @pytest.mark.parametrize(
     ("training", "depth", "names"),
     [
-        ({}, 1, ["vq-1", "level-1", "meta-policy", "joint"]),
         ({}, 2, ["vq-1", "level-1", "vq-2", "level-2", "meta-policy", "joint"]),
         ({"initialize": "equal_parts", "layerwise": False}, 2, ["parts-1", "parts-2", "joint"]),
         ({"initialize": "random"}, 2, ["level-1", "level-2", "meta-policy", "joint"]),
         ({"lower_levels": "frozen"}, 1, ["vq-1", "level-1", "meta-policy"]),
-        ({"upper_levels": "segments"}, 1, ["vq-1", "level-1", "meta-policy", "joint"]),
         ({"upper_levels": "segments"}, 3, ["vq-1", "level-1", "segments", "upper", "joint"]),
-        ({"layerwise": False}, 2, ["vq-1", "vq-2", "joint"]),
         ({"initialize": "cuts"}, 1, ["cuts-1", "level-1", "meta-policy", "joint"]),
-        ({"initialize": "mixture"}, 1, ["vq-1", "mixture", "joint"]),
         ({"initialize": "mixture", "upper_levels": "segments"}, 3, ["vq-1", "vq-2", "vq-3", "mixture", "joint"]),
         ({"layerwise": False, "initialize": "random"}, 3, ["joint"]),
         ({}, 0, ["policy"]),
@@ -188,33 +184,15 @@ def test_stages_share_the_budget_and_what_one_leaves_goes_to_the_later_ones(tmp_
     assert trainer.summary["spent"]["epochs"] == 62 - left
 
 
-def test_a_budget_that_is_smaller_than_the_stages_is_the_last_ones(tmp_path):
-    trainer = make_trainer(make_spec((2,), epochs=2), random_demonstrations(), tmp_path)
-    trainer.run()
-    assert epochs_of(trainer) == {"meta-policy": 1, "joint": 1}
-    assert [stage["converged"] for stage in trainer.summary["stages"]][:2] == [False, False]
-
-
-@pytest.mark.parametrize("model", [(2,), (2, 2), "flat", "per_timestep"])
+@pytest.mark.parametrize("model", [(2, 2), "flat"])
 def test_every_model_has_the_same_budget(tmp_path, model):
-    """Whatever the number of its stages: 1, 4 or 6 here. The steps are those of minibatches of 3 out of 8."""
+    """Whatever the number of its stages: 1 or 6 here. The steps are those of minibatches of 3 out of 8."""
     training = {"epochs": 14, "patience": None, "batch_size": 3, "restarts": 2}
     spec = flat(model, **training) if isinstance(model, str) else make_spec(model, **training)
     trainer = make_trainer(spec, random_demonstrations(), tmp_path)
     trainer.run()
     assert sum(epochs_of(trainer, 0).values()) == sum(epochs_of(trainer, 1).values()) == 14
     assert trainer.summary["budget"] == trainer.summary["spent"] == {"epochs": 14, "gradient_steps": 14 * 3}
-
-
-def test_the_training_that_is_told_is_that_of_the_best_restart(tmp_path):
-    joint = {"initialize": "random", "layerwise": False, "patience": 2, "restarts": 3}
-    trainer = make_trainer(make_spec((2,), 4, **joint, **QUICK), random_demonstrations(), tmp_path)
-    trainer.run()
-    best = max(trainer.history, key=lambda row: row["tune"])["restart"]
-    counts = [epochs_of(trainer, restart)["joint"] for restart in range(3)]
-    assert best != 2  # not simply the last
-    assert counts.count(counts[best]) == 1
-    assert trainer.summary["spent"]["epochs"] == counts[best]
 
 
 def test_without_a_budget_every_stage_trains_until_its_patience(tmp_path):
@@ -276,8 +254,8 @@ def test_the_running_mean_of_the_weights_is_evaluated_and_kept(tmp_path, monkeyp
         ("adam", {"epochs": 12}, 2 * 6 * 2),
         pytest.param("momentum", {"epochs": 18}, 2 * 6 * 3, marks=pytest.mark.slow),
         pytest.param("adam", {"epochs": 30, "patience": 1}, None, marks=pytest.mark.slow),
-        ("adam", {"epochs": 10, "upper_levels": "segments"}, 2 * 5 * 2),
-        ("adam", {"epochs": 12, "average": 0.9}, 2 * 6 * 2),
+        pytest.param("adam", {"epochs": 10, "upper_levels": "segments"}, 2 * 5 * 2, marks=pytest.mark.slow),
+        pytest.param("adam", {"epochs": 12, "average": 0.9}, 2 * 6 * 2, marks=pytest.mark.slow),
         ("adam", {"epochs": 12, "initialize": ["cuts", "mixture"]}, 12 + 12),
     ],
     ids=["adam", "momentum", "stages that stop early", "levels from segments", "mean weights", "starts that differ"],
@@ -350,9 +328,7 @@ def test_what_is_not_finite_names_the_demonstration(tmp_path):
     [
         ([0.0, 1.0, 2.0, 4.0], 2, 3.0, 2),  # 1 before the last two, 4 with them
         ([0.0, 5.0, 2.0, 4.0], 2, 0.0, 2),  # patience is exhausted
-        ([0.0, 5.0, 2.0, 6.0], 2, 1.0, 2),
         ([3.0, 1.0, 2.0], 5, 0.0, 2),  # it was best before it began
-        ([1.0, 1.5], 5, 0.5, 1),
         ([7.0], 5, 0.0, 0),  # no epochs at all
         ([0.0, *range(30)], None, 20.0, 20),
     ],
@@ -408,7 +384,11 @@ def test_a_planted_hierarchy_is_recovered_from_the_best_of_several_cuts(tmp_path
     assert [each["nmi"] is not None for each in told["each"]] == [number != told["best"] for number in range(6)]
 
 
-@pytest.mark.parametrize("optimizer", [{"name": "em"}, {"name": "adam", "lr": 0.03}], ids=["em", "adam"])
+@pytest.mark.parametrize(
+    "optimizer",
+    [{"name": "em"}, pytest.param({"name": "adam", "lr": 0.03}, marks=pytest.mark.slow)],
+    ids=["em", "adam"],
+)
 @pytest.mark.parametrize("counts", [(3,), (3, 2)])
 def test_a_hierarchy_begins_from_the_mixtures_fit_with_psi_one_half(tmp_path, counts, optimizer):
     """The stage before the last maximises the likelihood of the spec whose options always end."""
@@ -443,7 +423,8 @@ def test_a_hierarchy_begins_from_the_mixtures_fit_with_psi_one_half(tmp_path, co
         )
 
 
-@pytest.mark.parametrize("counts", [(4,), pytest.param((4, 2), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("counts", [(4,), (4, 2)])
 def test_a_planted_hierarchy_is_recovered(tmp_path, counts):
     """Held-out log-likelihood within 2 % of the truth's own, and segments that agree with the true options."""
     spec = make_spec(counts, control=CONTROL, **(TRAINING if len(counts) > 1 else TRAINING | {"restarts": 1}))

@@ -87,8 +87,6 @@ def test_it_is_trained_with_the_lowest_level_and_with_all():
     ("changes", "message"),
     [
         ({"network": SEES, "meta": {"network": "lstm"}}, "hierarchy.meta_policy.network: reads the trunk: use one of"),
-        ({"network": {"network": "conv"}}, "hierarchy.levels.0.policy.network: reads the trunk"),
-        ({"own": {"network": "lstm"}}, "hierarchy.levels.0.trunk.network: reads the trunk"),
         ({"network": LINEAR | {"inputs": ["state"]}}, "hierarchy.levels.0.policy.inputs: the trunk reads the obs"),
         ({"own": SEES | {"shared": True}}, "hierarchy.levels.0.trunk.shared: all options share the hierarchy's trunk"),
     ],

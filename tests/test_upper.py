@@ -162,7 +162,7 @@ def planted_pairs(demonstrations=20, steps=40, seed=0):
     return replace(tables, termination=(ended, tables.termination[1]), control=(control, *tables.control[1:])), above
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_planted_level_is_found(seed):
     tables, above = planted_pairs(seed=seed)
     lengths = torch.full((20,), 40)

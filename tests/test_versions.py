@@ -15,10 +15,9 @@ from command_line import call
 from dots import followed
 
 import ddco_pyro
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import shifted
 from ddco_pyro.encoding import Encoding, encode, load
-from ddco_pyro.errors import BadInput
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import SpecError, parse_spec
@@ -184,44 +183,3 @@ def test_from_pictures_to_a_policy_by_commands(source: Path, tmp_path: Path) -> 
 def test_versions_of_another_shape(observation: dict[str, Any], message: str) -> None:
     with pytest.raises(SpecError, match=message):
         ddco_pyro.fit(parse_spec(spec_of(observation)), demonstrations())
-
-
-def test_versions_that_are_not_there() -> None:
-    with pytest.raises(DemonstrationsError, match=r"no obs/place_mov \(did you mean 'place_moved'\?\)"):
-        ddco_pyro.fit(parse_spec(spec_of({"key": "place", "augment": {"versions": "place_mov"}})), demonstrations())
-    with pytest.raises(SpecError, match=r"observations.1.augment: step is computed and has no versions"):
-        parse_spec(spec_of("place", {"key": "step", "augment": {"versions": "place_moved"}}))
-
-
-def test_pictures_have_no_versions() -> None:
-    data = spec_of({"key": "camera", "augment": {"versions": "place"}})
-    data["hierarchy"]["levels"][0]["policy"] = {"network": "conv", "hidden": []}
-    with pytest.raises(
-        SpecError, match=r"'camera' has pictures: augment.versions is for vectors; shift moves pictures"
-    ):
-        ddco_pyro.fit(parse_spec(data), followed(6))
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--moved", 2], "--moved 2 --shift 0: pictures are moved so many times, by so many pixels at most; give both"),
-        (["--shift", 2], "--moved 0 --shift 2: "),
-        (["--moved", 2, "--shift", 20], "--shift 20: would move pictures of 20 × 20 pixels out of sight"),
-        (["--moved", 2, "--shift", 2, "--as", "again"], "obs/again_moved is there already; choose another name with"),
-    ],
-)
-def test_what_cannot_be_moved(source: Path, tmp_path: Path, options: list[Any], message: str) -> None:
-    twice, out = tmp_path / "source.hdf5", tmp_path / "made" / "out.hdf5"
-    out.parent.mkdir()
-    demos = Demonstrations.read(source)
-    named = (
-        replace(demo, observations={**demo.observations, "again_moved": demo.observations["place"]}) for demo in demos
-    )
-    replace(demos, demonstrations=tuple(named)).write(twice)
-    ended = call("encode", twice, "--observation", "camera", "--out", out, *options)
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-    assert message in ended.err
-    assert not list(out.parent.iterdir())
-    with pytest.raises(BadInput, match="--moved -1 --shift -1"):
-        Encoding("camera", moved=-1, shift=-1)

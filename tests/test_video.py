@@ -43,19 +43,3 @@ def test_the_border_has_the_colour_of_the_active_option(episode):
             assert (edge == option_rgb(choice)).all()
     assert not (captioned(episode, 3)[-1] == option_rgb(1)).all(-1).any()
     assert (episode.frames[0] == 0).all()  # the episode's own frames stay as they are
-
-
-def test_an_episode_without_options_has_no_border(episode):
-    scripted = Episode(0, episode.record, {}, np.zeros((3, 0), int), episode.frames)
-    assert (captioned(scripted, 0)[-1] == 0).all()
-    assert (captioned(scripted, 0) == 255).any()
-
-
-def test_the_light_edge_of_the_text_hugs_its_ink(episode):
-    """A heavier font is also wider: drawn beneath, it would run ahead of the text."""
-    scripted = Episode(0, episode.record, {}, np.zeros((3, 0), int), [np.full((60, 200, 3), 128, np.uint8)] * 4)
-    frame = captioned(scripted, 2)[..., 0]
-    ink, edge = (np.argwhere(mask).T for mask in (frame < 60, frame > 200))
-    for axis in (0, 1):
-        assert 0 <= ink[axis].min() - edge[axis].min() <= 2
-        assert 0 <= edge[axis].max() - ink[axis].max() <= 2

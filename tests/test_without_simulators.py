@@ -64,13 +64,12 @@ def said(folder):
         ("fit", "mine.yaml", "--out", "run", *quick),
         ("segment", "run", "mine.hdf5", "--html", "segments.html"),
         ("export", "run", "--out", "controller"),
-        ("report", "run"),
         *((command, "task.yaml", "--out", f"{command}.out") for command in ("collect", "fit")),
     )
 
 
 def test_from_a_file_to_an_export(folder, said):
-    assert [line for line in said if line.startswith("status ")] == [*["status 0"] * 5, *["status 2"] * 2], said
+    assert [line for line in said if line.startswith("status ")] == [*["status 0"] * 4, *["status 2"] * 2], said
     assert (folder / "segments.html").exists()
     assert (folder / "run" / "report.html").exists()
     assert (folder / "controller" / "weights.npz").exists()

@@ -212,8 +212,7 @@ def test_friction_holds_what_the_jaws_close_on_until_they_open(environment: Envi
     assert (attempt.lifted, attempt.returned) == ({number}, True)
 
 
-@pytest.mark.parametrize("turn", [0.0, np.pi / 4, np.pi / 2])
-@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize(("number", "turn"), [(0, 0.0), (1, np.pi / 4), (2, np.pi / 2)])
 def test_what_falls_where_loads_are_shown_slides_back(environment: Environment, number: int, turn: float) -> None:
     physics = environment.physics
     quaternion = np.array([np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)])
@@ -246,14 +245,6 @@ def test_a_simulation_that_breaks_down_ends_the_bin_with_finite_observations(env
     assert step.last()
     assert task.outcome(environment)["ended_unstable"] == 1.0
     assert all(np.isfinite(value).all() for value in step.observation.values())
-
-
-def test_nothing_to_be_seen_ends_the_bin(environment: Environment, monkeypatch: pytest.MonkeyPatch) -> None:
-    black = np.zeros((geometry.IMAGE_SIZE, geometry.IMAGE_SIZE, 2), np.uint8)
-    monkeypatch.setattr(bin_picking.camera, "masks", lambda _: black)
-    go(environment, (0.0, 0.02, 0.03), 0)
-    assert go(environment, (0.0, 0.02, 0.03), 1).last()
-    assert task.outcome(environment)["ended_unseen"] == 1.0
 
 
 def test_a_grasp_is_of_what_is_seen_in_the_bin(environment: Environment, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -293,13 +284,6 @@ def test_four_misses_in_a_row_end_the_bin(environment: Environment) -> None:
     assert ended == [False] * 7 + [True]
     found = task.outcome(environment)
     assert (found["ended_missed"], found["attempts"], found["empty"], found["recovered"]) == (1.0, 4.0, 4.0, 4.0)
-
-
-def test_a_trial_that_goes_nowhere_is_a_miss(environment: Environment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bin_picking, "MOST_STEPS", 3)
-    ended = [go(environment, (0.0, 0.02, 0.03), 1).last() for _ in range(12)]
-    assert ended == [False] * 11 + [True]
-    assert task.outcome(environment)["ended_missed"] == 1.0
 
 
 # Bookkeeping, on attempts made up by hand.

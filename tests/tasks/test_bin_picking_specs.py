@@ -36,10 +36,6 @@ def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_both_specs_are_here() -> None:
-    assert [path.stem for path in SPECS] == ["bin_picking", "bin_picking_hybrid"]
-
-
 @pytest.mark.parametrize("path", SPECS, ids=lambda path: path.stem)
 def test_specs_are_checked_against_the_task(path: Path) -> None:
     spec = load_spec(path)

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 from bin_picking import criteria
 from bin_picking_recovery import Load, Trial, counted
-from bin_picking_recovery import trials as trials_of
 from ddco_tasks.bin_picking.trials import Attempt, Trials
 
 
@@ -56,20 +53,3 @@ def test_recoveries_are_of_what_is_held_where_it_is_shown() -> None:
         "one back": 1, "one lost": 1, "due back": 4, "back": 2,
     }  # fmt: skip
     assert (falling["nothing"], falling["unseen"]) == (1, 0)
-
-
-def test_a_load_is_shown_where_the_gripper_shows_it_be_it_late() -> None:
-    """A grasp that is tried again shows its load some steps later; one that opens its jaws before shows none."""
-    away, empty, showing = Load(FIRST, False, False), Load(NONE, False, False), Load(FIRST, True, True)
-    task = SimpleNamespace(
-        trials=SimpleNamespace(
-            attempts=[Attempt(2, FIRST, FIRST, ("accept",), 9), Attempt(2, NONE, NONE, ("bin",), 6)]
-        ),
-        lifted=None,
-    )
-    late, never, open_ended = trials_of(task, [empty] * 7 + [showing, away] + [empty] * 6 + [away, showing, showing])
-    assert late.load is showing
-    assert late.steps == slice(0, 9)
-    assert never.load is None
-    assert open_ended.load is showing
-    assert open_ended.attempt is None

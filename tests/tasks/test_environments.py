@@ -18,8 +18,8 @@ from ddco_pyro.spec.base import TASKS
 NAMES = sorted(point.name for point in entry_points(group=TASKS))
 
 
-QUICK = ("needle", "pushing_goal", "bin_picking")
-"""The others differ from them in what is observed or in when they end."""
+QUICK = ("needle", "pushing_goal")
+"""The others differ from them in what is observed or in when they end; a bin takes long."""
 each = pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in NAMES]
 )

@@ -237,9 +237,9 @@ def test_grip_depends_on_how_the_needle_was_grasped(environment: Environment) ->
 
 
 def test_supervisor_succeeds_where_the_open_loop_plan_fails() -> None:
-    seeds = range(8)
-    assert sum(run(seed, "supervisor")["success"] for seed in seeds) >= 7
-    assert sum(run(seed, "open_loop")["success"] for seed in seeds) <= 4
+    seeds = range(5)
+    assert all(run(seed, "supervisor")["success"] for seed in seeds)
+    assert sum(run(seed, "open_loop")["success"] for seed in seeds) <= 2
 
 
 def test_phases_cover_the_episode() -> None:

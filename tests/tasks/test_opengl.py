@@ -43,17 +43,22 @@ def ended(*command: str | Path, **environment: str) -> subprocess.CompletedProce
     return subprocess.run(command, env=own, cwd=ROOT, capture_output=True, text=True, check=False)
 
 
+LOOKING = "import runpy; runpy.run_path('tasks/opengl.py', run_name='__main__')"
+CHECKING = "sys.argv = ['ddco-pyro', 'check', 'specs/needle.yaml']; from ddco_pyro.cli.app import main; main()"
+
+
+@pytest.mark.parametrize("cause", LIBRARIES)
 @pytest.mark.parametrize(
-    "cause", [next(iter(LIBRARIES)), *(pytest.param(one, marks=pytest.mark.slow) for one in [*LIBRARIES][1:])]
+    ("script", "head"),
+    [
+        pytest.param(LOOKING, "", id="looking"),
+        pytest.param(CHECKING, "ddco-pyro: ", id="checking", marks=pytest.mark.slow),
+    ],
 )
-def test_without_opengl_libraries_one_line_names_the_packages(cause: str) -> None:
-    before = WITHOUT.format(missing=LIBRARIES[cause])
-    command = "sys.argv = ['ddco-pyro', 'check', 'specs/needle.yaml']; from ddco_pyro.cli.app import main; main()"
-    looking = "import runpy; runpy.run_path('tasks/opengl.py', run_name='__main__')"
-    for script, head in ((command, "ddco-pyro: "), (looking, "")):
-        found = ended(sys.executable, "-c", before + script)
-        assert (found.returncode, found.stdout) == (1, "")
-        assert found.stderr.splitlines() == [f"{head}{advice(cause)}"]
+def test_without_opengl_libraries_one_line_names_the_packages(cause: str, script: str, head: str) -> None:
+    found = ended(sys.executable, "-c", WITHOUT.format(missing=LIBRARIES[cause]) + script)
+    assert (found.returncode, found.stdout) == (1, "")
+    assert found.stderr.splitlines() == [f"{head}{advice(cause)}"]
     assert f"apt-get install {PACKAGES}" in advice(cause)
 
 

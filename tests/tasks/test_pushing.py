@@ -10,13 +10,11 @@ from ddco_tasks.planning import points_along
 from ddco_tasks.pushing import environment as pushing
 from ddco_tasks.pushing import geometry as pushing_geometry
 from ddco_tasks.pushing.environment import Environment, limited, single, task
-from ddco_tasks.pushing.rules import PUSH_HEIGHT
 from ddco_tasks.rendering import render
 
 from ddco_pyro.simulation.episodes import run_episode
 
 GRAVITY, FRICTION = 9.81, 0.4
-BEHIND_BOX = np.array([-0.3, PUSH_HEIGHT])  # of the tip, for a box at 0
 
 
 @pytest.fixture

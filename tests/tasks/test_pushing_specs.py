@@ -23,6 +23,7 @@ LEVELS = {
     "image_ff_hybrid": 1, "image_rnn": 1, "image_rnn_flat": 0, "image_rnn_hybrid": 1,
 }  # fmt: skip
 CAMERAS = {"camera": pushing.camera(48, 64)}
+QUICK = ("pushing_3level", "pushing_hybrid", "pushing_flat_mlp")
 
 
 @pytest.fixture(scope="module")
@@ -46,14 +47,15 @@ def test_all_specs_are_here() -> None:
 
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(path, marks=[pytest.mark.slow] if "image" in path.stem else []) for path in SPECS],
+    [pytest.param(path, marks=[] if path.stem in QUICK else pytest.mark.slow) for path in SPECS],
     ids=lambda path: path.stem,
 )
 def test_specs_fit_and_act(path: Path, demonstrations: Path, tmp_path: Path) -> None:
     found = fit(short(path, demonstrations), out=tmp_path / "run")
     assert found.metrics.engine_check.value < 1e-6
     brief = replace(pushing.limited, load=lambda seed: pushing.load_single(seed), cameras=CAMERAS)
-    (episode,) = play(brief, Controller.from_spec(found.hierarchy, found.spec.rollout), [0], keep=("tip",))
+    controller = Controller.from_spec(found.hierarchy, found.spec.rollout)
+    (episode,) = play(brief, controller, [0], found.spec.observed, keep=("tip",))
     levels = LEVELS[path.stem.removeprefix("pushing_")]
     assert episode.choices.shape == (len(episode.record.observations["tip"]), levels)
     lowest = 0 if path.stem.endswith("hybrid") else 1
