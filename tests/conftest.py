@@ -19,6 +19,7 @@ from dots import followed
 from hypothesis import settings
 from matplotlib.figure import Figure
 
+from ddco_pyro import exporting
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
 
@@ -109,6 +110,14 @@ def watched():
 def toy_run(cache, tmp_path_factory, toy_spec, watched):
     """A fit of the toy task with both baselines beside it; nobody changes its folder."""
     return fit(toy_spec, out=tmp_path_factory.mktemp("runs") / "toy", on_event=watched)
+
+
+@pytest.fixture
+def numpy_alone(monkeypatch):
+    """Exports have numpy's form alone: programs, which hold no more than the networks, take seconds to make."""
+    compare = exporting._compare
+    monkeypatch.setattr(exporting, "_programs", lambda program, onnx: {})
+    monkeypatch.setattr(exporting, "_compare", lambda folder, forms: compare(folder, ["numpy"]))
 
 
 @pytest.fixture(scope="session")

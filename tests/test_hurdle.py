@@ -13,7 +13,7 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.controls import control_dimensions, control_parts, described
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.exporting import TOLERANCE, export, runner
-from ddco_pyro.spec import ControlSpec, SpecError, dump_spec, parse_spec, with_overrides
+from ddco_pyro.spec import ControlSpec, SpecError, dump_spec, load_spec, parse_spec, with_overrides
 
 
 def spec_of(options=3, epochs=6, path="unused.hdf5", **control):
@@ -44,7 +44,8 @@ def test_without_skill_options_gain_nothing(at_once):
     """
     demos, gained = no_ops(30, at_once=at_once), {}
     for kind in ("gaussian", "auto"):
-        spec = with_overrides(spec_of(epochs=100, kind=kind), {"compare_with": ["flat"]})
+        flat = {"kind": "flat", "policy": {"network": "linear"}}
+        spec = with_overrides(spec_of(epochs=100, kind=kind), {"compare_with": [flat], "training.optimizer": {}})
         gained[kind] = ddco_pyro.fit(spec, demos).metrics.comparison["flat"].difference
     assert gained["gaussian"].nats_per_step > 1
     assert abs(gained["auto"].nats_per_step) < 3 * gained["auto"].standard_error < 0.075
@@ -87,13 +88,6 @@ def test_a_declared_value_may_be_an_extreme():
     (part,) = control_parts(ControlSpec(parts=parts), control_dimensions([controls]))
     assert (part.exact, part.low, part.high) == ((0.0,), (-np.inf,), (np.inf,))
     assert [part.kind for part in control_parts(ControlSpec(), control_dimensions([controls]))] == ["clipped"]
-
-
-def test_a_declared_gaussian_is_told_what_its_comparisons_are_worth():
-    (part,) = decided(no_ops(), kind="gaussian")
-    assert part.why == (
-        "as declared; exactly 0 in 49.6 % of the steps, and options gain by collecting these steps, without any skill"
-    )
 
 
 @pytest.mark.parametrize(
@@ -176,17 +170,12 @@ def test_scaling_keeps_exactly_the_value_apart(fitted):
     np.testing.assert_array_equal(scaling.unscaled(torch.from_numpy(scaled))[0], rows[0])
 
 
-@pytest.mark.parametrize(
-    ("control", "onnx"), [("mean", False), ("sample", False), pytest.param("sample", True, marks=pytest.mark.slow)]
-)
-def test_values_are_emitted_exactly_and_exports_act_alike(fitted, control, onnx, tmp_path):
-    rollout = fitted.spec.rollout.model_copy(update={"control": control})
+@pytest.mark.parametrize("control", ["mean", "sample"])
+@pytest.mark.usefixtures("numpy_alone")
+def test_values_are_emitted_exactly_and_exports_act_alike(fitted, control, tmp_path):
     acting = ddco_pyro.load(fitted.folder)
-    changed = acting.__class__(
-        acting.spec.model_copy(update={"rollout": rollout}), acting.hierarchy, acting.metrics, acting.folder
-    )
-    differences = export(changed, tmp_path / "out", onnx=onnx)
-    assert all(difference < TOLERANCE for difference, _ in differences.values())
+    changed = acting.__class__(with_overrides(acting.spec, {"rollout.control": control}), acting.hierarchy)
+    assert export(changed, tmp_path / "out")["numpy"][0] < TOLERANCE
     exported, original = runner.Runner(tmp_path / "out"), changed.controller()
     ours, theirs = [], []
     for observation in np.random.default_rng(3).normal(0, 1.5, (150, 4)):
@@ -213,15 +202,6 @@ def test_a_controller_rests_as_often_as_the_demonstrations(fitted):
         assert abs(share - (shown[:, dimension] == value).mean()) < 0.1
 
 
-def test_a_hurdle_is_not_ranked_against_a_density(fitted, tmp_path):
-    other = spec_of(2, path=fitted.spec.demonstrations.path, kind="gaussian", parts=[{"name": "jaw", "dims": [3]}])
-    run = ddco_pyro.fit(other, out=tmp_path / "run").folder
-    ended = call("compare", fitted.folder, run)
-    assert ended.status == 2
-    said = "control dimension 0 is hurdle with bounds -1 and 1 at 0, of dimension 0 in one and gaussian in the other"
-    assert said in ended.err
-
-
 def test_commands_say_it_in_a_line(fitted, tmp_path):
     (tmp_path / "spec.yaml").write_text(dump_spec(fitted.spec))
     line = "control dimensions 1-2: hurdle (exactly 0.3 in"
@@ -231,9 +211,7 @@ def test_commands_say_it_in_a_line(fitted, tmp_path):
 
 
 @pytest.mark.parametrize("row", ROWS)
-def test_files_with_such_values_are_inspected_begun_and_fitted(row, tmp_path):
+def test_files_with_such_values_are_begun_and_fitted(row, tmp_path):
     path = ROWS[row].make(tmp_path)
-    assert call("inspect", path).status == 0
     assert call("init", path, "--out", tmp_path / "spec.yaml").status == 0
-    small = ("--set", "training.epochs=2", "--set", "compare_with=[]", "--out", tmp_path / "run")
-    assert call("fit", tmp_path / "spec.yaml", *small).status == 0
+    ddco_pyro.fit(load_spec(tmp_path / "spec.yaml", ["training.epochs=2", "compare_with=[]"]))
