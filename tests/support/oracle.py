@@ -75,7 +75,7 @@ Path = tuple[tuple[int, ...], ...]
 
 
 def paths(tables: Tables, n: int, length: int, sizes: list[int]) -> Iterator[tuple[Path, Path, float]]:
-    """Every (h, b) that is possible, with its joint density; a step that follows another is looked up when seen again."""
+    """Every possible (h, b) with its joint density; a step that follows another is looked up when it is seen again."""
     joint = list(itertools.product(*map(range, sizes)))
     ends = list(itertools.product((0, 1), repeat=len(sizes)))
     known = Tables(
