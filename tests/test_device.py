@@ -54,8 +54,7 @@ OTHER = {
 }
 """Those that are computed by another algorithm, or in another order, where they are not on the host."""
 
-QUICK = ("mlp", "a trunk of branches")
-ALL = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in (*SAME, *OTHER)]
+ALL = [name if name in SAME else pytest.param(name, marks=pytest.mark.slow) for name in (*SAME, *OTHER)]
 
 
 @pytest.fixture(scope="module")

@@ -80,7 +80,7 @@ def expectation(model, ridge, batch, trained=EVERYTHING, discovering=None):
     for _ in range(400):
         made.step(batch)
         values.append(made.value)
-        if len(values) > 5 and values[-1] - values[-2] < 1e-10 * abs(values[-1]):
+        if len(values) > 5 and values[-1] - values[-2] < 1e-9 * abs(values[-1]):
             break
     return made, values
 
