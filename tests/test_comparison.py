@@ -166,13 +166,6 @@ def test_models_and_parameters_are_named(found, folders):
         assert by_name[str(folder)].parameters == sum(one.numel() for one in load(folder).hierarchy.parameters())
 
 
-def test_the_order_of_the_runs_does_not_matter(found, folders):
-    again = compare(folders[::-1])
-    assert [row.name for row in again.rows] == [row.name for row in found.rows]
-    for row, before in zip(again.rows, found.rows, strict=True):
-        assert row.total == pytest.approx(before.total, abs=1e-9)
-
-
 def test_demonstrations_may_be_held_out_in_another_order(folders, toy_spec, other, tmp_path):
     """A run that reads the same demonstrations from a file of its own, turned round, with masks."""
     demos = demonstrations(toy_spec)

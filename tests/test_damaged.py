@@ -16,7 +16,6 @@ import pytest
 import torch
 import yaml
 from command_line import call
-from safetensors.torch import save_file
 from selecting import data_at
 
 import ddco_pyro
@@ -26,7 +25,7 @@ from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.metrics import Metrics, read_successes
+from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import agreement, header, likelihood, options, rollouts, training
 from ddco_pyro.training.data import demonstrations
 
@@ -216,14 +215,6 @@ def test_damaged_rollouts(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert call("report", run).err.startswith(f"ddco-pyro: {run / 'rollouts.csv'}: is damaged: ")
 
 
-def test_rollouts_without_success_are_no_damage(run: Path) -> None:
-    assert {seed for method, seed in read_successes(run) if method == "ddco"} == {1000, 1001}
-    (run / "rollouts.csv").write_text("method,seed,error\nddco,1000,0.5\n")
-    assert read_successes(run) == {}
-    (run / "rollouts.csv").unlink()
-    assert read_successes(run) == {}
-
-
 def test_a_damaged_history(run: Path) -> None:
     for content in (b"restart,stage,epoch,train,tune\n0,joint,1,x,1\n", b"a\n1\n", b"\xff\xfe\n1"):
         (run / "history.csv").write_bytes(content)
@@ -282,15 +273,6 @@ def test_a_damaged_checkpoint_is_refused(run: Path) -> None:
     refused(run, again, path, "its contents are not what was written")
     path.unlink()
     assert call(*again).status == 0
-
-
-def test_what_was_written_without_a_checksum_is_read(tmp_path: Path) -> None:
-    tensors, metadata = {"x": torch.arange(6.0).reshape(2, 3)}, {"steps": "7"}
-    save_file(tensors, tmp_path / "old", metadata)
-    write_tensors(tmp_path / "new", tensors, metadata)
-    for name in ("old", "new"):
-        found, about = read_tensors(tmp_path / name)
-        assert (about, found["x"].tolist()) == (metadata, tensors["x"].tolist())
 
 
 # --- selections -------------------------------------------------------------------------------------------------------

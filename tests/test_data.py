@@ -113,18 +113,6 @@ def test_demonstrations_may_come_from_another_task(tmp_path):
     assert demonstrations(given).lengths == (5, 5, 5)
 
 
-def test_a_file_that_is_not_there_and_cannot_be_collected_is_an_error(tmp_path):
-    missing = {"path": str(tmp_path / "none.hdf5")}
-    for read in (demonstrations, dimensions):
-        with pytest.raises(DemonstrationsError) as refused:
-            read(spec(task=None, demonstrations=missing | {"labels": "phase"}, observations=["offsets", "visited"]))
-        assert str(refused.value) == (
-            f"demonstrations.path: {missing['path']}: there is no such file; put it there, or fit to another with "
-            "--set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, with actions, obs/offsets, "
-            "obs/visited, labels/phase in each data/<demonstration>"
-        )
-
-
 LEVEL = {"count": 2, "policy": {"network": "linear"}}
 CONV = {"network": "conv"}
 WRONG = {"network": "user_networks:Wrong", "options": {"how": "swapped"}}

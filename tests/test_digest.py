@@ -216,15 +216,6 @@ def test_a_run_of_another_version_is_to_be_fitted_again(finished: Path, tmp_path
         assert call(*command) == (2, "", f"ddco-pyro: {run}: {said}: fit again\n")
 
 
-def test_a_damaged_digest_is_one_line(finished: Path, tmp_path: Path) -> None:
-    run = shutil.copytree(finished / "run", tmp_path / "run")
-    for damaged in ("", "{}", '{"names": [1]}'):
-        (run / "demonstrations.json").write_text(damaged)
-        ended = call("fit", run / "spec.yaml", "--out", run, "--resume")
-        assert (ended.status, ended.err.count("\n")) == (2, 1)
-        assert ended.err.startswith(f"ddco-pyro: {run / 'demonstrations.json'}: is damaged: ")
-
-
 # --- the digest -------------------------------------------------------------------------------------------------------
 
 

@@ -182,12 +182,6 @@ def test_memory_holds_a_block_of_pictures(tmp_path, out, monkeypatch):
         tracemalloc.stop()
 
 
-def test_a_folder_does_not_hide_an_encoder_of_its_name(few_dots, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "random_conv").mkdir()
-    assert encode(few_dots, tmp_path / "out.hdf5", Encoding("camera")).about.reader is None
-
-
 def killed(path, out, encoding, kind, after):
     """Encode in another process, which kills itself at an event."""
     left = after

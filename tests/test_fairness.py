@@ -11,7 +11,7 @@ import pytest
 import toy_task
 import yaml
 from command_line import call
-from selecting import Told, candidate, score, spec_at
+from selecting import Told, spec_at
 
 import ddco_pyro
 from ddco_pyro.comparison import compare
@@ -19,8 +19,7 @@ from ddco_pyro.comparison.page import write
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.selection import Workers, select
-from ddco_pyro.selection.choice import as_data, choose, markdown, table
-from ddco_pyro.spec import SpecError, dump_spec, with_overrides
+from ddco_pyro.spec import dump_spec, with_overrides
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.networks import nearest_widths
 
@@ -55,25 +54,6 @@ def test_a_baseline_beside_trains_as_it_would_alone(toy_spec, tmp_path):
     spec = with_overrides(toy_spec, shared | alone | {"training.optimizer.lr": 0.03})
     assert beside.metrics.log_likelihood_per_step == fit(spec, out=tmp_path / "alone").metrics.log_likelihood_per_step
     assert beside.spec.training == spec.training
-
-
-@pytest.mark.parametrize(
-    ("changes", "problem"),
-    [
-        (
-            {"compare_with": [OWN | {"optimizer": {"schedule": "cosine"}}], "training.epochs": None},
-            "compare_with.0.optimizer.schedule: cosine ends at training.epochs, which is null",
-        ),
-        (
-            {"hierarchy": None, "baseline": OWN, "compare_with": []},
-            "baseline.optimizer: is for baselines in compare_with; give it in training.optimizer",
-        ),
-    ],
-)
-def test_an_optimiser_that_cannot_be_a_baselines_own(toy_spec, changes, problem):
-    with pytest.raises(SpecError) as caught:
-        with_overrides(toy_spec, changes)
-    assert problem in str(caught.value)
 
 
 # --- equal in size ----------------------------------------------------------------------------------------------------
@@ -173,20 +153,6 @@ def test_a_comparison_marks_them(fitted, tmp_path):
     data = json.loads((tmp_path / "comparison" / "compare.json").read_text())
     assert [row["training"]["converged"] for row in data["rows"]] == [False, False]
     assert (tmp_path / "comparison" / "compare.html").read_text().count("27, not converged") == 2
-
-
-def test_a_selection_counts_the_folds(tmp_path):
-    scores = [score(0, f, 1.0, steps=s, converged=c) for f, (s, c) in enumerate([(10, True), (12, False), (20, False)])]
-    scores += [score(1, f, 2.0, steps=5) for f in range(3)]
-    found = choose([candidate(0), candidate(1)], scores, 3)
-    data = as_data(found)
-    assert [(row["gradient_steps"], row["not_converged"]) for row in data["candidates"]] == [(14.0, 2), (5.0, 0)]
-    first, second = table(found).rows
-    assert first[-3:] == ["14", "3", "not converged in 2"]
-    assert "not converged" not in second[-1]
-    assert len(first) == len(table(found).head)
-    text = markdown(found, {**data, "folds": 3, "demonstrations": 3, "stop_early": None})
-    assert "| 14 | 3 | not converged in 2 |" in text
 
 
 def test_a_fold_says_whether_its_training_had_converged(tmp_path):

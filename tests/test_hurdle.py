@@ -89,22 +89,6 @@ def test_a_declared_value_may_be_an_extreme():
     assert [part.kind for part in control_parts(ControlSpec(), control_dimensions([controls]))] == ["clipped"]
 
 
-@pytest.mark.parametrize(
-    ("control", "message"),
-    [
-        ({"parts": [{"name": "a", "dims": [0], "kind": "hurdle", "value": 0.5}]}, r"parts\.0\.value: .* exactly 0\.5 "),
-        ({"parts": [{"name": "a", "dims": [0], "value": 0.0}]}, "parts.0.value: is for kind: hurdle"),
-        (
-            {"parts": [{"name": "a", "dims": [0], "kind": "hurdle", "value": 1.0, "bounds": [-1, 1]}]},
-            "parts.0.value: must lie between the bounds",
-        ),
-    ],
-)
-def test_values_that_do_not_fit_are_refused(control, message):
-    with pytest.raises(SpecError, match=message):
-        decided(no_ops(), **spec_of(**control).control.model_dump())
-
-
 def test_a_dimension_without_such_a_value_is_no_hurdle():
     with pytest.raises(SpecError, match="control dimension 0 is at no value inside its range in 5 % of the steps"):
         control_parts(ControlSpec(kind="hurdle"), control_dimensions([np.linspace(-1, 1, 50)[:, None]]))

@@ -313,14 +313,3 @@ def test_a_run_says_for_which_labels_its_options_stand(files):
         assert "option 3" in text
         assert "option 3 (" not in text
         assert "(option 3)" not in text
-
-
-def test_labels_that_do_not_fit_are_refused_before_anything_is_written(files):
-    text = (files / "mine.yaml").read_text()
-    for old, new in (("{level: skill", "{level: arm"), ("count: 3", "count: 1")):
-        (files / "other.yaml").write_text(text.replace(old, new))
-        for command in (["check"], ["fit", "--out", files / "none"]):
-            ended = call(command[0], files / "other.yaml", *command[1:])
-            assert (ended.status, ended.err.count("\n")) == (2, 1)
-            assert "training.labels" in ended.err
-        assert not (files / "none").exists()

@@ -10,7 +10,7 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.report import write_report
-from ddco_pyro.spec import SpecError, parse_spec
+from ddco_pyro.spec import parse_spec
 
 
 def demonstrations():
@@ -60,19 +60,3 @@ def test_each_level_is_measured_with_its_own_labels(tmp_path, monkeypatch, label
     assert call("segment", "run", "demos.hdf5", "--html", "page.html").status == 0
     shown = (tmp_path / "page.html").read_text()
     assert [shown.count(f"Agreement with the label “{name}”") for name in names] == [names.count(one) for one in names]
-
-
-@pytest.mark.parametrize(
-    ("labels", "problem"),
-    [
-        (
-            ["phase"],
-            r"demonstrations.labels: must have a name for each of 2 levels, or be one name for all, got \['phase'\]",
-        ),
-        ([], r"demonstrations.labels: must have at least 1 item"),
-        (3, "demonstrations.labels: must be a name, or a list with a name for each level, got 3"),
-    ],
-)
-def test_labels_that_do_not_suit_the_levels(labels, problem):
-    with pytest.raises(SpecError, match=problem):
-        spec(labels)
