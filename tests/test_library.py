@@ -143,7 +143,6 @@ def test_several_baselines_of_a_kind(commanded: Path, tmp_path: Path) -> None:
     outcomes = {"ddco": (1, 1), "flat": (0, 1), "flat_2": (0, 0)}
     rows = [f"{name},{seed},{value}" for name, values in outcomes.items() for seed, value in enumerate(values)]
     (tmp_path / "run" / "rollouts.csv").write_text("\n".join(["method,seed,success", *rows]))
-    assert call("report", tmp_path / "run").status == 0
     both = [tmp_path / "run" / "baselines" / name for name in ("flat", "flat_2")]
     assert call("compare", tmp_path / "run", *both, "--out", tmp_path / "compared").status == 0
     pairs = json.loads((tmp_path / "compared" / "compare.json").read_text())["rollouts"]
