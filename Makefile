@@ -32,7 +32,6 @@ test: lint
 
 # About an hour: planted recoveries, many kills, more processes, every notebook, dynamax, and the site besides.
 test-all: lint
-	$(PIP) -e '.[bench,docs]'
 	$(BIN)/pytest -n 2 --dist worksteal -q -m ''
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 

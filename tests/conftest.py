@@ -17,8 +17,10 @@ import toy_task
 import yaml
 from dots import followed
 from hypothesis import settings
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from ddco_pyro import exporting
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
 
@@ -44,27 +46,23 @@ def cache(tmp_path_factory):
     return folder
 
 
-SAVEFIG = Figure.savefig
+PRINT = FigureCanvasAgg.print_png
 
 
 @pytest.fixture(scope="session", autouse=True)
 def undrawn():
     """Every figure is saved as the same small picture: rendering takes most of the time of a report."""
     content = io.BytesIO()
-    SAVEFIG(Figure(figsize=(0.1, 0.1)), content, format="png")
-
-    def savefig(figure, file, **options):
-        file.write(content.getvalue()) if hasattr(file, "write") else Path(file).write_bytes(content.getvalue())
-
+    PRINT(FigureCanvasAgg(Figure(figsize=(0.1, 0.1))), content)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", savefig)
+        patch.setattr(FigureCanvasAgg, "print_png", lambda canvas, file, **more: file.write(content.getvalue()))
         yield
 
 
 @contextmanager
 def rendering():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", SAVEFIG)
+        patch.setattr(FigureCanvasAgg, "print_png", PRINT)
         yield
 
 
@@ -109,6 +107,14 @@ def watched():
 def toy_run(cache, tmp_path_factory, toy_spec, watched):
     """A fit of the toy task with both baselines beside it; nobody changes its folder."""
     return fit(toy_spec, out=tmp_path_factory.mktemp("runs") / "toy", on_event=watched)
+
+
+@pytest.fixture
+def numpy_alone(monkeypatch):
+    """Exports have numpy's form alone: programs, which hold no more than the networks, take seconds to make."""
+    compare = exporting._compare
+    monkeypatch.setattr(exporting, "_programs", lambda program, onnx: {})
+    monkeypatch.setattr(exporting, "_compare", lambda folder, forms: compare(folder, ["numpy"]))
 
 
 @pytest.fixture(scope="session")

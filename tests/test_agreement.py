@@ -8,7 +8,7 @@ from itertools import groupby, permutations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
@@ -204,6 +204,7 @@ def sides(pairs):
     return [[np.array([pair[side] for pair in demo]) for demo in pairs] for side in (0, 1)]
 
 
+@settings(max_examples=40)
 @given(demonstrations, st.permutations(range(4)), st.permutations(range(3)))
 def test_names_do_not_matter(pairs, options, labels):
     segments, truth = sides(pairs)
@@ -218,6 +219,7 @@ def test_names_do_not_matter(pairs, options, labels):
     assert renamed == pytest.approx(found)
 
 
+@settings(max_examples=40)
 @given(demonstrations)
 def test_every_measure_is_at_most_1_which_is_perfect_and_a_matching_for_each_is_no_worse(pairs):
     segments, truth = sides(pairs)

@@ -6,7 +6,6 @@ import json
 
 import apart
 import arena_cell
-import arena_playing
 import arena_recording
 import h5py
 import numpy as np
@@ -114,49 +113,6 @@ def test_the_first_successes_are_recorded(tmp_path):
     steps = 4 + 5 + 7 + 8
     shares = {"subgoal": [0, pytest.approx((steps - 4) / steps), 0], "mission": [1]}
     assert said == {"successes": 4, "attempts": 5, "shares": shares, "noise": 0}
-
-
-def test_an_expert_that_fails_is_one_line_and_no_file(tmp_path):
-    with pytest.raises(SystemExit, match="toy: the expert succeeded in 0 of 20 episodes; 2 are needed"):
-        arena_recording.collect(tmp_path / "demos.hdf5", "toy", lambda _: None, 2, 1, {})
-    assert not list(tmp_path.iterdir())
-
-
-class Line:
-    """An agent at 0 that has to get to 3 within five steps."""
-
-    def reset(self, seed):
-        self.place, self.time = 0, 0
-        return {"body": np.array([0.0])}
-
-    def step(self, control):
-        self.place, self.time = self.place + int(control[0]), self.time + 1
-        return {"body": np.array([float(self.place)])}, self.place == 3, self.time == 5
-
-
-class Walker:
-    """Takes a step while it sees less than this."""
-
-    def __init__(self, until):
-        self.until = until
-
-    def reset(self, seed):
-        pass
-
-    def act(self, observation):
-        return np.array([int(observation["body"][0] < self.until)])
-
-
-def test_controllers_are_played_and_shown_a_demonstration_scripted_ones_played_alone(tmp_path):
-    arena_recording.collect(tmp_path / "demos.hdf5", "toy", episode, 2, 1, {})
-    players, out = {"good": Walker(3), "short": Walker(2)}, tmp_path / "played.json"
-    arena_playing.play_all(Line(), out, players, range(2), tmp_path / "demos.hdf5", {"late": Walker(9)})
-    done, failed = {"success": True, "steps": 3}, {"success": False, "steps": 5}
-    assert json.loads(out.read_text()) == {
-        "episodes": {"good": [done, done], "short": [failed, failed], "late": [done, done]},
-        "demonstration": "demo_0",
-        "controls": {"good": [[1], [1], [1], [0]], "short": [[1], [1], [0], [0]]},
-    }
 
 
 # --- cells ------------------------------------------------------------------------------------------------------------

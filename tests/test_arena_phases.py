@@ -63,16 +63,3 @@ def test_a_decorated_function_is_seen_through():
 
     phases = Phases(desired)
     assert [phases.of(desired, x) for x in (True, False)] == [([1], 0), ([0], 1)]
-
-
-def test_what_has_no_phase_is_refused():
-    phases = Phases(Expert._desired_pos)
-    phases.of(Expert._desired_pos, 0)
-    with pytest.raises(LookupError, match="_desired_pos was not called"):
-        phases.of(abs, -1)
-
-    def nothing():
-        pass
-
-    with pytest.raises(ValueError, match="has no return statement"):
-        Phases(nothing)

@@ -103,11 +103,6 @@ def test_another_encoder_has_another_file():
     assert path(1, ["offsets"]) == path(2, ["offsets"])
 
 
-def test_what_is_not_kept_is_not_recorded():
-    record = run_episode(watched, "supervisor", 3, observed=["camera"], keep=["offsets"]).record
-    assert [*record.observations] == ["offsets"]
-
-
 def test_pictures_are_collected_where_the_spec_observes_them(monkeypatch):
     """Compressed and a frame in each chunk; in slices as long as memory allows; in a file of their own."""
     monkeypatch.setattr(collecting, "EPISODES_WITH_PICTURES", 2)
@@ -144,12 +139,6 @@ def test_a_spec_with_a_camera_is_checked_fitted_and_rolled_out(tmp_path):
         watched, Controller.from_spec(fit.hierarchy, RolloutSpec()), range(1000, 1002), fit.hierarchy.encoder.shapes
     )
     assert [one.outcome["success"] for one in alone].count(1.0) == measured.successes
-
-
-def test_without_the_camera_nothing_is_drawn(tmp_path):
-    fit = ddco_pyro.fit(spec_of("offsets"), out=tmp_path / "run")
-    roll_out(fit, 2, jobs=1)
-    assert DRAWN == []
 
 
 def test_a_gymnasium_environment_has_the_cameras_it_is_asked_for():

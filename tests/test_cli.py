@@ -89,25 +89,6 @@ def test_the_printed_schema_accepts_every_spec_short_and_resolved(refusals, path
     assert refusals(yaml.safe_load(dump_spec(load_spec(path)))) == []
 
 
-@pytest.mark.parametrize(
-    ("change", "place"),
-    [
-        ({"observation": ["offsets"]}, None),
-        ({"seed": "many"}, "seed"),
-        ({"training": {"epoch": 3}}, "training"),
-        ({"training": {"epochs": 0}}, "training"),
-        ({"control": {"std": -1}}, "control"),
-        ({"hierarchy": {"levels": [{"count": 0}]}}, "hierarchy"),
-        ({"inference": {"engine": "fast"}}, "inference"),
-    ],
-)
-def test_the_printed_schema_refuses_what_check_refuses(refusals, tmp_path, change, place):
-    data = yaml.safe_load(toy_task.SPEC) | change
-    assert refusals(data) == [place]
-    (tmp_path / "wrong.yaml").write_text(yaml.safe_dump(data))
-    assert call("check", tmp_path / "wrong.yaml").status == 2
-
-
 def test_collect_prints_the_file(spec, tmp_path):
     path = tmp_path / "own.hdf5"
     ended = call("collect", spec, "--out", path, "--set", "demonstrations.count=3")
@@ -132,20 +113,18 @@ def test_fit_writes_a_run_and_its_report(run):
         assert re.search(rf"^ *{words.method(name)} +│ +{valid} +│ +{train}", ended.out, re.MULTILINE)
 
 
-def test_rollout_and_report(run):
+def test_rollout_and_its_report(run):
     folder, _ = run
-    ended = call("rollout", folder, "--episodes", 2, "--video", "--jobs", 1)
+    ended = call("rollout", folder, "--episodes", 1, "--video", "--jobs", 1)
     assert ended.status == 0
     methods = ddco_pyro.load(folder).metrics.rollouts.methods
     assert list(methods) == ["open_loop", "supervisor", "flat", "ddco"]
     for name, one in methods.items():
         successes = one.measures["success"].successes
-        assert re.search(rf"^ *{words.method(name)} +│ +{successes} of 2 \(", ended.out, re.MULTILINE)
-    assert len(list((folder / "videos").glob("*.mp4"))) == 8
-    again = call("rollout", folder, "--episodes", 2, "--video", "--jobs", 1, "--resume")
+        assert re.search(rf"^ *{words.method(name)} +│ +{successes} of 1 \(", ended.out, re.MULTILINE)
+    assert len(list((folder / "videos").glob("*.mp4"))) == 4
+    again = call("rollout", folder, "--episodes", 1, "--video", "--jobs", 1, "--resume")
     assert (again.status, again.out, again.err) == (0, ended.out, "")  # nothing is rolled out, so no progress is shown
-    (folder / "report.html").unlink()
-    assert call("report", folder) == (0, f"report: {folder / 'report.html'}\n", "")
     assert "open_loop" in (folder / "report.html").read_text()
 
 
@@ -221,34 +200,18 @@ def test_bad_input_is_refused_in_one_line(arguments, message, spec, run):
 WRONG = "{network: 'user_networks:Wrong', options: {how: joined}}"
 
 
-@pytest.mark.parametrize(
-    ("override", "place", "shapes"),
-    [
-        (f"hierarchy.levels.0.policy={WRONG}", "hierarchy.levels.0.policy", ("[2, 3, 4]", "[2, 3, 2, 2]")),
-        (f"compare_with=[{{kind: flat, policy: {WRONG}}}]", "compare_with.0.policy", ("[2, 3, 2]", "[2, 3, 1, 2]")),
-    ],
-)
-def test_an_own_network_of_another_shape_is_refused_before_any_work(spec, tmp_path, cache, override, place, shapes):
+def test_an_own_network_of_another_shape_is_refused_before_any_work(spec, tmp_path, cache):
     line = (
-        f"ddco-pyro: {place}: network 'user_networks:Wrong' gives shape {shapes[0]}; "
-        f"it has to be a tensor [N, T, copies, outputs], here {shapes[1]}\n"
+        "ddco-pyro: compare_with.0.policy: network 'user_networks:Wrong' gives shape [2, 3, 2]; "
+        "it has to be a tensor [N, T, copies, outputs], here [2, 3, 1, 2]\n"
     )
     kept = sorted(cache.rglob("*"))
+    override = f"compare_with=[{{kind: flat, policy: {WRONG}}}]"
     changed = ["--allow-code", *with_set(override, "demonstrations.seed=77")]
     assert call("check", spec, *changed) == (2, "", line)
     assert call("fit", spec, "--out", tmp_path / "run", *changed) == (2, "", line)
     assert not (tmp_path / "run").exists()
     assert sorted(cache.rglob("*")) == kept
-
-
-def test_every_problem_of_a_spec_has_its_line(spec):
-    ended = call("check", spec, *with_set("seed=-1", "training.epochs=0"))
-    assert ended.status == 2
-    assert [line.partition(": ")[0] for line in ended.err.splitlines()] == ["ddco-pyro"] * 2
-    assert {re.search(r"toy\.yaml: ([\w.]+):", line)[1] for line in ended.err.splitlines()} == {
-        "seed",
-        "training.epochs",
-    }
 
 
 def test_training_that_fails_says_why(spec, tmp_path):
@@ -310,14 +273,8 @@ def test_debug_shows_the_traceback():
 # --- in a process of its own ------------------------------------------------------------------------------------------
 
 
-def test_a_command_ends_with_its_status_and_finds_tasks_beside_it(spec):
-    """The toy task is found in the working folder."""
-    beside = ("--allow-code", "--set", "task=toy_task:task")
-    process = start("check", spec, *beside)
-    out, err = process.communicate(timeout=HANGS)
-    assert (process.returncode, err) == (0, "")
-    assert "hierarchy.meta_policy" in out
-    process = start("check", spec, "--set", "training.epoch=3", *beside)
+def test_a_command_ends_with_its_status(spec):
+    process = start("check", spec, "--set", "training.epoch=3")
     out, err = process.communicate(timeout=HANGS)
     assert (process.returncode, out, err.count("\n")) == (2, "", 1)
 
@@ -333,14 +290,13 @@ def test_a_pipe_that_is_closed_ends_it_quietly():
         assert process.returncode == 1
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
-def test_a_name_that_the_terminal_cannot_print_is_printed_all_the_same(encoding):
+def test_a_name_that_the_terminal_cannot_print_is_printed_all_the_same():
     name = os.fsdecode(b"gone \xc3\xa9\xff.yaml")
-    environment = {**os.environ, "PYTHONIOENCODING": encoding, "LC_ALL": "C"}
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
     ended = subprocess.run([COMMAND, "init", name], capture_output=True, env=environment)
-    shown = name.encode(encoding, "backslashreplace").decode(encoding)
+    shown = name.encode("ascii", "backslashreplace").decode()
     assert ended.returncode == 2
-    assert ended.stderr.decode(encoding) == f"ddco-pyro: {shown}: there is no such file or folder; check the path\n"
+    assert ended.stderr.decode() == f"ddco-pyro: {shown}: there is no such file or folder; check the path\n"
 
 
 @pytest.mark.slow
@@ -381,8 +337,7 @@ HEAVY = ("h5py", "matplotlib", "pandas", "pyro", "scipy.stats", "sklearn", "symp
 @pytest.mark.parametrize(
     ("module", "arguments"),
     [
-        ("ddco_pyro.cli.app", ["--help"]),
-        ("ddco_pyro.cli", ["fit", "--help"]),
+        ("ddco_pyro.cli.app", ["fit", "--help"]),
         ("ddco_pyro.cli", ["check", "--schema"]),
         ("ddco_pyro.cli", ["check", "nowhere.yaml"]),
     ],
@@ -394,11 +349,17 @@ def test_help_and_refusals_load_nothing_heavy(module, arguments):
     assert ended.stdout.splitlines()[-1] == "[]"
 
 
-def test_check_loads_no_package_that_it_does_not_use(spec):
-    """Sorting and indexing on torch's "meta" device import sympy; figures import matplotlib; intervals scipy.stats."""
-    program = LIGHT.format(module="ddco_pyro.cli", arguments=["ddco-pyro", "check", str(spec)], heavy=HEAVY)
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert ended.returncode == 0
+def test_check_finds_tasks_beside_it_and_loads_no_package_that_it_does_not_use(spec):
+    """The toy task is found in the working folder.
+
+    Sorting and indexing on torch's "meta" device import sympy; figures import matplotlib; intervals scipy.stats.
+    """
+    arguments = ["ddco-pyro", "check", str(spec), "--allow-code", "--set", "task=toy_task:task"]
+    program = LIGHT.format(module="ddco_pyro.cli", arguments=arguments, heavy=HEAVY)
+    own = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=HERE, env=own)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert "hierarchy.meta_policy" in ended.stdout
     assert set(ast.literal_eval(ended.stdout.splitlines()[-1])) <= {"h5py", "torch"}
 
 
@@ -409,9 +370,3 @@ def test_the_packages_names_are_there_when_asked_for():
     assert ddco_pyro.load_spec is load_spec
     with pytest.raises(AttributeError, match="module 'ddco_pyro' has no attribute 'nothing'"):
         _ = ddco_pyro.nothing
-
-
-def test_the_resolved_spec_is_yaml(spec):
-    ended = call("check", spec)
-    printed = ended.out[: ended.out.index("shape or parameters")].rpartition("\n")[0]
-    assert yaml.safe_load(printed)["training"]["batch_size"] == 3

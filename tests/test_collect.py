@@ -104,14 +104,6 @@ def test_another_version_of_a_simulator_or_of_the_tasks_package_has_another_file
     assert (cache_path(toy_task.task, TASK, SPEC) == named) == (package == "toy-task")
 
 
-def test_a_simulator_that_is_not_installed_is_no_obstacle(monkeypatch):
-    def missing(name):
-        raise importlib.metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(importlib.metadata, "version", missing)
-    assert cache_path(toy_task.task, TASK, SPEC).suffix == ".hdf5"
-
-
 def test_a_file_of_ones_own_is_written_and_then_kept(tmp_path):
     path = tmp_path / "new" / "demos.hdf5"
     assert collect(TASK, SPEC, path) == path

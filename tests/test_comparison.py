@@ -8,7 +8,6 @@ import json
 import re
 import shutil
 from dataclasses import replace
-from html.parser import HTMLParser
 from urllib.parse import unquote
 
 import numpy as np
@@ -167,13 +166,6 @@ def test_models_and_parameters_are_named(found, folders):
         assert by_name[str(folder)].parameters == sum(one.numel() for one in load(folder).hierarchy.parameters())
 
 
-def test_the_order_of_the_runs_does_not_matter(found, folders):
-    again = compare(folders[::-1])
-    assert [row.name for row in again.rows] == [row.name for row in found.rows]
-    for row, before in zip(again.rows, found.rows, strict=True):
-        assert row.total == pytest.approx(before.total, abs=1e-9)
-
-
 def test_demonstrations_may_be_held_out_in_another_order(folders, toy_spec, other, tmp_path):
     """A run that reads the same demonstrations from a file of its own, turned round, with masks."""
     demos = demonstrations(toy_spec)
@@ -194,10 +186,9 @@ def test_demonstrations_may_be_held_out_in_another_order(folders, toy_spec, othe
     ("changes", "reason"),
     [
         ({"seed": 1}, r"not held out on the same data: demo_\d+ was held out by \S+ alone; fit both with the same"),
-        ({"demonstrations__seed": 50}, r"same data: demo_\d+ was held out by \S+ alone"),
         ({"demonstrations__valid_fraction": 0.0}, r"held nothing out \(demonstrations.valid_fraction: 0\); there is"),
     ],
-    ids=["another split", "other demonstrations", "nothing held out"],
+    ids=["another split", "nothing held out"],
 )
 def test_runs_that_share_no_held_out_data_are_refused(folders, other, changes, reason):
     with pytest.raises(CompareError, match=reason) as refused:
@@ -219,7 +210,8 @@ def test_demonstrations_that_have_changed_since_are_refused(toy_spec, other, tmp
     path = tmp_path / "own.hdf5"
     demos = demonstrations(toy_spec)
     demos.write(path)
-    first, second = (other(name, demonstrations__path=str(path), seed=0) for name in ("first", "second"))
+    first = other("first", demonstrations__path=str(path))
+    second = load(shutil.copytree(first.folder, tmp_path / "second"))
     assert len(compare([first.folder, second.folder]).rows) == 2
     for demo in demos:
         demo.actions[0] *= 0.5
@@ -273,24 +265,17 @@ def best_match(labels, options):
     return max(np.mean([match[h] == label for h, label in zip(options, labels, strict=True)]) for match in matches)
 
 
-def test_runs_without_labels_have_no_table_of_them(other):
-    runs = [other(name, demonstrations__labels=None, training__epochs=n) for n, name in ((1, "a"), (2, "b"))]
-    compared = compare([each.folder for each in runs])
-    assert compared.agreement == []
-    assert page.agreement_table(compared) is None
-
-
 # --- rollouts ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def rolled(toy_run, other, tmp_path_factory):
+def rolled(toy_run, other, folders, tmp_path_factory):
     """Two runs with rollouts from initial states of which some are the same; one more without."""
     first = load(shutil.copytree(toy_run.folder, tmp_path_factory.mktemp("rolled") / "first"))
     second = other("second", rollout__seed=1002, rollout__policies=[])
     for run, episodes in ((first, 6), (second, 7)):
         roll_out(run, episodes, film=0, jobs=1)
-    return first, second, other("third")
+    return first, second, load(folders[-1])
 
 
 def successes(folder, method):
@@ -319,32 +304,7 @@ def test_rollouts_are_paired_by_initial_state(rolled):
         assert one["p_value"] == pytest.approx(expected)
 
 
-def test_without_rollouts_there_is_no_table_of_them(found):
-    assert found.rollouts == []
-    assert page.rollout_table(found) is None
-
-
 # --- what is written --------------------------------------------------------------------------------------------------
-
-
-class Cells(HTMLParser):
-    """The text of all cells of a page, and what it would load from elsewhere."""
-
-    def __init__(self):
-        super().__init__()
-        self.cells, self.loaded, self.inside = [], [], False
-
-    def handle_starttag(self, tag, attributes):
-        self.inside = tag in ("td", "th")
-        self.cells += [""] * self.inside
-        self.loaded += [value for key, value in attributes if key in ("src", "href") and not value.startswith("data:")]
-
-    def handle_data(self, data):
-        if self.inside:
-            self.cells[-1] += data
-
-    def handle_endtag(self, tag):
-        self.inside = False
 
 
 @pytest.mark.usefixtures("drawn_here")
@@ -360,17 +320,14 @@ def test_the_files_say_the_same(found, tmp_path):
     runs = page.run_table(found)
     assert table[0] == runs.head
     assert table[2 : 2 + len(found.rows)] == runs.rows
-    read = Cells()
-    read.feed(path.read_text())
-    assert read.loaded == []
+    html = path.read_text()
     rest = [page.agreement_table(found), page.demonstration_table(found)]
-    assert read.cells == [cell for one in (runs, *rest) for row in (one.head, *one.rows) for cell in row]
+    assert all(f">{cell}<" in html for one in (runs, *rest) for row in (one.head, *one.rows) for cell in row)
+    assert not re.search(r'(src|href)="(?!data:)', html)  # nothing is loaded from elsewhere
     assert data["demonstrations"] == found.worst_first
     assert text.startswith(page.verdict(found))
-    below = [row for row in table[2 + len(found.rows) :] if not row[0].startswith("---")]
-    assert below == [row for one in rest for row in (one.head, *one.rows)]
     assert data["agreement"] == found.agreement
-    assert f'<p class="verdict">{page.verdict(found)}</p>' in path.read_text()
+    assert f'<p class="verdict">{page.verdict(found)}</p>' in html
     assert (folder / "compare.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -379,15 +336,3 @@ def test_the_command_ends_with_the_verdict(folders, found, tmp_path):
     *_, verdict, place = ended.out.splitlines()
     assert verdict == page.verdict(found)
     assert place == f"comparison: {tmp_path / 'x' / 'compare.html'}"
-
-
-def test_a_single_trajectory_has_no_error(other, tmp_path):
-    runs = [
-        other(name, demonstrations__valid_fraction=0.05, seed=0, training__epochs=n) for n, name in ((1, "a"), (2, "b"))
-    ]
-    found = compare([one.folder for one in runs])
-    assert len(found.trajectories) == 1
-    assert found.rows[1].dse is None
-    assert "–" in page.run_table(found).rows[1]
-    data = json.loads((write(found, tmp_path / "x").parent / "compare.json").read_text())
-    assert data["rows"][1]["dse"] is None

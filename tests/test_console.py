@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from made_metrics import compared, made_metrics
 
 from ddco_pyro.cli import console
-from ddco_pyro.drawing.page import Table
 from ddco_pyro.events import (
-    CandidateGivenUp,
     DemonstrationsDone,
-    EpisodeEnded,
     EpochEnded,
-    FoldScored,
-    SelectionBegan,
     TrainingBegan,
     TrainingEnded,
 )
@@ -63,55 +57,3 @@ def test_the_first_of_many_says_nothing_of_the_time_left(clock, capsys):
     first, second = capsys.readouterr().err.splitlines()
     assert first == "training ddco: 1/1000  joint: training 1.000, tuning 0.500 nats/step"
     assert second.startswith("training ddco: 12/1000, 988 s left")
-
-
-def test_markup_in_names_is_text(clock, capsys):
-    with console.Progress() as progress:
-        progress(EpisodeEnded("[bold]own[/bold]", 1))
-    assert "[bold]own[/bold]" in capsys.readouterr().err
-
-
-def test_log_likelihoods(capsys):
-    values = {"train": 1.0, "valid": 0.5}
-    console.log_likelihoods(made_metrics(log_likelihood_per_step=values, comparison={"flat": compared(-0.25, 0.125)}))
-    _, head, _, ours, theirs = capsys.readouterr().out.splitlines()
-    assert [cell.strip() for cell in head.split("┃")[1:3]] == ["Held out", "Training"]
-    assert [cell.strip() for cell in ours.split("│")[:3]] == ["DDCO", "0.500", "1.000"]
-    assert "−0.250 ± 0.125" in theirs
-
-
-def test_successes(capsys):
-    rate = {"successes": 3, "trials": 4, "rate": 0.75, "interval": [0.3, 0.95]}
-    mean = {"mean": 1.5, "std": None, "trials": 1, "interval": None}
-    nothing = {"mean": None, "std": None, "trials": 0, "interval": None}
-    methods = {
-        "ddco": {"measures": {"success": rate, "error": mean}},
-        "flat": {"measures": {"success": rate, "error": nothing}},
-    }
-    console.successes(made_metrics(rollouts={"seed": 0, "episodes": 4, "methods": methods}))
-    printed = capsys.readouterr().out
-    assert "4 episodes each" in printed
-    ddco, flat = printed.splitlines()[-2:]
-    assert [cell.strip() for cell in ddco.split("│")] == ["DDCO", "3 of 4 (30 to 95 %)", "1.50, n = 1"]
-    assert [cell.strip() for cell in flat.split("│")] == ["flat", "3 of 4 (30 to 95 %)", "– (n = 0)"]
-
-
-def test_nothing_is_cut_where_there_is_no_terminal(capsys):
-    name = "runs/" + "long-" * 20 + "name"
-    console.show(Table(["rank", "run"], [["0", name]]))
-    assert name in capsys.readouterr().out
-
-
-def test_a_selection_says_what_was_kept_failed_and_given_up(clock, capsys):
-    with console.Progress() as progress:
-        progress(SelectionBegan(total=9, kept=2))
-        progress(FoldScored("count = 1", 0, ""))
-        progress(FoldScored("count = 2", 0, "it diverged"))
-        progress(CandidateGivenUp("count = 3", 4))
-        progress(FoldScored("count = 1", 1, ""))
-    lines = capsys.readouterr().err.splitlines()
-    assert all(line.startswith("cross-validation (2 of 9 kept): ") for line in lines)
-    said = [line.partition("kept): ")[2] for line in lines]
-    assert "count = 2, fold 0 failed: it diverged" in said
-    assert "count = 3: stopped early, 4 folds less" in said
-    assert said[-1].startswith("7/7, 0 s left")

@@ -157,7 +157,7 @@ def test_choices_follow_the_models_latents(counts, emits, network):
     hierarchy = make(counts, emits, network, seed=3)
     states = torch.randn(3, 3, generator=torch.Generator().manual_seed(1)).numpy()
     truth = without_controls(hierarchy, states)
-    controller, episodes = Controller(hierarchy), 300
+    controller, episodes = Controller(hierarchy), 200
     last = []
     for seed in range(episodes):
         controller.reset(seed)

@@ -16,7 +16,6 @@ import pytest
 import torch
 import yaml
 from command_line import call
-from safetensors.torch import save_file
 from selecting import data_at
 
 import ddco_pyro
@@ -26,11 +25,11 @@ from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.drawing import words
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.metrics import Metrics, read_successes
+from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import agreement, header, likelihood, options, rollouts, training
+from ddco_pyro.selection import select
+from ddco_pyro.spec import load_spec
 from ddco_pyro.training.data import demonstrations
-
-LINE = r"ddco-pyro: {path}: is damaged: "
 
 
 @pytest.fixture(scope="module")
@@ -71,64 +70,61 @@ def refused(run: Path, command: tuple[str, ...], path: Path, what: str) -> None:
 
 # --- metrics.json -----------------------------------------------------------------------------------------------------
 
-DAMAGE: dict[str, tuple[Any, str]] = {
-    "truncated": (lambda text: text[: len(text) // 2], "is no JSON: EOF while parsing"),
-    "empty": (lambda text: "", "is no JSON: EOF while parsing a value at line 1 column 0"),
-    "{}": (lambda text: "{}", "model: missing; it has to be given"),
-    "[]": (lambda text: "[]", "must be a mapping (key: value), got []"),
-    "a string": (
+DAMAGE: tuple[tuple[Any, str], ...] = (
+    (lambda text: text[: len(text) // 2], "is no JSON: EOF while parsing"),
+    (lambda text: "", "is no JSON: EOF while parsing a value at line 1 column 0"),
+    (lambda text: "[]", "must be a mapping (key: value), got []"),
+    (
         lambda text: text.replace('"parameters": ', '"parameters": "many", "was": '),
         "comparison.flat.parameters: must be a whole number, got 'many'",
     ),
-    "a key less": (lambda text: text.replace('"comparison"', '"comparisons"'), "comparison: missing"),
-}
+    (lambda text: text.replace('"comparison"', '"comparisons"'), "comparison: missing"),
+)
 
 
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_damaged_metrics(run: Path, damage: str) -> None:
-    change, what = DAMAGE[damage]
+def test_damaged_metrics(run: Path) -> None:
     path = run / "metrics.json"
-    path.write_text(change(path.read_text()))
-    refused(run, COMMANDS["report"], path, what)
+    whole = path.read_text()
+    for change, what in DAMAGE:
+        path.write_text(change(whole))
+        refused(run, COMMANDS["report"], path, what)
+    path.write_text(whole)
+    (run / "baselines" / "flat" / "metrics.json").write_text("{}")
+    refused(run, COMMANDS["report"], run / "baselines" / "flat" / "metrics.json", "model: missing")
 
 
-@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
-def test_every_command_refuses_damaged_metrics(
-    run: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
-) -> None:
+def test_every_command_refuses_damaged_metrics_and_a_damaged_model(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(run.parent)
-    (run / "metrics.json").write_text("{}")
-    refused(run, command, run / "metrics.json", "model: missing")
+    metrics, model = run / "metrics.json", run / "model.safetensors"
+    whole, content = metrics.read_text(), model.read_bytes()
+    for command in COMMANDS.values():
+        metrics.write_text("{}")
+        refused(run, command, metrics, "model: missing")
+        metrics.write_text(whole)
+        model.write_bytes(content[:-3] + bytes([content[-3] ^ 1]) + content[-2:])
+        refused(run, command, model, "its contents are not what was written")
+        model.write_bytes(content)
 
 
-@pytest.mark.parametrize(("model", "value"), [(".", float("nan")), ("baselines/flat", float("inf"))])
-def test_weights_that_are_not_finite(run: Path, monkeypatch: pytest.MonkeyPatch, model: str, value: float) -> None:
+def test_weights_that_are_not_finite(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(run.parent)
-    path = run / model / "model.safetensors"
-    tensors, metadata = read_tensors(path)
-    name = next(name for name, tensor in sorted(tensors.items()) if tensor.is_floating_point() and tensor.numel() > 1)
-    tensors[name].view(-1)[1] = value
-    write_tensors(path, tensors, metadata)
-    refused(run, COMMANDS["compare"], path, f"{name} has numbers that are NaN or infinite")
+    for model, value in ((".", float("nan")), ("baselines/flat", float("inf"))):
+        path = run / model / "model.safetensors"
+        content, (tensors, metadata) = path.read_bytes(), read_tensors(path)
+        name = next(name for name, one in sorted(tensors.items()) if one.is_floating_point() and one.numel() > 1)
+        tensors[name].view(-1)[1] = value
+        write_tensors(path, tensors, metadata)
+        refused(run, COMMANDS["compare"], path, f"{name} has numbers that are NaN or infinite")
+        path.write_bytes(content)
 
 
-@pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"[" * 100_000, b'{"model": NaN}'])
-def test_metrics_that_are_no_text(run: Path, content: bytes) -> None:
-    (run / "metrics.json").write_bytes(content)
-    refused(run, COMMANDS["report"], run / "metrics.json", "")
-
-
-def test_damaged_metrics_of_a_baseline(run: Path) -> None:
-    path = run / "baselines" / "flat" / "metrics.json"
-    path.write_text("{}")
-    refused(run, COMMANDS["report"], path, "model: missing")
-
-
-def test_metrics_of_another_hierarchy(run: Path) -> None:
+def test_metrics_that_are_no_text_or_of_another_hierarchy(run: Path) -> None:
     path = run / "metrics.json"
     data = json.loads(path.read_text())
-    path.write_text(json.dumps(data | {"options": [[*data["options"][0], data["options"][0][-1]]]}))
-    refused(run, COMMANDS["report"], path, "is not about levels with 2 options")
+    other = json.dumps(data | {"options": [[*data["options"][0], data["options"][0][-1]]]}).encode()
+    for content in (b"\xff\xfe\x00", b"[" * 100_000, b'{"model": NaN}', other):
+        path.write_bytes(content)
+        refused(run, COMMANDS["report"], path, "is not about levels with 2 options" if content == other else "")
 
 
 def places(data: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -197,44 +193,29 @@ def test_what_is_removed_is_made_again(run: Path) -> None:
     """As the line says that is to be done."""
     metrics = json.loads((run / "metrics.json").read_text())
     model = (run / "model.safetensors").read_bytes()
+    (run / "model.safetensors").write_text("damaged")
+    command = call("report", run).err.partition("; remove it and fit again: ddco-pyro ")[2].split()
+    assert command == ["fit", str(run / "spec.yaml"), "--out", str(run), "--resume"]
     for name in ("metrics.json", "model.safetensors"):
-        (run / name).write_text("damaged")
-        ended = call("report", run)
-        command = ended.err.partition("; remove it and fit again: ddco-pyro ")[2].split()
         (run / name).unlink()
-        assert call(*command).status == 0
-        assert (run / "model.safetensors").read_bytes() == model
-        again = json.loads((run / "metrics.json").read_text())
-        aside = {"seconds": ..., "rollouts": ..., "engine_check": ...}
-        assert again | aside == metrics | aside
+    ddco_pyro.fit(run / "spec.yaml", out=run)
+    assert (run / "model.safetensors").read_bytes() == model
+    again = json.loads((run / "metrics.json").read_text())
+    aside = {"seconds": ..., "rollouts": ..., "engine_check": ...}
+    assert again | aside == metrics | aside
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"method,seed,success\nddco,x,1\n",
-        b"a\n1\n",
-        b"\xff\xfe",
-    ],
-)
-def test_damaged_rollouts(run: Path, monkeypatch: pytest.MonkeyPatch, content: bytes) -> None:
+def test_damaged_rollouts(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(run.parent)
-    (run / "rollouts.csv").write_bytes(content)
-    refused(run, COMMANDS["compare"], run / "rollouts.csv", "")
+    for content in (b"method,seed,success\nddco,x,1\n", b"a\n1\n", b"\xff\xfe"):
+        (run / "rollouts.csv").write_bytes(content)
+        refused(run, COMMANDS["compare"], run / "rollouts.csv", "")
     (run / "videos").mkdir(exist_ok=True)
     (run / "videos" / "ddco-1000.mp4").touch()  # a film, whose outcome is in the table
     assert call("report", run).err.startswith(f"ddco-pyro: {run / 'rollouts.csv'}: is damaged: ")
-
-
-def test_rollouts_without_success_are_no_damage(run: Path) -> None:
-    assert {seed for method, seed in read_successes(run) if method == "ddco"} == {1000, 1001}
-    (run / "rollouts.csv").write_text("method,seed,error\nddco,1000,0.5\n")
-    assert read_successes(run) == {}
-    (run / "rollouts.csv").unlink()
-    assert read_successes(run) == {}
 
 
 def test_a_damaged_history(run: Path) -> None:
@@ -244,59 +225,34 @@ def test_a_damaged_history(run: Path) -> None:
         assert (ended.status, ended.err.count("\n")) == (2, 1)
         assert ended.err.startswith(f"ddco-pyro: {run / 'history.csv'}: is damaged: ")
         assert "; remove it and metrics.json and fit again: ddco-pyro fit" in ended.err
-    for name in ("history.csv", "metrics.json"):
-        (run / name).unlink()
-    assert call(*ended.err.partition("fit again: ddco-pyro ")[2].split()).status == 0
-
-
-UNFINISHED = {
-    "truncated": (lambda text: text[:-20], "is no JSON: EOF while parsing"),
-    "{}": (lambda text: "{}", "models: missing; it has to be given"),
-    "an outcome less": (
-        lambda text: json.dumps(json.loads(text) | {"seeds": [1000, 1001, 1002]}),
-        "outcomes: supervisor has 2, but there are 3 seeds",
-    ),
-}
 
 
 def test_damaged_unfinished_rollouts(run: Path) -> None:
     outcomes = {"supervisor": [{"success": 1.0}, {"success": 0.0}]}
     whole = json.dumps({"models": "0", "seeds": [1000, 1001], "outcomes": outcomes})
     path = run / "rollouts.unfinished.json"
-    for change, what in UNFINISHED.values():
-        path.write_text(change(whole))
+    another = json.dumps(json.loads(whole) | {"seeds": [1000, 1001, 1002]})
+    for content, what in ((whole[:-20], "is no JSON"), (another, "outcomes: supervisor has 2, but there are 3 seeds")):
+        path.write_text(content)
         refused(run, COMMANDS["rollout"], path, what)
     path.write_text(whole)  # of other models: not taken, and put away at the end
-    assert call(*(one.replace("RUN", str(run)) for one in COMMANDS["rollout"])).status == 0
+    roll_out(ddco_pyro.load(run), 1, jobs=1)
     assert not path.exists()
 
 
 # --- tensors ----------------------------------------------------------------------------------------------------------
 
 
-def same(
-    ours: tuple[dict[str, torch.Tensor], dict[str, str]], theirs: tuple[dict[str, torch.Tensor], dict[str, str]]
-) -> bool:
-    return (
-        ours[1] == theirs[1]
-        and ours[0].keys() == theirs[0].keys()
-        and all(
-            value.dtype == theirs[0][name].dtype and torch.equal(value, theirs[0][name])
-            for name, value in ours[0].items()
-        )
-    )
-
-
 @pytest.mark.parametrize("name", [
     "model.safetensors", pytest.param("checkpoints/restart-0.safetensors", marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_a_flipped_bit_is_refused_or_makes_no_difference(toy_run: Fit, tmp_path: Path, name: str) -> None:
-    """Of every 37th byte, in the header too."""
+    """Of every 37th byte, and of every third one in the header."""
     path, content = tmp_path / "file", (toy_run.folder / name).read_bytes()
     whole = read_tensors(toy_run.folder / name)
     header = 8 + struct.unpack("<Q", content[:8])[0]
     messages, read = [], 0
-    for at in [*range(header), *range(header, len(content), 37)]:
+    for at in [*range(0, header, 3), *range(header, len(content), 37)]:
         path.write_bytes(content[:at] + bytes([content[at] ^ (1 << at % 8)]) + content[at + 1 :])
         try:
             found = read_tensors(path)
@@ -311,31 +267,16 @@ def test_a_flipped_bit_is_refused_or_makes_no_difference(toy_run: Fit, tmp_path:
     assert len(messages) > 20 * read
 
 
-def test_a_damaged_model_is_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(run.parent)
-    path = run / "model.safetensors"
-    content = path.read_bytes()
-    path.write_bytes(content[:-3] + bytes([content[-3] ^ 1]) + content[-2:])
-    for command in COMMANDS.values():
-        refused(run, command, path, "its contents are not what was written")
-
-
 def test_a_damaged_checkpoint_is_refused(run: Path) -> None:
     path = run / "checkpoints" / "restart-0.safetensors"
-    content = path.read_bytes()
+    content, model = path.read_bytes(), (run / "model.safetensors").read_bytes()
     path.write_bytes(content[:-3] + bytes([content[-3] ^ 1]) + content[-2:])
     (run / "metrics.json").unlink()
     again = ("fit", str(run / "spec.yaml"), "--out", str(run), "--resume")
     refused(run, again, path, "its contents are not what was written")
     path.unlink()
-    assert call(*again).status == 0
-
-
-def test_what_was_written_without_a_checksum_is_read(tmp_path: Path) -> None:
-    tensors, metadata = {"x": torch.arange(6.0).reshape(2, 3)}, {"steps": "7"}
-    save_file(tensors, tmp_path / "old", metadata)
-    write_tensors(tmp_path / "new", tensors, metadata)
-    assert same(read_tensors(tmp_path / "old"), read_tensors(tmp_path / "new"))
+    ddco_pyro.fit(run / "spec.yaml", out=run)
+    assert (run / "model.safetensors").read_bytes() == model
 
 
 # --- selections -------------------------------------------------------------------------------------------------------
@@ -346,42 +287,38 @@ def selected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("selected")
     data = data_at(folder) | {"selection": {"folds": 2, "grid": {"seed": [1, 2]}}}
     (folder / "spec.yaml").write_text(yaml.safe_dump(data))
-    assert call("select", folder / "spec.yaml", "--out", folder / "run", "--jobs", "1").status == 0
+    select(load_spec(folder / "spec.yaml"), folder / "run")
     return folder
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda text: text[:40],
-        lambda text: "{}",
-        lambda text: text.replace('"fold": 1', '"fold": 0'),
-        lambda text: text.replace('"steps": [', '"steps": [0, '),
-    ],
+SCORES = (
+    lambda text: text[:40],
+    lambda text: text.replace('"fold": 1', '"fold": 0'),
+    lambda text: text.replace('"steps": [', '"steps": [0, '),
 )
-def test_a_damaged_score(selected: Path, tmp_path: Path, change: Any) -> None:
-    shutil.copytree(selected, tmp_path, dirs_exist_ok=True)
-    path = tmp_path / "run" / "folds" / "001-01.json"
-    content = path.read_text()
-    path.write_text(change(content))
-    assert path.read_text() != content
-    again = ("select", selected / "spec.yaml", "--out", tmp_path / "run", "--jobs", "1", "--resume")
-    ended = call(*again)
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-    assert ended.err.startswith(f"ddco-pyro: {path}: is damaged: ")
-    assert "; remove it and do the same again: this fold alone is trained anew" in ended.err
 
 
-def test_damaged_folds(selected: Path, tmp_path: Path) -> None:
+def test_a_damaged_score_and_damaged_folds(selected: Path, tmp_path: Path) -> None:
     shutil.copytree(selected, tmp_path, dirs_exist_ok=True)
-    path = tmp_path / "run" / "folds.json"
-    content = path.read_bytes()
     again = ("select", selected / "spec.yaml", "--out", tmp_path / "run", "--jobs", "1", "--resume")
-    for damaged in (content[:50], b"[]"):
-        path.write_bytes(damaged)
+
+    def damaged(path: Path, text: str) -> str:
+        path.write_text(text)
         ended = call(*again)
         assert (ended.status, ended.err.count("\n")) == (2, 1)
         assert ended.err.startswith(f"ddco-pyro: {path}: is damaged: ")
+        return ended.err
+
+    path = tmp_path / "run" / "folds" / "001-01.json"
+    whole = path.read_text()
+    for change in SCORES:
+        assert change(whole) != whole
+        assert "; remove it and do the same again: this fold alone is trained anew" in damaged(path, change(whole))
+    path.write_text(whole)
+    path = tmp_path / "run" / "folds.json"
+    content = path.read_bytes()
+    for text in (content[:50].decode(), "[]"):
+        damaged(path, text)
     path.unlink()
-    assert call(*again).status == 0
+    select(load_spec(selected / "spec.yaml"), tmp_path / "run")
     assert path.read_bytes() == content

@@ -96,10 +96,6 @@ def test_dimensions_come_from_the_task_where_there_is_no_file_yet(tmp_path):
     assert not any(tmp_path.iterdir())
 
 
-def test_demonstrations_are_read_from_the_file(path):
-    assert demonstrations(spec(demonstrations={"path": str(path)})).names == ("demo_4", "demo_9")
-
-
 def test_demonstrations_are_collected_where_there_is_no_file_yet(tmp_path):
     path, told = tmp_path / "later.hdf5", []
     given = spec(demonstrations={"path": str(path), "count": 3, "labels": "phase"})
@@ -115,23 +111,6 @@ def test_demonstrations_may_come_from_another_task(tmp_path):
     given = spec(task="not_registered", demonstrations=elsewhere)
     assert dimensions(given) == Dimensions({"offsets": (4,), "visited": (1,)}, 2, 5)
     assert demonstrations(given).lengths == (5, 5, 5)
-
-
-def test_a_file_that_is_not_there_and_cannot_be_collected_is_an_error(tmp_path):
-    missing = {"path": str(tmp_path / "none.hdf5")}
-    for read in (demonstrations, dimensions):
-        with pytest.raises(DemonstrationsError) as refused:
-            read(spec(task=None, demonstrations=missing | {"labels": "phase"}, observations=["offsets", "visited"]))
-        assert str(refused.value) == (
-            f"demonstrations.path: {missing['path']}: there is no such file; put it there, or fit to another with "
-            "--set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, with actions, obs/offsets, "
-            "obs/visited, labels/phase in each data/<demonstration>"
-        )
-
-
-def test_labels_that_are_not_there_are_an_error(path):
-    with pytest.raises(DemonstrationsError, match=r"demos\.hdf5: demo_4: labels is missing"):
-        demonstrations(spec(demonstrations={"path": str(path), "labels": "phase"}))
 
 
 LEVEL = {"count": 2, "policy": {"network": "linear"}}

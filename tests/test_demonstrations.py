@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from random_demonstrations import demonstration, demonstrations
@@ -46,6 +46,7 @@ def test_what_is_read_is_what_was_written(path: Path) -> None:
         assert_equal(one, other)
 
 
+@settings(max_examples=40)
 @given(
     hnp.arrays(
         np.float64,

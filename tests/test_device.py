@@ -22,7 +22,7 @@ from ddco_pyro.exporting import export
 from ddco_pyro.model.networks.conv import _field_means
 from ddco_pyro.spec import Spec, parse_spec
 from ddco_pyro.training import devices
-from ddco_pyro.training.networks import build_hierarchy
+from ddco_pyro.training.networks import Dimensions, build_hierarchy
 from ddco_pyro.training.restarts import OtherDevice
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*to a meta parameter:UserWarning")  # the double is called meta
@@ -54,8 +54,7 @@ OTHER = {
 }
 """Those that are computed by another algorithm, or in another order, where they are not on the host."""
 
-QUICK = ("mlp", "a trunk of branches")
-ALL = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in (*SAME, *OTHER)]
+ALL = [name if name in SAME else pytest.param(name, marks=pytest.mark.slow) for name in (*SAME, *OTHER)]
 
 
 @pytest.fixture(scope="module")
@@ -114,8 +113,8 @@ def test_a_fit_with_networks_elsewhere(demos: Demonstrations, network: str, monk
         optimizer={"name": "momentum", "lr": 0.01},  # Adam's steps hide their sizes
         clip_gradient=100.0 if network in SAME else 1.0,  # a norm over two devices is summed in another order
     )
-    here = ddco_pyro.fit(spec, demos)
-    monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", 6 * here.hierarchy.step_bytes)  # in chunks too
+    one = build_hierarchy(spec, Dimensions.of(demos))
+    monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", 6 * one.step_bytes)  # in chunks too
     here = ddco_pyro.fit(spec, demos)
     on(monkeypatch, THERE)
     with Device():
@@ -257,20 +256,6 @@ def test_a_run_goes_on_where_it_was_begun(demos: Demonstrations, tmp_path, monke
             np.testing.assert_array_equal(weights(again)[name], values)
     for name in ("model.safetensors", "history.csv"):
         assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-
-
-def test_what_is_trained_elsewhere_is_finished_anywhere(demos: Demonstrations, tmp_path, monkeypatch) -> None:
-    """A restart that is done is taken as it is, and the run says where that was."""
-    spec = spec_of(DROPPING, initialize="random")
-    on(monkeypatch, THERE)
-    with Device():
-        there = ddco_pyro.fit(spec, demos, tmp_path)
-    (tmp_path / "metrics.json").unlink()
-    on(monkeypatch, torch.device("cpu"))
-    here = ddco_pyro.fit(spec, demos, tmp_path)
-    for name, values in weights(there).items():
-        np.testing.assert_array_equal(weights(here)[name], values)
-    assert here.metrics.training.device == THERE.type
 
 
 def test_restarts_that_were_stopped_elsewhere_keep_nothing_from_being_finished(demos, tmp_path, monkeypatch) -> None:

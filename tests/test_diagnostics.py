@@ -110,10 +110,3 @@ def test_control_by_a_caller_above_does_not_count_for_the_one_below():
     upper = level(0.6, 0.2, 0.2)
     lower = level(0.7, 0.15, 0.15)  # the upper options emit control in 0.1 of the 0.4 in which they act
     assert [(one.kind, one.level) for one in diagnose([lower, upper])] == [("high_fitting", 2)]
-
-
-def test_every_sign_comes_with_advice():
-    levels = [level(0.6, 0.001, 0.399, durations=[1.0, 1.0, 1.2]), level(0.0, 0.95, 0.05)]
-    found = diagnose(levels, [[pair(1, 2, 5.0)], [pair(1, 2, 0.01)]])
-    assert {one.kind for one in found} == {"unused", "redundant", "dominating", "never_persisting", "high_fitting"}
-    assert all(one.advice for one in found)

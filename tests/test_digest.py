@@ -121,17 +121,28 @@ def changing(finished: Path):
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_run_of_a_file_that_has_changed_is_not_continued_and_not_shown(changing: Path, change: str) -> None:
+def test_a_run_of_a_file_that_has_changed_is_not_continued(changing: Path, change: str) -> None:
     edit, what = CHANGES[change]
     edited(changing / "demos.hdf5", edit)
     before = contents(changing)
     for name in ("run", "interrupted"):
-        ended = call("fit", changing / name / "spec.yaml", "--out", changing / name, "--resume")
-        assert (ended.status, ended.err) == (2, f"ddco-pyro: {REFUSED.format(folder=changing / name, what=what)}\n")
-    for command in (["report", changing / "run"], ["report", changing / "run" / "baselines" / "flat"],
-                    ["merge", changing / "run", "--out", changing / "merged"]):  # fmt: skip
-        ended = call(*command)
-        assert (ended.status, ended.err) == (2, f"ddco-pyro: {REFUSED.format(folder=command[1], what=what)}\n")
+        with pytest.raises(BadInput) as refused:
+            ddco_pyro.fit(changing / name / "spec.yaml", out=changing / name)
+        assert str(refused.value) == REFUSED.format(folder=changing / name, what=what)
+    assert contents(changing) == before
+
+
+def test_a_run_of_a_file_that_has_changed_is_not_shown(changing: Path) -> None:
+    edit, what = CHANGES["a control"]
+    edited(changing / "demos.hdf5", edit)
+    run, before = changing / "run", contents(changing)
+    for folder, command in (
+        (run, ["fit", run / "spec.yaml", "--out", run, "--resume"]),
+        (run, ["report", run]),
+        (run / "baselines" / "flat", ["report", run / "baselines" / "flat"]),
+        (run, ["merge", run, "--out", changing / "merged"]),
+    ):
+        assert call(*command) == (2, "", f"ddco-pyro: {REFUSED.format(folder=folder, what=what)}\n")
     assert contents(changing) == before
 
 
@@ -143,28 +154,19 @@ def test_what_makes_no_difference_is_not_refused(changing: Path, tmp_path: Path)
     assert (run / "model.safetensors").read_bytes() == (changing / "run" / "model.safetensors").read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("change", "what"),
-    [
-        (lambda demos: replace(demos, masks={"valid": demos.names[3:5]}), "mask/valid changed"),
-        (
-            lambda demos: replace(
-                demos, demonstrations=tuple(replace(one, labels={"phase": np.ones(len(one), int)}) for one in demos)
-            ),
-            "labels/phase changed",
-        ),
-    ],
-    ids=["masks", "labels"],
-)
-def test_other_demonstrations_from_memory_are_refused(tmp_path: Path, change, what: str) -> None:
+def test_other_demonstrations_from_memory_are_refused(tmp_path: Path) -> None:
     """A finished run of them is no result of these."""
+    demos = labelled()
+    masked = replace(demos, masks={"valid": demos.names[3:5]})
+    records = tuple(replace(one, labels={"phase": np.ones(len(one), int)}) for one in demos)
     spec = with_overrides(spec_of(tmp_path / "unused.hdf5"), {"compare_with": [], "training.epochs": 1})
     fit = ddco_pyro.fit(spec, labelled(), out=tmp_path / "run")
     assert ddco_pyro.fit(spec, labelled(), out=tmp_path / "run").metrics == fit.metrics
     before = contents(tmp_path)
-    with pytest.raises(BadInput) as refused:
-        ddco_pyro.fit(spec, change(labelled()), out=tmp_path / "run")
-    assert str(refused.value) == REFUSED.format(folder=tmp_path / "run", what=what)
+    for other, what in ((masked, "mask/valid"), (replace(demos, demonstrations=records), "labels/phase")):
+        with pytest.raises(BadInput) as refused:
+            ddco_pyro.fit(spec, other, out=tmp_path / "run")
+        assert str(refused.value) == REFUSED.format(folder=tmp_path / "run", what=f"{what} changed")
     assert contents(tmp_path) == before
 
 
@@ -177,11 +179,9 @@ def test_a_baseline_of_other_demonstrations_is_not_taken_over(finished: Path, tm
             for one, new in zip(labelled(), other, strict=True))).write(tmp_path / "demos.hdf5")  # fmt: skip
     there = ddco_pyro.fit(spec, tmp_path / "demos.hdf5", out=tmp_path / "there")
     flat = shutil.copytree(there.folder / "baselines", tmp_path / "here" / "baselines") / "flat"
-    for text in (flat / "spec.yaml",):
-        text.write_text(text.read_text().replace(str(tmp_path / "demos.hdf5"), str(path)))
     shutil.copy(there.folder / "spec.yaml", tmp_path / "here")
-    here = tmp_path / "here" / "spec.yaml"
-    here.write_text(here.read_text().replace(str(tmp_path / "demos.hdf5"), str(path)))
+    for text in (flat / "spec.yaml", tmp_path / "here" / "spec.yaml"):
+        text.write_text(text.read_text().replace(str(tmp_path / "demos.hdf5"), str(path)))
     with pytest.raises(BadInput, match=rf"^{flat}: is a run of other demonstrations \(actions changed\)"):
         ddco_pyro.fit(spec, out=tmp_path / "here")
 
@@ -203,7 +203,7 @@ def test_a_selection_of_a_file_that_has_changed_is_not_continued(tmp_path: Path)
     assert contents(tmp_path) == before
 
 
-@pytest.mark.parametrize("written", [None, 1, 2])
+@pytest.mark.parametrize("written", [None, 2])
 def test_a_run_of_another_version_is_to_be_fitted_again(finished: Path, tmp_path: Path, written: int | None) -> None:
     said = f"this run was written by version {written or 1} of the run folder's format, and version 3 is read here"
     for name in ("run", "interrupted"):
@@ -212,19 +212,8 @@ def test_a_run_of_another_version_is_to_be_fitted_again(finished: Path, tmp_path
         (run / "demonstrations.json").unlink()
         if written is not None:
             (run / "demonstrations.json").write_text(json.dumps(digest))
-        commands = [("fit", run / "spec.yaml", "--out", run, "--resume"), ("report", run)]
-        for command in commands if name == "run" else commands[:1]:
-            ended = call(*command)
-            assert (ended.status, ended.err) == (2, f"ddco-pyro: {run}: {said}: fit again\n")
-
-
-def test_a_damaged_digest_is_one_line(finished: Path, tmp_path: Path) -> None:
-    run = shutil.copytree(finished / "run", tmp_path / "run")
-    for damaged in ("", "{}", '{"names": [1]}'):
-        (run / "demonstrations.json").write_text(damaged)
-        ended = call("fit", run / "spec.yaml", "--out", run, "--resume")
-        assert (ended.status, ended.err.count("\n")) == (2, 1)
-        assert ended.err.startswith(f"ddco-pyro: {run / 'demonstrations.json'}: is damaged: ")
+        command = ("report", run) if name == "run" else ("fit", run / "spec.yaml", "--out", run, "--resume")
+        assert call(*command) == (2, "", f"ddco-pyro: {run}: {said}: fit again\n")
 
 
 # --- the digest -------------------------------------------------------------------------------------------------------

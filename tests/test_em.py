@@ -80,7 +80,7 @@ def expectation(model, ridge, batch, trained=EVERYTHING, discovering=None):
     for _ in range(400):
         made.step(batch)
         values.append(made.value)
-        if len(values) > 5 and values[-1] - values[-2] < 1e-11 * abs(values[-1]):
+        if len(values) > 5 and values[-1] - values[-2] < 1e-9 * abs(values[-1]):
             break
     return made, values
 
@@ -303,6 +303,7 @@ def test_a_flat_policy_for_each_time_step_is_least_squares_at_that_step():
 def test_a_fit_that_is_interrupted_has_the_same_bits(tmp_path, initialize):
     flat = initialize == "flat"
     spec, demos = flat_spec(std=LEARNED) if flat else small_spec(initialize=initialize), demonstrations(12)
+    spec = with_overrides(spec, {"training.epochs": 15})
     whole, cut = (make_trainer(spec, demos, tmp_path / name) for name in ("whole", "cut"))
     expected = train(whole.data, Restart(Progress(0)))
     path = tmp_path / "restart.safetensors"

@@ -71,11 +71,11 @@ def test_random_convolutions_say_where_the_dot_is(source, out):
 def test_an_autoencoder_says_where_the_dot_is(source, out):
     """It gives the picture from that: better than the best picture that never changes, which cannot show a dot."""
     seen = []
-    encode(source, out, Encoding("camera", "autoencoder", size=16, updates=200), seen.append)
+    encode(source, out, Encoding("camera", "autoencoder", size=16, updates=150), seen.append)
     assert held_out_accuracy(out) > 0.9
     pictures = together(Demonstrations.read(source).split(0.2, 0)[0], "camera") / 255
     losses = [event.loss for event in seen if isinstance(event, UpdatesDone)]
-    assert len(losses) == 4
+    assert len(losses) == 3
     assert losses[-1] < 0.8 * pictures.var(0).mean()
 
 
@@ -109,13 +109,6 @@ def test_all_but_the_pictures_stays(few_dots, out):
         assert demo.attributes == other.attributes
     with h5py.File(out) as file:
         assert file["data/demo_0/obs/camera_features"].dtype == np.float32
-
-
-def test_two_cameras_one_after_the_other(few_dots, out, tmp_path):
-    encode(few_dots, out, Encoding("camera", size=5))
-    encode(out, tmp_path / "both.hdf5", Encoding("other", size=3, name="wrist"))
-    shapes = Demonstrations.read(tmp_path / "both.hdf5").observation_shapes
-    assert shapes == {"place": (2,), "camera_features": (5,), "wrist": (3,)}
 
 
 def test_random_convolutions_written_out(few_dots, out):
@@ -187,18 +180,6 @@ def test_memory_holds_a_block_of_pictures(tmp_path, out, monkeypatch):
         assert tracemalloc.get_traced_memory()[1] < pictures.nbytes / 2
     finally:
         tracemalloc.stop()
-
-
-def test_a_folder_does_not_hide_an_encoder_of_its_name(few_dots, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "random_conv").mkdir()
-    assert encode(few_dots, tmp_path / "out.hdf5", Encoding("camera")).about.reader is None
-
-
-def test_another_seed_is_another_encoder(few_dots, tmp_path):
-    made = [encode(few_dots, tmp_path / f"{seed}.hdf5", Encoding("camera", seed=seed)).path for seed in (0, 1)]
-    features = [together(Demonstrations.read(path), "camera_features") for path in made]
-    assert not np.allclose(*features)
 
 
 def killed(path, out, encoding, kind, after):

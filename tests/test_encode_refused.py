@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import shutil
-from pathlib import Path
 
-import h5py
 import pytest
 from command_line import call
 from dots import followed
@@ -52,47 +49,6 @@ def test_what_cannot_be_used(few_dots, out, options, message):
     assert (ended.status, ended.err.count("\n")) == (2, 1)
     assert message in ended.err
     assert not list(out.parent.iterdir())
-
-
-def cut(path):
-    path.write_bytes(path.read_bytes()[:2000])
-
-
-def without_a_picture(path):
-    with h5py.File(path, "r+") as file:
-        del file["data/demo_3/obs/camera"]
-
-
-def shorter(path):
-    with h5py.File(path, "r+") as file:
-        pictures = file["data/demo_3/obs/camera"][:-1]
-        del file["data/demo_3/obs/camera"]
-        file["data/demo_3/obs/camera"] = pictures
-
-
-def unknown_in_a_mask(path):
-    with h5py.File(path, "r+") as file:
-        del file["mask/train"]
-        file["mask/train"] = [b"demo_77"]
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (cut, "cannot be read as HDF5, or is damaged"),
-        (without_a_picture, "demo_3: obs/camera is missing, which demo_0 has"),
-        (shorter, "demo_3: obs/camera has 7 steps, but actions has 8"),
-        (unknown_in_a_mask, "mask/train: there is no demonstration 'demo_77'"),
-        (Path.unlink, "there is no such file"),
-    ],
-)
-def test_demonstrations_that_cannot_be_used(few_dots, tmp_path, out, change, message):
-    path = shutil.copy(few_dots, tmp_path / "changed.hdf5")
-    change(Path(path))
-    ended = call("encode", path, "--observation", "camera", "--out", out)
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-    assert message in ended.err
-    assert not [file for file in tmp_path.iterdir() if "out" in file.name]
 
 
 def test_what_was_not_written_here_stays(few_dots, out):

@@ -160,11 +160,6 @@ def test_images_stay_bytes():
         np.testing.assert_array_equal(found.images["camera"][n, : len(demo)], demo.observations["camera"])
 
 
-def test_images_alone_have_no_features():
-    found = fitted(ObservationSpec(key="camera")).inputs(d.observations for d in DEMOS)
-    assert (found.vector.shape, set(found.images)) == ((3, 5, 0), {"camera"})
-
-
 def test_the_step_is_a_part_of_the_longest_training_demonstration():
     encoder = fitted(ObservationSpec(key="pose"), ObservationSpec(key="step", standardize=False))
     found = encoder.inputs(demo.observations for demo in DEMOS)

@@ -180,6 +180,8 @@ NOT_OF_SEQUENCES = {
 }
 
 
-@parametrize_with_checks([RowsAlone(2, settings=QUICK)], expected_failed_checks=lambda _: NOT_OF_SEQUENCES)
+@parametrize_with_checks(
+    [RowsAlone(2, settings={"training.epochs": 2})], expected_failed_checks=lambda _: NOT_OF_SEQUENCES
+)
 def test_the_checks_of_scikit_learn(estimator: Any, check: Any) -> None:
     check(estimator)

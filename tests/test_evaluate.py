@@ -145,26 +145,37 @@ def test_rollouts_that_the_run_holds_are_not_done_again_if_asked(copied, rolled,
     assert contents(copied.folder) == before
 
 
+def begun(run, episodes, film, **options):
+    """The methods whose episodes are begun, of which the first is stopped."""
+    seen = []
+
+    def stop(task, policy, *rest):
+        seen.append(policy)
+        raise KeyboardInterrupt
+
+    with mock.patch("ddco_pyro.fitting.rollouts.run_episodes", stop), pytest.raises(KeyboardInterrupt):
+        roll_out(run, episodes, film, jobs=1, **options)
+    return seen
+
+
 @pytest.mark.parametrize(
-    ("change", "episodes", "film", "resume"),
+    ("changes", "episodes", "film", "resume"),
     [
-        ("nothing", EPISODES, 2, False),
-        ("nothing", EPISODES - 1, 2, True),
-        ("nothing", EPISODES, 3, True),
-        ("seed", EPISODES, 2, True),
-        ("method", EPISODES, 2, True),
+        ({}, EPISODES, 2, False),
+        ({}, EPISODES - 1, 2, True),
+        ({}, EPISODES, 3, True),
+        ({"rollout.seed": FIRST + 1}, EPISODES, 2, True),
     ],
 )
-def test_others_are(copied, change, episodes, film, resume):
+def test_others_are(copied, changes, episodes, film, resume):
+    assert begun(changed(copied, **changes), episodes, film, resume=resume) == [METHODS[0]]
+
+
+def test_other_methods_are_rolled_out(copied):
     told = []
-    if change == "seed":
-        copied = changed(copied, **{"rollout.seed": FIRST + 1})
-    if change == "method":
-        copied = changed(copied, **{"rollout.policies": ["supervisor"]})
-    results = roll_out(copied, episodes, film, told.append, jobs=1, resume=resume)
-    methods = METHODS[1:] if change == "method" else METHODS
-    assert Counter(event.method for event in told) == dict.fromkeys(methods, episodes)
-    assert (list(results.methods), results.episodes) == (methods, episodes)
+    results = roll_out(changed(copied, **{"rollout.policies": ["supervisor"]}), 2, 0, told.append, jobs=1, resume=True)
+    assert Counter(event.method for event in told) == dict.fromkeys(METHODS[1:], 2)
+    assert (list(results.methods), results.episodes) == (METHODS[1:], 2)
 
 
 def interrupted(run, after, **options):
@@ -180,24 +191,31 @@ def interrupted(run, after, **options):
         roll_out(run, EPISODES, 2, on_event, jobs=1, **options)
 
 
+@pytest.fixture(scope="module")
+def cut(toy_run, tmp_path_factory):
+    """The folder of rollouts that were interrupted in the third method."""
+    folder = shutil.copytree(toy_run.folder, tmp_path_factory.mktemp("cut") / "run")
+    interrupted(ddco_pyro.load(folder), after=2 * EPISODES + 3)
+    return folder
+
+
 @pytest.fixture
-def fresh(toy_run, tmp_path):
-    return ddco_pyro.load(shutil.copytree(toy_run.folder, tmp_path / "fresh"))
+def fresh(cut, tmp_path):
+    return ddco_pyro.load(shutil.copytree(cut, tmp_path / "fresh"))
 
 
 def test_what_was_interrupted_goes_on_with_the_next_method(rolled, fresh, monkeypatch):
     run, results, *_ = rolled
-    interrupted(fresh, after=2 * EPISODES + 3)
     assert fresh.metrics.rollouts is None
-    begun, told = [], []
+    seen, told = [], []
 
     def counted(task, policy, *rest):
-        begun.append(policy)
+        seen.append(policy)
         return run_episodes(task, policy, *rest)
 
     monkeypatch.setattr("ddco_pyro.fitting.rollouts.run_episodes", counted)
     assert roll_out(fresh, EPISODES, 2, told.append, jobs=1) == results
-    assert len(begun) == len(METHODS) - 2
+    assert len(seen) == len(METHODS) - 2
     assert told == [EpisodeEnded(name, len(METHODS) * EPISODES) for name in METHODS for _ in range(EPISODES)]
     assert (fresh.folder / "rollouts.csv").read_bytes() == (run.folder / "rollouts.csv").read_bytes()
     assert {path.name for path in fresh.folder.iterdir()} == {path.name for path in run.folder.iterdir()}
@@ -205,18 +223,9 @@ def test_what_was_interrupted_goes_on_with_the_next_method(rolled, fresh, monkey
 
 @pytest.mark.parametrize("change", ["model", "baseline", "seeds", "films"])
 def test_what_was_interrupted_is_not_mixed_with_anything_else(fresh, change):
-    interrupted(fresh, after=2 * EPISODES + 3)
     if change in ("model", "baseline"):
         path = fresh.folder / {"model": ".", "baseline": "baselines/flat"}[change] / "model.safetensors"
         tensors, metadata = read_tensors(path)
         write_tensors(path, {key: value + 0.5 * value.is_floating_point() for key, value in tensors.items()}, metadata)
     episodes, film = EPISODES - (change == "seeds"), 3 if change == "films" else 0
-    begun = []
-
-    def stop(task, policy, *rest):
-        begun.append(policy)
-        raise KeyboardInterrupt
-
-    with mock.patch("ddco_pyro.fitting.rollouts.run_episodes", stop), pytest.raises(KeyboardInterrupt):
-        roll_out(ddco_pyro.load(fresh.folder), episodes, film, jobs=1)
-    assert begun == [METHODS[0]]
+    assert begun(ddco_pyro.load(fresh.folder), episodes, film) == [METHODS[0]]

@@ -91,12 +91,14 @@ def test_a_sound_fit_may_differ_by_what_float32_does(tmp_path, capsys, monkeypat
     assert f" of {allowed(tmp_path):.1e} that are allowed; " in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("numpy_alone")
 def test_what_a_wide_layer_rounds_one_step_at_a_time_counts(tmp_path):
     """A product with a vector adds up in another order than one with a matrix; exported forms act step by step."""
-    export(perceptron(8000), tmp_path, onnx=True)
+    export(perceptron(8000), tmp_path)
     assert allowed(tmp_path) == pytest.approx(max(1e-6, 4 * measured(tmp_path)), rel=1e-6)
 
 
+@pytest.mark.usefixtures("numpy_alone")
 def test_where_float32_is_exact_enough_the_tolerance_is_as_it_was(tmp_path):
     export(steep(0.5), tmp_path)
     assert measured(tmp_path) < 2.5e-7
@@ -124,7 +126,8 @@ class Single(torch.nn.Module):
         return self.network(inputs.map(torch.Tensor.float, inputs.time))[0]
 
 
-def test_large_pictures_are_compared_with_few_bytes(tmp_path, monkeypatch):
+@pytest.mark.usefixtures("numpy_alone")
+def test_large_pictures_are_compared_with_few_bytes(tmp_path):
     """60 pictures of 240 kB, in which places are told apart still: each has as many colours as its squares."""
     network = {"network": "conv", "layers": [{"filters": 4, "kernel": 5, "stride": 8}]}
     spec = parse_spec(
@@ -134,7 +137,6 @@ def test_large_pictures_are_compared_with_few_bytes(tmp_path, monkeypatch):
             "baseline": {"kind": "flat", "policy": network},
         }
     )
-    monkeypatch.setattr(module, "_programs", lambda program, onnx: {})  # take seconds and are written as they were
     module._write(Fit(spec, Hierarchy(spec, {"camera": (250, 331, 3)}, 2, 7).eval()), tmp_path, onnx=False)
     assert (tmp_path / "check.npz").stat().st_size < 1.5e6
     with np.load(tmp_path / "check.npz") as file:
@@ -146,6 +148,7 @@ def test_large_pictures_are_compared_with_few_bytes(tmp_path, monkeypatch):
     assert (np.diff(pictures, axis=0) != 0).mean() > 0.99
 
 
+@pytest.mark.usefixtures("numpy_alone")
 def test_no_fit_is_so_unsound_that_anything_goes(tmp_path):
     """A hundred thousand times the difference of units: what it says is rounding to 1 %."""
     with pytest.raises(
@@ -155,9 +158,9 @@ def test_no_fit_is_so_unsound_that_anything_goes(tmp_path):
 
 
 @pytest.mark.parametrize("array", [f"caller_0.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")])
+@pytest.mark.usefixtures("numpy_alone")
 def test_weights_that_are_off_by_a_thousandth_are_refused(array, tmp_path, monkeypatch):
     """Each array alone, of numpy's form; replaying it later shows it too."""
-    numpy_alone(monkeypatch)
     refused(tmp_path, monkeypatch, lambda folder: scale(folder / "weights.npz", array), "numpy")
     export(steep(STEEP), tmp_path / "later")
     scale(tmp_path / "later" / "weights.npz", array)
@@ -165,13 +168,6 @@ def test_weights_that_are_off_by_a_thousandth_are_refused(array, tmp_path, monke
     with pytest.raises(SystemExit) as ended:
         runner.main()
     assert ended.value.code == 1
-
-
-def numpy_alone(monkeypatch):
-    """Programs take seconds to make."""
-    compare = module._compare
-    monkeypatch.setattr(module, "_programs", lambda program, onnx: {})
-    monkeypatch.setattr(module, "_compare", lambda folder, forms: compare(folder, ["numpy"]))
 
 
 @pytest.mark.parametrize("form", ["torch", "onnx"])

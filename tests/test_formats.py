@@ -18,13 +18,12 @@ import pytest
 from command_line import call
 from safetensors.numpy import load_file
 
-from ddco_pyro.cli.runs import FORMATS
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
-from ddco_pyro.segmenting.formats import Asked, Writer
+from ddco_pyro.segmenting.formats import Asked
 from ddco_pyro.segmenting.formats.elan import ELAN
 from ddco_pyro.segmenting.formats.label_studio import LabelStudio
 from ddco_pyro.segmenting.formats.lerobot import SARM, Annotated
@@ -92,14 +91,6 @@ def planted(tmp_path):
 
 
 # --- the list ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("form", FORMATS, ids=lambda form: form.option)
-def test_every_format_has_a_writer_and_a_row_in_the_documentation(form):
-    module, _, kind = form.writer.partition(":")
-    assert issubclass(getattr(import_module(f"ddco_pyro.segmenting.formats.{module}"), kind), Writer)
-    page = (HERE.parent / "docs" / "formats.md").read_text()
-    assert f"| `{form.option}" in page
 
 
 # --- MimicGen and Isaac Lab Mimic -------------------------------------------------------------------------------------
@@ -402,6 +393,7 @@ def test_lerobot_acts_as_the_run_does(toy_run, tmp_path):
     in_tools("act_lerobot.py", tmp_path / "policy", tmp_path / "export")
 
 
+@pytest.mark.usefixtures("numpy_alone")
 def test_a_policy_for_lerobot_has_the_weights_of_the_export(toy_run, tmp_path):
     """Its ``runner.py`` acts with them alone, as the export's does."""
     assert call("export", toy_run.folder, "--lerobot", tmp_path / "policy").status == 0

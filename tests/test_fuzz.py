@@ -74,11 +74,11 @@ def check_files(folder: Path, seeds: range) -> None:
 
 
 def test_damaged_specs(base: dict[str, Any], tmp_path: Path) -> None:
-    check_specs(base, tmp_path / "spec.yaml", range(30))
+    check_specs(base, tmp_path / "spec.yaml", range(20))
 
 
 def test_damaged_files(tmp_path: Path) -> None:
-    check_files(tmp_path, range(20))
+    check_files(tmp_path, range(12))
 
 
 @pytest.mark.slow

@@ -170,11 +170,3 @@ def test_looking_at_the_memory_leaves_networks_as_they_were():
     assert all(module.training for module in hierarchy.modules())
     assert all(parameter.grad is None for parameter in hierarchy.parameters())
     assert all(torch.equal(value, before[name]) for name, value in hierarchy.state_dict().items())
-
-
-def test_callers_that_emit_no_control_have_no_sigma():
-    hierarchy = make_hierarchy((2, 2), ("options",), std={"learn": True, "per_option": True})
-    names = [name for name, _ in hierarchy.named_parameters() if ".std." in name]
-    assert names == ["levels.0.policy.std.raw_own"]
-    hybrid = make_hierarchy((2, 2), ("options", "control"), std={"learn": True, "per_option": True})
-    assert sum(".std." in name for name, _ in hybrid.named_parameters()) == 3

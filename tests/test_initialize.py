@@ -188,7 +188,7 @@ def few_rows(seed, columns):
     return np.random.default_rng(seed).normal(size=(sum(FEW), columns)).astype(np.float32)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_clusters_are_k_means_of_observations_and_weighted_controls(seed):
     vector, actions = few_rows(seed, 8), few_rows(seed + 10, 1)
     batch = make_batch(vector, actions, lengths=FEW)
@@ -229,17 +229,6 @@ def test_images_are_seen_as_block_means():
     rows = np.hstack([vector, blocks.reshape(len(blocks), -1)])
     choices = alive(Clusters(batch, 3, seed=0).choices(batch), FEW)
     assert_k_means(rows, choices, 3)
-
-
-def test_images_are_told_apart_by_blocks_and_by_nothing_finer():
-    """Which blocks of a chess board are dark says one thing, which pixels within the blocks are, another."""
-    steps, (rows, columns) = np.arange(sum(FEW)), np.indices((2 * POOLED, 3 * POOLED))
-    block, pixel = steps % 2, steps // 2 % 2
-    blocks = (rows // 2 + columns // 3 + block[:, None, None]) % 2
-    pixels = (rows + columns + pixel[:, None, None]) % 2
-    images = np.repeat((20 * blocks + 200 * pixels).astype(np.uint8)[..., None], 3, axis=-1)
-    batch = make_batch(0 * few_rows(9, 2), few_rows(10, 2), {"camera": images}, FEW)
-    assert adjusted_rand_score(block, alive(Clusters(batch, 2, seed=0).choices(batch), FEW)) == 1
 
 
 def test_equal_seeds_give_equal_clusters():

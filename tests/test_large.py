@@ -213,11 +213,11 @@ def test_what_cannot_be_read_in_blocks(
 
 
 def test_looking_does_not_take_more_than_a_block(tmp_path: Path) -> None:
-    small, path = large(tmp_path / "small.hdf5", 3, 100), large(tmp_path / "large.hdf5", 3, 20_000)
+    small, path = large(tmp_path / "small.hdf5", 3, 100), large(tmp_path / "large.hdf5", 3, 10_000)
     base, found = measured("inspect", small), measured("inspect", path)
     assert (base.status, found.status) == (0, 0)
-    assert "3 demonstrations of 20000 to 20000 steps" in found.out
-    assert found.peak - base.peak < 150e6  # of 480 MB
+    assert "3 demonstrations of 10000 to 10000 steps" in found.out
+    assert found.peak - base.peak < 150e6  # of 240 MB
 
 
 @pytest.mark.slow

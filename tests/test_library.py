@@ -143,7 +143,6 @@ def test_several_baselines_of_a_kind(commanded: Path, tmp_path: Path) -> None:
     outcomes = {"ddco": (1, 1), "flat": (0, 1), "flat_2": (0, 0)}
     rows = [f"{name},{seed},{value}" for name, values in outcomes.items() for seed, value in enumerate(values)]
     (tmp_path / "run" / "rollouts.csv").write_text("\n".join(["method,seed,success", *rows]))
-    assert call("report", tmp_path / "run").status == 0
     both = [tmp_path / "run" / "baselines" / name for name in ("flat", "flat_2")]
     assert call("compare", tmp_path / "run", *both, "--out", tmp_path / "compared").status == 0
     pairs = json.loads((tmp_path / "compared" / "compare.json").read_text())["rollouts"]
@@ -293,24 +292,6 @@ def test_check_reads_no_observations(commanded: Path, reads: Counter) -> None:
     """The controls are read: which are constant, or take two values, is part of what it says."""
     assert call("check", commanded / "spec.yaml").status == 0
     assert reads == {name: 1.0 for name in everything(commanded / "demos.hdf5") if name.endswith("/actions")}
-
-
-def test_check_sees_what_headers_say(tmp_path: Path) -> None:
-    path, spec = tmp_path / "demos.hdf5", tmp_path / "spec.yaml"
-    spec.write_text(yaml.safe_dump(spec_for(path)))
-    changes = {
-        "demo_3: obs/place has shape (3,) at each step, but (2,) in demo_0": np.zeros((8, 3)),
-        "demo_3: obs/place has 5 steps, but actions has 8": np.zeros((5, 2)),
-        "demo_3: obs/place holds |S1, it has to hold real numbers": np.full((8, 2), b"a"),
-    }
-    for said, values in changes.items():
-        two_skills().write(path)
-        with h5py.File(path, "r+") as file:
-            del file["data/demo_3/obs/place"]
-            file["data/demo_3/obs/place"] = values
-        ended = call("check", spec)
-        assert (ended.status, ended.err.count("\n")) == (2, 1)
-        assert ended.err.startswith(f"ddco-pyro: {path}: {said}")
 
 
 def test_a_spec_that_does_not_fit_is_refused_before_anything_is_written(commanded: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Iterator
@@ -53,52 +54,50 @@ class Truth:
 
 def brute_force(tables: Tables, n: int, length: int) -> Truth:
     """p(ξ_n) and the marginals of §4.1 by summing over all (b, h) paths."""
-    tables = Tables(
-        *(tuple(t.detach() for t in part) for part in (tables.selection, tables.termination, tables.control))
-    )
     sizes = [table.shape[-1] for table in tables.selection]
-    shape = [(length, size) for size in sizes]
-    u, v, w = ([np.zeros(s) for s in shape] for _ in range(3))
-    total, by_path = 0.0, {}
+    u, v, w = ([[[0.0] * size for _ in range(length)] for size in sizes] for _ in range(3))
+    total, likeliest, best = 0.0, 0.0, ()
     for path, ends, probability in paths(tables, n, length, sizes):
         total += probability
-        by_path[path] = by_path.get(path, 0.0) + probability
+        if probability > likeliest:
+            likeliest, best = probability, path
         for t in range(length):
             for d, h in enumerate(path[t]):
-                u[d][t, h] += probability
-                v[d][t, h] += probability * ends[t][d]
-                if t + 1 < length:
-                    w[d][t, h] += probability * (1 - ends[t + 1][d])
-    one_path = max(
-        ((probability, path) for path, _, probability in paths(tables, n, length, sizes)), key=lambda item: item[0]
-    )
-    for table in (*u, *v, *w):
-        table /= total
-    return Truth(math.log(total), one_path[1], u, v, w)
+                u[d][t][h] += probability
+                if ends[t][d]:
+                    v[d][t][h] += probability
+                if t + 1 < length and not ends[t + 1][d]:
+                    w[d][t][h] += probability
+    return Truth(math.log(total), best, *([np.array(table) / total for table in part] for part in (u, v, w)))
 
 
 Path = tuple[tuple[int, ...], ...]
 
 
 def paths(tables: Tables, n: int, length: int, sizes: list[int]) -> Iterator[tuple[Path, Path, float]]:
+    """Every possible (h, b) with its joint density; a step that follows another is looked up when it is seen again."""
     joint = list(itertools.product(*map(range, sizes)))
     ends = list(itertools.product((0, 1), repeat=len(sizes)))
-    first = tuple(1 for _ in sizes)
-    for path in itertools.product(joint, repeat=length):
-        for later in itertools.product(ends, repeat=length - 1):
-            b = (first, *later)
-            probability = 1.0
-            for t in range(length):
-                probability *= _step(tables, n, t, path[t], b[t], path[t - 1] if t else None)
-                if probability == 0.0:
-                    break
-            else:
-                yield path, b, probability
+    known = Tables(
+        *(tuple(table[n].tolist() for table in part) for part in (tables.selection, tables.termination, tables.control))
+    )
+
+    @functools.cache
+    def following(t: int, before: tuple[int, ...] | None) -> list[tuple[tuple[int, ...], tuple[int, ...], float]]:
+        steps = ((h, b) for h in joint for b in (ends if t else [(1,) * len(sizes)]))
+        return [(h, b, p) for h, b in steps if (p := _step(known, t, h, b, before)) > 0]
+
+    def walk(h: Path, b: Path, probability: float) -> Iterator[tuple[Path, Path, float]]:
+        if len(h) == length:
+            yield h, b, probability
+            return
+        for choices, ended, p in following(len(h), h[-1] if h else None):
+            yield from walk((*h, choices), (*b, ended), probability * p)
+
+    yield from walk((), (), 1.0)
 
 
-def _step(
-    tables: Tables, n: int, t: int, h: tuple[int, ...], b: tuple[int, ...], before: tuple[int, ...] | None
-) -> float:
+def _step(tables: Tables, t: int, h: tuple[int, ...], b: tuple[int, ...], before: tuple[int, ...] | None) -> float:
     probability = 1.0
     for d in range(len(h)):
         if before is not None:
@@ -107,19 +106,19 @@ def _step(
             elif before[d] == 0:
                 probability *= float(b[d] == 1)
             else:
-                probability *= math.exp(tables.termination[d][n, t, before[d] - 1, b[d]])
+                probability *= math.exp(tables.termination[d][t][before[d] - 1][b[d]])
         caller = h[d + 1] if d + 1 < len(h) else None
         if b[d] == 0:
             probability *= float(before is not None and h[d] == before[d])
         elif caller == 0:
             probability *= float(h[d] == 0)
         else:
-            probability *= math.exp(tables.selection[d][n, t, 0 if caller is None else caller - 1, h[d]])
-    return probability * math.exp(_control(tables, n, t, h))
+            probability *= math.exp(tables.selection[d][t][0 if caller is None else caller - 1][h[d]])
+    return probability * math.exp(_control(tables, t, h))
 
 
-def _control(tables: Tables, n: int, t: int, h: tuple[int, ...]) -> float:
+def _control(tables: Tables, t: int, h: tuple[int, ...]) -> float:
     for d, choice in enumerate(h):
         if choice != 0:
-            return float(tables.control[d][n, t, choice - 1])
-    return float(tables.control[-1][n, t, 0])
+            return tables.control[d][t][choice - 1]
+    return tables.control[-1][t][0]
