@@ -19,7 +19,7 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.evaluation.agreement import agreement
-from ddco_pyro.segmenting import Segmented, boundary_intervals, segments
+from ddco_pyro.segmenting import Segmented, recorded, segments
 from ddco_pyro.segmenting.baselines import BASELINES, segment
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.data import parts as split_in_parts
@@ -202,20 +202,33 @@ def test_numbers_follow_the_cursor(toy_run, file, tmp_path):
             )
 
 
-def test_the_interval_of_a_boundary_is_that_of_enumerated_paths():
-    """A chain that goes from option 1 to option 2 once: p(first step of 2 = t) is known for every t."""
-    step = np.array([0.0, 0.02, 0.04, 0.2, 0.5, 0.2, 0.03, 0.01])  # p(boundary at t)
-    second = np.cumsum(step)
-    active = np.stack([np.zeros(8), 1 - second, second], axis=1)
-    options = np.where(np.arange(8) < 4, 1, 2)
-    begun = np.isin(np.arange(8), [0, 4])
-    (first, (low, high)) = boundary_intervals(options, begun, active).tolist()
-    assert first == [0, 0]
-    assert (low, high) == (3, 5)  # windows reach from step 3 to step 6
-    assert step[:low].sum() < 0.07
-    assert step[high + 1 :].sum() <= 0.05
-    again = boundary_intervals(np.ones(8, int), begun, active).tolist()
-    assert again == [[0, 0], [4, 4]]  # the same option again: u says nothing of the step
+def test_intervals_are_those_of_the_posterior_draws(toy_run, file):
+    """The very draws of ``Inferred.draws`` for a demonstration, and one interval for each segment."""
+    with open_source(file) as source:
+        known = segments(toy_run, source, intervals=True)
+        assert segments(toy_run, source).segments[0].levels["option"].intervals is None
+        demos = Demonstrations(tuple(recorded(known, toy_run, source)))
+    (piece,) = toy_run.infer(demos)
+    wide = 0
+    for row, demo in enumerate(known.segments):
+        level = demo.levels["option"]
+        starts = np.flatnonzero(level.boundaries)
+        assert level.intervals.shape == (len(starts), 2)
+        assert level.intervals[0].tolist() == [0, 0]
+        ((options,), (ended,)) = piece.draws(row, 100, (0, len(demo)))
+        for place, (before, start, after) in enumerate(zip(starts, starts[1:], [*starts[2:], len(demo)], strict=False)):
+            a, b = level.options[start - 1], level.options[start]
+            at = [
+                min(steps, key=lambda step: (abs(step - start), step))
+                for path, new in zip(options, ended, strict=True)
+                if (steps := [t for t in range(before + 1, after) if path[t - 1] == a and path[t] == b and new[t] == 1])
+            ]
+            low, high = level.intervals[place + 1]
+            within = np.mean([low <= step <= high for step in at]) if at else 1.0
+            assert within >= 0.9
+            assert before < low <= high < after
+            wide += high > low
+    assert wide  # some boundary is uncertain
 
 
 def marked(page):
