@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 import shutil
+import subprocess
 from pathlib import Path
 
 import h5py
@@ -18,6 +19,7 @@ from time_lines import embedded, tracks, unpacked
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.sources import open_source
+from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.segmenting import Segmented, recorded, segments
 from ddco_pyro.segmenting.baselines import BASELINES, segment
@@ -185,6 +187,35 @@ def test_the_page_shows_every_segment(toy_run, file, tmp_path):
     assert data["lanes"][0]["names"] == list(toy_run.names["option"])
     assert "http" not in text
     assert not re.search(r"<(link|iframe|img)|src=|@import|url\(\"?http", text)
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+COLOURS = """<script>
+  dispatchEvent(new Event("beforeprint"));  // draws every demonstration, visible or not
+  const canvas = document.querySelector(".lanes canvas"), context = canvas.getContext("2d");
+  const { longest, tracks: [track] } = JSON.parse(document.querySelector(".timeline script").textContent);
+  const seen = Array.from({ length: track.steps }, (_, step) => {
+    const x = Math.round(74 + (canvas.width - 74) * (step + .85) / longest);
+    const numbers = [...context.getImageData(x, 18, 1, 1).data].slice(0, 3);
+    return "#" + numbers.map(one => one.toString(16).padStart(2, "0")).join("");
+  });
+  document.body.dataset.seen = seen.join();
+</script>"""
+"""Writes the colour that stands at the end of each step of the first demonstration, in its first lane."""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def test_a_browser_draws_the_colour_of_each_steps_option(toy_run, file, tmp_path):
+    page = tmp_path / "segments.html"
+    assert call("segment", toy_run.folder, file, "--html", page).status == 0
+    page.write_text(page.read_text().replace("</body>", COLOURS + "</body>"))
+    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1400,1600", "--dump-dom"]
+    command += ["--force-device-scale-factor=1", f"--user-data-dir={tmp_path / 'profile'}", page.as_uri()]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    (seen,) = re.findall(r'data-seen="([^"]*)"', ended.stdout)
+    level = look(toy_run.folder, file).segments[0].levels["option"]
+    assert seen.split(",") == [option_colour(option) for option in level.options]
 
 
 def test_numbers_follow_the_cursor(toy_run, file, tmp_path):
