@@ -42,10 +42,12 @@ bench: $(DEMO)
 	$(PIP) -e '.[bench,segments]'
 	$(BIN)/python benchmarks/performance.py
 
-# What reads the formats of segments, in an environment of its own: LeRobot needs Python 3.12. About 6 GB with CUDA.
+# What reads the formats of segments, in an environment of its own: LeRobot needs Python 3.12. About 8 GB with CUDA.
 tools:
 	test -x .venv-tools/bin/python || python3.12 -m venv .venv-tools
-	.venv-tools/bin/pip install -q 'lerobot[dataset]>=0.6' label-studio-sdk 'rerun-sdk>=0.41' pympi-ling ./lerobot_policy_ddco
+	.venv-tools/bin/pip install -q 'lerobot[dataset,evaluation]>=0.6' label-studio-sdk 'rerun-sdk>=0.41' pympi-ling \
+		tensorflow-cpu tensorflow-datasets rlds ./lerobot_policy_ddco
+	.venv-tools/bin/pip install -q --no-deps isaaclab 'mimicgen @ git+https://github.com/NVlabs/mimicgen'
 	$(PIP) -e '.[rerun]'
 
 # CHECK='--packages FOLDER': dependencies that are installed already, instead of those that pip finds.

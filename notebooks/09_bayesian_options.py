@@ -21,7 +21,9 @@
 import os
 import warnings
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
+from shutil import which
 
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
@@ -32,6 +34,7 @@ import pyro
 import pyro.distributions as dist
 import torch
 import yaml
+from IPython.display import display
 from pyro.infer import MCMC, NUTS, SVI, Predictive, Trace_ELBO, TraceEnum_ELBO, infer_discrete
 from pyro.infer.autoguide import AutoLowRankMultivariateNormal, AutoNormal, init_to_value
 from pyro.infer.inspect import get_model_relations
@@ -42,6 +45,7 @@ from torch.func import functional_call
 from ddco_pyro import Demonstration, Demonstrations, EliminatedAHMM, fit
 from ddco_pyro.fitting.draws import matched
 from ddco_pyro.inference import log_likelihood, most_likely_path, posterior, sample_paths
+from ddco_pyro.inference.enumeration import known_controls
 from ddco_pyro.inference.marginal import bayesian_ahmm
 from ddco_pyro.model.ahmm import Acting, ahmm, choose
 from ddco_pyro.model.batch import encode
@@ -103,24 +107,28 @@ print("share of the steps by option:", fitted[..., 1:].mean((0, 1)).numpy().roun
 # ## The AHMM is a Pyro program
 #
 # `ahmm` samples terminations `b_1_t`, options `h_1_t` and controls `a_t` in a plate over demonstrations. Pyro itself
-# finds which site depends on which. The picture has the first four steps; observed sites are filled. Where Graphviz is
-# installed, `pyro.render_model(ahmm, model_args=program)` draws all steps.
+# finds which site depends on which. The picture has the first four steps; observed sites are filled. Graphviz draws it
+# with `pyro.render_model`; where Graphviz is missing, networkx draws the same relations.
 
 # %%
 program = (complete(tables, batch.lengths), outputs.emissions, batch.actions)
-relations = get_model_relations(ahmm, program)
-shown = [site for site in relations["sample_sample"] if int(site.split("_")[-1]) < 4]
-graph = nx.DiGraph([(cause, site) for site in shown for cause in relations["sample_sample"][site]])
-figure, axes = plt.subplots(figsize=(8, 3), layout="constrained")
-nx.draw_networkx(
-    graph,
-    {site: (int(site.split("_")[-1]), "ahb".index(site[0])) for site in graph},
-    node_color=["lightgray" if site in relations["observed"] else "white" for site in graph],
-    edgecolors="black", node_size=1500, font_size=9, ax=axes,
-)  # fmt: skip
-axes.margins(0.1, 0.25)
-axes.axis("off")
-plt.show()
+first = tables.trajectory(0, 4)
+short = (complete(first, torch.tensor([4])), *known_controls(first))
+if which("dot") and find_spec("graphviz"):
+    display(pyro.render_model(ahmm, model_args=short))
+else:
+    relations = get_model_relations(ahmm, short)
+    graph = nx.DiGraph([(cause, site) for site, causes in relations["sample_sample"].items() for cause in causes])
+    figure, axes = plt.subplots(figsize=(8, 3), layout="constrained")
+    nx.draw_networkx(
+        graph,
+        {site: (int(site.split("_")[-1]), "ahb".index(site[0])) for site in graph},
+        node_color=["lightgray" if site in relations["observed"] else "white" for site in graph],
+        edgecolors="black", node_size=1500, font_size=9, ax=axes,
+    )  # fmt: skip
+    axes.margins(0.1, 0.25)
+    axes.axis("off")
+    plt.show()
 
 # %% [markdown]
 # `EliminatedAHMM` is the same program with options and terminations summed out, as one distribution. Its `log_prob`,

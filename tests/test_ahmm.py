@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from collections import Counter
 from dataclasses import replace
 
@@ -10,6 +12,7 @@ import pyro
 import pytest
 import torch
 from oracle import brute_force, paths, random_tables
+from pyro.infer.inspect import get_model_relations
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.enumeration import known_controls
@@ -56,6 +59,46 @@ def test_the_sites_are_those_of_the_paper():
     observed = {name for name in sites if trace.nodes[name]["is_observed"]}
     assert observed == {"a_0", "a_1", "a_2"}
     assert all(trace.nodes[name]["value"].shape == (2,) for name in sites if name not in observed)
+
+
+def causes(depth, steps):
+    """What each site depends on, in §4.1 and at every level."""
+    found = {}
+    for t in range(steps):
+        for d in range(depth, 0, -1):
+            above, before = [f"h_{d + 1}_{t}"] * (d < depth), [f"h_{d}_{t - 1}"] * (t > 0)
+            found[f"h_{d}_{t}"] = {*above, *before, *[f"b_{d}_{t}"] * (t > 0)}
+            if t > 0:
+                found[f"b_{d}_{t}"] = {*before, *[f"b_{d - 1}_{t}"] * (d > 1)}
+        found[f"a_{t}"] = {f"h_{d}_{t}" for d in range(1, depth + 1)}
+    return found
+
+
+def program_of(counts):
+    """Arguments of the model for random tables of three steps."""
+    tables = random_tables(counts, (True,) * len(counts), trajectories=2, steps=3)
+    return complete(tables, torch.tensor([3, 2])), *known_controls(tables)
+
+
+@pytest.mark.parametrize("counts", [(2,), (2, 3)])
+def test_pyro_finds_the_dependencies(counts):
+    relations = get_model_relations(ahmm, program_of(counts))
+    expected = causes(len(counts), 3)
+    assert {site: set(others) for site, others in relations["sample_sample"].items()} == expected
+    assert relations["observed"] == ["a_0", "a_1", "a_2"]
+    assert set(relations["plate_sample"]["demonstrations"]) == expected.keys()
+
+
+@pytest.mark.parametrize("counts", [(2,), (2, 3)])
+def test_pyro_draws_the_dependencies(counts):
+    pytest.importorskip("graphviz")
+    expected = causes(len(counts), 3)
+    graph = pyro.render_model(ahmm, model_args=program_of(counts))
+    edges = set(re.findall(r"^\s*(\w+) -> (\w+)", graph.source, re.MULTILINE))
+    assert edges == {(cause, site) for site, others in expected.items() for cause in others}
+    assert set(re.findall(r"(\w+) \[label=\1", graph.source)) == expected.keys()
+    if shutil.which("dot"):
+        assert b"<svg" in graph.pipe(format="svg")
 
 
 def test_without_options_there_is_only_the_control():

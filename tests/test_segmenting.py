@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import h5py
@@ -17,8 +19,9 @@ from time_lines import embedded, tracks, unpacked
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.sources import open_source
+from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.evaluation.agreement import agreement
-from ddco_pyro.segmenting import Segmented, boundary_intervals, segments
+from ddco_pyro.segmenting import Segmented, recorded, segments
 from ddco_pyro.segmenting.baselines import BASELINES, segment
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.data import parts as split_in_parts
@@ -180,6 +183,34 @@ def test_the_page_shows_every_segment(toy_run, written):
     assert not re.search(r"<(link|iframe|img)|src=|@import|url\(\"?http", text)
 
 
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+COLOURS = """<script>
+  dispatchEvent(new Event("beforeprint"));  // draws every demonstration, visible or not
+  const canvas = document.querySelector(".lanes canvas"), context = canvas.getContext("2d");
+  const { longest, tracks: [track] } = JSON.parse(document.querySelector(".timeline script").textContent);
+  const seen = Array.from({ length: track.steps }, (_, step) => {
+    const x = Math.round(74 + (canvas.width - 74) * (step + .85) / longest);
+    const numbers = [...context.getImageData(x, 18, 1, 1).data].slice(0, 3);
+    return "#" + numbers.map(one => one.toString(16).padStart(2, "0")).join("");
+  });
+  document.body.dataset.seen = seen.join();
+</script>"""
+"""Writes the colour that stands at the end of each step of the first demonstration, in its first lane."""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def test_a_browser_draws_the_colour_of_each_steps_option(toy_run, written, tmp_path):
+    page = tmp_path / "segments.html"
+    page.write_text(written[1]["--html"].read_text().replace("</body>", COLOURS + "</body>"))
+    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1400,1600", "--dump-dom"]
+    command += ["--force-device-scale-factor=1", f"--user-data-dir={tmp_path / 'profile'}", page.as_uri()]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    (seen,) = re.findall(r'data-seen="([^"]*)"', ended.stdout)
+    level = look(toy_run.folder, written[0]).segments[0].levels["option"]
+    assert seen.split(",") == [option_colour(option) for option in level.options]
+
+
 def test_numbers_follow_the_cursor(toy_run, written):
     tracks = embedded(written[1]["--html"].read_text())["tracks"]
     for demo, track in zip(demonstrations(toy_run.spec), tracks, strict=True):
@@ -194,20 +225,33 @@ def test_numbers_follow_the_cursor(toy_run, written):
             )
 
 
-def test_the_interval_of_a_boundary_is_that_of_enumerated_paths():
-    """A chain that goes from option 1 to option 2 once: p(first step of 2 = t) is known for every t."""
-    step = np.array([0.0, 0.02, 0.04, 0.2, 0.5, 0.2, 0.03, 0.01])  # p(boundary at t)
-    second = np.cumsum(step)
-    active = np.stack([np.zeros(8), 1 - second, second], axis=1)
-    options = np.where(np.arange(8) < 4, 1, 2)
-    begun = np.isin(np.arange(8), [0, 4])
-    (first, (low, high)) = boundary_intervals(options, begun, active).tolist()
-    assert first == [0, 0]
-    assert (low, high) == (3, 5)  # windows reach from step 3 to step 6
-    assert step[:low].sum() < 0.07
-    assert step[high + 1 :].sum() <= 0.05
-    again = boundary_intervals(np.ones(8, int), begun, active).tolist()
-    assert again == [[0, 0], [4, 4]]  # the same option again: u says nothing of the step
+def test_intervals_are_those_of_the_posterior_draws(toy_run, file):
+    """The very draws of ``Inferred.draws`` for a demonstration, and one interval for each segment."""
+    with open_source(file) as source:
+        known = segments(toy_run, source, intervals=True)
+        assert segments(toy_run, source).segments[0].levels["option"].intervals is None
+        demos = Demonstrations(tuple(recorded(known, toy_run, source)))
+    (piece,) = toy_run.infer(demos)
+    wide = 0
+    for row, demo in enumerate(known.segments):
+        level = demo.levels["option"]
+        starts = np.flatnonzero(level.boundaries)
+        assert level.intervals.shape == (len(starts), 2)
+        assert level.intervals[0].tolist() == [0, 0]
+        ((options,), (ended,)) = piece.draws(row, 100, (0, len(demo)))
+        for place, (before, start, after) in enumerate(zip(starts, starts[1:], [*starts[2:], len(demo)], strict=False)):
+            a, b = level.options[start - 1], level.options[start]
+            at = [
+                min(steps, key=lambda step: (abs(step - start), step))
+                for path, new in zip(options, ended, strict=True)
+                if (steps := [t for t in range(before + 1, after) if path[t - 1] == a and path[t] == b and new[t] == 1])
+            ]
+            low, high = level.intervals[place + 1]
+            within = np.mean([low <= step <= high for step in at]) if at else 1.0
+            assert within >= 0.9
+            assert before < low <= high < after
+            wide += high > low
+    assert wide  # some boundary is uncertain
 
 
 def marked(page):

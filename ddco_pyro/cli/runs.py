@@ -300,7 +300,7 @@ def segment(
             check_installed(BASELINES)
             if missing and not writers:
                 raise BadInput(f"--baselines: {missing}; name what to write, such as --html PAGE")
-        segmented = segments(fit, source, progress)
+        segmented = segments(fit, source, progress, intervals="--html" in outputs)
         segmented = replace(segmented, frequency=fps or segmented.frequency)
         if baselines:
             segmented = beside_baselines(segmented, fit, source, gripper)

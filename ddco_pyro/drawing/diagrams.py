@@ -132,7 +132,7 @@ def dendrogram(merges: np.ndarray, choices: Sequence[int], names: Sequence[str])
         points = " ".join(f"{right(x):.1f},{row * y / 10:.1f}" for x, y in zip(distances, rows, strict=True))
         parts.append(Markup('<polyline class="edge" points="{}"/>').format(points))
         parts.append(
-            _text(right(distances[1]) + 4, row * (rows[1] + rows[2]) / 20 + 4, f"{distances[1]:.2f}", "start", "soft")
+            _text(right(distances[1]) + 4, row * (rows[1] + rows[2]) / 20 - 4, f"{distances[1]:.2f}", "start", "soft")
         )
     for place, leaf in enumerate(found["leaves"]):
         choice, y = choices[leaf], row * (place + 0.5)

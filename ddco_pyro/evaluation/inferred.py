@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ import torch
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.memory import INFERENCE
 from ddco_pyro.inference.engines import log_likelihood
-from ddco_pyro.inference.paths import Path, most_likely_path
+from ddco_pyro.inference.paths import Path, most_likely_path, sample_paths
 from ddco_pyro.inference.posteriors import Decomposition, Posterior, decompose, posterior
 from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -24,6 +25,62 @@ GROUP_BYTES = 5e8
 
 COPIES = 4
 """Bytes for each byte of an observation, with the encoded batch."""
+
+
+DRAWS = 100
+"""Paths of each demonstration that the intervals of its boundaries come from."""
+
+
+class Boundary(NamedTuple):
+    """A boundary of the most likely path, and where draws have it.
+
+    :param step: the first step of the new segment.
+    :param low: the first step of the interval; ``high`` is its last. Both are ``step`` if no draw has the boundary.
+    :param probability: the share of draws that have the boundary.
+    """
+
+    step: int
+    low: int
+    high: int
+    probability: float
+
+
+def boundaries(
+    path: np.ndarray, starts: np.ndarray, options: np.ndarray, chosen: np.ndarray, mass: float = 0.9
+) -> list[Boundary]:
+    """The boundaries of a path, with their intervals over draws from the posterior p(ζ | ξ).
+
+    A boundary is a step at which option a ends and option b begins. A draw has the boundary where it has a step
+    with the same a and b between the two neighbouring boundaries of the path; its nearest such step counts.
+
+    >>> path, starts = np.array([1, 1, 2, 2]), np.array([True, False, True, False])
+    >>> options = np.array([[1, 1, 2, 2], [1, 2, 2, 2], [1, 1, 1, 1]])
+    >>> boundaries(path, starts, options, np.diff(options, prepend=-1) != 0)[0][:3]
+    (2, 1, 2)
+
+    :param path: the options of the path [T].
+    :param starts: whether a segment of the path begins at a step [T].
+    :param options: the options of the draws [M, T].
+    :param chosen: whether a draw's segment begins at a step [M, T].
+    :param mass: the share of these draws whose step is within the interval, at least; half of the rest is on
+        either side.
+    """
+    steps = len(path)
+    edges = [0, *(np.flatnonzero(starts[1:]) + 1).tolist(), steps]
+    found = []
+    for before, step, after in zip(edges, edges[1:-1], edges[2:], strict=False):
+        window = np.arange(before + 1, after)
+        here = (options[:, before : after - 1] == path[step - 1]) & (options[:, before + 1 : after] == path[step])
+        here &= chosen[:, before + 1 : after]
+        distance = np.where(here, np.abs(window - step), steps)
+        having = here.any(1)
+        low = high = step
+        if having.any():
+            at = np.sort(window[distance.argmin(1)][having])
+            tail = int((1 - mass) / 2 * len(at))
+            low, high = int(at[tail]), int(at[-1 - tail])
+        found.append(Boundary(step, low, high, float(having.mean())))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +128,40 @@ class Inferred:
         """Choices and terminations of the most likely path, [N, T] for each level; -1 past a demonstration's end."""
         return most_likely_path(self.tables, self.batch.lengths)
 
+    def draws(self, row: int, number: int, seed: Sequence[int]) -> np.ndarray:
+        """Choices and terminations of draws from p(ζ | ξ) for one demonstration, [2, D, number, T]."""
+        length = self.lengths[row]
+        path = sample_paths(self.tables.trajectory(row, length), torch.tensor([length]), number, seed)
+        return torch.stack([torch.stack(kind)[:, :, 0] for kind in path]).numpy()
+
+    def intervals(self, row: int, lasts: Sequence[bool]) -> list[np.ndarray]:
+        """The 90 % interval of the first step of each segment of one demonstration, for each level, [segments, 2].
+
+        :param lasts: of each level, whether its options can be active for more than one step; see :func:`started`.
+        """
+        found, steps = [], self.lengths[row]
+        levels = zip(lasts, *self.path, *self.draws(row, DRAWS, (0, steps)), strict=True)
+        for lasting, choices, ends, options, ended in levels:
+            path, last = choices[row, :steps].numpy(), ends[row, :steps].numpy()
+            every = boundaries(path, started(path, last, lasting), options, started(options, ended, lasting))
+            found.append(np.array([(0, 0), *((each.low, each.high) for each in every)]))
+        return found
+
     @cached_property
     def decomposition(self) -> Decomposition:
         """The contributions of each control dimension, and of the choice of options, to log p(ξ)."""
         return decompose(self.outputs, self.batch)
+
+
+def started(options: np.ndarray, terminations: np.ndarray, lasts: bool) -> np.ndarray:
+    """Whether a segment begins at each step of paths [..., T], true at the first step.
+
+    A segment begins with a new choice, which may be the same option. Where options end after every step (``lasts`` is
+    false), a segment begins where the option differs from the step before.
+    """
+    found: np.ndarray = terminations == 1 if lasts else np.diff(options, prepend=-1) != 0
+    found[..., 0] = True
+    return found
 
 
 def infer(hierarchy: Hierarchy, demonstrations: Iterable[Demonstration]) -> Iterator[Inferred]:

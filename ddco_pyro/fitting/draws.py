@@ -10,25 +10,10 @@ import numpy as np
 import torch
 
 from ddco_pyro.errors import BadInput
-from ddco_pyro.evaluation.inferred import Inferred
-from ddco_pyro.inference.paths import sample_paths
+from ddco_pyro.evaluation.inferred import Boundary, Inferred, boundaries
 
 if TYPE_CHECKING:
     from xarray import DataTree
-
-
-class Boundary(NamedTuple):
-    """A boundary of the most likely path, and where draws have it.
-
-    :param step: the first step of the new segment.
-    :param low: the first step of the interval; ``high`` is its last. Both are ``step`` if no draw has the boundary.
-    :param probability: the share of draws that have the boundary.
-    """
-
-    step: int
-    low: int
-    high: int
-    probability: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,35 +41,17 @@ class Draws:
     ) -> list[Boundary]:
         """The boundaries of a path of one demonstration, with their intervals over all draws of all chains.
 
-        A boundary is a step at which option a ends and option b begins. A draw has the boundary where it has a step
-        with the same a and b between the two neighbouring boundaries of the path; its nearest such step counts.
-
         :param path: the options of the path [T], such as of ``fit.segment``.
         :param starts: the first steps of its segments, bool [T]; None: where the option changes.
-        :param mass: the share of these draws whose step is within the interval, at least; half of the rest is on
-            either side.
+        :param mass: as in :func:`~ddco_pyro.evaluation.inferred.boundaries`.
         """
         steps = len(path) if (path >= 0).all() else int(np.argmax(path < 0))
         options, chosen = (
             each[level][:, :, demonstration, :steps].reshape(-1, steps) for each in (self.options, self.starts)
         )
-        begins = np.diff(path[:steps], prepend=-1) != 0 if starts is None else np.asarray(starts[:steps], dtype=bool)
         if starts is None:
-            chosen = np.diff(options, prepend=-1, axis=1) != 0
-        edges = [0, *(np.flatnonzero(begins[1:]) + 1).tolist(), steps]
-        found = []
-        for before, step, after in zip(edges, edges[1:-1], edges[2:], strict=False):
-            window = np.arange(before + 1, after)
-            here = (options[:, window - 1] == path[step - 1]) & (options[:, window] == path[step]) & chosen[:, window]
-            distance = np.where(here, np.abs(window - step), steps)
-            having = here.any(1)
-            low = high = step
-            if having.any():
-                at = np.sort(window[distance.argmin(1)][having])
-                tail = int((1 - mass) / 2 * len(at))
-                low, high = int(at[tail]), int(at[-1 - tail])
-            found.append(Boundary(step, low, high, float(having.mean())))
-        return found
+            starts, chosen = (np.diff(each[..., :steps], prepend=-1) != 0 for each in (path, options))
+        return boundaries(path[:steps], np.asarray(starts[:steps], dtype=bool), options, chosen, mass)
 
     def to_datatree(self) -> DataTree:
         """The draws as xarray's ``DataTree``, which ArviZ takes as inference data.
@@ -172,9 +139,7 @@ def _chain(model: Iterable[Inferred], draws: int, seed: tuple[int, int]) -> Chai
         names += piece.names
         values.append(piece.log_likelihood)
         for n, length in enumerate(piece.lengths):
-            one = piece.tables.trajectory(n, length)
-            path = sample_paths(one, torch.tensor([length]), draws, (*seed, len(paths)))
-            paths.append(torch.stack([torch.stack(kind)[:, :, 0] for kind in path]).numpy())
+            paths.append(piece.draws(n, draws, (*seed, len(paths))))
             active.append(torch.cat([level[n, :length] for level in piece.posterior.u], dim=1))
     return Chain(tuple(names), np.concatenate(values), paths, active)
 

@@ -1,8 +1,9 @@
 """Whole paths ζ = (b, h) of the latents: the most likely path of a demonstration, and draws from p(ζ | ξ).
 
-A compiled forward pass in log space is followed by one step back after the other; O(D·S) a step. The forward pass
-takes the maximum over predecessors, or their sum. The backward pass then takes the best predecessor, or draws one.
-``messages`` and ``spread`` are those of :mod:`ddco_pyro.inference.kernel`, in logarithms.
+A compiled forward pass in log space takes the maximum over predecessors, or their sum; O(D·S) a step. It leaves the
+probabilities of each step back, given the choices after it: 0 or 1 for the best path. A path then takes one step back
+after the other, without logarithms; O(D + Σ C_d) a step. ``messages`` and ``spread`` are rows of those of
+:mod:`ddco_pyro.inference.kernel`, in logarithms.
 """
 
 from __future__ import annotations
@@ -104,10 +105,11 @@ def _trace(tables: Tables, lengths: Tensor, best: bool, uniforms: np.ndarray) ->
     others = rows, starts, lengths.numpy(), best, uniforms, joint, terminated, possible, structure
     on_threads(lambda first, last: _trace_all(first, last, *others), lengths.numpy())
     refuse_impossible(torch.from_numpy(possible))
-    within = joint >= 0
+    digits = structure.digits(np.arange(len(structure.actors)))
+    ended = [np.arange(tables.depth + 1) > level for level in range(tables.depth)]
     return Path(
-        tuple(torch.from_numpy(np.where(within, digit, -1)) for digit in structure.digits(joint)),
-        tuple(torch.from_numpy(np.where(within, terminated > level, -1)) for level in range(tables.depth)),
+        tuple(torch.from_numpy(np.append(digit, -1)[joint]) for digit in digits),  # -1, past the end, is the last entry
+        tuple(torch.from_numpy(np.append(each.astype(np.int64), -1)[terminated]) for each in ended),
     )
 
 
@@ -119,140 +121,99 @@ def _plus(first: float, second: float, best: bool) -> float:
 
 
 @jit
-def _above(d: int, below: int, of: Structure) -> int:
-    """The entry of level d + 1's message that holds an entry of level d's without its last choice."""
-    return of.starts[d + 1] + (below - of.starts[d]) // of.sizes[d]
+def _cumulative(values: Array, best: bool) -> float:
+    """Make logarithms a distribution function, and return the logarithm of their sum; of the maximum, for ``best``.
+
+    A number uniform in [0, 1) draws the first entry above it. Zero draws the first of the largest, for ``best``.
+    """
+    total = -np.inf
+    for i in range(len(values)):
+        total = _plus(total, values[i], best)
+        values[i] = total
+    for i in range(len(values)):
+        values[i] = np.exp(values[i] - total) if not best else 1.0 if values[i] == total else 0.0
+    return total
 
 
 @jit
-def _selected(t: int, d: int, below: int, rows: Rows, spread: Array, of: Structure) -> float:
-    """log-mass that selects, at level d, the choice of message entry ``below``."""
-    j, above = (below - of.starts[d]) % of.sizes[d], _above(d, below, of)
-    first = of.callers[above]
-    if first < 0:
-        return spread[t, above] if j == 0 else -np.inf
-    return spread[t, above] + rows.selection[t, first + j]
+def _share(first: float, second: float, best: bool) -> float:
+    """The part of the first of two logarithms in their sum; 1 or 0 for ``best``."""
+    if first == -np.inf:
+        return 0.0
+    if best:
+        return 1.0 if first >= second else 0.0
+    return 1.0 / (1.0 + np.exp(second - first))
 
 
 @jit
-def _kept(t: int, d: int, below: int, rows: Rows, messages: Array, of: Structure) -> float:
-    """log-mass that keeps, at level d, the choice of message entry ``below``; choice 0 never is kept."""
-    j = (below - of.starts[d]) % of.sizes[d]
-    return messages[t, below] + rows.termination[t, of.ends[d] + 2 * j - 2] if j > 0 else -np.inf
+def _forward(rows: Rows, best: bool, keeps: Array, ways: Array, of: Structure) -> float:
+    """Fill ``keeps`` and ``ways``, both [1 + T, messages], of one trajectory; returns log p(ξ), or the best path's.
 
-
-@jit
-def _ended(t: int, d: int, below: int, rows: Rows, messages: Array, of: Structure) -> float:
-    """log-mass that terminates, at level d, the choice of message entry ``below``; choice 0 always terminates."""
-    j = (below - of.starts[d]) % of.sizes[d]
-    return messages[t, below] + (rows.termination[t, of.ends[d] + 2 * j - 1] if j > 0 else 0.0)
-
-
-@jit
-def _forward(rows: Rows, best: bool, messages: Array, spread: Array, of: Structure) -> None:
-    """Fill ``messages`` [1 + T, messages] and ``spread`` [T, messages] of one trajectory."""
-    depth = len(of.sizes)
-    messages[0] = -np.inf
-    messages[0, of.starts[depth]] = 0.0  # at t = 0 everything is selected
-    for t in range(len(spread)):
+    keeps[t] has, for each entry of a level's message, the probability that its last choice was kept at t, not selected.
+    ways[t] has, for the choices of each level below one entry, the distribution function of the choice that terminated
+    at t. The first entries of ways[T] are the distribution function of the last joint choice.
+    """
+    depth, steps = len(of.sizes), len(rows.control)
+    messages, spread = np.full(of.starts[-1], -np.inf), np.empty(of.starts[-1])
+    keeps[:] = 0.0
+    messages[of.starts[depth]] = 0.0  # at t = 0 everything is selected
+    for t in range(steps):
         for d in range(depth if t > 0 else 0):
             c, below = of.sizes[d], of.starts[d]
             for above in range(of.starts[d + 1], of.starts[d + 2]):
-                total = messages[t, below]  # choice 0 lasts one step
+                ways[t, below] = messages[below]  # choice 0 lasts one step
                 for j in range(1, c):
-                    ended = messages[t, below + j] + rows.termination[t, of.ends[d] + 2 * j - 1]
-                    total = _plus(total, ended, best)
-                messages[t, above] = total
+                    ways[t, below + j] = messages[below + j] + rows.termination[t, of.ends[d] + 2 * j - 1]
+                messages[above] = _cumulative(ways[t, below : below + c], best)
                 below += c
-        spread[t, of.starts[depth]] = messages[t, of.starts[depth]]
+        spread[of.starts[depth]] = messages[of.starts[depth]]
         for d in range(depth - 1, -1, -1):
             c, below = of.sizes[d], of.starts[d]
             for above in range(of.starts[d + 1], of.starts[d + 2]):
-                mass, first = spread[t, above], of.callers[above]
-                spread[t, below] = mass if first < 0 else mass + rows.selection[t, first]
+                mass, first = spread[above], of.callers[above]
+                spread[below] = mass if first < 0 else mass + rows.selection[t, first]
                 for j in range(1, c):
                     if first < 0:
-                        spread[t, below + j] = -np.inf
+                        spread[below + j] = -np.inf
                     else:
-                        kept = messages[t, below + j] + rows.termination[t, of.ends[d] + 2 * j - 2]
-                        spread[t, below + j] = _plus(kept, mass + rows.selection[t, first + j], best)
+                        kept = messages[below + j] + rows.termination[t, of.ends[d] + 2 * j - 2] if t > 0 else -np.inf
+                        selected = mass + rows.selection[t, first + j]
+                        spread[below + j] = _plus(kept, selected, best)
+                        keeps[t, below + j] = _share(kept, selected, best)
                 below += c
         for s in range(len(of.actors)):
             actor = of.actors[s]
-            messages[t + 1, s] = spread[t, s] + rows.control[t, actor] if actor >= 0 else -np.inf
+            messages[s] = spread[s] + rows.control[t, actor] if actor >= 0 else -np.inf
             if rows.choice.shape[1]:
-                messages[t + 1, s] += rows.choice[t, s]
+                messages[s] += rows.choice[t, s]
+    ways[steps] = messages
+    return _cumulative(ways[steps, : of.starts[1]], best)
 
 
 @jit
-def _pick(values: Array, best: bool, uniform: float) -> int:
-    """The first of the largest logarithms, or a draw in proportion to their exponentials."""
-    largest = 0
-    for i in range(len(values)):
-        if values[i] > values[largest]:
-            largest = i
-    if best:
-        return largest
-    total = 0.0
-    for i in range(len(values)):
-        total += np.exp(values[i] - values[largest])
-    left = uniform * total
-    for i in range(len(values)):
-        left -= np.exp(values[i] - values[largest])
-        if left < 0.0:
+def _pick(distribution: Array, uniform: float) -> int:
+    """The first entry of a distribution function above ``uniform``."""
+    for i in range(len(distribution)):
+        if uniform < distribution[i]:
             return i
-    return largest  # rounding left a little
+    return 0  # of a path that has probability 0
 
 
 @jit
-def _keeps(kept: float, selected: float, best: bool, uniform: float) -> bool:
-    """:func:`_pick` of two logarithms: whether the first is picked."""
-    if best:
-        return kept >= selected
-    larger = max(kept, selected)
-    first, second = np.exp(kept - larger), np.exp(selected - larger)
-    return uniform * (first + second) < first
-
-
-@jit
-def _before(t: int, d: int, index: int, rows: Rows, messages: Array, best: bool, uniforms: Array, of: Structure) -> int:
-    """The joint choice at t - 1, given entry ``index`` of level d + 1's message and termination of all levels to d."""
-    for level in range(d, -1, -1):
-        c = of.sizes[level]
-        first = of.starts[level] + (index - of.starts[level + 1]) * c
-        ways = np.empty(c)
-        for j in range(c):
-            ways[j] = _ended(t, level, first + j, rows, messages, of)
-        index = first + _pick(ways, best, uniforms[len(of.sizes) + level])
-    return index
-
-
-@jit
-def _back(
-    rows: Rows, messages: Array, spread: Array, best: bool, uniforms: Array, joint: Array, terminated: Array,
-    of: Structure,
-) -> bool:  # fmt: skip
-    """Fill ``joint`` [T] and the number of levels that ``terminated`` [T], from the last step to the first.
-
-    Returns whether the path has a probability above 0.
-    """
-    depth, steps = len(of.sizes), len(spread)
-    index = _pick(messages[steps, : of.starts[1]], best, uniforms[steps, 0])
-    possible = messages[steps, index] > -np.inf
+def _back(keeps: Array, ways: Array, uniforms: Array, joint: Array, terminated: Array, of: Structure) -> None:
+    """Fill ``joint`` [T] and the number of levels that ``terminated`` [T], from the last step to the first."""
+    depth, steps = len(of.sizes), len(joint)
+    index = _pick(ways[steps, : of.starts[1]], uniforms[steps, 0])
     for t in range(steps - 1, -1, -1):
         joint[t] = index
-        ended = depth
-        for d in range(depth):
-            kept = _kept(t, d, index, rows, messages, of) if t > 0 else -np.inf
-            selected = _selected(t, d, index, rows, spread, of)
-            if kept > -np.inf and _keeps(kept, selected, best, uniforms[t, d]):
-                ended = d
-                break
-            index = _above(d, index, of)
+        ended = 0
+        while ended < depth and not uniforms[t, ended] < keeps[t, index]:
+            index = of.starts[ended + 1] + (index - of.starts[ended]) // of.sizes[ended]
+            ended += 1
         terminated[t] = ended
-        if t > 0:
-            index = _before(t, ended - 1, index, rows, messages, best, uniforms[t], of)
-    return bool(possible)
+        for d in range(ended - 1 if t > 0 else -1, -1, -1):
+            first = of.starts[d] + (index - of.starts[d + 1]) * of.sizes[d]
+            index = first + _pick(ways[t, first : first + of.sizes[d]], uniforms[t, depth + d])
 
 
 @releasing
@@ -270,8 +231,8 @@ def _trace_all(
     :param uniforms: numbers uniform in [0, 1), [M, N, 1 + T, 2·D].
     """
     for n in range(first, last):
-        own = trajectory(rows, starts[n], lengths[n])
-        messages, spread = np.empty((1 + lengths[n], of.starts[-1])), np.empty((lengths[n], of.starts[-1]))
-        _forward(own, best, messages, spread, of)
+        own, steps = trajectory(rows, starts[n], lengths[n]), lengths[n]
+        keeps, ways = np.empty((1 + steps, of.starts[-1])), np.empty((1 + steps, of.starts[-1]))
+        possible[n] = _forward(own, best, keeps, ways, of) > -np.inf
         for m in range(len(joint)):
-            possible[n] = _back(own, messages, spread, best, uniforms[m, n], joint[m, n], terminated[m, n], of)
+            _back(keeps, ways, uniforms[m, n], joint[m, n, :steps], terminated[m, n, :steps], of)

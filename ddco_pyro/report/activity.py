@@ -24,6 +24,7 @@ class LevelActivity:
     :param ended: whether the path makes a new choice at this step: 1, 0, or -1 past the end [N, T].
     :param termination: ψ_h(s_t) of the k options [N, T, k].
     :param lasts: whether options can be active for more than one step.
+    :param intervals: of the first steps of the path's segments, [segments, 2] for each demonstration.
     :param names: the name of each choice, control first.
     """
 
@@ -33,6 +34,7 @@ class LevelActivity:
     ended: np.ndarray
     termination: np.ndarray
     lasts: bool = field(default=True, kw_only=True)
+    intervals: Sequence[np.ndarray] = field(default=(), kw_only=True)
     names: Sequence[str] = field(default=(), kw_only=True)
 
     @property
@@ -66,11 +68,17 @@ class Activity:
 def activity(fit: Fit, demos: Demonstrations) -> Activity:
     """The activity of a fit with at least one level."""
     assert fit.spec.hierarchy is not None  # a baseline has no levels
-    parts = [_arrays(piece, max(demos.lengths)) for piece in fit.infer(demos)]
+    known = fit.spec.hierarchy.levels
+    parts, intervals = [], []
+    for piece in fit.infer(demos):
+        parts.append(_arrays(piece, max(demos.lengths)))
+        intervals += [piece.intervals(row, [level.lasts for level in known]) for row in range(len(piece.names))]
     levels = []
-    for number, level in enumerate(fit.spec.hierarchy.levels):
+    for number, level in enumerate(known):
         arrays = (np.concatenate([part[what][number] for part in parts]) for what in range(4))
-        levels.append(LevelActivity(level.name, *arrays, lasts=level.lasts, names=fit.names[level.name]))
+        within = [each[number] for each in intervals]
+        names = fit.names[level.name]
+        levels.append(LevelActivity(level.name, *arrays, lasts=level.lasts, intervals=within, names=names))
     return Activity(tuple(levels), np.array(demos.lengths))
 
 

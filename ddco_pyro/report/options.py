@@ -306,7 +306,9 @@ def segmented(fit: Fit, demos: Demonstrations, activity: Activity) -> Segmented:
             demo, row = demos[places[name]], places[name]
             levels = {
                 level.name: LevelLabels.of(
-                    *(array[row, : len(demo)] for array in (level.path, level.ended, level.active)), lasts=level.lasts
+                    *(array[row, : len(demo)] for array in (level.path, level.ended, level.active)),
+                    lasts=level.lasts,
+                    intervals=level.intervals[row],
                 )
                 for level in activity.levels
             }

@@ -14,15 +14,12 @@ from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.memory import Extent, refuse_too_much
 from ddco_pyro.data.sources import Recording, Source, open_source
 from ddco_pyro.errors import BadInput, nearest
-from ddco_pyro.evaluation.inferred import Inferred
+from ddco_pyro.evaluation.inferred import Inferred, started
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.segmenting import baselines
 from ddco_pyro.spec import LevelSpec
 from ddco_pyro.training.data import parts
-
-TAIL = 0.05
-"""The posterior probability beyond each end of a boundary's interval."""
 
 __all__ = ["LevelLabels", "Segmented", "Segments", "beside_baselines", "recorded", "segments"]
 
@@ -35,8 +32,8 @@ class LevelLabels:
     :param boundaries: whether the path makes a new choice at this step [T], which may be the same option; true at the
         first step. Where options end after every step: whether the option differs from the step before.
     :param probability: posterior probability of the chosen option at each step [T].
-    :param intervals: the 90 % interval of each segment's first step [segments, 2], of :func:`boundary_intervals`; None
-        where unknown.
+    :param intervals: the 90 % interval of each segment's first step [segments, 2], of
+        :meth:`~ddco_pyro.evaluation.inferred.Inferred.intervals`; None where unknown.
     """
 
     options: np.ndarray
@@ -45,15 +42,21 @@ class LevelLabels:
     intervals: np.ndarray | None = None
 
     @classmethod
-    def of(cls, options: np.ndarray, terminations: np.ndarray, active: np.ndarray, *, lasts: bool) -> LevelLabels:
+    def of(
+        cls,
+        options: np.ndarray,
+        terminations: np.ndarray,
+        active: np.ndarray,
+        *,
+        lasts: bool,
+        intervals: np.ndarray | None = None,
+    ) -> LevelLabels:
         """Labels from the most likely path (choices and terminations [T]) and the posterior u [T, 1 + k].
 
         :param lasts: whether the level's options can be active for more than one step.
         """
-        boundaries = terminations == 1 if lasts else np.diff(options, prepend=-1) != 0
-        boundaries[0] = True
         probability = np.minimum(active[np.arange(len(options)), options], 1.0)  # rounding can exceed it
-        return cls(options, boundaries, probability, boundary_intervals(options, boundaries, active))
+        return cls(options, started(options, terminations, lasts), probability, intervals)
 
     def runs(self, anew: bool = True) -> list[tuple[int, int, int]]:
         """Each segment as (option, first step, step after the last).
@@ -62,36 +65,6 @@ class LevelLabels:
         """
         starts = np.flatnonzero(self.boundaries if anew else np.diff(self.options, prepend=-1)).tolist()
         return [(int(self.options[a]), a, b) for a, b in zip(starts, [*starts[1:], len(self.options)], strict=True)]
-
-
-def boundary_intervals(options: np.ndarray, boundaries: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """The equal-tailed 90 % interval of the first step of each segment, both ends included, [segments, 2].
-
-    Between the middles of two neighbouring segments with options a and b, the boundary is at or before step t with
-    probability u_t(b) / (u_t(a) + u_t(b)). This is exact if only a, then b are active there. Both ends are the
-    boundary where the option stays the same, and at the first step.
-
-    >>> active = np.array([[0, 1, 0], [0, 1, 0], [0, 0.8, 0.2], [0, 0.3, 0.7], [0, 0.1, 0.9], [0, 0, 1]])
-    >>> options, boundaries = np.array([1, 1, 1, 2, 2, 2]), np.array([True, False, False, True, False, False])
-    >>> boundary_intervals(options, boundaries, active).tolist()
-    [[0, 0], [2, 4]]
-
-    :param options: of each step [T].
-    :param boundaries: whether a segment begins at each step [T].
-    :param active: the posterior u [T, 1 + k].
-    """
-    starts = np.flatnonzero(boundaries)
-    edges = np.append(starts, len(options))
-    found = np.stack([starts, starts], axis=1)
-    for place in range(1, len(starts)):
-        before, own = options[edges[place - 1]], options[edges[place]]
-        first, last = edges[place - 1 : place + 1].sum() // 2 + 1, edges[place : place + 2].sum() // 2
-        pair = active[first : last + 1][:, [before, own]]
-        total = pair.sum(1)
-        if before != own and len(pair) and total.all():
-            begun = np.maximum.accumulate(pair[:, 1] / total)
-            found[place] = np.minimum(first + np.searchsorted(begun, [TAIL, 1 - TAIL]), last)
-    return found
 
 
 @dataclass(frozen=True)
@@ -151,9 +124,10 @@ def segment(fit: Fit, path: str | Path) -> Segmented:
         return segments(fit, source)
 
 
-def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
+def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bool = False) -> Segmented:
     """The segments of every demonstration of a source, except those that the run's spec excludes from its file.
 
+    :param intervals: with the intervals of their boundaries.
     :raises BadInput: the run has no options.
     :raises DemonstrationsError: a demonstration cannot be used, or lacks an observation of the run.
     """
@@ -165,7 +139,7 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore) -> Segmented:
     labels: dict[str, dict[str, np.ndarray]] = {}
     segmented: list[Segments] = []
     for piece in fit.infer(_demonstrations(source, chosen, fit, labels)):
-        segmented += _segments(fit, piece, hierarchy.levels, labels)
+        segmented += _segments(fit, piece, hierarchy.levels, labels, intervals)
         on_event(DemonstrationsDone(len(segmented), len(chosen)))
     names = fit.spec.demonstrations.labels_by_level(len(counts))
     truth = dict(zip(counts, names, strict=bool(names)))
@@ -262,12 +236,19 @@ def _check_shape(where: str, shape: tuple[int, ...], fitted: tuple[int, ...]) ->
 
 
 def _segments(
-    fit: Fit, piece: Inferred, levels: Sequence[LevelSpec], labels: dict[str, dict[str, np.ndarray]]
+    fit: Fit,
+    piece: Inferred,
+    levels: Sequence[LevelSpec],
+    labels: dict[str, dict[str, np.ndarray]],
+    intervals: bool,
 ) -> Iterator[Segments]:
     for row, (name, steps) in enumerate(zip(piece.names, piece.lengths, strict=True)):
+        known = piece.intervals(row, [level.lasts for level in levels]) if intervals else [None] * len(levels)
         each = {
-            level.name: LevelLabels.of(*(array[row, :steps].numpy() for array in arrays), lasts=level.lasts)
-            for level, *arrays in zip(levels, *piece.path, piece.posterior.u, strict=True)
+            level.name: LevelLabels.of(
+                *(array[row, :steps].numpy() for array in arrays), lasts=level.lasts, intervals=within
+            )
+            for level, within, *arrays in zip(levels, known, *piece.path, piece.posterior.u, strict=True)
         }
         value = float(piece.log_likelihood[row])
         if not math.isfinite(value):

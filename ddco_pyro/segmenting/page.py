@@ -28,8 +28,8 @@ FIRST = 10
 
 HOW = (
     "Time runs to the right. Colours are options; the height of a band is the posterior probability of its option. A "
-    "bar below a boundary is the 90 % interval of its step, from the posterior of the two options beside it. Grey rows "
-    "are labels. Numbers, the trajectory and pictures below follow the cursor."
+    "bar below a boundary is the 90 % interval of its step, over draws from the posterior. Grey rows are labels. "
+    "Numbers, the trajectory and pictures below follow the cursor."
 )
 
 
