@@ -495,17 +495,19 @@ def read_tidy(path: Path) -> list[Row]:
 def earlier(study: Study) -> list[Row]:
     """The rows of a declaration's tables ``kept``, by the names of the declaration."""
     found: dict[tuple[Any, ...], Row] = {}
+    seeds = study.declared.ranges("seeds").values()
     for kept in study.declared.kept:
         tasks, methods, measures = (
             {there: here for here, there in names.items()} for names in (kept.tasks, kept.methods, kept.measures)
         )
         for row in read_tidy(study.path.parent / kept.table):
-            whole = row.demonstrations is not None and isinstance(row.seed, int)  # no summary of several cells
-            if whole and kept.study in (None, row.study) and (not methods or row.method in methods):
+            declared = any(row.seed in block for block in seeds)  # other rows are of other cells, or of several
+            if declared and kept.study in (None, row.study) and (not methods or row.method in methods):
                 task, method = tasks.get(row.task, row.task), methods.get(row.method, row.method)
                 measure = measures.get(row.measure, row.measure)
                 own = replace(row, study=study.name, task=task, method=method, measure=measure)
-                found.setdefault((*own.cell, measure), own)
+                if task in study.tasks:
+                    found.setdefault((*own.cell, measure), own)
     return list(found.values())
 
 

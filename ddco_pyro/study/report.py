@@ -276,7 +276,10 @@ def design(study: Study, rows: Sequence[Row], state: State) -> list[str]:
         text = "have the data and seeds of their own studies, and may be older than the contrasts"
         lines.append(f"Results that are kept in {', '.join(tables)} {text}.")
     if declared.choose is not None:
-        lines.append(f"Each method's point of the grid has the highest {declared.choose} on the development seeds.")
+        first = {cell.of: cell.point for cell in state.cells if cell.part == "test"}
+        points = ", ".join(declared.label(method, dict(point), "") for method, point in first.items())
+        text = f"The point of each method has the highest {declared.choose} on the development seeds, of"
+        lines.append(f"{text} {len(declared.points(next(iter(declared.methods))))}: {points or 'not yet known'}.")
     test = [number for number, cell in enumerate(state.cells) if cell.part == "test"]
     done = [number for number in test if number in state.done]
     if len(done) < len(test):
@@ -292,7 +295,9 @@ def name_of(measure: str) -> str:
     """The name of a measure in tables and figures."""
     if measure == NATS:
         return "held-out nats/step"
-    return measure_names([measure])[0] if measure in (*UNMATCHED, *MATCHED) else words.measure(measure)
+    if measure in (*UNMATCHED, *MATCHED):
+        return measure_names([measure])[0]
+    return words.measure(measure) if measure.islower() else measure
 
 
 def shown(found: Estimate, form: str = ".2f") -> str:
@@ -315,7 +320,7 @@ def render(text: str, studies: Path, tables: Path = Path()) -> str:
     A quotation is ``<!-- study NAME: options - flat; success; 50 -->…<!-- / -->``: a method or a contrast, a measure,
     and a number of demonstrations, none where the table has none. A difference is bold where its interval excludes 0.
     ``40 - 80`` gives both methods of a contrast a number of their own. Several methods, measures or numbers, between
-    ``|``, make a table. These settings may follow:
+    ``|``, make a table, of means and of differences with intervals. These settings may follow:
 
     - ``study=NAME``, ``task=NAME`` and ``seed=NAME`` take rows of one study of the table, one task or one seed;
     - ``show`` is ``mean``, ``±`` (half of the interval), ``sd``, ``se``, ``range`` (least and greatest unit) or
@@ -345,9 +350,9 @@ def _quoted(rows: Sequence[Row], source: str, quotation: str) -> str:
     fields = [part.strip() for part in quotation.split(";")]
     settings = {found["key"]: found["value"] for part in fields if (found := _SETTING.fullmatch(part))}
     plain = [part.split(" | ") for part in fields if not _SETTING.fullmatch(part)]
-    show, form, times = settings.get("show", "interval"), settings.get("form"), float(settings.get("times", 1))
+    show, form, times = settings.get("show"), settings.get("form"), float(settings.get("times", 1))
     counts = [one.split(" - ") for one in plain[2]] if len(plain) == 3 else [[]]
-    if len(plain) not in (2, 3) or show not in SHOWN or not all(n.isdecimal() for one in counts for n in one):
+    if len(plain) not in (2, 3) or show not in (None, *SHOWN) or not all(n.isdecimal() for one in counts for n in one):
         raise BadInput(
             f"{source}: {quotation!r}: write a method or contrast, a measure and a number of demonstrations, such as: "
             f"options - flat; success; 50. After show= stands one of: {', '.join(SHOWN)}"
@@ -355,14 +360,19 @@ def _quoted(rows: Sequence[Row], source: str, quotation: str) -> str:
     wanted = {key: settings[key] for key in ("study", "seed") if key in settings}
     rows = [row for row in rows if all(str(getattr(row, key)) == value for key, value in wanted.items())]
 
+    (methods, measures), task = plain[:2], settings.get("task")
+    single = len(methods) * len(measures) * len(counts) == 1
+
     def cell(what: str, measure: str, count: Sequence[str], task: str | None) -> str:
         own = values(rows, what, measure, list(map(int, count)) or [None], task)
         several = any(seed != "" for one in own.values() for seed in one)  # a row without seed is their summary
         scaled = {t: {s: times * v for s, v in one.items() if s != "" or not several} for t, one in own.items()}
-        return _shown(estimate(scaled), " - " in what, measure, show, form) if own else ""
+        difference = " - " in what
+        how = show or ("interval" if single or difference else "mean")
+        own_form = f"+{form}" if form and difference and not single else form
+        return _shown(estimate(scaled), difference, measure, how, own_form) if own else ""
 
-    (methods, measures), task = plain[:2], settings.get("task")
-    if len(methods) * len(measures) * len(counts) == 1:
+    if single:
         if not (text := cell(methods[0], measures[0], counts[0], task)):
             raise BadInput(f"{source}: its tables have no {quotation!r}; check its names")
         return text
