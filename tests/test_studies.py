@@ -528,8 +528,8 @@ other,a,theirs,20,0,success,0.0
         ("summary; nats", "−2.50"),
         (
             "ours, k = 2 | theirs; success; 10 | 20; study=by_hand",
-            "\n| demonstrations | measure | ours, k = 2 | theirs |\n|--:|---|--:|--:|\n"
-            "| 10 | Success | 70% | – |\n| 20 | Success | – | 63% |\n",
+            "\n\n| demonstrations | measure | ours, k = 2 | theirs |\n|--:|---|--:|--:|\n"
+            "| 10 | Success | 70% | – |\n| 20 | Success | – | 63% |\n\n",
         ),
     ],
 )

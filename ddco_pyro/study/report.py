@@ -391,7 +391,7 @@ def _quoted(rows: Sequence[Row], source: str, quotation: str) -> str:
         "measure",
         *(one.replace(" - ", " − ") for one in methods),
     ]
-    return f"\n{Table(head, table, {0, 1} if by_task else {1}).markdown()}\n"
+    return f"\n\n{Table(head, table, {0, 2} if by_task else {1}).markdown()}\n\n"
 
 
 SHOWN = ("interval", "mean", "±", "sd", "se", "range", "above")
