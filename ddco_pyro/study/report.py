@@ -350,12 +350,17 @@ def _quoted(rows: Sequence[Row], source: str, quotation: str) -> str:
     fields = [part.strip() for part in quotation.split(";")]
     settings = {found["key"]: found["value"] for part in fields if (found := _SETTING.fullmatch(part))}
     plain = [part.split(" | ") for part in fields if not _SETTING.fullmatch(part)]
-    show, form, times = settings.get("show"), settings.get("form"), float(settings.get("times", 1))
+    show, form = settings.get("show"), settings.get("form")
     counts = [one.split(" - ") for one in plain[2]] if len(plain) == 3 else [[]]
-    if len(plain) not in (2, 3) or show not in (None, *SHOWN) or not all(n.isdecimal() for one in counts for n in one):
+    try:
+        times, _ = float(settings.get("times", 1)), format(0.0, form or "")
+        wrong = not all(n.isdecimal() for one in counts for n in one)
+    except ValueError:
+        wrong = True
+    if wrong or len(plain) not in (2, 3) or show not in (None, *SHOWN):
         raise BadInput(
             f"{source}: {quotation!r}: write a method or contrast, a measure and a number of demonstrations, such as: "
-            f"options - flat; success; 50. After show= stands one of: {', '.join(SHOWN)}"
+            f"options - flat; success; 50. After show= stands one of: {', '.join(SHOWN)}; form= is Python's"
         )
     wanted = {key: settings[key] for key in ("study", "seed") if key in settings}
     rows = [row for row in rows if all(str(getattr(row, key)) == value for key, value in wanted.items())]
@@ -372,26 +377,20 @@ def _quoted(rows: Sequence[Row], source: str, quotation: str) -> str:
         own_form = f"+{form}" if form and difference and not single else form
         return _shown(estimate(scaled), difference, measure, how, own_form) if own else ""
 
-    if single:
-        if not (text := cell(methods[0], measures[0], counts[0], task)):
-            raise BadInput(f"{source}: its tables have no {quotation!r}; check its names")
-        return text
     by_task = settings.get("by") == "task"
+    tasks = sorted({row.task for row in rows}) if by_task else [task]
     table = []
-    for one, count, measure in itertools.product(
-        sorted({row.task for row in rows}) if by_task else [task], counts, measures
-    ):
+    for one, count, measure in itertools.product(tasks, counts, measures):
         cells = [cell(what, measure, count, one) for what in methods]
         if any(cells):
-            named = [*([str(one)] if by_task else []), " − ".join(count), name_of(measure)]
-            table.append([*named, *(cell or "–" for cell in cells)])
-    head = [
-        *(["task"] if by_task else []),
-        "demonstrations",
-        "measure",
-        *(one.replace(" - ", " − ") for one in methods),
-    ]
-    return f"\n\n{Table(head, table, {0, 2} if by_task else {1}).markdown()}\n\n"
+            named = [str(one), " − ".join(count), name_of(measure)]
+            table.append([*named[not by_task :], *(text or "–" for text in cells)])
+    if not table:
+        raise BadInput(f"{source}: its tables have no {quotation!r}; check its names")
+    if single:
+        return table[0][-1]
+    head = ["task", "demonstrations", "measure", *(one.replace(" - ", " − ") for one in methods)]
+    return f"\n\n{Table(head[not by_task :], table, {0, 2} if by_task else {1}).markdown()}\n\n"
 
 
 SHOWN = ("interval", "mean", "±", "sd", "se", "range", "above")
