@@ -462,6 +462,36 @@ def test_a_measure_of_nothing_is_better_than_less(made):
     assert folder.chosen(cells.State(places, dict(enumerate(results)), {})) == {"options": {"control.std": 0.5}}
 
 
+def test_points_that_change_nothing_are_no_trials(made):
+    folder = made(**TUNED, grid={"control.std": [0.5, 1.0, 2.0]})
+    places = folder.cells("development")
+    values = {"options": {0.5: -1.0, 1.0: -1.0, 2.0: -0.5}, "flat": {0.5: -3.0, 1.0: -2.0, 2.0: -1.0}}
+    done = [cells.Done(depends={}, values={"nats": values[one.of][one.point["control.std"]]}) for one in places]
+    lines = report.design(folder.study, [], cells.State(places, dict(enumerate(done)), {}))
+    assert [line for line in lines if "no trials" in line] == [
+        "options: 1 of 3 points gave the results of another one: no trials."
+    ]
+
+
+def test_some_tasks_choose_for_all(tmp_path):
+    study = {
+        **TUNED,
+        "tasks": ["needle", "pushing"],
+        "choose_on": ["pushing"],
+        "grid": {"control.std": [0.5, 1.0]},
+        "demonstrations": {**RECORDED, "development": {"first": 100, "count": 20}},
+    }
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(SPEC))
+    path = tmp_path / "study.yaml"
+    path.write_text(yaml.safe_dump({**STUDY, **study}))
+    folder = Folder(Study.load(path), tmp_path / "out")
+    assert {cell.task for cell in folder.cells("development")} == {"pushing"}
+    assert {cell.task for cell in folder.cells("test", folder.chosen(folder.state()))} == {"needle", "pushing"}
+    path.write_text(yaml.safe_dump({**STUDY, **study, "choose_on": ["needles"]}))
+    with pytest.raises(SpecError, match=r"choose_on\.0: 'needles' is not among tasks"):
+        Study.load(path)
+
+
 def test_cells_of_an_earlier_table_are_not_done(made, done, tmp_path):
     write(done, done.state(), tmp_path)
     folder = made(kept=[{"table": "table.csv"}])

@@ -152,11 +152,12 @@ class Folder:
         :param chosen: the point of the grid of each method; None for all points.
         """
         declared, block = self.study.declared, getattr(self.study.declared.seeds, part)
+        tasks = self.study.tasks if part == "test" else declared.choose_on or self.study.tasks
         return [
             Cell(part, task, declared.label(method, point, part), count, block.first + place, method, point, place)
             for place in range(block.count)
             for count in declared.demonstrations.counts
-            for task in self.study.tasks
+            for task in tasks
             for method in declared.methods
             for point in ([dict(chosen[method])] if chosen else declared.points(method))
         ]

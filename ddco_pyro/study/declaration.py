@@ -159,6 +159,8 @@ class Declaration(Model):
     choose: Text | None = None
     """The measure by whose mean over the development seeds each method's point of its grid is chosen, among as many for
     every method; null: every point is a method of its own."""
+    choose_on: Items[TaskName] = ()
+    """The tasks of the development seeds, some of ``tasks``; empty: all."""
     methods: Annotated[dict[Text, MethodSpec], Field(min_length=1)]
     """The methods by name."""
     seeds: Blocks
@@ -252,6 +254,9 @@ class Declaration(Model):
     def _chosen(self) -> Iterator[tuple[str, str]]:
         if (self.choose is None) != (self.seeds.development is None):
             yield "choose", "goes together with seeds.development; give both or neither"
+        for number, task in enumerate(self.choose_on):
+            if self.choose is None or task not in self.tasks:
+                yield f"choose_on.{number}", f"{task!r} is not among tasks, or there is nothing to choose; remove it"
         trials = {name: len({point_name(point) for point in self.points(name)}) for name in self.methods}
         if self.choose is not None and len({*trials.values()}) > 1:
             said = ", ".join(f"{name} {count}" for name, count in trials.items())

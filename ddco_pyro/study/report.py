@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -280,6 +281,14 @@ def design(study: Study, rows: Sequence[Row], state: State) -> list[str]:
         points = ", ".join(declared.label(method, dict(point), "") for method, point in first.items())
         text = f"The point of each method has the highest {declared.choose} on the development seeds, of"
         lines.append(f"{text} {len(declared.points(next(iter(declared.methods))))}: {points or 'not yet known'}.")
+        tried: dict[str, dict[str, list[Any]]] = {}
+        for number, result in state.done.items():
+            if (cell := state.cells[number]).part == "development":
+                named = cell.task, cell.demonstrations, cell.seed
+                tried.setdefault(cell.of, {}).setdefault(cell.method, []).append((*named, result.values))
+        for method, results in tried.items():
+            if (same := len(results) - len({repr(one) for one in results.values()})) > 0:
+                lines.append(f"{method}: {same} of {len(results)} points gave the results of another one: no trials.")
     test = [number for number, cell in enumerate(state.cells) if cell.part == "test"]
     done = [number for number in test if number in state.done]
     if len(done) < len(test):
