@@ -12,6 +12,8 @@ episode.
 
 from __future__ import annotations
 
+import copy
+import functools
 import os
 import sys
 import warnings
@@ -21,6 +23,7 @@ from typing import Any
 os.environ.setdefault("MUJOCO_GL", "egl")
 
 import arena_recording
+import mujoco
 import numpy as np
 from arena_phases import Phases
 from arena_playing import Observation, arguments, named_controllers, play, play_all
@@ -46,6 +49,9 @@ UNSEEN = 1_000_000
 """Seeds of initial states from here on are not demonstrated."""
 
 CAMERA = "corner2"
+
+_compiled = functools.cache(mujoco.MjModel.from_xml_path)
+mujoco.MjModel.from_xml_path = lambda path: copy.copy(_compiled(path))  # most of the time of a short episode
 
 Step = tuple[Observation, np.ndarray, int, bool]
 """What was seen, the control, the phase, and whether the task succeeded thereby."""

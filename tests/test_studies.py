@@ -11,6 +11,7 @@ import signal
 from pathlib import Path
 
 import arena_playing
+import memory
 import numpy as np
 import pytest
 import sawyer
@@ -98,6 +99,13 @@ def done(file, tmp_path_factory):
     return folder
 
 
+TUNED = {
+    "choose": "nats",
+    "seeds": {"test": {"count": 1}, "development": {"first": 7, "count": 1}},
+    "demonstrations": {"path": "mine.hdf5", "counts": [3], "held_out": 2, "test": {"count": 6},
+                       "development": {"first": 6, "count": 6}},
+    "contrasts": [],
+}  # fmt: skip
 RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
 
 
@@ -118,6 +126,18 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
         ({"contrasts": [{"contrast": "options - flat", "measure": "nats"}]}, "must be one of 4, 6"),
         ({"contrasts": [{"contrast": "options - flat", "measure": "ari", "demonstrations": 6}]}, "not among measures"),
         ({"choose": "nats"}, "choose: goes together with seeds.development"),
+        (
+            {**TUNED, "methods": {"options": {"grid": {"control.std": [0.1, 0.2]}}, "flat": {"baseline": "flat"}}},
+            "unequal numbers of points to choose from (options 2, flat 1)",
+        ),
+        (
+            {**TUNED, "methods": {"options": {"grid": {"control.std": [0.1, 0.1]}}, "flat": {"baseline": "flat"}}},
+            "grid: is empty; name what to choose from",
+        ),
+        (
+            {"grid": {"control.std": [0.1]}, "methods": {"options": {"overrides": {"control.std": 0.2}}}},
+            "methods.options.overrides: has 'control.std', which the grid has, too",
+        ),
         (
             {"overrides": {"hierarchy.levels.0.policy.network": "os:system"}},
             "options: would import user code (os:system)",
@@ -392,16 +412,13 @@ def test_a_killed_study_goes_on_with_what_is_done(made):
     assert {path: path.read_bytes() for path in kept} == kept
 
 
-def test_the_best_point_on_development_seeds_is_tested(made):
-    """With σ of 50 every method explains the demonstrations worse than with 0.5."""
-    folder = made(
-        grid={"control.std": [50.0, 0.5]},
-        choose="nats",
-        seeds={"test": {"count": 1}, "development": {"first": 7, "count": 1}},
-        demonstrations={"path": "mine.hdf5", "counts": [3], "held_out": 2, "test": {"count": 6},
-                        "development": {"first": 6, "count": 6}},
-        contrasts=[],
-    )  # fmt: skip
+def test_the_best_point_on_development_seeds_is_tested(made, tmp_path, drawn_here):
+    """With σ of 50 every method explains the demonstrations worse than with 0.5. Options have a grid of their own."""
+    methods = {
+        "options": {"grid": {"control.std": [50.0, 0.5]}},
+        "flat": {"baseline": "flat", "grid": {"control.std": [0.5, 50.0]}},
+    }
+    folder = made(**TUNED, methods=methods)
     state = folder.run(HERE)
     parts = [cell.part for cell in state.cells]
     assert (parts.count("development"), parts.count("test"), len(state.done)) == (4, 2, 6)
@@ -411,16 +428,19 @@ def test_the_best_point_on_development_seeds_is_tested(made):
     }
     train, valid = folder._divided(folder.cells("development")[0])
     assert {*train, *valid} <= {f"demo_{n}" for n in range(6, 12)}
+    write(folder, state, tmp_path)
+    rows = read_tidy(tmp_path / "table.csv")
+    names = {"options", "flat", *(f"{name} (std = {std})" for name in ("options", "flat") for std in (0.5, 50.0))}
+    assert {row.method for row in rows} == names
+    chosen = "on the development seeds, of 2: options (std = 0.5), flat (std = 0.5)."
+    assert chosen in (tmp_path / "page.md").read_text()
+    assert not made(**TUNED, methods=methods, kept=[{"table": "table.csv"}]).state().missing
 
 
 def test_a_measure_of_nothing_is_better_than_less(made):
     """Means over development cells: −1 and 0 at the first point, −0.4 at the second; the best is the second."""
-    folder = made(
-        grid={"control.std": [0.5, 1.0]}, choose="nats", contrasts=[], methods={"options": {}},
-        seeds={"test": {"count": 1}, "development": {"first": 7, "count": 2}},
-        demonstrations={"path": "mine.hdf5", "counts": [3], "held_out": 2, "test": {"count": 6},
-                        "development": {"first": 6, "count": 6}},
-    )  # fmt: skip
+    seeds = {"test": {"count": 1}, "development": {"first": 7, "count": 2}}
+    folder = made(**{**TUNED, "seeds": seeds}, grid={"control.std": [0.5, 1.0]}, methods={"options": {}})
     values = {(7, 0.5): -1.0, (8, 0.5): 0.0, (7, 1.0): -0.4, (8, 1.0): -0.4}
     places = folder.cells("development")
     results = [cells.Done(depends={}, values={"nats": values[one.seed, one.point["control.std"]]}) for one in places]
@@ -428,6 +448,36 @@ def test_a_measure_of_nothing_is_better_than_less(made):
     assert folder.chosen(state) == {"options": {"control.std": 1.0}}
     results[0] = cells.Done(depends={}, values={"nats": -0.7})
     assert folder.chosen(cells.State(places, dict(enumerate(results)), {})) == {"options": {"control.std": 0.5}}
+
+
+def test_points_that_change_nothing_are_no_trials(made):
+    folder = made(**TUNED, grid={"control.std": [0.5, 1.0, 2.0]})
+    places = folder.cells("development")
+    values = {"options": {0.5: -1.0, 1.0: -1.0, 2.0: -0.5}, "flat": {0.5: -3.0, 1.0: -2.0, 2.0: -1.0}}
+    done = [cells.Done(depends={}, values={"nats": values[one.of][one.point["control.std"]]}) for one in places]
+    lines = report.design(folder.study, [], cells.State(places, dict(enumerate(done)), {}))
+    assert [line for line in lines if "no trials" in line] == [
+        "options: 1 of 3 points gave the results of another one: no trials."
+    ]
+
+
+def test_some_tasks_choose_for_all(tmp_path):
+    study = {
+        **TUNED,
+        "tasks": ["needle", "pushing"],
+        "choose_on": ["pushing"],
+        "grid": {"control.std": [0.5, 1.0]},
+        "demonstrations": {**RECORDED, "development": {"first": 100, "count": 20}},
+    }
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(SPEC))
+    path = tmp_path / "study.yaml"
+    path.write_text(yaml.safe_dump({**STUDY, **study}))
+    folder = Folder(Study.load(path), tmp_path / "out")
+    assert {cell.task for cell in folder.cells("development")} == {"pushing"}
+    assert {cell.task for cell in folder.cells("test", folder.chosen(folder.state()))} == {"needle", "pushing"}
+    path.write_text(yaml.safe_dump({**STUDY, **study, "choose_on": ["needles"]}))
+    with pytest.raises(SpecError, match=r"choose_on\.0: 'needles' is not among tasks"):
+        Study.load(path)
 
 
 def test_cells_of_an_earlier_table_are_not_done(made, done, tmp_path):
@@ -447,7 +497,7 @@ def test_cells_of_an_earlier_table_are_not_done(made, done, tmp_path):
 def test_pages_quote_the_tables_by_the_names_of_the_study(made, done, tmp_path):
     write(done, done.state(), tmp_path)
     rows = read_tidy(tmp_path / "table.csv")
-    own = values(rows, "options", "nats", 6)[""]
+    own = values(rows, "options", "nats", [6])[""]
     methods = {"mine": {}, "flat": {"baseline": "flat"}}
     kept = [{"table": "table.csv", "study": "study", "methods": {"mine": "options"}, "measures": {"nats/step": "nats"}}]
     made(kept=kept, methods=methods, contrasts=[])
@@ -458,6 +508,45 @@ def test_pages_quote_the_tables_by_the_names_of_the_study(made, done, tmp_path):
     assert render("nothing", tmp_path) == "nothing"
     with pytest.raises(BadInput, match="no"):
         render("<!-- study study: mine; nats; 5 --><!-- / -->", tmp_path)
+
+
+HAND = """study,task,method,demonstrations,seed,measure,value
+by_hand,a,"ours, k = 2",10,0,success,0.5
+by_hand,a,"ours, k = 2",10,1,success,0.7
+by_hand,a,"ours, k = 2",10,2,success,0.9
+by_hand,a,"ours, k = 2",10,,success,0.1
+by_hand,a,theirs,20,0,success,0.4
+by_hand,a,theirs,20,1,success,0.5
+by_hand,a,theirs,20,2,success,1.0
+by_hand,b,summary,,,nats,-2.5
+other,a,theirs,20,0,success,0.0
+"""
+
+
+@pytest.mark.parametrize(
+    ("quotation", "said"),
+    [
+        ("ours, k = 2; success; 10", "70% [20%, 120%]"),  # sd 0.2; t(0.975, 2) = 4.3027 times 0.2 / √3
+        ("ours, k = 2; success; 10; show=±; form=.3f", "0.700 ± 0.497"),
+        ("ours, k = 2; success; 10; show=sd; times=100; form=.1f", "70.0 ± 20.0"),
+        ("ours, k = 2; success; 10; show=se; form=.3f", "0.700 ± 0.115"),
+        ("ours, k = 2; success; 10; show=range", "50% to 90%"),
+        ("ours, k = 2; success; 10; seed=1; show=mean", "70%"),
+        ("ours, k = 2 - theirs; success; 10 - 20; study=by_hand; show=above", "2 of 3"),
+        ("ours, k = 2 - theirs; success; 10 - 20; study=by_hand; show=mean; form=+.2f", "+0.07"),
+        ("summary; nats", "−2.50"),
+        (
+            "ours, k = 2 | theirs; success; 10 | 20; study=by_hand",
+            "\n\n| demonstrations | measure | ours, k = 2 | theirs |\n|--:|---|--:|--:|\n"
+            "| 10 | Success | 70% | – |\n| 20 | Success | – | 63% |\n\n",
+        ),
+    ],
+)
+def test_a_table_is_quoted_as_by_hand(tmp_path, quotation, said):
+    (tmp_path / "hand.csv").write_text(HAND)
+    assert render(f"<!-- table hand: {quotation} -->?<!-- / -->", ROOT, tmp_path) == (
+        f"<!-- table hand: {quotation} -->{said}<!-- / -->"
+    )
 
 
 class Told:
@@ -481,16 +570,69 @@ def test_chunks_of_actions_are_averaged_over_what_was_given_for_a_step():
         assert acted == pytest.approx([np.average(one, weights=weights[: len(one)]) for one in given])
 
 
-def test_pages_of_the_project_agree_with_the_tables():
-    text = (ROOT / "README.md").read_text()
-    assert render(text, ROOT / "studies") == text
-    assert len(report._QUOTED.findall(text)) == 9
+RESULTS = ROOT / "docs" / "results"
+QUOTED = {
+    ROOT / "README.md": 9,
+    **{path: 5 for path in RESULTS.glob("*.md") if path.with_suffix(".csv").exists()},
+}
+"""The least number of quotations on each page that has a table."""
 
 
-@pytest.mark.parametrize("name", ["needle", "pushing", "arena", "bins"])
-def test_kept_results_are_not_done_again(name, tmp_path):
+@pytest.mark.parametrize("path", QUOTED, ids=lambda path: path.stem)
+def test_pages_of_the_project_agree_with_the_tables(path):
+    text = path.read_text()
+    assert render(text, ROOT / "studies", path.parent) == text
+    assert len(report._QUOTED.findall(text)) >= QUOTED[path]
+
+
+@pytest.mark.parametrize(
+    ("name", "missing"),
+    [
+        ("needle", set()),
+        ("pushing", set()),
+        ("arena", {"options by em", "options by em without ridges"}),
+        ("bins", set()),
+        ("planted", {"joint", "layer-wise", "segments, mixture", "joint, mixture"}),
+    ],
+)
+def test_kept_results_are_not_done_again(name, missing, tmp_path):
     folder = Folder(Study.load(ROOT / "studies" / f"{name}.yaml", allow_code=True), tmp_path)
-    assert not folder.state().missing
+    assert {cell.method for cell in folder.state().missing} == missing
+
+
+def test_planted_levels_are_scored_by_their_truth(tmp_path):
+    """The truth explains demonstrations of its own best, and finds the lowest level in nearly all steps."""
+    study = yaml.safe_load((ROOT / "studies" / "planted.yaml").read_text()) | {
+        "spec": str(ROOT / "specs" / "planted_levels.yaml"),
+        "overrides": {"training.epochs": 2, "training.restarts": 1},
+        "demonstrations": {"counts": [8], "held_out": 4, "test": {"first": 10, "count": 12}},
+        "starts": {"test": {"first": 500, "count": 6}},
+        "seeds": {"test": {"count": 1}},
+        "contrasts": [],
+        "kept": [],
+    }
+    study["methods"] = {name: study["methods"][name] for name in ("segments", "truth", "limit", "search")}
+    (tmp_path / "planted.yaml").write_text(yaml.safe_dump(study))
+    folder = Folder(Study.load(tmp_path / "planted.yaml", allow_code=True), tmp_path / "out")
+    state = folder.run(HERE)
+    found = {cell.method: state.done[number].values for number, cell in enumerate(state.cells)}
+    assert {name for name in found if len(found[name]) == 4} == {*found}
+    assert found["truth"]["NMI, level 1"] > 0.99
+    assert found["truth"]["nats"] >= max(found[name]["nats"] for name in ("limit", "search", "segments"))
+
+
+def test_the_figure_of_readme_has_the_numbers_of_its_table(tmp_path):
+    rows = memory.read()
+    chosen = memory.lines(rows, memory.WORTH)
+    assert [line[:2] for line in chosen] == [
+        ("arena", 50),
+        ("needle", 100),
+        ("arena", 50),
+        ("bins", 60),
+        ("pushing", 80),
+    ]
+    memory.draw(rows, chosen, tmp_path / "worth.png", columns=1)
+    assert (tmp_path / "worth.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_quoted_difference_is_that_of_both_tables():

@@ -22,14 +22,14 @@ def test_one_task_is_the_paired_t_test_over_seeds():
         assert p_value(found, bound) == pytest.approx(test.pvalue)
     interval = stats.ttest_rel(ours, theirs).confidence_interval(0.95)
     assert found.interval == pytest.approx((interval.low, interval.high))
-    assert (found.tasks, found.values, found.freedom) == (1, 8, 7)
+    assert (found.freedom, found.units) == (7, pytest.approx(tuple(ours - theirs)))
 
 
 def test_the_units_of_several_tasks_are_their_means():
     tasks = {"a": by_seed([0, 1]), "b": by_seed([1, 2, 3]), "c": by_seed([4])}
     found, test = estimate(tasks), stats.ttest_1samp([0.5, 2, 4], 1.0, alternative="greater")
     assert p_value(found, 1.0) == pytest.approx(test.pvalue)
-    assert (found.value, found.freedom, found.values) == (pytest.approx(6.5 / 3), 2, 6)
+    assert (found.value, found.freedom, found.range) == (pytest.approx(6.5 / 3), 2, (0.5, 4))
 
 
 def test_pairs_need_both_values():

@@ -112,7 +112,7 @@ def _render(pages: list[Path], studies: Path, check: bool) -> None:
             text = page.read_text(encoding="utf-8")
         except OSError as error:
             raise BadInput(f"{page}: cannot be read: {error.strerror}; check the path") from error
-        now = render(text, studies)
+        now = render(text, studies, page.parent)
         if now != text and check:
             raise Failed(f"{page}: differs from the tables; write it with: {command('study', 'render', page)}")
         if now != text:

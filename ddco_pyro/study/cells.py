@@ -152,13 +152,14 @@ class Folder:
         :param chosen: the point of the grid of each method; None for all points.
         """
         declared, block = self.study.declared, getattr(self.study.declared.seeds, part)
+        tasks = self.study.tasks if part == "test" else declared.choose_on or self.study.tasks
         return [
-            Cell(part, task, declared.label(method, point), count, block.first + place, method, point, place)
+            Cell(part, task, declared.label(method, point, part), count, block.first + place, method, point, place)
             for place in range(block.count)
             for count in declared.demonstrations.counts
-            for task in self.study.tasks
+            for task in tasks
             for method in declared.methods
-            for point in ([dict(chosen[method])] if chosen else declared.points)
+            for point in ([dict(chosen[method])] if chosen else declared.points(method))
         ]
 
     def state(self) -> State:
@@ -196,7 +197,7 @@ class Folder:
 
     def kept(self, cell: Cell) -> Done | None:
         """The results of a cell, if it is done: here, or in the declaration's table ``kept``."""
-        if cell.part == "test" and (values := self._earlier.get(cell.row)):
+        if values := self._earlier.get(cell.row):
             return Done(depends={}, values=values)
         path = self.place(cell)
         if not path.exists():
@@ -452,37 +453,42 @@ COLUMNS = ("study", "task", "method", "demonstrations", "seed", "measure", "valu
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the tidy table of a study."""
+    """A row of a tidy table.
+
+    :param demonstrations: None where the number does not depend on them.
+    :param seed: the training seed; text for other repetitions, empty where there is one value.
+    """
 
     study: str
     task: str
     method: str
-    demonstrations: int
-    seed: int
+    demonstrations: int | None
+    seed: int | str
     measure: str
     value: float
 
     @property
-    def cell(self) -> tuple[str, str, int, int]:
+    def cell(self) -> tuple[Any, ...]:
         """What names its cell."""
         return self.task, self.method, self.demonstrations, self.seed
 
 
 def read_tidy(path: Path) -> list[Row]:
-    """The rows of a tidy table that have a number of demonstrations and a training seed.
+    """The rows of a tidy table.
 
     :raises BadInput: the file cannot be read.
     """
 
-    def row(fields: Mapping[str, str]) -> Row | None:
-        count, seed, value = fields["demonstrations"], fields["seed"], float(fields["value"])
-        if not (count.isdecimal() and seed.isdecimal()):
-            return None
-        return Row(fields["study"], fields["task"], fields["method"], int(count), int(seed), fields["measure"], value)
+    def row(fields: Mapping[str, str]) -> Row:
+        count, seed = fields["demonstrations"], fields["seed"]
+        return Row(
+            fields["study"], fields["task"], fields["method"], int(count) if count else None,
+            int(seed) if seed.isdecimal() else seed, fields["measure"], float(fields["value"]),
+        )  # fmt: skip
 
     remedy = "write it with: ddco-pyro study report"
     try:
-        return [one for one in read_table(path, row, remedy) if one is not None]
+        return read_table(path, row, remedy)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}; {remedy}") from error
 
@@ -490,23 +496,26 @@ def read_tidy(path: Path) -> list[Row]:
 def earlier(study: Study) -> list[Row]:
     """The rows of a declaration's tables ``kept``, by the names of the declaration."""
     found: dict[tuple[Any, ...], Row] = {}
+    seeds = study.declared.ranges("seeds").values()
     for kept in study.declared.kept:
         tasks, methods, measures = (
             {there: here for here, there in names.items()} for names in (kept.tasks, kept.methods, kept.measures)
         )
         for row in read_tidy(study.path.parent / kept.table):
-            if kept.study in (None, row.study) and (not methods or row.method in methods):
+            declared = any(row.seed in block for block in seeds)  # other rows are of other cells, or of several
+            if declared and kept.study in (None, row.study) and (not methods or row.method in methods):
                 task, method = tasks.get(row.task, row.task), methods.get(row.method, row.method)
                 measure = measures.get(row.measure, row.measure)
                 own = replace(row, study=study.name, task=task, method=method, measure=measure)
-                found.setdefault((*own.cell, measure), own)
+                if task in study.tasks:
+                    found.setdefault((*own.cell, measure), own)
     return list(found.values())
 
 
 def tidy(folder: Folder, state: State) -> Iterator[Row]:
-    """The rows of the declared measures of all cells of the test that are done."""
+    """The rows of the declared measures of all cells that are done; those of development name their points."""
     for number, done in state.done.items():
         cell = state.cells[number]
-        for measure in folder.study.declared.measures if cell.part == "test" else ():
+        for measure in folder.study.declared.measures:
             if (value := done.values.get(measure)) is not None:
                 yield Row(folder.study.name, *cell.row, measure, value)

@@ -83,6 +83,10 @@ class DataSpec(Model):
     """The same for the choice among points of the grid."""
 
 
+Grid = dict[str, Annotated[Items[Any], Field(min_length=1)]]
+"""Key path in the spec to values, of which every combination is a point."""
+
+
 class MethodSpec(Model):
     """What one method changes in the spec."""
 
@@ -92,6 +96,8 @@ class MethodSpec(Model):
     """Name of a method of the simulator's adapter, which trains and acts instead; null: the spec is fitted."""
     overrides: dict[str, Any] = Field(default={})
     """Key path in the spec to a value."""
+    grid: Grid = Field(default={})
+    """Key path in the spec to values, beside those of the study's grid."""
 
 
 class ContrastSpec(Model):
@@ -148,11 +154,13 @@ class Declaration(Model):
     """Tasks; empty: the spec's task, or none for a file of demonstrations."""
     overrides: dict[str, Any] = Field(default={})
     """Key path in the spec to a value, for every method."""
-    grid: dict[str, Annotated[Items[Any], Field(min_length=1)]] = Field(default={})
+    grid: Grid = Field(default={})
     """Key path in the spec to values; every method is fitted with every combination."""
     choose: Text | None = None
-    """The measure by whose mean over the development seeds each method's point of the grid is chosen; null: every point
-    is a method of its own."""
+    """The measure by whose mean over the development seeds each method's point of its grid is chosen, among as many for
+    every method; null: every point is a method of its own."""
+    choose_on: Items[TaskName] = ()
+    """The tasks of the development seeds, some of ``tasks``; empty: all."""
     methods: Annotated[dict[Text, MethodSpec], Field(min_length=1)]
     """The methods by name."""
     seeds: Blocks
@@ -240,26 +248,35 @@ class Declaration(Model):
                 yield f"methods.{name}.by", "names a method of an adapter; give its world"
             if method.by is not None and method.baseline is not None:
                 yield f"methods.{name}.baseline", "stands beside by; keep one of the two"
+            for path in method.overrides.keys() & (self.grid.keys() | method.grid.keys()):
+                yield f"methods.{name}.overrides", f"has {path!r}, which the grid has, too; keep one of the two"
 
     def _chosen(self) -> Iterator[tuple[str, str]]:
         if (self.choose is None) != (self.seeds.development is None):
             yield "choose", "goes together with seeds.development; give both or neither"
-        if self.choose is not None and not self.grid:
+        for number, task in enumerate(self.choose_on):
+            if self.choose is None or task not in self.tasks:
+                yield f"choose_on.{number}", f"{task!r} is not among tasks, or there is nothing to choose; remove it"
+        trials = {name: len({point_name(point) for point in self.points(name)}) for name in self.methods}
+        if self.choose is not None and len({*trials.values()}) > 1:
+            said = ", ".join(f"{name} {count}" for name, count in trials.items())
+            yield "methods", f"have unequal numbers of points to choose from ({said}); name as many for each"
+        elif self.choose is not None and max(trials.values()) == 1:
             yield "grid", "is empty; name what to choose from"
 
-    @property
-    def points(self) -> list[dict[str, Any]]:
-        """The points of the grid, each with values by key path."""
-        return [dict(zip(self.grid, values, strict=True)) for values in itertools.product(*self.grid.values())]
+    def points(self, method: str) -> list[dict[str, Any]]:
+        """The points of a method's grid, each with values by key path."""
+        grid = self.grid | self.methods[method].grid
+        return [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
 
-    def label(self, method: str, point: dict[str, Any]) -> str:
-        """The name of a method in tables: with the point of the grid, where none is chosen."""
-        return f"{method} ({point_name(point)})" if point and self.choose is None else method
+    def label(self, method: str, point: dict[str, Any], part: str = "test") -> str:
+        """The name of a method in tables: with the point of the grid, unless it was chosen."""
+        return f"{method} ({point_name(point)})" if point and (self.choose is None or part != "test") else method
 
     @property
     def labels(self) -> list[str]:
-        """The names of all methods in tables."""
-        return list(dict.fromkeys(self.label(method, point) for method in self.methods for point in self.points))
+        """The names of all methods in the tables of the test."""
+        return list(dict.fromkeys(self.label(name, point) for name in self.methods for point in self.points(name)))
 
 
 def _said(numbers: range) -> str:
@@ -317,7 +334,7 @@ class Study:
 
     def changes(self, method: str, point: dict[str, Any]) -> dict[str, Any]:
         """What a method with a point of the grid changes in the spec, by key path."""
-        own = {**self.declared.overrides, **point, **self.declared.methods[method].overrides}
+        own = {**self.declared.overrides, **self.declared.methods[method].overrides, **point}
         return {"demonstrations.leave_one_out": False, "selection.grid": {}, **own}
 
     def overridden_code(self) -> dict[str, str]:
@@ -327,8 +344,8 @@ class Study:
         """
         given: Any = SKELETON if self.base is None else self.base.model_dump(exclude_unset=True)
         found: dict[str, str] = {}
-        for method, point in itertools.product(self.declared.methods, self.declared.points):
-            where = self.declared.label(method, point)
+        for method, point in [(name, one) for name in self.declared.methods for one in self.declared.points(name)]:
+            where = self.declared.label(method, point, "")
             try:
                 spec = parse_spec(given, self.changes(method, point))
             except SpecError as error:

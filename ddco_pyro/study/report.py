@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -21,7 +23,7 @@ from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.metrics import write_table
 from ddco_pyro.segmenting.agreement import measure_names
-from ddco_pyro.study.cells import COLUMNS, Folder, Row, State, earlier, tidy
+from ddco_pyro.study.cells import COLUMNS, Folder, Row, State, earlier, read_tidy, tidy
 from ddco_pyro.study.declaration import NATS, ContrastSpec, Study
 from ddco_pyro.study.statistics import LEVEL, BySeed, Estimate, bootstrap, estimate, holm, p_value, paired
 
@@ -31,16 +33,21 @@ FILES = ("table.csv", "page.md", "page.html", "contrasts.png", "methods.png")
 COLUMNS_OF_PANELS = 4
 
 
-def values(rows: Iterable[Row], what: str, measure: str, demonstrations: int, task: str | None = None) -> BySeed:
-    """The values of a method, or the paired differences of ``ours - theirs``, by task and training seed."""
-    found: dict[str, dict[str, dict[int, float]]] = {}
+def values(
+    rows: Iterable[Row], what: str, measure: str, demonstrations: Sequence[int | None], task: str | None = None
+) -> BySeed:
+    """The values of a method, or the paired differences of ``ours - theirs``, by task and training seed.
+
+    :param demonstrations: of a method; a second number is that of ``theirs``.
+    """
+    found: dict[tuple[str, int | None], dict[str, dict[int | str, float]]] = {}
     for row in rows:
-        if (row.measure, row.demonstrations) == (measure, demonstrations) and task in (None, row.task):
-            found.setdefault(row.method, {}).setdefault(row.task, {})[row.seed] = row.value
-    if what in found or " - " not in what:
-        return found.get(what, {})
+        if row.measure == measure and task in (None, row.task):
+            found.setdefault((row.method, row.demonstrations), {}).setdefault(row.task, {})[row.seed] = row.value
+    if (what, demonstrations[0]) in found or " - " not in what:
+        return found.get((what, demonstrations[0]), {})
     ours, _, theirs = what.partition(" - ")
-    return paired(found.get(ours.strip(), {}), found.get(theirs.strip(), {}))
+    return paired(found.get((ours.strip(), demonstrations[0]), {}), found.get((theirs.strip(), demonstrations[-1]), {}))
 
 
 @dataclass(frozen=True)
@@ -74,7 +81,7 @@ def tested(study: Study, rows: Sequence[Row]) -> list[Tested]:
     found = []
     for contrast in study.declared.contrasts:
         count = contrast.demonstrations or study.declared.demonstrations.counts[0]
-        differences = values(rows, contrast.contrast, contrast.measure, count)
+        differences = values(rows, contrast.contrast, contrast.measure, [count])
         estimated = estimate(differences) if differences else None
         p = math.nan if estimated is None else p_value(estimated, contrast.bound)
         found.append(Tested(contrast, count, estimated, p, math.nan, differences))
@@ -183,7 +190,7 @@ def _methods(study: Study, rows: Sequence[Row], to: Path) -> list[Block]:
     for measure in study.declared.measures:
         table = []
         for label in labels:
-            cells = [_estimated(values(rows, label, measure, count)) for count in counts]
+            cells = [_estimated(values(rows, label, measure, [count])) for count in counts]
             if any(cells):
                 table.append([label, *(shown(cell) if cell else "–" for cell in cells)])
         head = [name_of(measure), *(f"{count} demonstrations" for count in counts)]
@@ -206,7 +213,7 @@ def draw(study: Study, rows: Sequence[Row]) -> Figure:
     """
     counts, labels, measures = study.declared.demonstrations.counts, study.declared.labels, study.declared.measures
     if len(counts) == 1:
-        by_method = {(m, label): values(rows, label, m, counts[0]) for m in measures for label in labels}
+        by_method = {(m, label): values(rows, label, m, counts[:1]) for m in measures for label in labels}
         panels = [
             Panel("", name_of(m), [_drawn(_estimated(by_method[m, one]), by_method[m, one]) for one in labels])
             for m in measures
@@ -223,7 +230,7 @@ def draw(study: Study, rows: Sequence[Row]) -> Figure:
         all_axes = figure.subplots(lines, columns, squeeze=False).flat
         for axes, (measure, task) in zip(all_axes, wanted, strict=False):
             for number, label in enumerate(labels, start=1):
-                points = [(n, _estimated(values(rows, label, measure, n, task))) for n in counts]
+                points = [(n, _estimated(values(rows, label, measure, [n], task))) for n in counts]
                 known = [(n, one) for n, one in points if one]
                 middle = [one.value for _, one in known]
                 both = [one.interval if task is None else one.range for _, one in known]
@@ -270,7 +277,18 @@ def design(study: Study, rows: Sequence[Row], state: State) -> list[str]:
         text = "have the data and seeds of their own studies, and may be older than the contrasts"
         lines.append(f"Results that are kept in {', '.join(tables)} {text}.")
     if declared.choose is not None:
-        lines.append(f"Each method's point of the grid has the highest {declared.choose} on the development seeds.")
+        first = {cell.of: cell.point for cell in state.cells if cell.part == "test"}
+        points = ", ".join(declared.label(method, dict(point), "") for method, point in first.items())
+        text = f"The point of each method has the highest {declared.choose} on the development seeds, of"
+        lines.append(f"{text} {len(declared.points(next(iter(declared.methods))))}: {points or 'not yet known'}.")
+        tried: dict[str, dict[str, list[Any]]] = {}
+        for number, result in state.done.items():
+            if (cell := state.cells[number]).part == "development":
+                named = cell.task, cell.demonstrations, cell.seed
+                tried.setdefault(cell.of, {}).setdefault(cell.method, []).append((*named, result.values))
+        for method, results in tried.items():
+            if (same := len(results) - len({repr(one) for one in results.values()})) > 0:
+                lines.append(f"{method}: {same} of {len(results)} points gave the results of another one: no trials.")
     test = [number for number, cell in enumerate(state.cells) if cell.part == "test"]
     done = [number for number in test if number in state.done]
     if len(done) < len(test):
@@ -286,7 +304,9 @@ def name_of(measure: str) -> str:
     """The name of a measure in tables and figures."""
     if measure == NATS:
         return "held-out nats/step"
-    return measure_names([measure])[0] if measure in (*UNMATCHED, *MATCHED) else words.measure(measure)
+    if measure in (*UNMATCHED, *MATCHED):
+        return measure_names([measure])[0]
+    return words.measure(measure) if measure.islower() else measure
 
 
 def shown(found: Estimate, form: str = ".2f") -> str:
@@ -297,44 +317,107 @@ def shown(found: Estimate, form: str = ".2f") -> str:
 
 # --- numbers that other pages quote -----------------------------------------------------------------------------------
 
-_QUOTED = re.compile(r"<!-- study (?P<study>[\w-]+): (?P<what>.*?) -->(?P<text>.*?)<!-- / -->", re.DOTALL)
+_QUOTED = re.compile(
+    r"<!-- (?P<kind>study|table) (?P<name>[\w-]+): (?P<what>.*?) -->(?P<text>.*?)<!-- / -->", re.DOTALL
+)
+_SETTING = re.compile(r"(?P<key>study|task|seed|form|show|times|by)=(?P<value>.*)", re.DOTALL)
 
 
-def render(text: str, studies: Path) -> str:
-    """A page's text with every quoted number as the tables of the studies have it.
+def render(text: str, studies: Path, tables: Path = Path()) -> str:
+    """A page's text with every quoted number as the tables have it.
 
     A quotation is ``<!-- study NAME: options - flat; success; 50 -->…<!-- / -->``: a method or a contrast, a measure,
-    and a number of demonstrations. ``task=NAME`` takes one task, and ``form=+.0%`` formats as Python does. A difference
-    is bold where its interval excludes 0.
+    and a number of demonstrations, none where the table has none. A difference is bold where its interval excludes 0.
+    ``40 - 80`` gives both methods of a contrast a number of their own. Several methods, measures or numbers, between
+    ``|``, make a table, of means and of differences with intervals. These settings may follow:
 
-    :param studies: the folder of the declarations, whose tables ``kept`` have the numbers.
-    :raises BadInput: a quotation is wrong, or its study keeps no such value.
+    - ``study=NAME``, ``task=NAME`` and ``seed=NAME`` take rows of one study of the table, one task or one seed;
+    - ``show`` is ``mean``, ``±`` (half of the interval), ``sd``, ``se``, ``range`` (least and greatest unit) or
+      ``above`` (how many units are above 0); else mean and interval;
+    - ``times=900`` multiplies, ``form=+.0%`` formats as Python does, and ``by=task`` gives a table rows for each task.
+
+    :param studies: the folder of the declarations, whose tables ``kept`` have the numbers of ``study NAME``.
+    :param tables: the folder of ``NAME.csv``, which has the numbers of ``table NAME``.
+    :raises BadInput: a quotation is wrong, or there is no such value.
     """
-    known: dict[str, list[Row]] = {}
+    known: dict[tuple[str, str], list[Row]] = {}
 
     def quoted(match: re.Match[str]) -> str:
-        name, what = match["study"], match["what"]
-        if name not in known:  # nothing of a study is imported for its numbers
-            known[name] = earlier(Study.load(studies / f"{name}.yaml", allow_code=True))
-        return f"<!-- study {name}: {what} -->{_quoted(known[name], name, what)}<!-- / -->"
+        source, what = (match["kind"], match["name"]), match["what"]
+        if source not in known:  # nothing of a study is imported for its numbers
+            of_study = match["kind"] == "study"
+            own = studies / f"{match['name']}.yaml"
+            known[source] = (
+                earlier(Study.load(own, allow_code=True)) if of_study else read_tidy(tables / f"{match['name']}.csv")
+            )
+        return f"<!-- {' '.join(source)}: {what} -->{_quoted(known[source], ' '.join(source), what)}<!-- / -->"
 
     return _QUOTED.sub(quoted, text)
 
 
-def _quoted(rows: Sequence[Row], name: str, quotation: str) -> str:
+def _quoted(rows: Sequence[Row], source: str, quotation: str) -> str:
     fields = [part.strip() for part in quotation.split(";")]
-    named: Mapping[str, str] = dict(part.split("=", 1) for part in fields if "=" in part)
-    plain = [part for part in fields if "=" not in part]
-    if len(plain) != 3 or not plain[2].isdecimal() or named.keys() - {"task", "form"}:
+    settings = {found["key"]: found["value"] for part in fields if (found := _SETTING.fullmatch(part))}
+    plain = [part.split(" | ") for part in fields if not _SETTING.fullmatch(part)]
+    show, form = settings.get("show"), settings.get("form")
+    counts = [one.split(" - ") for one in plain[2]] if len(plain) == 3 else [[]]
+    try:
+        times, _ = float(settings.get("times", 1)), format(0.0, form or "")
+        wrong = not all(n.isdecimal() for one in counts for n in one)
+    except ValueError:
+        wrong = True
+    if wrong or len(plain) not in (2, 3) or show not in (None, *SHOWN):
         raise BadInput(
-            f"study {name}: {quotation!r}: write a method or contrast, a measure and a number of demonstrations, such "
-            "as: options - flat; success; 50"
+            f"{source}: {quotation!r}: write a method or contrast, a measure and a number of demonstrations, such as: "
+            f"options - flat; success; 50. After show= stands one of: {', '.join(SHOWN)}; form= is Python's"
         )
-    what, measure, count = plain
-    found = _estimated(values(rows, what, measure, int(count), named.get("task")))
-    if found is None:
-        raise BadInput(f"study {name}: its tables have no {quotation!r}; check its names, and kept in the study")
-    difference = " - " in what
-    percent = measure == "success"
-    text = shown(found, named.get("form", ("+" if difference else "") + (".0%" if percent else ".2f")))
-    return f"**{text}**" if difference and found.interval[0] * found.interval[1] > 0 else text
+    wanted = {key: settings[key] for key in ("study", "seed") if key in settings}
+    rows = [row for row in rows if all(str(getattr(row, key)) == value for key, value in wanted.items())]
+
+    (methods, measures), task = plain[:2], settings.get("task")
+    single = len(methods) * len(measures) * len(counts) == 1
+
+    def cell(what: str, measure: str, count: Sequence[str], task: str | None) -> str:
+        own = values(rows, what, measure, list(map(int, count)) or [None], task)
+        several = any(seed != "" for one in own.values() for seed in one)  # a row without seed is their summary
+        scaled = {t: {s: times * v for s, v in one.items() if s != "" or not several} for t, one in own.items()}
+        difference = " - " in what
+        how = show or ("interval" if single or difference else "mean")
+        own_form = f"+{form}" if form and difference and not single else form
+        return _shown(estimate(scaled), difference, measure, how, own_form) if own else ""
+
+    by_task = settings.get("by") == "task"
+    tasks = sorted({row.task for row in rows}) if by_task else [task]
+    table = []
+    for one, count, measure in itertools.product(tasks, counts, measures):
+        cells = [cell(what, measure, count, one) for what in methods]
+        if any(cells):
+            named = [str(one), " − ".join(count), name_of(measure)]
+            table.append([*named[not by_task :], *(text or "–" for text in cells)])
+    if not table:
+        raise BadInput(f"{source}: its tables have no {quotation!r}; check its names")
+    if single:
+        return table[0][-1]
+    head = ["task", "demonstrations", "measure", *(one.replace(" - ", " − ") for one in methods)]
+    return f"\n\n{Table(head[not by_task :], table, {0, 2} if by_task else {1}).markdown()}\n\n"
+
+
+SHOWN = ("interval", "mean", "±", "sd", "se", "range", "above")
+"""How a quotation shows an estimate."""
+
+
+def _shown(found: Estimate, difference: bool, measure: str, show: str, form: str | None) -> str:
+    form = form or ("+" if difference else "") + (".0%" if measure.startswith("success") else ".2f")
+    number = len(found.units)
+    half = {"±": found.interval[1] - found.value, "se": found.error, "sd": found.error * math.sqrt(number)}
+    if show == "above":
+        return f"{sum(unit > 0 for unit in found.units)} of {number}"
+    if show == "range":
+        text = " to ".join(format(end, form) for end in found.range)
+    elif show in half:
+        text = f"{found.value:{form}} ± {half[show]:{form.replace('+', '')}}"
+    else:
+        text = shown(found, form) if show == "interval" else format(found.value, form)
+    bold = difference and show in ("interval", "±") and found.interval[0] * found.interval[1] > 0
+    text = text.replace("-", "−")
+    return f"**{text}**" if bold else text

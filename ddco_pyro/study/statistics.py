@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 LEVEL = 0.025
 """One-sided level of the tests, which corresponds to two-sided 95 % intervals."""
 
-BySeed = Mapping[str, Mapping[int, float]]
+BySeed = Mapping[str, Mapping[Any, float]]
 """Values by task and training seed."""
 
 
@@ -27,20 +28,22 @@ class Estimate:
     :param error: the standard error; NaN for a single unit, as the interval is.
     :param freedom: degrees of freedom of the t interval: tasks − 1, or seeds − 1 for a single task.
     :param interval: the 95 % t interval.
-    :param range: the least and the greatest unit.
-    :param tasks: the number of tasks, and of ``values`` in all.
+    :param units: the means of the tasks, or the values of the seeds of a single task.
     """
 
     value: float
     error: float
     freedom: int
     interval: tuple[float, float]
-    range: tuple[float, float]
-    tasks: int
-    values: int
+    units: tuple[float, ...]
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The least and the greatest unit."""
+        return min(self.units), max(self.units)
 
 
-def paired(ours: BySeed, theirs: BySeed) -> dict[str, dict[int, float]]:
+def paired(ours: BySeed, theirs: BySeed) -> dict[str, dict[Any, float]]:
     """Differences by task and seed, where both have a value.
 
     >>> paired({"push": {0: 0.75, 1: 0.5}}, {"push": {0: 0.5}})
@@ -71,8 +74,7 @@ def estimate(values: BySeed) -> Estimate:
     value, freedom = float(means.mean()), len(units) - 1
     error = float(units.std(ddof=1) / math.sqrt(len(units))) if freedom else math.nan
     half = error * float(stdtrit(freedom, 1 - LEVEL)) if freedom else math.nan
-    ends, values_in_all = (float(units.min()), float(units.max())), sum(map(len, by_task))
-    return Estimate(value, error, freedom, (value - half, value + half), ends, len(means), values_in_all)
+    return Estimate(value, error, freedom, (value - half, value + half), tuple(map(float, units)))
 
 
 def bootstrap(values: BySeed, draws: int = 4000, seed: int = 0) -> tuple[float, float]:
