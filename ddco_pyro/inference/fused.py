@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from functools import partial
 from itertools import accumulate, chain
 from typing import Any, NamedTuple
 
@@ -23,13 +24,14 @@ from ddco_pyro.inference import kernel, logspace
 from ddco_pyro.inference.kernel import Lots, Shape, Sizes, Structure, Tasks
 from ddco_pyro.model.elementary import LANES, Array
 from ddco_pyro.model.links import Link, links_of
-from ddco_pyro.model.passes import Pass, Task, View
+from ddco_pyro.model.passes import NORMAL, Pass, view_of
 from ddco_pyro.model.tables import Tables, complete
 
 HELD = 4 * 10**6
 """Most numbers of a buffer that is held from one call to the next, so that its pages need not be mapped again."""
 
 _held = threading.local()
+NOTHING = np.empty(0)
 
 
 class Part(NamedTuple):
@@ -85,19 +87,20 @@ class Eliminate(torch.autograd.Function):
         """log p(ξ), [N]."""
         needed, probed, evidence = ctx.needs_input_grad[3:], len(parts), len(tables.evidence)
         own = len(inputs) - probed - evidence
-        ctx.found = eliminate(tables, lengths, parts, needed[:own], needed[own : own + probed], any(needed[own + probed :]))
+        marginals = any(needed[own + probed :])
+        ctx.again = partial(eliminate, tables, lengths, parts, needed[:own], needed[own : own + probed], marginals)
+        found = ctx.found = ctx.again()
         ctx.save_for_backward(*inputs)
-        value: Tensor = ctx.found.value
-        return value
+        return found.value  # type: ignore[no-any-return]
 
     @staticmethod
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        """The gradients of each trajectory, weighted with ``upstream`` [N].
+        """The gradients of each trajectory, weighted with ``upstream`` [N] in place.
 
         torch's ``once_differentiable`` refuses a second derivative only where ``upstream`` requires a gradient.
         With respect to the inputs it would silently be 0, so each gradient passes through :class:`_Refuse`.
         """
-        found: Elimination = ctx.found
+        found, ctx.found = ctx.found or ctx.again(), None
         inputs, needed = ctx.saved_tensors, ctx.needs_input_grad[3:]
         each = [*found.gradients, *found.posteriors, *(found.marginals or (None,) * len(inputs))]
         with torch.no_grad():
@@ -115,7 +118,7 @@ def _weighted(each: Tensor, upstream: Tensor, of: Tensor) -> Tensor:
     """The gradient of a tensor from those of the trajectories [N, ...]."""
     if each.dim() > of.dim():
         return torch.tensordot(upstream.to(each.dtype), each, 1).to(of.dtype)
-    return (each * upstream.to(each.dtype).reshape(-1, *(1,) * (each.dim() - 1))).to(of.dtype)
+    return each.mul_(upstream.to(each.dtype).reshape(-1, *(1,) * (each.dim() - 1))).to(of.dtype)
 
 
 class _Refuse(torch.autograd.Function):
@@ -176,12 +179,12 @@ def eliminate(
     trajectories, each = np.zeros((2, lots, LANES), dtype=np.int64)
     trajectories.reshape(-1)[-run.number :], each.reshape(-1)[-run.number :] = order, lengths.numpy()[order]
     found = np.empty((run.number, run.shared + 2))
-    tasks, constants = np.array(run.tasks, dtype=np.int64), np.concatenate(run.constants)
+    tasks, constants = np.array(run.tasks, dtype=np.int64), np.concatenate([NOTHING, *run.constants])
     others = (
         Lots(trajectories.ctypes.data, each.ctypes.data),
         Tasks(len(tasks), tasks.ctypes.data, constants.ctypes.data),
-        View.of(joint),
-        View.of(choices),
+        view_of(joint),
+        view_of(choices),
         found.ctypes.data,
     )
 
@@ -206,7 +209,7 @@ class _Run:
         self.number, self.steps = len(lengths), steps
         self.padded = bool((lengths < steps).any())
         self.tasks: list[list[int]] = []
-        self.constants: list[Array] = [np.empty(0)]
+        self.constants: list[Array] = []
         self.kept, self.shared, self.widest, self.controls, self.fixed = 0, 0, 0, 0, 0
         self.gradients: list[Tensor | None] = []
         self.posteriors: list[Tensor | None] = []
@@ -214,46 +217,54 @@ class _Run:
         self._shared: list[tuple[int, int, Pass, Tensor]] = []
         self.widths = [0, 0, 0]
 
-    def room(self, *columns: int) -> Tensor:
-        """Room for float64 posteriors [N, T, ...]."""
-        return (torch.zeros if self.padded else torch.empty)(self.number, self.steps, *columns, dtype=torch.float64)
+    def room(self, columns: int) -> Tensor:
+        """Room for float64 posteriors [N, T, columns]."""
+        return (torch.zeros if self.padded else torch.empty)(self.number, self.steps, columns, dtype=torch.float64)
 
     def add(self, part: Part, needed: Sequence[bool], wanted: bool) -> None:
         """Add the passes of a link."""
-        posterior = self.room(*part.link.shape[2:]) if wanted else None
-        self.posteriors.append(posterior)
+        posterior = self.room(part.link.columns) if wanted else None
+        self.posteriors.append(None if posterior is None else posterior.unflatten(2, part.link.shape[2:]))
         self.widths[part.group] += part.link.columns
         for own in part.link.passes():
-            asked, needed = any(needed[: len(own.tensors)]), needed[len(own.tensors) :]
-            self._add(own, part, asked, posterior)
+            self._add(own, part, any(needed[: len(own.tensors)]), posterior)
+            needed = needed[len(own.tensors) :]
             posterior = None  # passes of a link have the same columns
         self.widest = max(self.widest, part.link.columns)
 
     def _add(self, own: Pass, part: Part, asked: bool, posterior: Tensor | None) -> None:
-        raw, *others = (_readable(tensor) for tensor in own.tensors)
-        controls, std = own.controls, others[0] if own.by_step > 1 else None
-        controls = None if controls is None else _readable(controls)
-        new = torch.zeros_like if self.padded else torch.empty_like
-        given = [new(tensor) if asked and tensor is not None else None for tensor in (raw, std)]
-        views = (raw, controls, std, *given, None if posterior is None else posterior.flatten(2))
-        plain = own.kind, part.group, part.first, own.callers, own.size, own.option, self.fixed, self.kept, self.shared
-        self.tasks.append(Task(*plain, *map(View.of, views)).numbers())
-        self._read += views  # their memory stays theirs
-        for place, tensor in enumerate(own.tensors):
-            if asked and place >= own.by_step:
-                self._shared.append((len(self.gradients), self.shared + (place - 1) * own.callers * own.size, own, tensor))
-            self.gradients.append(given[place] if place < own.by_step else None)
-        self.constants.append(own.constants)
-        self.fixed, self.kept, self.shared = self.fixed + len(own.constants), self.kept + own.kept, self.shared + own.shared
-        self.widest = max(self.widest, own.callers * own.size)
+        raw = _readable(own.tensors[0])
+        std = _readable(own.tensors[1]) if own.by_step > 1 else None
+        controls = None if own.controls is None else _readable(own.controls)
+        given = [self._like(tensor) if asked else None for tensor in (raw, std)[: own.by_step]]
+        read = raw, controls, std, given[0], given[-1] if std is not None else None, posterior
+        self._read += read  # their memory stays theirs
+        numbers = [own.kind, part.group, part.first, own.callers, own.size, own.option, self.fixed, self.kept, self.shared]
+        for tensor in read:
+            numbers += view_of(tensor)
+        self.tasks.append(numbers)
+        self.gradients += given
+        many = own.callers * own.size
+        for place in range(own.by_step, len(own.tensors)):
+            if asked and own.tensors[place].requires_grad:
+                self._shared.append((len(self.gradients), self.shared + (place - 1) * many, own, own.tensors[place]))
+            self.gradients.append(None)
+        if own.kind == NORMAL:
+            self.constants.append(own.constants)
+            self.fixed += len(own.constants)
+        self.kept, self.shared, self.widest = self.kept + own.kept, self.shared + own.shared, max(self.widest, many)
         if controls is not None:
             self.controls = max(self.controls, controls.shape[2])
+
+    def _like(self, tensor: Tensor) -> Tensor:
+        """Room for the gradient of a tensor."""
+        return torch.zeros_like(tensor) if self.padded else torch.empty_like(tensor)
 
     def take_shared(self, found: Array) -> None:
         """Take over the gradients of what steps share, [N, n]."""
         for place, first, own, tensor in self._shared:
-            size = own.callers * own.size
-            each = torch.from_numpy(found[:, first : first + size]).reshape(-1, own.callers, own.size)
+            each = torch.from_numpy(found[:, first : first + own.callers * own.size])
+            each = each.unflatten(1, (own.callers, own.size))
             fitting = each.sum_to_size(len(found), *(1,) * (2 - tensor.dim()), *tensor.shape)
             self.gradients[place] = fitting.reshape(len(found), *tensor.shape)
 

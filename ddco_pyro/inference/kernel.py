@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from ddco_pyro.model.elementary import (
-    LANES, Array, Plane, absolute, at, exponential, jit, lanes, logarithm, number, put, where, whole, write,
+    LANES, Array, Plane, absolute, apart, at, exponential, jit, lanes, logarithm, number, put, where, whole, write,
 )  # fmt: skip
 from ddco_pyro.model.passes import LAST, PLAIN, VIEW, Lot, Room, Rows, View, fill, give, slope, take, task
 
@@ -259,6 +259,7 @@ def _act(t: int, rows: Rows, messages: Plane, spread: Plane, of: Shape) -> Any:
 @jit
 def _forward(lot: Lot, rows: Rows, messages: Plane, spread: Plane, scale: Plane, of: Shape) -> Any:
     """Fill a block of ``messages``, ``spread`` and ``scale``; its log-likelihood, NaN where a step leaves no mass."""
+    apart()
     value = lanes(0.0)
     for t in range(lot.begin, lot.end):
         if t > 0:
@@ -375,6 +376,7 @@ def _backward(
 
     Only underflow can change this sum.
     """
+    apart()
     exact = lanes(0.0) == 0.0
     for t in range(lot.end - 1, lot.begin - 1, -1):
         i = t - lot.begin
@@ -410,6 +412,7 @@ def _fill(
     A step past a trajectory's length keeps every choice and emits nothing, so it changes no probability. A step without
     a finite largest density is not scaled.
     """
+    apart()
     choices, columns = rows.choice.columns, rows.control.columns
     for t in range(lot.begin, lot.end):
         for j in range(columns):
@@ -442,6 +445,7 @@ def _fill(
 @jit
 def _rest(t: int, lot: Lot, rows: Rows, of: Shape) -> None:
     """Have the lanes whose trajectory is over keep every choice and emit nothing."""
+    apart()
     alive = _alive(lot, t)
     for j in range(rows.selection.columns):
         put(rows.selection, t, j, where(alive, at(rows.selection, t, j), 0.0))
@@ -459,6 +463,7 @@ def _rest(t: int, lot: Lot, rows: Rows, of: Shape) -> None:
 
 @jit
 def _clear(plane: Plane, steps: int) -> None:
+    apart()
     for t in range(steps):
         for j in range(plane.columns):
             put(plane, t, j, 0.0)

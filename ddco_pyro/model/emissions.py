@@ -14,6 +14,7 @@ from functools import reduce
 from operator import add
 from typing import Any, Protocol, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
@@ -149,20 +150,18 @@ class Gaussian(Emission):
 
     def _pass(self, actions: Tensor, hurdle: bool = False) -> Pass:
         callers, size = self.shape[-2:]
-        std, low, high = self.std.detach().double(), *self._bounds()
-        units = (self.log_scale.detach() + 0.5 * LOG_2PI).expand(callers, size)
-        if std.dim() <= 2:
-            std = std.expand(callers, size)
-            inverse, units = 1 / std, std.log() + units
-        else:
-            inverse = torch.ones(callers, size)
-        constants = torch.cat([part.flatten().double() for part in (inverse, units, low, high)]).numpy()
-        return Pass(NORMAL, callers, size, self.tensors(), int(hurdle), actions, constants, callers * size)
+        std, units = self.std.detach().numpy(), self.log_scale.detach().numpy() + 0.5 * LOG_2PI
+        by_step = 2 if std.ndim > 2 else 1
+        constants = np.empty(2 * callers * size + 2 * size)
+        inverse, constant = constants[: 2 * callers * size].reshape(2, callers, size)
+        inverse[:], constant[:] = (1.0, units) if by_step > 1 else (1 / std.astype(float), np.log(std.astype(float)) + units)
+        constants[-2 * size : -size], constants[-size:] = self._bounds()
+        many = callers * size
+        return Pass(NORMAL, callers, size, self.tensors(), int(hurdle), actions, constants, many, by_step, 4 * many)
 
-    def _bounds(self) -> tuple[Tensor, Tensor]:
-        """The lower and the upper bound of each dimension, [A]."""
-        none = torch.full(self.shape[-1:], torch.inf)
-        return -none, none
+    def _bounds(self) -> tuple[Any, Any]:
+        """The lower and the upper bound of each dimension, [A] or one for all."""
+        return -np.inf, np.inf
 
     @property
     def mode(self) -> Tensor:
@@ -214,8 +213,8 @@ class Clipped(Gaussian):
         """The sum over dimensions, float64 [..., K]."""
         return self.by_dimension(actions).sum(-1)
 
-    def _bounds(self) -> tuple[Tensor, Tensor]:
-        return self.low.detach(), self.high.detach()
+    def _bounds(self) -> tuple[Any, Any]:
+        return self.low.detach().numpy(), self.high.detach().numpy()
 
     @property
     def mode(self) -> Tensor:

@@ -12,8 +12,8 @@ import numpy as np
 from torch import Tensor
 
 from ddco_pyro.model.elementary import (
-    Array, Plane, absolute, any_of, at, exponential, gather, jit, lanes, log_normal_cdf, logarithm, number, put, scatter,
-    where, whole,
+    LANES, Array, Plane, absolute, any_of, apart, at, exponential, gather, gather_square, jit, lanes, log_normal_cdf, logarithm,
+    number, put, scatter, scatter_square, where, whole,
 )  # fmt: skip
 
 TERMINATION_BOUND = 12.0
@@ -37,6 +37,8 @@ class Pass(NamedTuple):
     :param controls: [N, T, A]; None for kinds without.
     :param constants: of the kind, float64.
     :param kept: lanes of each step that the gradient needs.
+    :param by_step: how many of the tensors, the first ones, differ from step to step.
+    :param shared: lanes of a trajectory's gradients of σ, the units' logarithms and both bounds, which steps share.
     """
 
     kind: int
@@ -47,16 +49,8 @@ class Pass(NamedTuple):
     controls: Tensor | None = None
     constants: Array = np.empty(0)
     kept: int = 0
-
-    @property
-    def by_step(self) -> int:
-        """How many of the tensors, the first ones, differ from step to step."""
-        return sum(tensor.dim() > 2 for tensor in self.tensors)
-
-    @property
-    def shared(self) -> int:
-        """Lanes of a trajectory's gradients of σ, the units' logarithms and both bounds, which steps share."""
-        return 4 * self.callers * self.size if self.kind == NORMAL else 0
+    by_step: int = 1
+    shared: int = 0
 
 
 class View(NamedTuple):
@@ -69,18 +63,21 @@ class View(NamedTuple):
     k: int
     c: int
 
-    @classmethod
-    def of(cls, tensor: Tensor | None) -> View:
-        """The view of a float32 or float64 tensor [N, T], [N, T, K] or [N, T, K, C]."""
-        if tensor is None:
-            return cls(0, 0, 0, 0, 0, 0)
-        each = tensor.element_size()
-        strides = [each * stride for stride in tensor.stride()] + [0, 0]
-        return cls(tensor.data_ptr(), each == 4, *strides[:4])
+
+NO_VIEW = View(0, 0, 0, 0, 0, 0)
+
+
+def view_of(tensor: Tensor | None) -> View:
+    """The view of a float32 or float64 tensor [N, T], [N, T, K] or [N, T, K, C]."""
+    if tensor is None:
+        return NO_VIEW
+    each = tensor.element_size()
+    n, t, k, c = (*tensor.stride(), 0, 0)[:4]
+    return View(tensor.data_ptr(), int(each == 4), n * each, t * each, k * each, c * each)
 
 
 class Task(NamedTuple):
-    """A pass as compiled code reads it.
+    """A pass as compiled code reads it, from a row of whole numbers.
 
     :param group: the group of rows: 0 for selections, 1 for terminations, 2 for controls.
     :param first: its first column there.
@@ -104,10 +101,6 @@ class Task(NamedTuple):
     of_raw: View
     of_std: View
     posterior: View
-
-    def numbers(self) -> list[int]:
-        """All numbers in a row."""
-        return [*self[:PLAIN], *(number for view in self[PLAIN:] for number in view)]
 
 
 PLAIN, VIEW = len(Task._fields) - 6, len(View._fields)
@@ -184,27 +177,55 @@ def _address(view: View, lot: Lot, t: int, lane: int) -> int:
 
 
 @jit
+def _dense(view: View, callers: int, size: int) -> bool:
+    """Whether at least four numbers of a step stand side by side."""
+    each = 4 if view.single != 0 else 8
+    rows = view.k == each * size and (size == 1 or view.c == each)
+    return callers * size >= LANES and (rows or callers == 1 and view.c == each)
+
+
+@jit
 def take(view: View, lot: Lot, callers: int, size: int, out: Plane) -> None:
-    """Fill ``out`` [block, callers · size, lanes] from a tensor."""
+    """Fill ``out`` [block, callers · size] from a tensor."""
+    apart()
+    single, many, each = view.single != 0, callers * size, 4 if view.single != 0 else 8
+    dense = _dense(view, callers, size)
     for t in range(lot.begin, lot.end):
+        i = t - lot.begin
         a, b = _address(view, lot, t, 0), _address(view, lot, t, 1)
         c, d = _address(view, lot, t, 2), _address(view, lot, t, 3)
-        for k in range(callers):
-            for i in range(size):
-                x = k * view.k + i * view.c
-                put(out, t - lot.begin, k * size + i, gather(a + x, b + x, c + x, d + x, view.single != 0))
+        if dense:
+            for j in range(0, many, LANES):
+                first = min(j, many - LANES)
+                x = first * each
+                gather_square(a + x, b + x, c + x, d + x, single, out, i, first)
+        else:
+            for k in range(callers):
+                for j in range(size):
+                    x = k * view.k + j * view.c
+                    put(out, i, k * size + j, gather(a + x, b + x, c + x, d + x, single))
 
 
 @jit
 def give(view: View, lot: Lot, callers: int, size: int, rows: Plane) -> None:
-    """Write ``rows`` [block, callers · size, lanes] to a tensor. The last lane is written last, so it stays."""
+    """Write ``rows`` [block, callers · size] to a tensor. The last lane is written last, so it stays."""
+    apart()
+    single, many, each = view.single != 0, callers * size, 4 if view.single != 0 else 8
+    dense = _dense(view, callers, size)
     for t in range(lot.begin, lot.end):
+        i = t - lot.begin
         a, b = _address(view, lot, t, 0), _address(view, lot, t, 1)
         c, d = _address(view, lot, t, 2), _address(view, lot, t, 3)
-        for k in range(callers):
-            for i in range(size):
-                x = k * view.k + i * view.c
-                scatter(a + x, b + x, c + x, d + x, view.single != 0, at(rows, t - lot.begin, k * size + i))
+        if dense:
+            for j in range(0, many, LANES):
+                first = min(j, many - LANES)
+                x = first * each
+                scatter_square(a + x, b + x, c + x, d + x, single, rows, i, first)
+        else:
+            for k in range(callers):
+                for j in range(size):
+                    x = k * view.k + j * view.c
+                    scatter(a + x, b + x, c + x, d + x, single, at(rows, i, k * size + j))
 
 
 # --- one pass after the other -----------------------------------------------------------------------------------------
@@ -213,6 +234,7 @@ def give(view: View, lot: Lot, callers: int, size: int, rows: Plane) -> None:
 @jit
 def fill(of: Task, lot: Lot, constants: int, kept: Plane, rows: Rows, room: Room) -> None:
     """Fill the columns of a pass in ``rows`` with probabilities, or add log-densities to them."""
+    apart()
     take(of.raw, lot, of.callers, of.size, room.raw)
     if of.kind >= NORMAL:
         _take_controls(of, lot, room)
@@ -242,6 +264,7 @@ def slope(of: Task, lot: Lot, constants: int, kept: Plane, rows: Rows, posterior
     :param posterior: of the block.
     :param shared: [1, n, lanes].
     """
+    apart()
     found = posterior.selection if of.group == 0 else (posterior.termination if of.group == 1 else posterior.control)
     columns = of.callers * of.size
     if of.kind == SOFTMAX:
@@ -287,6 +310,7 @@ def slope(of: Task, lot: Lot, constants: int, kept: Plane, rows: Rows, posterior
 
 @jit
 def _exponentials(of: Task, lot: Lot, logs: Plane, rows: Plane) -> None:
+    apart()
     for t in range(lot.end - lot.begin):
         for j in range(of.callers * of.size):
             put(rows, lot.begin + t, of.first + j, exponential(at(logs, t, j)))
@@ -294,6 +318,7 @@ def _exponentials(of: Task, lot: Lot, logs: Plane, rows: Plane) -> None:
 
 @jit
 def _softmax(of: Task, lot: Lot, logits: Plane, rows: Plane) -> None:
+    apart()
     for t in range(lot.end - lot.begin):
         for k in range(of.callers):
             own, column = k * of.size, of.first + k * (of.option + of.size)
@@ -315,6 +340,7 @@ def _softmax(of: Task, lot: Lot, logits: Plane, rows: Plane) -> None:
 
 @jit
 def _softmax_slope(of: Task, lot: Lot, rows: Plane, found: Plane, out: Plane) -> None:
+    apart()
     for t in range(lot.end - lot.begin):
         for k in range(of.callers):
             column, total = of.first + k * (of.option + of.size) + of.option, lanes(0.0)
@@ -328,6 +354,7 @@ def _softmax_slope(of: Task, lot: Lot, rows: Plane, found: Plane, out: Plane) ->
 @jit
 def _terminations(of: Task, lot: Lot, logits: Plane, kept: Plane, rows: Plane) -> None:
     """1 - ψ and ψ; kept is the slope of the bound."""
+    apart()
     for t in range(lot.end - lot.begin):
         for j in range(of.callers):
             x = at(logits, t, j) * (2.0 / TERMINATION_BOUND)
@@ -342,6 +369,7 @@ def _terminations(of: Task, lot: Lot, logits: Plane, kept: Plane, rows: Plane) -
 @jit
 def _terminations_slope(of: Task, lot: Lot, kept: Plane, rows: Plane, found: Plane, out: Plane) -> None:
     """(q_1 (1 - ψ) - q_0 ψ) times the slope of the bound, for posteriors q."""
+    apart()
     for t in range(lot.end - lot.begin):
         for j in range(of.callers):
             column = of.first + 2 * j
@@ -353,6 +381,7 @@ def _terminations_slope(of: Task, lot: Lot, kept: Plane, rows: Plane, found: Pla
 @jit
 def _take_controls(of: Task, lot: Lot, room: Room) -> None:
     """Fill the controls of a block; after them, for a hurdle, 1 where all are 0."""
+    apart()
     numbers = 1 if of.kind == CATEGORIES else of.size
     if of.kind == SWITCHES and of.option > 0:
         numbers = of.option
@@ -372,6 +401,7 @@ def _normal(of: Task, lot: Lot, constants: int, kept: Plane, rows: Plane, room: 
     Constants are K·A times 1/σ, then as many times log σ with the constant of the normal, then both bounds of each
     dimension. Where σ depends on the step, the constants are without it.
     """
+    apart()
     size, steps, many = of.size, lot.end - lot.begin, of.callers * of.size
     normalising, bounds = of.constants + many, of.constants + 2 * many
     if of.std.address != 0:
@@ -401,6 +431,7 @@ def _normal(of: Task, lot: Lot, constants: int, kept: Plane, rows: Plane, room: 
 @jit
 def _normal_slope(of: Task, lot: Lot, constants: int, kept: Plane, found: Plane, shared: Plane, room: Room) -> None:
     """The gradients of μ and of a σ of each step; those of a shared σ, the units and the bounds are added up."""
+    apart()
     size, steps, many = of.size, lot.end - lot.begin, of.callers * of.size
     bounds = of.constants + 2 * many
     if of.std.address != 0:
@@ -439,6 +470,7 @@ def _normal_slope(of: Task, lot: Lot, constants: int, kept: Plane, found: Plane,
 @jit
 def _switches(of: Task, lot: Lot, kept: Plane, rows: Plane, room: Room) -> None:
     """Add log logistic(±y); kept is its derivative in y. A hurdle's switch is on where all controls are 0."""
+    apart()
     for t in range(lot.end - lot.begin):
         for k in range(of.callers):
             density = lanes(0.0)
@@ -459,6 +491,7 @@ def _switches(of: Task, lot: Lot, kept: Plane, rows: Plane, room: Room) -> None:
 @jit
 def _categories(of: Task, lot: Lot, kept: Plane, rows: Plane, room: Room) -> None:
     """Add the log-softmax of the action; kept are the probabilities. An action below 0 is impossible."""
+    apart()
     for t in range(lot.end - lot.begin):
         action = at(room.controls, t, 0)
         for k in range(of.callers):
