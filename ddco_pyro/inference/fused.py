@@ -173,11 +173,11 @@ def eliminate(
     choices = run.room(sum(tables.sizes)) if marginals else None
     sizes = Sizes(
         *run.widths, 0 if depth == 1 else states, run.kept, run.shared, max(run.widest, states), run.controls,
-        int(structure.starts[-1]), 0 if choices is None else choices.shape[2],
+        structure.starts[-1].item(), 0 if choices is None else choices.shape[2],
     )  # fmt: skip
-    order, lots = np.argsort(lengths.numpy(), kind="stable"), -(-run.number // LANES)
-    trajectories, each = np.zeros((2, lots, LANES), dtype=np.int64)
-    trajectories.reshape(-1)[-run.number :], each.reshape(-1)[-run.number :] = order, lengths.numpy()[order]
+    order = np.argsort(run.lengths, kind="stable")
+    trajectories, each = np.zeros((2, -(-run.number // LANES), LANES), dtype=np.int64)
+    trajectories.reshape(-1)[-run.number :], each.reshape(-1)[-run.number :] = order, run.lengths[order]
     found = np.empty((run.number, run.shared + 2))
     tasks, constants = np.array(run.tasks, dtype=np.int64), np.concatenate([NOTHING, *run.constants])
     others = (
@@ -190,7 +190,7 @@ def eliminate(
 
     def some(first: int, last: int) -> None:
         buffer = _buffer(sizes.numbers(int(each[first:last, -1].max())))
-        kernel.eliminate(first, last, *others, buffer.ctypes.data, sizes, Shape.of(structure))
+        kernel.eliminate(first, last, *others, buffer.ctypes.data, sizes, Shape.of(tables.sizes))
 
     kernel.on_threads(some, each.sum(1))
     run.take_shared(found)
@@ -206,8 +206,8 @@ class _Run:
     """The passes of a run as compiled code reads them, and room for what they give."""
 
     def __init__(self, lengths: Tensor, steps: int) -> None:
-        self.number, self.steps = len(lengths), steps
-        self.padded = bool((lengths < steps).any())
+        self.lengths, self.number, self.steps = lengths.numpy(), len(lengths), steps
+        self.padded = bool(self.lengths.min() < steps)
         self.tasks: list[list[int]] = []
         self.constants: list[Array] = []
         self.kept, self.shared, self.widest, self.controls, self.fixed = 0, 0, 0, 0, 0
@@ -239,7 +239,17 @@ class _Run:
         given = [self._like(tensor) if asked else None for tensor in (raw, std)[: own.by_step]]
         read = raw, controls, std, given[0], given[-1] if std is not None else None, posterior
         self._read += read  # their memory stays theirs
-        numbers = [own.kind, part.group, part.first, own.callers, own.size, own.option, self.fixed, self.kept, self.shared]
+        numbers = [
+            own.kind,
+            part.group,
+            part.first,
+            own.callers,
+            own.size,
+            own.option,
+            self.fixed,
+            self.kept,
+            self.shared,
+        ]
         for tensor in read:
             numbers += view_of(tensor)
         self.tasks.append(numbers)
@@ -284,9 +294,7 @@ def _buffer(size: int) -> Array:
     return held
 
 
-def _repeat_in_log_space(
-    tables: Tables, n: int, length: int, parts: list[Part], elimination: Elimination
-) -> None:
+def _repeat_in_log_space(tables: Tables, n: int, length: int, parts: list[Part], elimination: Elimination) -> None:
     """Eliminate a trajectory in log space and write the results into ``elimination``."""
 
     def alone(tensor: Tensor) -> Tensor:
@@ -308,7 +316,9 @@ def _repeat_in_log_space(
     elimination.value[n] = value.detach()[0]
     for into, leaf, gradient in zip(elimination.gradients, leaves, each, strict=False):
         if into is not None:
-            into[(n, slice(length)) if leaf.dim() > 2 else n] = (gradient[0] if leaf.dim() > 2 else gradient).to(into.dtype)
+            into[(n, slice(length)) if leaf.dim() > 2 else n] = (gradient[0] if leaf.dim() > 2 else gradient).to(
+                into.dtype
+            )
     for into, posterior in zip(elimination.posteriors, each[len(leaves) :], strict=True):
         if into is not None:
             into[n, :length] = posterior[0]

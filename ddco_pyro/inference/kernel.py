@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import cache
 from typing import Any, NamedTuple
 
 import numba
@@ -22,7 +22,21 @@ import numpy as np
 import torch
 
 from ddco_pyro.model.elementary import (
-    LANES, Array, Plane, absolute, apart, at, exponential, jit, lanes, logarithm, number, put, where, whole, write,
+    LANES,
+    Array,
+    Plane,
+    absolute,
+    apart,
+    at,
+    exponential,
+    jit,
+    lanes,
+    logarithm,
+    number,
+    put,
+    where,
+    whole,
+    write,
 )  # fmt: skip
 from ddco_pyro.model.passes import LAST, PLAIN, VIEW, Lot, Room, Rows, View, fill, give, slope, take, task
 
@@ -72,7 +86,7 @@ class Structure(NamedTuple):
     choices: Array
 
     @classmethod
-    @lru_cache
+    @cache
     def of(cls, sizes: tuple[int, ...]) -> Structure:
         """The structure of levels with these numbers of choices C_d, lowest first."""
         depth = len(sizes)
@@ -169,8 +183,10 @@ class Shape(NamedTuple):
     choices: int
 
     @classmethod
-    def of(cls, structure: Structure) -> Shape:
-        """The shape of a structure, which holds the arrays."""
+    @cache
+    def of(cls, sizes: tuple[int, ...]) -> Shape:
+        """The shape of a structure, whose arrays stay."""
+        structure = Structure.of(sizes)
         return cls(len(structure.sizes), len(structure.actors), *(array.ctypes.data for array in structure))
 
 
@@ -384,7 +400,9 @@ def _backward(
             for s in range(of.joint):
                 if whole(of.actors, s) >= 0:
                     for d in range(of.depth):
-                        _add(sums.choice, i, whole(of.choices, s * of.depth + d), at(messages, t + 1, s) * at(back, 0, s))
+                        _add(
+                            sums.choice, i, whole(of.choices, s * of.depth + d), at(messages, t + 1, s) * at(back, 0, s)
+                        )
         total = _adjoint_act(t, i, rows, messages, spread, scale, back, sums, of)
         exact = exact & (absolute(total - 1.0) <= TOLERANCE)  # NaN is not
         _adjoint_down(t, i, rows, spread, back, sums, of)
@@ -404,9 +422,7 @@ def _backward(
 
 
 @jit
-def _fill(
-    lot: Lot, tasks: Tasks, evidence: View, kept: Plane, rows: Rows, room: Room, of: Shape
-) -> Any:
+def _fill(lot: Lot, tasks: Tasks, evidence: View, kept: Plane, rows: Rows, room: Room, of: Shape) -> Any:
     """Fill a block of rows; the sum of the logarithms that densities of controls are scaled by.
 
     A step past a trajectory's length keeps every choice and emits nothing, so it changes no probability. A step without

@@ -171,11 +171,15 @@ def scatter(first: Any, second: Any, third: Any, fourth: Any, single: Any, value
     """Write a number to each of four addresses."""
 
 
-def gather_square(first: Any, second: Any, third: Any, fourth: Any, single: Any, plane: Any, t: Any, column: Any) -> Any:
+def gather_square(
+    first: Any, second: Any, third: Any, fourth: Any, single: Any, plane: Any, t: Any, column: Any
+) -> Any:
     """Write to four columns of a plane what stands at four addresses, four numbers side by side at each."""
 
 
-def scatter_square(first: Any, second: Any, third: Any, fourth: Any, single: Any, plane: Any, t: Any, column: Any) -> Any:
+def scatter_square(
+    first: Any, second: Any, third: Any, fourth: Any, single: Any, plane: Any, t: Any, column: Any
+) -> Any:
     """Write four columns of a plane to four addresses, four numbers side by side at each."""
 
 
@@ -337,7 +341,7 @@ SQRT_HALF, SQRT_2_OVER_PI = math.sqrt(0.5), math.sqrt(2 / math.pi)
 @jit
 def exponential(x: Any) -> Any:
     """exp(x) of lanes: relative error below 5e-16, 0 below :data:`SMALLEST`, NaN for NaN, exp(709) at least above."""
-    within = where(SMALLEST < x, where(x < 709.0, x, 709.0), SMALLEST)
+    within = where(x > SMALLEST, where(x < 709.0, x, 709.0), SMALLEST)
     k = floor(within * LOG2_E + 0.5)
     r = x - k * LN2_HIGH - k * LN2_LOW
     q = r * 2.08767569878681e-09 + 2.505210838544172e-08
@@ -358,7 +362,7 @@ def exponential(x: Any) -> Any:
 def logarithm(x: Any) -> Any:
     """log(x) of lanes that are positive and normal: error below 5e-16, relative or absolute; NaN for NaN."""
     part, k = mantissa(x), exponent(x)
-    high = 1.4142135623730951 < part
+    high = part > 1.4142135623730951
     m, k = where(high, part * 0.5, part), where(high, k + 1.0, k)
     s = (m - 1.0) / (m + 1.0)
     z = s * s

@@ -154,7 +154,9 @@ class Gaussian(Emission):
         by_step = 2 if std.ndim > 2 else 1
         constants = np.empty(2 * callers * size + 2 * size)
         inverse, constant = constants[: 2 * callers * size].reshape(2, callers, size)
-        inverse[:], constant[:] = (1.0, units) if by_step > 1 else (1 / std.astype(float), np.log(std.astype(float)) + units)
+        inverse[:], constant[:] = (
+            (1.0, units) if by_step > 1 else (1 / std.astype(float), np.log(std.astype(float)) + units)
+        )
         constants[-2 * size : -size], constants[-size:] = self._bounds()
         many = callers * size
         return Pass(NORMAL, callers, size, self.tensors(), int(hurdle), actions, constants, many, by_step, 4 * many)

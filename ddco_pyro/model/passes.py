@@ -12,8 +12,26 @@ import numpy as np
 from torch import Tensor
 
 from ddco_pyro.model.elementary import (
-    LANES, Array, Plane, absolute, any_of, apart, at, exponential, gather, gather_square, jit, lanes, log_normal_cdf, logarithm,
-    number, put, scatter, scatter_square, where, whole,
+    LANES,
+    Array,
+    Plane,
+    absolute,
+    any_of,
+    apart,
+    at,
+    exponential,
+    gather,
+    gather_square,
+    jit,
+    lanes,
+    log_normal_cdf,
+    logarithm,
+    number,
+    put,
+    scatter,
+    scatter_square,
+    where,
+    whole,
 )  # fmt: skip
 
 TERMINATION_BOUND = 12.0
@@ -181,7 +199,7 @@ def _dense(view: View, callers: int, size: int) -> bool:
     """Whether at least four numbers of a step stand side by side."""
     each = 4 if view.single != 0 else 8
     rows = view.k == each * size and (size == 1 or view.c == each)
-    return callers * size >= LANES and (rows or callers == 1 and view.c == each)
+    return callers * size >= LANES and (rows or (callers == 1 and view.c == each))
 
 
 @jit
@@ -258,7 +276,9 @@ def fill(of: Task, lot: Lot, constants: int, kept: Plane, rows: Rows, room: Room
 
 
 @jit
-def slope(of: Task, lot: Lot, constants: int, kept: Plane, rows: Rows, posterior: Rows, shared: Plane, room: Room) -> None:
+def slope(
+    of: Task, lot: Lot, constants: int, kept: Plane, rows: Rows, posterior: Rows, shared: Plane, room: Room
+) -> None:
     """Write the posteriors of a pass and the gradients of its tensors; add to those that steps share.
 
     :param posterior: of the block.
@@ -358,7 +378,7 @@ def _terminations(of: Task, lot: Lot, logits: Plane, kept: Plane, rows: Plane) -
     for t in range(lot.end - lot.begin):
         for j in range(of.callers):
             x = at(logits, t, j) * (2.0 / TERMINATION_BOUND)
-            bound = 1.0 - 2.0 / (1.0 + exponential(where(700.0 < x, 700.0, x)))
+            bound = 1.0 - 2.0 / (1.0 + exponential(where(x > 700.0, 700.0, x)))
             other = exponential(bound * -TERMINATION_BOUND)
             ending = 1.0 / (1.0 + other)
             put(rows, lot.begin + t, of.first + 2 * j, other * ending)
@@ -409,6 +429,7 @@ def _normal(of: Task, lot: Lot, constants: int, kept: Plane, rows: Plane, room: 
     for i in range(many):
         d, column = i % size, of.first + i // size
         low, high = number(constants, bounds + d), number(constants, bounds + size + d)
+        bounded = low > -np.inf or high < np.inf
         for t in range(steps):
             control = at(room.controls, t, d)
             inverse, constant = lanes(number(constants, of.constants + i)), lanes(number(constants, normalising + i))
@@ -418,7 +439,7 @@ def _normal(of: Task, lot: Lot, constants: int, kept: Plane, rows: Plane, room: 
             z = (control - at(room.raw, t, i)) * inverse
             density = z * z * -0.5 - constant
             below, above = control <= low, high <= control
-            if any_of(below | above):
+            if bounded and any_of(below | above):
                 x = (where(below, low, high) - at(room.raw, t, i)) * inverse
                 mass, ratio = log_normal_cdf(where(below, x, 0.0 - x))
                 density = where(below | above, mass, density)
@@ -439,9 +460,14 @@ def _normal_slope(of: Task, lot: Lot, constants: int, kept: Plane, found: Plane,
     for i in range(many):
         d, column = i % size, of.first + i // size
         low, high = number(constants, bounds + d), number(constants, bounds + size + d)
+        bounded = low > -np.inf or high < np.inf
         of_std, of_scale, of_low, of_high = lanes(0.0), lanes(0.0), lanes(0.0), lanes(0.0)
         for t in range(steps):
-            control, share, inverse = at(room.controls, t, d), at(found, t, column), lanes(number(constants, of.constants + i))
+            control, share, inverse = (
+                at(room.controls, t, d),
+                at(found, t, column),
+                lanes(number(constants, of.constants + i)),
+            )
             if of.option > 0:
                 share = where(at(room.controls, t, size) == 0.0, share, 0.0)
             if of.std.address != 0:
@@ -450,7 +476,7 @@ def _normal_slope(of: Task, lot: Lot, constants: int, kept: Plane, found: Plane,
             z, over = (control - mean) * inverse, share * inverse
             change, of_own, inside = z * over, (z * z - 1.0) * over, share
             below, above = control <= low, high <= control
-            if any_of(below | above):
+            if bounded and any_of(below | above):
                 x, mass = (where(below, low, high) - mean) * inverse, over * at(kept, lot.begin + t, of.kept + i)
                 on = below | above
                 signed = where(below, mass, 0.0 - mass)
@@ -458,7 +484,8 @@ def _normal_slope(of: Task, lot: Lot, constants: int, kept: Plane, found: Plane,
                 of_low, of_high = of_low + where(below, mass, 0.0), of_high - where(above, mass, 0.0)
                 inside = where(on, 0.0, share)
             put(room.of_raw, t, i, change)
-            put(room.of_std, t, i, of_own)
+            if of.of_std.address != 0:
+                put(room.of_std, t, i, of_own)
             of_std, of_scale = of_std + of_own, of_scale - inside
         s = of.shared + i
         put(shared, 0, s, at(shared, 0, s) + of_std)
