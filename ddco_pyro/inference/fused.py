@@ -171,9 +171,10 @@ def eliminate(
     joint = None if joint is None else joint.detach().flatten(2)
     states = 0 if joint is None else joint.shape[2]
     choices = run.room(sum(tables.sizes)) if marginals else None
+    selection, termination, control = run.widths
     sizes = Sizes(
-        *run.widths, 0 if depth == 1 else states, run.kept, run.shared, max(run.widest, states), run.controls,
-        structure.starts[-1].item(), 0 if choices is None else choices.shape[2],
+        selection, termination, control, 0 if depth == 1 else states, run.kept, run.shared, max(run.widest, states),
+        run.controls, structure.starts[-1].item(), 0 if choices is None else choices.shape[2],
     )  # fmt: skip
     order = np.argsort(run.lengths, kind="stable")
     trajectories, each = np.zeros((2, -(-run.number // LANES), LANES), dtype=np.int64)
@@ -236,7 +237,7 @@ class _Run:
         raw = _readable(own.tensors[0])
         std = _readable(own.tensors[1]) if own.by_step > 1 else None
         controls = None if own.controls is None else _readable(own.controls)
-        given = [self._like(tensor) if asked else None for tensor in (raw, std)[: own.by_step]]
+        given = [self._like(tensor) if asked and tensor is not None else None for tensor in (raw, std)[: own.by_step]]
         read = raw, controls, std, given[0], given[-1] if std is not None else None, posterior
         self._read += read  # their memory stays theirs
         numbers = [
@@ -307,8 +308,8 @@ def _repeat_in_log_space(tables: Tables, n: int, length: int, parts: list[Part],
         depth = tables.depth
         meta_policy, *levels = found[2 * depth :]
         evidence = tuple(None if e is None else e[n : n + 1, :length].detach() for e in tables.evidence)
-        own = Tables((*found[:depth],), (*found[depth : 2 * depth],), (*levels, meta_policy), evidence)
-        whole = complete(own, torch.tensor([length]))
+        alone_tables = Tables((*found[:depth],), (*found[depth : 2 * depth],), (*levels, meta_policy), evidence)
+        whole = complete(alone_tables, torch.tensor([length]))
         value = logspace.log_likelihood(whole)
         assert whole.emission is not None  # log_likelihood has scored it
         leaves = [leaf for link in links for leaf in link.inputs]

@@ -100,6 +100,8 @@ _of_two(operator.sub, lambda builder, x, y: builder.fsub(x, y, flags=("contract"
 _of_two(operator.mul, lambda builder, x, y: builder.fmul(x, y, flags=("contract",)))
 _of_two(operator.truediv, lambda builder, x, y: builder.fdiv(x, y))
 _of_two(operator.lt, lambda builder, x, y: builder.fcmp_ordered("<", x, y), Mask)
+_of_two(operator.gt, lambda builder, x, y: builder.fcmp_ordered(">", x, y), Mask)
+_of_two(operator.ge, lambda builder, x, y: builder.fcmp_ordered(">=", x, y), Mask)
 _of_two(operator.le, lambda builder, x, y: builder.fcmp_ordered("<=", x, y), Mask)
 _of_two(operator.eq, lambda builder, x, y: builder.fcmp_ordered("==", x, y), Mask)
 _instruction(operator.and_, lambda builder, x, y: builder.and_(x, y), Mask, (Mask, Mask))

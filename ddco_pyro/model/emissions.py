@@ -150,15 +150,12 @@ class Gaussian(Emission):
 
     def _pass(self, actions: Tensor, hurdle: bool = False) -> Pass:
         callers, size = self.shape[-2:]
-        std, units = self.std.detach().numpy(), self.log_scale.detach().numpy() + 0.5 * LOG_2PI
+        std, units = self.std.detach().double().numpy(), self.log_scale.detach().numpy() + 0.5 * LOG_2PI
         by_step = 2 if std.ndim > 2 else 1
-        constants = np.empty(2 * callers * size + 2 * size)
-        inverse, constant = constants[: 2 * callers * size].reshape(2, callers, size)
-        inverse[:], constant[:] = (
-            (1.0, units) if by_step > 1 else (1 / std.astype(float), np.log(std.astype(float)) + units)
-        )
+        many, constants = callers * size, np.empty(2 * (callers + 1) * size)
+        inverse, constant = constants[: 2 * many].reshape(2, callers, size)
+        inverse[:], constant[:] = (1.0, units) if by_step > 1 else (1 / std, np.log(std) + units)
         constants[-2 * size : -size], constants[-size:] = self._bounds()
-        many = callers * size
         return Pass(NORMAL, callers, size, self.tensors(), int(hurdle), actions, constants, many, by_step, 4 * many)
 
     def _bounds(self) -> tuple[Any, Any]:

@@ -142,7 +142,7 @@ class Lot(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """What the passes give of every step, or posteriors: tables of all levels side by side, [T, n, lanes].
+    """What the passes give of every step, or posteriors: tables of all levels side by side, planes or arrays [T, n].
 
     :param selection: selection probabilities, Σ callers·C_d columns.
     :param termination: termination probabilities, Σ 2·k_d columns.
@@ -151,10 +151,10 @@ class Rows(NamedTuple):
         columns. It has no columns where there are none.
     """
 
-    selection: Plane
-    termination: Plane
-    control: Plane
-    choice: Plane
+    selection: Any
+    termination: Any
+    control: Any
+    choice: Any
 
 
 class Room(NamedTuple):
