@@ -13,18 +13,17 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import cgutils, types
 from numba.core.typing.templates import ConcreteTemplate, infer_global
 from numba.extending import lower_builtin, models, register_model
 
 Array = np.ndarray
 
-jit = numba.njit(error_model="numpy", fastmath={"contract"}, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+jit = numba.njit(  # type: ignore[call-overload]
+    error_model="numpy", fastmath={"contract"}, no_cpython_wrapper=True, no_cfunc_wrapper=True
+)
 """Compiles functions that compiled functions alone call."""
-
-inlined = numba.njit(error_model="numpy", fastmath={"contract"}, inline="always")
-"""Writes a function into the one that calls it, so that both are compiled and optimised once."""
 
 LANES = 4
 """Numbers in a register of AVX2; compilers of other processors split or join registers."""
@@ -282,7 +281,7 @@ def _transposed(builder: Any, rows: Any) -> list[Any]:
 
     low = [pick(rows[i], rows[i + 1], [0, 4, 1, 5]) for i in (0, 2)]
     high = [pick(rows[i], rows[i + 1], [2, 6, 3, 7]) for i in (0, 2)]
-    return [pick(*pair, places) for pair in (low, high) for places in ([0, 1, 4, 5], [2, 3, 6, 7])]
+    return [pick(pair[0], pair[1], places) for pair in (low, high) for places in ([0, 1, 4, 5], [2, 3, 6, 7])]
 
 
 def _gather_square(builder: Any, vector: Any, addresses: Any, place: Any) -> None:
@@ -312,8 +311,15 @@ _instruction(exponent, _exponent, Lanes, (Lanes,))
 _instruction(mantissa, _mantissa, Lanes, (Lanes,))
 _instruction(at, lambda builder, *args: builder.load(_plane(builder, *args), align=8), Lanes, (Rows, Whole, Whole))
 _instruction(put, _put, types.void, *((Rows, Whole, Whole, kind) for kind in (Lanes, Number)))
-_instruction(whole, lambda builder, *args: builder.load(_place(builder, *args, I64)), Whole, (Whole, Whole))
-_instruction(number, lambda builder, *args: builder.load(_place(builder, *args, DOUBLE)), Number, (Whole, Whole))
+_instruction(
+    whole, lambda builder, address, index: builder.load(_place(builder, address, index, I64)), Whole, (Whole, Whole)
+)
+_instruction(
+    number,
+    lambda builder, address, index: builder.load(_place(builder, address, index, DOUBLE)),
+    Number,
+    (Whole, Whole),
+)
 _instruction(write, _write, types.void, (Whole, Whole, Number))
 _instruction(gather, _by_precision(_gather), Lanes, (*(Whole,) * LANES, types.boolean))
 _instruction(scatter, _by_precision(_scatter), types.void, (*(Whole,) * LANES, types.boolean, Lanes))

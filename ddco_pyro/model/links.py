@@ -115,7 +115,8 @@ class Selection(Link):
 
     def passes(self) -> list[Pass]:
         """A softmax."""
-        return [Pass(SOFTMAX, *self.inputs[0].shape[2:], self.inputs, self.control)]
+        callers, size = self.inputs[0].shape[2:]
+        return [Pass(SOFTMAX, callers, size, self.inputs, self.control)]
 
 
 class Termination(Link):
