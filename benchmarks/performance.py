@@ -32,7 +32,6 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import EpochEnded, Event
 from ddco_pyro.inference import Engine, fused
 from ddco_pyro.inference.engines import log_likelihood
-from ddco_pyro.inference.kernel import Rows, Structure, any_levels, on_threads, one_level
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables, complete
@@ -167,24 +166,8 @@ def over_other_engines() -> Iterator[Row]:
 
 
 def kernel(tables: Tables, lengths: torch.Tensor) -> Callable[[], float]:
-    """Our forward-backward with posteriors, from ready probabilities."""
-    *levels, meta_policy = tables.control
-    rows = [
-        torch.cat([table.flatten(2).double() for table in group], -1).flatten(0, 1).exp().numpy()
-        for group in (tables.selection, tables.termination, (meta_policy, *levels))
-    ]
-    nothing, structure = np.empty((len(rows[0]), 0)), Structure.of(tables.sizes)
-    starts = np.arange(len(lengths)) * tables.steps
-    run = one_level if tables.depth == 1 else any_levels
-
-    def call() -> float:
-        value, exact = np.empty(len(lengths)), np.empty(len(lengths), dtype=np.bool_)
-        posteriors = Rows(*(np.empty_like(row) for row in rows), nothing)
-        others = Rows(*rows, nothing), starts, lengths.numpy(), value, exact, posteriors, structure
-        on_threads(lambda first, last: run(first, last, *others), lengths.numpy())
-        return float(value.sum())
-
-    return call
+    """Our forward-backward with all posteriors, from logarithms."""
+    return lambda: float(fused.posteriors(tables, lengths).value.sum())
 
 
 def enumeration(tables: Tables, lengths: torch.Tensor) -> Callable[[], None]:
@@ -208,8 +191,6 @@ def inference() -> Iterator[Row]:
         tables, lengths = tables_of(number, steps)
         size, ours, chain = f"{number} × {steps}", kernel(tables, lengths), complete(tables, lengths)
         few = 1 if steps > 1000 else 5
-        logs = partial(fused.eliminate, tables, lengths)
-        yield side_by_side((f"pass from logarithms {size}", "pass"), logs, ours)
         yield side_by_side((f"Pyro enumeration {size}", "pass"), enumeration(tables, lengths), ours, few, warm=few > 1)
         same(ours(), float(peers.funsor_elimination(chain)))
         for name, peer in (

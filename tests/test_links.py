@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 import torch
+from oracle import random_tables
 from scipy import special
 from torch.nn.functional import log_softmax, one_hot, pad
 
-from ddco_pyro.model.elementary import exponentials, log_normal_cdf, logarithms
+from ddco_pyro.inference import logspace
+from ddco_pyro.inference.engines import log_likelihood
+from ddco_pyro.model.elementary import LANES, Plane, at, exponential, log_normal_cdf, logarithm, put
 from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Density, Gaussian, Hurdle, Product
-from ddco_pyro.model.links import TERMINATION_BOUND, Alive, LogTable, Posterior, Selection, Termination
-from ddco_pyro.model.tables import NEVER
+from ddco_pyro.model.links import Link, LinkedTables, LogTable, Selection, Termination
+from ddco_pyro.model.passes import TERMINATION_BOUND
+from ddco_pyro.model.tables import NEVER, Tables, complete
 
 NUMBER, STEPS, CALLERS = 3, 7, 4
 LENGTHS = [torch.tensor([7, 7, 7]), torch.tensor([7, 1, 4])]
@@ -81,44 +86,46 @@ ROWS[1, 0] = 1  # impossible
 
 
 CASES = [
-    *(Selection(normal(NUMBER, STEPS, CALLERS, 3), control) for control in (0, 1)),
-    Selection(normal(STEPS, NUMBER, 1, 5).detach().transpose(0, 1).requires_grad_(), 0),
-    Termination(normal(NUMBER, STEPS, CALLERS)),
-    Termination(normal(NUMBER, STEPS, CALLERS, scale=40.0)),
-    LogTable(normal(NUMBER, STEPS, CALLERS)),
-    *(Density(emission, controls(emission)) for emission in EMISSIONS),
-    Density(categorical(False), torch.where(INDICES == 2, 7, INDICES).unsqueeze(-1)),  # 7 is impossible
-    Density(categorical(True), ROWS.double()),
+    *(("selection", 0, Selection(normal(NUMBER, STEPS, CALLERS, 4 - control), control)) for control in (0, 1)),
+    ("selection", 1, Selection(normal(STEPS, NUMBER, 1, 5).detach().transpose(0, 1).requires_grad_(), 0)),
+    ("termination", 1, Termination(normal(NUMBER, STEPS, CALLERS))),
+    ("termination", 1, Termination(normal(NUMBER, STEPS, CALLERS, scale=40.0))),
+    ("control", 1, LogTable(normal(NUMBER, STEPS, CALLERS), log=True)),
+    *(("control", 1, Density(emission, controls(emission))) for emission in EMISSIONS),
+    ("control", 1, Density(categorical(False), torch.where(INDICES == 2, 7, INDICES).unsqueeze(-1))),  # 7: impossible
+    ("control", 1, Density(categorical(True), ROWS.double())),
 ]
 
 
+def with_link(group, place, link):
+    """Tables of three options under four, of which one is a link; and the same with the formula's table."""
+    given = random_tables((3, CALLERS), (True, True), trajectories=NUMBER, steps=STEPS, seed=5)
+    parts = {name: list(getattr(given, name)) for name in ("selection", "termination", "control")}
+    parts[group][place] = link
+    formulas = ([part.formula() if isinstance(part, Link) else part for part in each] for each in parts.values())
+    return LinkedTables(*parts.values()), Tables(*(tuple(each) for each in formulas))
+
+
 @pytest.mark.parametrize("lengths", LENGTHS)
-@pytest.mark.parametrize("link", CASES)
-def test_compiled_passes_are_the_formula_and_its_gradient(link, lengths):
-    """In columns 2 to 2 + n of rows of n + 3; what is past the trajectories has no gradient."""
-    alive, columns = Alive.of(lengths, STEPS), slice(2, 2 + link.columns)
-    rows = np.full((len(alive.rows), link.columns + 3), np.nan)
-    kept = link.fill(alive, rows, 2)
-    table, steps = link.formula(), torch.arange(STEPS) < lengths[:, None]
-    logs = isinstance(link, Density)
-    expected = (table if logs else table.exp())[steps].flatten(1).detach()
-    torch.testing.assert_close(torch.from_numpy(rows[:, columns]), expected, rtol=1e-12, atol=1e-12)
-    posterior, weight = normal(*rows.shape).detach().numpy(), normal(len(rows)).detach().numpy()
-    posterior[:, columns] *= (table[steps] > NEVER).flatten(1).numpy()  # as the elimination gives it
-    found = link.gradients(alive, Posterior(rows, posterior, weight), 2, kept)
-    upstream = torch.from_numpy(posterior[:, columns] * weight[:, None]).reshape(-1, *link.shape[2:])
+@pytest.mark.parametrize(("group", "place", "link"), CASES)
+def test_compiled_passes_are_the_formula_and_its_gradient(group, place, link, lengths):
+    """Of every trajectory, in the log-likelihood; what is past the trajectories has no gradient."""
+    tables, formulas = with_link(group, place, link)
     wanted = [tensor for tensor in link.inputs if tensor.requires_grad]
-    truth = torch.autograd.grad(table[steps], wanted, upstream, allow_unused=True)
-    ours = [own for own, tensor in zip(found, link.inputs, strict=True) if tensor.requires_grad]
-    for own, theirs in zip(ours, truth, strict=True):
+    value, truth = log_likelihood(tables, lengths), logspace.log_likelihood(complete(formulas, lengths))
+    torch.testing.assert_close(value, truth, rtol=1e-12, atol=1e-12)
+    weight = normal(NUMBER).detach()
+    found = torch.autograd.grad(value, wanted, weight, retain_graph=True)
+    expected = torch.autograd.grad(truth, wanted, weight, allow_unused=True)
+    again = torch.autograd.grad(value, wanted, weight)
+    for own, theirs, repeated in zip(found, expected, again, strict=True):
         torch.testing.assert_close(own, theirs, rtol=1e-9, atol=1e-11)
+        assert torch.equal(own, repeated)
 
 
 @pytest.mark.parametrize("scale", [1.0, 300.0])
 def test_switches_and_categories_are_those_of_torch(scale):
-    """Log-probabilities and the gradients of logits, however large the logits are."""
-    alive = Alive.of(LENGTHS[0], STEPS)
-    upstream, weight = normal(21, CALLERS).detach(), normal(21).detach()
+    """Log-likelihoods, and the gradients of logits, however large the logits are."""
     switches, choices = (normal(NUMBER, STEPS, CALLERS, size, scale=scale) for size in (2, 3))
     on = (normal(NUMBER, STEPS, 2).detach() > 0).double()
     bernoulli = torch.distributions.Bernoulli(logits=switches).log_prob(on.unsqueeze(2)).sum(-1)
@@ -127,37 +134,37 @@ def test_switches_and_categories_are_those_of_torch(scale):
         (Binary(switches), on, switches, bernoulli),
         (Categorical(choices, torch.tensor(False)), INDICES.unsqueeze(-1), choices, drawn),
     ):
-        link, rows = Density(emission, actions), np.empty((21, CALLERS))
-        kept = link.fill(alive, rows, 0)
-        expected = truth.detach().flatten(0, 1).numpy()
-        np.testing.assert_allclose(rows, expected, rtol=1e-12, atol=1e-12)
-        (found,) = link.gradients(alive, Posterior(rows, upstream.numpy(), weight.numpy()), 0, kept)
-        (slope,) = torch.autograd.grad(truth, logits, (upstream * weight[:, None]).reshape(truth.shape))
-        torch.testing.assert_close(found, slope, rtol=1e-10, atol=1e-12)
+        tables, _ = with_link("control", 1, Density(emission, actions))
+        theirs, _ = with_link("control", 1, LogTable(truth, log=True))
+        value, expected = log_likelihood(tables, LENGTHS[0]), log_likelihood(theirs, LENGTHS[0])
+        torch.testing.assert_close(value, expected, rtol=1e-12, atol=1e-12)
+        found, slope = (torch.autograd.grad(each.sum(), logits, retain_graph=True) for each in (value, expected))
+        torch.testing.assert_close(found, slope, rtol=1e-9, atol=1e-12)
 
 
 def test_single_precision_loses_only_the_rounding_of_the_outputs():
-    """However large the logits are."""
-    lengths = LENGTHS[0]
-    alive = Alive.of(lengths, STEPS)
-    single = normal(NUMBER, STEPS, 1, 6, dtype=torch.float32, scale=30.0)
-    for link, exact in (
-        (Selection(single, 1), Selection(single.double(), 1)),
-        (Termination(single.squeeze(2)), Termination(single.squeeze(2).double())),
+    """However large the logits are, and however they stand in memory."""
+    chosen, ended = (normal(NUMBER, STEPS, CALLERS, size, dtype=torch.float32, scale=30.0) for size in (4, 1))
+    for group, link, exact in (
+        ("selection", Selection(chosen, 0), Selection(chosen.double(), 0)),
+        ("selection", Selection(chosen.mT.contiguous().mT, 0), Selection(chosen.double(), 0)),
+        ("termination", Termination(ended.squeeze(3)), Termination(ended.squeeze(3).double())),
     ):
-        rows = [np.empty((len(alive.rows), link.columns)) for _ in range(2)]
-        for one, own in zip((link, exact), rows, strict=True):
-            one.fill(alive, own, 0)
-        np.testing.assert_allclose(*rows, rtol=1e-12)
+        place = 0 if group == "selection" else 1
+        own, theirs = (with_link(group, place, each)[0] for each in (link, exact))
+        torch.testing.assert_close(
+            log_likelihood(own, LENGTHS[1]), log_likelihood(theirs, LENGTHS[1]), rtol=1e-13, atol=0
+        )
 
 
-def test_what_is_not_a_number_stays_visible():
-    logits = torch.tensor([0.0, torch.nan, 1.0]).reshape(1, 1, 1, 3)
-    alive, chosen, ended = Alive.of(torch.tensor([1]), 1), np.empty((1, 3)), np.empty((1, 6))
-    Selection(logits, 0).fill(alive, chosen, 0)
-    Termination(logits[0]).fill(alive, ended, 0)
-    assert np.isnan(chosen).all()
-    assert np.isnan(ended).tolist() == [[False, False, True, True, False, False]]
+@pytest.mark.parametrize("kind", ["selection", "termination"])
+def test_what_is_not_a_number_stays_visible(kind):
+    """In its own trajectory alone."""
+    logits = normal(NUMBER, STEPS, CALLERS, 4).detach()
+    logits[1, 2, 0, 1] = torch.nan
+    link = Selection(logits, 0) if kind == "selection" else Termination(logits[..., 1])
+    tables, _ = with_link(kind, 0 if kind == "selection" else 1, link)
+    assert log_likelihood(tables, LENGTHS[0]).isfinite().tolist() == [True, False, True]
 
 
 def test_formulas_are_those_of_the_model():
@@ -168,25 +175,43 @@ def test_formulas_are_those_of_the_model():
     torch.testing.assert_close(Termination(logits[:, :, 0]).table, expected)
 
 
+@numba.njit
+def apply(which, steps, x, results):
+    """Compute a function of lanes at an address; results are [steps, 2]."""
+    for t in range(steps):
+        own = at(Plane(x, 1), t, 0)
+        if which == 0:
+            first = second = exponential(own)
+        elif which == 1:
+            first = second = logarithm(own)
+        else:
+            first, second = log_normal_cdf(own)
+        put(Plane(results, 2), t, 0, first)
+        put(Plane(results, 2), t, 1, second)
+
+
+def computed(which, x):
+    """Values and derivatives at x [M]."""
+    lots = -(-len(x) // LANES)
+    padded, results = np.ones(lots * LANES), np.empty((lots, 2, LANES))
+    padded[: len(x)] = x
+    apply(which, lots, padded.ctypes.data, results.ctypes.data)
+    return results[:, 0].reshape(-1)[: len(x)], results[:, 1].reshape(-1)[: len(x)]
+
+
 def test_elementary_functions_have_the_errors_that_they_state():
     x = np.concatenate([np.linspace(-50, 40, 20_001), -np.logspace(0, 12, 2001), np.logspace(-12, 3, 2001)])
-    value, slope = x.copy(), np.empty_like(x)
-    log_normal_cdf(value, slope)
+    value, slope = computed(2, x)
     truth = special.log_ndtr(x)
     assert (np.abs(value - truth) / np.maximum(1, np.abs(truth))).max() < 2e-15
     low, high = x <= 0, (x > 0) & (x < 37)
     hazard = np.sqrt(2 / np.pi) / special.erfcx(-x[low] / np.sqrt(2))
-    np.testing.assert_allclose(slope[low], hazard, rtol=2e-15)
+    np.testing.assert_allclose(slope[low], hazard, rtol=4e-15)
     density = np.exp(-0.5 * x[high] ** 2) / np.sqrt(2 * np.pi) / special.ndtr(x[high])
     np.testing.assert_allclose(slope[high], density, rtol=4e-15)
     x = np.linspace(-708, 709, 20_001)
-    value = x.copy()
-    exponentials(value)
-    np.testing.assert_allclose(value, np.exp(x), rtol=1e-15)
-    special_values = np.array([-709.0, -np.inf, np.nan])
-    exponentials(special_values)
-    np.testing.assert_array_equal(special_values, [0.0, 0.0, np.nan])
+    np.testing.assert_allclose(computed(0, x)[0], np.exp(x), rtol=1e-15)
+    np.testing.assert_array_equal(computed(0, np.array([-709.0, -np.inf, np.nan]))[0], [0.0, 0.0, np.nan])
     x = np.logspace(-300, 300, 20_001)
-    value = x.copy()
-    logarithms(value)
+    value = computed(1, x)[0]
     assert (np.abs(value - np.log(x)) / np.maximum(1, np.abs(np.log(x)))).max() < 1e-15

@@ -1,16 +1,18 @@
-"""The fused engine: log-likelihood and posterior in one compiled pass. Its gradient is the posterior (§4.1).
+"""The fused engine: one compiled pass from networks' outputs to the log-likelihood and the gradient of every output.
+
+The gradient is the posterior (§4.1), taken through the links of the outputs (:mod:`ddco_pyro.model.links`). Tables that
+are given are links of themselves.
 
 The pass works in scaled probability space. Underflow there matters only where a trajectory's past makes next to
 impossible what its future demands. The product of past and future, Σ_h α_t(h) β_t(h), is then not 1. The pass
 measures this product at every step, and a trajectory whose product is off is done again in log space.
-
-Probabilities come from the links of the networks' outputs, which also turn the posteriors into gradients
-(:mod:`ddco_pyro.model.links`). Tables that are given are links of themselves.
 """
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
+from functools import partial
 from itertools import accumulate, chain
 from typing import Any, NamedTuple
 
@@ -19,65 +21,59 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.inference import kernel, logspace
-from ddco_pyro.inference.kernel import Array, Rows, Structure
-from ddco_pyro.model.links import Alive, Link, Posterior, links_of
+from ddco_pyro.inference.kernel import Lots, Shape, Sizes, Structure, Tasks
+from ddco_pyro.model.elementary import LANES, Array
+from ddco_pyro.model.links import Link, links_of
+from ddco_pyro.model.passes import NORMAL, Pass, view_of
 from ddco_pyro.model.tables import Tables, complete
+
+HELD = 4 * 10**6
+"""Most numbers of a buffer that is held from one call to the next, so that its pages need not be mapped again."""
+
+_held = threading.local()
+NOTHING = np.empty(0)
 
 
 class Part(NamedTuple):
-    """A link, and its place in the rows of its group: the ``group``-th field of :class:`Rows`, from ``first`` on."""
+    """A link, and its place in the rows of its group: the ``group``-th field of rows, from column ``first`` on."""
 
     link: Link
     group: int
     first: int
 
-    @property
-    def columns(self) -> slice:
-        """The columns of the link's entries."""
-        return slice(self.first, self.first + self.link.columns)
-
 
 def _parts(tables: Tables) -> list[Part]:
     *levels, meta_policy = links_of(tables, "control")
     found = []
-    for group, links in enumerate((links_of(tables, "selection"), links_of(tables, "termination"))):
-        found += _side_by_side(links, group)
-    return found + _side_by_side((meta_policy, *levels), 2)
-
-
-def _side_by_side(links: Sequence[Link], group: int) -> list[Part]:
-    firsts = accumulate((link.columns for link in links), initial=0)
-    return [Part(link, group, first) for link, first in zip(links, firsts, strict=False)]
+    groups = links_of(tables, "selection"), links_of(tables, "termination"), (meta_policy, *levels)
+    for group, links in enumerate(groups):
+        firsts = accumulate((link.columns for link in links), initial=0)
+        found += [Part(link, group, first) for link, first in zip(links, firsts, strict=False)]
+    return found
 
 
 class Elimination(NamedTuple):
-    """Result of one pass; rows hold the M steps of all trajectories.
+    """Result of one pass over N trajectories, padded to T steps. What is past a trajectory is 0.
 
     :param value: log p(ξ), [N] float64.
-    :param rows: the probabilities that the links gave.
-    :param posteriors: posterior probabilities of the same entries.
-    :param kept: what each link keeps for its gradient.
-    :param alive: the steps that the rows hold.
-    :param parts: the links, and their places in the rows.
+    :param gradients: of each trajectory's value by the inputs of the parts, None where they are not wanted. Those of
+        inputs that steps share are [N, ...].
+    :param posteriors: of the parts' entries, float64 in the tables' shapes; None where they are not wanted.
+    :param marginals: posterior marginals of the choices of each level, float64 [N, T, C_d]; empty where not wanted.
     """
 
     value: Tensor
-    rows: Rows
-    posteriors: Rows
-    kept: list[Any]
-    alive: Alive
-    parts: list[Part]
+    gradients: list[Tensor | None]
+    posteriors: list[Tensor | None]
+    marginals: tuple[Tensor, ...]
 
     @property
     def tables(self) -> Tables:
-        """The posteriors as tables, float64; 0 past the trajectories."""
-        selection, termination, (meta_policy, *levels) = (
-            tuple(self._table(part) for part in self.parts if part.group == group) for group in range(3)
-        )
-        return Tables(selection, termination, (*levels, meta_policy))
-
-    def _table(self, part: Part) -> Tensor:
-        return self.alive.put(self.posteriors[part.group][:, part.columns], part.link.shape)
+        """The posteriors as tables."""
+        depth = len(self.posteriors) // 3
+        selection, termination = self.posteriors[:depth], self.posteriors[depth : 2 * depth]
+        meta_policy, *levels = self.posteriors[2 * depth :]
+        return Tables.of(depth, (*selection, *termination, *levels, meta_policy))
 
 
 class Eliminate(torch.autograd.Function):
@@ -89,59 +85,40 @@ class Eliminate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, tables: Tables, lengths: Tensor, parts: list[Part], *inputs: Tensor | None) -> Tensor:
         """log p(ξ), [N]."""
-        ctx.evidence = len(tables.evidence)
-        wanted = ctx.evidence > 0 and any(ctx.needs_input_grad[-ctx.evidence :])
-        ctx.found, ctx.lengths, ctx.tables = eliminate(tables, lengths, wanted, parts), lengths, tables
+        needed, probed, evidence = ctx.needs_input_grad[3:], len(parts), len(tables.evidence)
+        own = len(inputs) - probed - evidence
+        marginals = any(needed[own + probed :])
+        ctx.again = partial(eliminate, tables, lengths, parts, needed[:own], needed[own : own + probed], marginals)
+        found = ctx.found = ctx.again()
         ctx.save_for_backward(*inputs)
-        value: Tensor = ctx.found.value
-        return value
+        return found.value  # type: ignore[no-any-return]
 
     @staticmethod
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        """The posteriors, weighted with ``upstream`` [N], through the links.
+        """The gradients of each trajectory, weighted with ``upstream`` [N] in place.
 
         torch's ``once_differentiable`` refuses a second derivative only where ``upstream`` requires a gradient.
         With respect to the inputs it would silently be 0, so each gradient passes through :class:`_Refuse`.
         """
-        found: Elimination = ctx.found
+        found, ctx.found = ctx.found or ctx.again(), None
         inputs, needed = ctx.saved_tensors, ctx.needs_input_grad[3:]
+        each = [*found.gradients, *found.posteriors, *(found.marginals or (None,) * len(inputs))]
         with torch.no_grad():
-            weight = np.repeat(upstream.detach().numpy(), ctx.lengths.numpy())
-            gradients = _gradients(found, weight, needed)
-            if ctx.evidence:
-                gradients += _evidence_gradients(ctx.tables, found, weight)
+            gradients = [
+                None if own is None or not wanted else _weighted(own, upstream, of)
+                for own, of, wanted in zip(each, inputs, needed, strict=False)
+            ]
         if torch.is_grad_enabled():
             leaves = [part for part in (upstream, *inputs) if part is not None and part.requires_grad]
             gradients = [None if one is None else _Refuse.apply(one, *leaves) for one in gradients]
-        return None, None, None, *(one if wanted else None for one, wanted in zip(gradients, needed, strict=True))
+        return None, None, None, *gradients
 
 
-def _gradients(found: Elimination, weight: Array, needed: Sequence[bool]) -> list[Tensor | None]:
-    """The gradients of the links' inputs, where a link has one that is ``needed``, then those of the probes."""
-    gradients: list[Tensor | None] = []
-    for part, kept in zip(found.parts, found.kept, strict=True):
-        wanted = any(needed[len(gradients) : len(gradients) + len(part.link.inputs)])
-        posterior = Posterior(found.rows[part.group], found.posteriors[part.group], weight)
-        none = (None,) * len(part.link.inputs)
-        gradients += part.link.gradients(found.alive, posterior, part.first, kept) if wanted else none
-    for part in found.parts:
-        if part.link.probe is None:
-            gradients.append(None)
-        else:
-            weighted = found.posteriors[part.group][:, part.columns] * weight[:, None]
-            gradients.append(found.alive.put(weighted, part.link.shape))
-    return gradients
-
-
-def _evidence_gradients(tables: Tables, found: Elimination, weight: Array) -> list[Tensor | None]:
-    """The marginals of the levels with evidence; None where they were not asked for."""
-    if not found.posteriors.choice.shape[1]:
-        return [None] * tables.depth
-    weighted = np.split(found.posteriors.choice * weight[:, None], np.cumsum(tables.sizes)[:-1], axis=1)
-    return [
-        None if own is None else found.alive.gradient(part, own)
-        for part, own in zip(weighted, tables.evidence, strict=True)
-    ]
+def _weighted(each: Tensor, upstream: Tensor, of: Tensor) -> Tensor:
+    """The gradient of a tensor from those of the trajectories [N, ...]."""
+    if each.dim() > of.dim():
+        return torch.tensordot(upstream.to(each.dtype), each, 1).to(of.dtype)
+    return each.mul_(upstream.to(each.dtype).reshape(-1, *(1,) * (each.dim() - 1))).to(of.dtype)
 
 
 class _Refuse(torch.autograd.Function):
@@ -168,68 +145,183 @@ def log_likelihood(tables: Tables, lengths: Tensor) -> Tensor:
     return value
 
 
-def eliminate(tables: Tables, lengths: Tensor, marginals: bool = False, parts: list[Part] | None = None) -> Elimination:
-    """Log-likelihoods and posteriors of tables on the CPU with at least one option level.
+def posteriors(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elimination:
+    """Log-likelihoods and the posteriors of tables on the CPU with at least one option level, without a gradient.
 
-    :param marginals: whether the posteriors have those of the choices.
-    :param parts: of the tables, if they are known.
+    :param marginals: whether those of the choices are wanted, too.
     """
-    parts = _parts(tables) if parts is None else parts
-    alive, structure = Alive.of(lengths, tables.steps), Structure.of(tables.sizes)
-    steps = len(alive.rows)
-    widths = [max(part.columns.stop for part in parts if part.group == group) for group in range(3)]
-    rows = [np.empty((steps, width)) for width in widths]
-    kept = [part.link.fill(alive, rows[part.group], part.first) for part in parts]
-    choice, one_level = choice_factors(tables, alive), tables.depth == 1
-    if one_level and choice.shape[1]:
-        rows[2] += choice  # a choice has a column there
-        choice = choice[:, :0].copy()
-    starts = (lengths.cumsum(0) - lengths).numpy()
-    value, shift = torch.empty(2, len(lengths), dtype=torch.float64)
-    exact = np.empty(len(lengths), dtype=np.bool_)
-    kernel.scale_densities(rows[2], starts, lengths.numpy(), shift.numpy())
-    found = [np.empty_like(own) for own in rows]
-    choices = np.empty((steps, sum(tables.sizes) if marginals and not one_level else 0))
-    given = Rows(rows[0], rows[1], rows[2], np.exp(choice))
-    posteriors = Rows(found[0], found[1], found[2], choices)
-    run = kernel.one_level if one_level else kernel.any_levels
-    others = given, starts, lengths.numpy(), value.numpy(), exact, posteriors, structure
-    kernel.on_threads(lambda first, last: run(first, last, *others), lengths.numpy())
-    if one_level and marginals:
-        posteriors = posteriors._replace(choice=posteriors.control)
-    elimination = Elimination(value.add_(shift), given, posteriors, kept, alive, parts)
-    if not exact.all():
-        _repeat_in_log_space(tables, lengths, starts, np.flatnonzero(~exact).tolist(), elimination)
+    parts = _parts(tables)
+    return eliminate(tables, lengths, parts, (), (True,) * len(parts), marginals)
+
+
+def eliminate(
+    tables: Tables, lengths: Tensor, parts: list[Part], needed: Sequence[bool], wanted: Sequence[bool], marginals: bool
+) -> Elimination:
+    """Log-likelihoods and what else is asked for.
+
+    :param needed: the inputs of the parts that need a gradient; empty for none.
+    :param wanted: the parts whose posteriors are wanted.
+    :param marginals: whether those of the choices are.
+    """
+    run, depth, taken = _Run(lengths, tables.steps), tables.depth, 0
+    for part, asked in zip(parts, wanted, strict=True):
+        run.add(part, needed[taken : taken + len(part.link.inputs)], asked)
+        taken += len(part.link.inputs)
+    joint, structure = tables.joint_evidence(), Structure.of(tables.sizes)
+    joint = None if joint is None else joint.detach().flatten(2)
+    states = 0 if joint is None else joint.shape[2]
+    choices = run.room(sum(tables.sizes)) if marginals else None
+    selection, termination, control = run.widths
+    sizes = Sizes(
+        selection, termination, control, 0 if depth == 1 else states, run.kept, run.shared, max(run.widest, states),
+        run.controls, structure.starts[-1].item(), 0 if choices is None else choices.shape[2],
+    )  # fmt: skip
+    order = np.argsort(run.lengths, kind="stable")
+    trajectories, each = np.zeros((2, -(-run.number // LANES), LANES), dtype=np.int64)
+    trajectories.reshape(-1)[-run.number :], each.reshape(-1)[-run.number :] = order, run.lengths[order]
+    found = np.empty((run.number, run.shared + 2))
+    tasks, constants = np.array(run.tasks, dtype=np.int64), np.concatenate([NOTHING, *run.constants])
+    others = (
+        Lots(trajectories.ctypes.data, each.ctypes.data),
+        Tasks(len(tasks), tasks.ctypes.data, constants.ctypes.data),
+        view_of(joint),
+        view_of(choices),
+        found.ctypes.data,
+    )
+
+    def some(first: int, last: int) -> None:
+        buffer = _buffer(sizes.numbers(int(each[first:last, -1].max())))
+        kernel.eliminate(first, last, *others, buffer.ctypes.data, sizes, Shape.of(tables.sizes))
+
+    kernel.on_threads(some, each.sum(1))
+    run.take_shared(found)
+    value, exact = torch.from_numpy(found[:, -2].copy()), found[:, -1] == 1.0
+    split = () if choices is None else choices.split(tables.sizes, dim=-1)
+    elimination = Elimination(value, run.gradients, run.posteriors, split)
+    for n in np.flatnonzero(~exact).tolist():
+        _repeat_in_log_space(tables, n, int(lengths[n]), parts, elimination)
     return elimination
 
 
-def choice_factors(tables: Tables, alive: Alive) -> Array:
-    """The evidence of every joint choice, [M, S]; [M, 0] without evidence."""
-    joint = tables.joint_evidence()
-    return np.empty((len(alive.rows), 0)) if joint is None else alive.take(joint.flatten(2))
+class _Run:
+    """The passes of a run as compiled code reads them, and room for what they give."""
+
+    def __init__(self, lengths: Tensor, steps: int) -> None:
+        self.lengths, self.number, self.steps = lengths.numpy(), len(lengths), steps
+        self.padded = bool(self.lengths.min() < steps)
+        self.tasks: list[list[int]] = []
+        self.constants: list[Array] = []
+        self.kept, self.shared, self.widest, self.controls, self.fixed = 0, 0, 0, 0, 0
+        self.gradients: list[Tensor | None] = []
+        self.posteriors: list[Tensor | None] = []
+        self._read: list[Tensor | None] = []
+        self._shared: list[tuple[int, int, Pass, Tensor]] = []
+        self.widths = [0, 0, 0]
+
+    def room(self, columns: int) -> Tensor:
+        """Room for float64 posteriors [N, T, columns]."""
+        return (torch.zeros if self.padded else torch.empty)(self.number, self.steps, columns, dtype=torch.float64)
+
+    def add(self, part: Part, needed: Sequence[bool], wanted: bool) -> None:
+        """Add the passes of a link."""
+        posterior = self.room(part.link.columns) if wanted else None
+        self.posteriors.append(None if posterior is None else posterior.unflatten(2, part.link.shape[2:]))
+        self.widths[part.group] += part.link.columns
+        for own in part.link.passes():
+            self._add(own, part, any(needed[: len(own.tensors)]), posterior)
+            needed = needed[len(own.tensors) :]
+            posterior = None  # passes of a link have the same columns
+        self.widest = max(self.widest, part.link.columns)
+
+    def _add(self, own: Pass, part: Part, asked: bool, posterior: Tensor | None) -> None:
+        raw = _readable(own.tensors[0])
+        std = _readable(own.tensors[1]) if own.by_step > 1 else None
+        controls = None if own.controls is None else _readable(own.controls)
+        given = [self._like(tensor) if asked and tensor is not None else None for tensor in (raw, std)[: own.by_step]]
+        read = raw, controls, std, given[0], given[-1] if std is not None else None, posterior
+        self._read += read  # their memory stays theirs
+        numbers = [
+            own.kind,
+            part.group,
+            part.first,
+            own.callers,
+            own.size,
+            own.option,
+            self.fixed,
+            self.kept,
+            self.shared,
+        ]
+        for tensor in read:
+            numbers += view_of(tensor)
+        self.tasks.append(numbers)
+        self.gradients += given
+        many = own.callers * own.size
+        for place in range(own.by_step, len(own.tensors)):
+            if asked and own.tensors[place].requires_grad:
+                self._shared.append((len(self.gradients), self.shared + (place - 1) * many, own, own.tensors[place]))
+            self.gradients.append(None)
+        if own.kind == NORMAL:
+            self.constants.append(own.constants)
+            self.fixed += len(own.constants)
+        self.kept, self.shared, self.widest = self.kept + own.kept, self.shared + own.shared, max(self.widest, many)
+        if controls is not None:
+            self.controls = max(self.controls, controls.shape[2])
+
+    def _like(self, tensor: Tensor) -> Tensor:
+        """Room for the gradient of a tensor."""
+        return torch.zeros_like(tensor) if self.padded else torch.empty_like(tensor)
+
+    def take_shared(self, found: Array) -> None:
+        """Take over the gradients of what steps share, [N, n]."""
+        for place, first, own, tensor in self._shared:
+            each = torch.from_numpy(found[:, first : first + own.callers * own.size])
+            each = each.unflatten(1, (own.callers, own.size))
+            fitting = each.sum_to_size(len(found), *(1,) * (2 - tensor.dim()), *tensor.shape)
+            self.gradients[place] = fitting.reshape(len(found), *tensor.shape)
 
 
-def _repeat_in_log_space(
-    tables: Tables, lengths: Tensor, starts: Array, inexact: list[int], elimination: Elimination
-) -> None:
-    """Eliminate the ``inexact`` trajectories in log space and write the results into ``elimination``."""
-    parts = elimination.parts
-    logs: dict[int, Tensor] = {number: part.link.formula().detach().double() for number, part in enumerate(parts)}
-    for n in inexact:
-        length, own = int(lengths[n]), slice(starts[n], starts[n] + int(lengths[n]))
-        leaves = [log[n : n + 1, :length].clone().requires_grad_() for log in logs.values()]
-        by_group = [[leaf for leaf, part in zip(leaves, parts, strict=True) if part.group == g] for g in range(3)]
-        meta_policy, *levels = by_group[2]
+def _readable(tensor: Tensor) -> Tensor:
+    """The tensor without a gradient, float32 or float64."""
+    plain = tensor.detach()
+    return plain if plain.dtype in (torch.float32, torch.float64) else plain.double()
+
+
+def _buffer(size: int) -> Array:
+    if size > HELD:
+        return np.empty(size)
+    held: Array | None = getattr(_held, "buffer", None)
+    if held is None or len(held) < size:
+        held = _held.buffer = np.empty(size)
+    return held
+
+
+def _repeat_in_log_space(tables: Tables, n: int, length: int, parts: list[Part], elimination: Elimination) -> None:
+    """Eliminate a trajectory in log space and write the results into ``elimination``."""
+
+    def alone(tensor: Tensor) -> Tensor:
+        own = tensor[n : n + 1, :length] if tensor.dim() > 2 else tensor
+        return own.detach().double().clone().requires_grad_()
+
+    with torch.enable_grad():
+        links = [part.link.map(alone) for part in parts]
+        found = [link.formula() for link in links]
+        depth = tables.depth
+        meta_policy, *levels = found[2 * depth :]
         evidence = tuple(None if e is None else e[n : n + 1, :length].detach() for e in tables.evidence)
-        alone = Tables((*by_group[0],), (*by_group[1],), (*levels, meta_policy), evidence)
-        with torch.enable_grad():
-            whole = complete(alone, lengths[n : n + 1])
-            value = logspace.log_likelihood(whole)
-            assert whole.emission is not None  # log_likelihood has scored it
-            *gradients, joint = torch.autograd.grad(value.sum(), [*leaves, whole.emission], materialize_grads=True)
-        elimination.value[n] = value.detach()[0]
-        for part, gradient in zip(parts, gradients, strict=True):
-            elimination.posteriors[part.group][own, part.columns] = gradient[0].flatten(1)
-        if tables.depth > 1 and elimination.posteriors.choice.shape[1]:
-            marginals = [logspace.marginal(joint, level)[0] for level in range(1, tables.depth + 1)]
-            elimination.posteriors.choice[own] = torch.cat(marginals, -1)
+        alone_tables = Tables((*found[:depth],), (*found[depth : 2 * depth],), (*levels, meta_policy), evidence)
+        whole = complete(alone_tables, torch.tensor([length]))
+        value = logspace.log_likelihood(whole)
+        assert whole.emission is not None  # log_likelihood has scored it
+        leaves = [leaf for link in links for leaf in link.inputs]
+        *each, joint = torch.autograd.grad(value.sum(), [*leaves, *found, whole.emission], materialize_grads=True)
+    elimination.value[n] = value.detach()[0]
+    for into, leaf, gradient in zip(elimination.gradients, leaves, each, strict=False):
+        if into is not None:
+            into[(n, slice(length)) if leaf.dim() > 2 else n] = (gradient[0] if leaf.dim() > 2 else gradient).to(
+                into.dtype
+            )
+    for into, posterior in zip(elimination.posteriors, each[len(leaves) :], strict=True):
+        if into is not None:
+            into[n, :length] = posterior[0]
+    for level, marginal in enumerate(elimination.marginals, 1):
+        marginal[n, :length] = logspace.marginal(joint, level)[0]

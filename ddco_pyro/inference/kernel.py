@@ -1,26 +1,44 @@
 """Forward-backward over the joint choices of a hierarchy in scaled probability space, compiled; O(D·S) a step.
 
-Trajectories run in parallel. Within one trajectory the arrays of a step lie close together in memory, which matters
-more than the arithmetic. :class:`Structure` defines how joint choices and messages are numbered.
+Four trajectories go side by side, each in a lane of :mod:`ddco_pyro.model.elementary`. Their steps go in blocks: passes
+fill a block of rows, the forward pass goes on through it, and on the way back each block's posteriors become gradients
+before the next block's are computed. :class:`Structure` defines how joint choices and messages are numbered.
 
-Row t of ``messages`` [1 + T, messages] begins with the filtered probabilities of the joint choices at t - 1. Above
-level 1 the row holds the mass that goes up from them at t: the mass that terminated at every level below.
-Row t of ``spread`` [T, messages] holds the mass that comes down again, for levels D + 1 to 2: the terminated mass,
-spread by the selections, and the kept mass.
+Row t of ``messages`` [1 + T, messages, lanes] begins with the filtered probabilities of the joint choices at t - 1.
+Above level 1 the row holds the mass that goes up from them at t: the mass that terminated at every level below.
+Row t of ``spread`` [T, messages, lanes] holds the mass that comes down again, for levels D + 1 to 2: the terminated
+mass, spread by the selections, and the kept mass.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import torch
 
-from ddco_pyro.model.elementary import Array, exponentials
+from ddco_pyro.model.elementary import (
+    LANES,
+    Array,
+    Plane,
+    absolute,
+    apart,
+    at,
+    exponential,
+    jit,
+    lanes,
+    logarithm,
+    number,
+    put,
+    where,
+    whole,
+    write,
+)  # fmt: skip
+from ddco_pyro.model.passes import LAST, PLAIN, VIEW, Lot, Room, Rows, View, fill, give, slope, take, task
 
 IMPOSSIBLE = -1
 """Marks a joint choice with an option below a choice 0, and a caller that is itself below a choice 0."""
@@ -31,10 +49,15 @@ TOLERANCE = 1e-9
 STEPS_A_THREAD = 4096
 """Steps of trajectories that are worth a thread of their own."""
 
-SMALL = 1e-150
-"""Logarithms of products are taken before the product of two such numbers underflows."""
+BLOCK = 32
+"""Steps of a block: what passes hand each other stays in the first cache."""
 
-jit = numba.njit(cache=True, error_model="numpy", forceinline=True)
+SMALL, LARGE = 1e-300, 1e300
+"""Mass of a step, and backward messages, beyond which a trajectory is done in log space."""
+
+TASK = 8 * (PLAIN + 6 * VIEW)
+"""Bytes of a task."""
+
 releasing = numba.njit(cache=True, error_model="numpy", nogil=True)
 
 
@@ -43,7 +66,7 @@ class Structure(NamedTuple):
 
     A joint choice is one index, with h^D as the slowest digit and h^1 as the fastest. A *message* of level d runs over
     (h^D, ..., h^d). The messages of levels 1 to D + 1 stand one after the other; level D + 1 has a single entry.
-    Each row of a table holds the levels side by side. The tuples let the compiler unroll loops over levels.
+    Each row of a table holds the levels side by side.
 
     :param sizes: C_d, [D].
     :param starts: first index of each level's message, and the number of all entries, [D + 2].
@@ -55,15 +78,15 @@ class Structure(NamedTuple):
     :param choices: for each joint choice, the columns of its choices in a row of marginals, [S, D].
     """
 
-    sizes: tuple[int, ...]
-    starts: tuple[int, ...]
-    ends: tuple[int, ...]
+    sizes: Array
+    starts: Array
+    ends: Array
     callers: Array
     actors: Array
     choices: Array
 
     @classmethod
-    @lru_cache
+    @cache
     def of(cls, sizes: tuple[int, ...]) -> Structure:
         """The structure of levels with these numbers of choices C_d, lowest first."""
         depth = len(sizes)
@@ -82,12 +105,12 @@ class Structure(NamedTuple):
             valid = (digits[chosen, level:] > 0).all(1)
             actors[chosen] = np.where(valid, controls[level] + digits[chosen, level] - 1, IMPOSSIBLE)
         return cls(
-            sizes=sizes,
+            sizes=np.array(sizes),
             starts=_offsets(messages),
             ends=_offsets([2 * (size - 1) for size in sizes])[:-1],
             callers=np.concatenate(callers),
             actors=actors,
-            choices=np.ascontiguousarray(digits + np.array(_offsets(sizes)[:-1])),
+            choices=np.ascontiguousarray(digits + _offsets(sizes)[:-1]),
         )
 
     def digits(self, joint: Array) -> tuple[Array, ...]:
@@ -99,29 +122,17 @@ class Structure(NamedTuple):
         return tuple(choices)
 
 
-def _offsets(sizes: Sequence[int]) -> tuple[int, ...]:
+def _offsets(sizes: Sequence[int]) -> Array:
     """Where each of consecutive parts begins, and where the last one ends."""
-    return tuple(np.cumsum([0, *sizes]).tolist())
-
-
-class Rows(NamedTuple):
-    """Tables of all levels side by side, [M, ...]: a row for each step of all trajectories, one after the other.
-
-    :param selection: selection probabilities, [M, Σ callers·C_d].
-    :param termination: termination probabilities, [M, Σ 2·k_d].
-    :param control: densities of the controls, scaled at each step, [M, 1 + Σ k_d].
-    :param choice: factors of the joint choices, [M, S]; among posteriors, the marginals of the choices, [M, Σ C_d].
-        The last dimension is 0 where there are none.
-    """
-
-    selection: Array
-    termination: Array
-    control: Array
-    choice: Array
+    return np.cumsum([0, *sizes])
 
 
 def on_threads(run: Callable[[int, int], object], lengths: Array) -> None:
-    """Call ``run(first, last)`` for parts of the trajectories, on at most ``torch.get_num_threads()`` threads."""
+    """Call ``run(first, last)`` for parts of the trajectories, or lots of them, on at most ``torch.get_num_threads()``
+    threads.
+
+    :param lengths: steps of each, [N].
+    """
     number = len(lengths)
     threads = min(torch.get_num_threads(), number, 1 + int(lengths.sum()) // STEPS_A_THREAD)
     if threads == 1:
@@ -132,321 +143,418 @@ def on_threads(run: Callable[[int, int], object], lengths: Array) -> None:
         list(pool.map(run, bounds[:-1], bounds[1:]))
 
 
-@jit
-def trajectory(rows: Rows, start: int, steps: int) -> Rows:
-    """The rows of the trajectory of so many steps that begins at row ``start``."""
-    own = slice(start, start + steps)
-    return Rows(rows.selection[own], rows.termination[own], rows.control[own], rows.choice[own])
+class Sizes(NamedTuple):
+    """Columns of the arrays of a run.
+
+    :param kept: lanes that passes keep of a step; ``shared`` of a trajectory.
+    :param room: the most numbers of a step that a pass takes or gives; ``controls`` likewise.
+    :param marginals: Σ C_d, or 0 without the posteriors of the choices.
+    """
+
+    selection: int
+    termination: int
+    control: int
+    choice: int
+    kept: int
+    shared: int
+    room: int
+    controls: int
+    messages: int
+    marginals: int
+
+    def numbers(self, steps: int) -> int:
+        """Numbers that a run holds, for trajectories of at most so many steps."""
+        rows = self.selection + self.termination + self.control
+        block = rows + self.marginals + 4 * self.room + self.controls + 1
+        step = rows + self.choice + self.kept + 2 * self.messages + 1
+        return LANES * (BLOCK * block + step * steps + 2 * self.messages + self.shared + 2)
+
+
+class Shape(NamedTuple):
+    """A :class:`Structure` as compiled code reads it: the number of levels D, of joint choices S, and addresses."""
+
+    depth: int
+    joint: int
+    sizes: int
+    starts: int
+    ends: int
+    callers: int
+    actors: int
+    choices: int
+
+    @classmethod
+    @cache
+    def of(cls, sizes: tuple[int, ...]) -> Shape:
+        """The shape of a structure, whose arrays stay."""
+        structure = Structure.of(sizes)
+        return cls(len(structure.sizes), len(structure.actors), *(array.ctypes.data for array in structure))
+
+
+class Lots(NamedTuple):
+    """Addresses of the trajectories of each lot, [lots, lanes], and of their lengths."""
+
+    trajectories: int
+    lengths: int
+
+
+class Tasks(NamedTuple):
+    """The number of :class:`ddco_pyro.model.passes.Task`, their address, and that of their constants."""
+
+    number: int
+    address: int
+    constants: int
+
+
+# --- forward ----------------------------------------------------------------------------------------------------------
 
 
 @jit
-def _up(t: int, rows: Rows, messages: Array, of: Structure) -> None:
+def _up(t: int, rows: Rows, messages: Plane, of: Shape) -> None:
     """Fill row t of ``messages`` for levels 2 to D + 1."""
-    for d in range(len(of.sizes)):
-        c, below = of.sizes[d], of.starts[d]
-        for above in range(of.starts[d + 1], of.starts[d + 2]):
-            total = messages[t, below]  # choice 0 lasts one step
+    for d in range(of.depth):
+        c, below = whole(of.sizes, d), whole(of.starts, d)
+        for above in range(whole(of.starts, d + 1), whole(of.starts, d + 2)):
+            total = at(messages, t, below)  # choice 0 lasts one step
             for j in range(1, c):
-                total += messages[t, below + j] * rows.termination[t, of.ends[d] + 2 * j - 1]
-            messages[t, above] = total
+                total = total + at(messages, t, below + j) * at(rows.termination, t, whole(of.ends, d) + 2 * j - 1)
+            put(messages, t, above, total)
             below += c
 
 
 @jit
-def _down(t: int, rows: Rows, messages: Array, spread: Array, of: Structure) -> None:
+def _down(t: int, rows: Rows, messages: Plane, spread: Plane, of: Shape) -> None:
     """Fill row t of ``spread`` for levels D + 1 to 2."""
-    depth = len(of.sizes)
-    spread[t, of.starts[depth]] = messages[t, of.starts[depth]]
+    depth = of.depth
+    put(spread, t, whole(of.starts, depth), at(messages, t, whole(of.starts, depth)))
     for d in range(depth - 1, 0, -1):
-        c, below = of.sizes[d], of.starts[d]
-        for above in range(of.starts[d + 1], of.starts[d + 2]):
-            mass, first = spread[t, above], of.callers[above]
+        c, below = whole(of.sizes, d), whole(of.starts, d)
+        for above in range(whole(of.starts, d + 1), whole(of.starts, d + 2)):
+            mass, first = at(spread, t, above), whole(of.callers, above)
             if first < 0:
-                spread[t, below] = mass
-                spread[t, below + 1 : below + c] = 0.0
-            else:
-                spread[t, below] = mass * rows.selection[t, first]
+                put(spread, t, below, mass)
                 for j in range(1, c):
-                    kept = messages[t, below + j] * rows.termination[t, of.ends[d] + 2 * j - 2]
-                    spread[t, below + j] = mass * rows.selection[t, first + j] + kept
+                    put(spread, t, below + j, 0.0)
+            else:
+                put(spread, t, below, mass * at(rows.selection, t, first))
+                for j in range(1, c):
+                    kept = at(messages, t, below + j) * at(rows.termination, t, whole(of.ends, d) + 2 * j - 2)
+                    put(spread, t, below + j, mass * at(rows.selection, t, first + j) + kept)
             below += c
 
 
 @jit
-def _act(t: int, rows: Rows, messages: Array, spread: Array, of: Structure) -> float:
+def _act(t: int, rows: Rows, messages: Plane, spread: Plane, of: Shape) -> Any:
     """Fill level 1 of row t + 1 of ``messages``, not yet normalised, and return its sum: the last step of
     :func:`_down`, times the likelihood of the control.
     """
-    c, below, total = of.sizes[0], 0, 0.0
-    weighted = rows.choice.shape[1] > 0
-    for above in range(of.starts[1], of.starts[2]):
-        mass, first = spread[t, above], of.callers[above]
-        message = mass * rows.control[t, of.actors[below]]
+    c, below, total = whole(of.sizes, 0), 0, lanes(0.0)
+    weighted = rows.choice.columns > 0
+    for above in range(whole(of.starts, 1), whole(of.starts, 2)):
+        mass, first = at(spread, t, above), whole(of.callers, above)
+        message = mass * at(rows.control, t, whole(of.actors, below))
         if weighted:
-            message *= rows.choice[t, below]
+            message = message * at(rows.choice, t, below)
         if first < 0:
-            messages[t + 1, below + 1 : below + c] = 0.0
+            for j in range(1, c):
+                put(messages, t + 1, below + j, 0.0)
         else:
-            message *= rows.selection[t, first]
+            message = message * at(rows.selection, t, first)
             for j in range(1, c):
-                kept = messages[t, below + j] * rows.termination[t, 2 * j - 2]
-                option = (mass * rows.selection[t, first + j] + kept) * rows.control[t, j]
+                kept = at(messages, t, below + j) * at(rows.termination, t, 2 * j - 2)
+                option = (mass * at(rows.selection, t, first + j) + kept) * at(rows.control, t, j)
                 if weighted:
-                    option *= rows.choice[t, below + j]
-                messages[t + 1, below + j] = option
-                total += option
-        messages[t + 1, below] = message
-        total += message
+                    option = option * at(rows.choice, t, below + j)
+                put(messages, t + 1, below + j, option)
+                total = total + option
+        put(messages, t + 1, below, message)
+        total = total + message
         below += c
     return total
 
 
 @jit
-def _adjoint_act(
-    t: int, rows: Rows, messages: Array, spread: Array, scale: float, back: Array, sums: Rows, of: Structure
-) -> float:
-    """Adjoint of :func:`_act` except for the kept mass; returns Σ_s α_t(s) β_t(s).
-
-    ``back`` holds β_t at level 1. It becomes the adjoint of the mass that came down and, at level 2, of ``spread``.
-    """
-    c, below, total = of.sizes[0], 0, 0.0
-    weighted = rows.choice.shape[1] > 0
-    for above in range(of.starts[1], of.starts[2]):
-        actor, first = of.actors[below], of.callers[above]
-        both = messages[t + 1, below] * back[below]
-        total += both
-        sums.control[actor] += both
-        over = back[below] * rows.control[t, actor] * scale
-        if weighted:
-            over *= rows.choice[t, below]
-        if first >= 0:
-            mass = spread[t, above]
-            over *= rows.selection[t, first]
-            sums.selection[first] += mass * over
-            for j in range(1, c):
-                both = messages[t + 1, below + j] * back[below + j]
-                total += both
-                sums.control[j] += both
-                here = back[below + j] * rows.control[t, j] * scale
-                if weighted:
-                    here *= rows.choice[t, below + j]
-                back[below + j] = here
-                term = here * rows.selection[t, first + j]
-                over += term
-                sums.selection[first + j] += mass * term
-        back[above] = over
-        below += c
-    return total
-
-
-@jit
-def _adjoint_down(t: int, rows: Rows, spread: Array, back: Array, sums: Rows, of: Structure) -> None:
-    """Adjoint of the selections in :func:`_down`: ``back`` of levels 3 to D + 1 from level 2's."""
-    for d in range(1, len(of.sizes)):
-        c, below = of.sizes[d], of.starts[d]
-        for above in range(of.starts[d + 1], of.starts[d + 2]):
-            first = of.callers[above]
-            if first < 0:
-                back[above] = back[below]
-            else:
-                mass, total = spread[t, above], 0.0
-                for j in range(c):
-                    term = back[below + j] * rows.selection[t, first + j]
-                    total += term
-                    sums.selection[first + j] += mass * term
-                back[above] = total
-            below += c
-
-
-@jit
-def _adjoint_up(t: int, rows: Rows, messages: Array, back: Array, sums: Rows, of: Structure) -> None:
-    """Adjoint of :func:`_up` and of the kept mass in :func:`_down`: ``back`` becomes that of row t of ``messages``."""
-    for d in range(len(of.sizes) - 1, -1, -1):
-        c, below = of.sizes[d], of.starts[d]
-        for above in range(of.starts[d + 1], of.starts[d + 2]):
-            over = back[above]
-            back[below] = over
-            for j in range(1, c):
-                column = of.ends[d] + 2 * (j - 1)
-                mass = messages[t, below + j]
-                keeping = back[below + j] * rows.termination[t, column]
-                stopping = over * rows.termination[t, column + 1]
-                sums.termination[column] += mass * keeping
-                sums.termination[column + 1] += mass * stopping
-                back[below + j] = keeping + stopping
-            below += c
-
-
-@jit
-def _flush(sums: Array, row: Array) -> None:
-    """Write the sums of one step and reset them."""
-    for column in range(len(sums)):
-        row[column] = sums[column]
-        sums[column] = 0.0
-
-
-@jit
-def _forward(rows: Rows, messages: Array, spread: Array, scale: Array, of: Structure) -> float:
-    """Fill ``messages``, ``spread`` and ``scale`` [T]; the log-likelihood, NaN where a step leaves no mass."""
-    messages[0] = 0.0
-    messages[0, of.starts[len(of.sizes)]] = 1.0  # at t = 0 everything is selected
-    value = 0.0
-    for t in range(len(scale)):
+def _forward(lot: Lot, rows: Rows, messages: Plane, spread: Plane, scale: Plane, of: Shape) -> Any:
+    """Fill a block of ``messages``, ``spread`` and ``scale``; its log-likelihood, NaN where a step leaves no mass."""
+    apart()
+    value = lanes(0.0)
+    for t in range(lot.begin, lot.end):
         if t > 0:
             _up(t, rows, messages, of)
         _down(t, rows, messages, spread, of)
         total = _act(t, rows, messages, spread, of)
-        value += np.log(total) if total > 0.0 else np.nan
-        scale[t] = 1.0 / total
-        for s in range(len(of.actors)):
-            messages[t + 1, s] *= scale[t]
+        total = where(_alive(lot, t), total, 1.0)
+        value = value + where(total < SMALL, np.nan, logarithm(total))
+        inverse = 1.0 / total
+        put(scale, t, 0, inverse)
+        for s in range(of.joint):
+            put(messages, t + 1, s, at(messages, t + 1, s) * inverse)
     return value
 
 
 @jit
-def _backward(rows: Rows, messages: Array, spread: Array, scale: Array, posterior: Rows, of: Structure) -> bool:
-    """Fill the posteriors; whether Σ_s α_t(s) β_t(s) = 1 at every step, which only underflow can change."""
-    back = np.ones(messages.shape[1])  # level 1: β
-    none = np.zeros(0)
-    sums = Rows(
-        np.zeros(rows.selection.shape[1]), np.zeros(rows.termination.shape[1]), np.zeros(rows.control.shape[1]), none
-    )
-    exact = True
-    for t in range(len(scale) - 1, -1, -1):
-        if posterior.choice.shape[1]:
-            posterior.choice[t] = 0.0
-            for s in range(len(of.actors)):
-                if of.actors[s] >= 0:
-                    for d in range(of.choices.shape[1]):
-                        posterior.choice[t, of.choices[s, d]] += messages[t + 1, s] * back[s]
-        total = _adjoint_act(t, rows, messages, spread, scale[t], back, sums, of)
-        exact &= abs(total - 1.0) <= TOLERANCE  # NaN is not
-        _adjoint_down(t, rows, spread, back, sums, of)
+def _alive(lot: Lot, t: int) -> Any:
+    """The lanes whose trajectory has a step t."""
+    return float(t) < lot.own
+
+
+# --- backward ---------------------------------------------------------------------------------------------------------
+
+
+@jit
+def _add(rows: Plane, t: int, column: int, value: Any) -> None:
+    put(rows, t, column, at(rows, t, column) + value)
+
+
+@jit
+def _adjoint_act(
+    t: int, i: int, rows: Rows, messages: Plane, spread: Plane, scale: Plane, back: Plane, sums: Rows, of: Shape
+) -> Any:
+    """Adjoint of :func:`_act` except for the kept mass; returns Σ_s α_t(s) β_t(s).
+
+    ``back`` holds β_t at level 1. It becomes the adjoint of the mass that came down and, at level 2, of ``spread``.
+
+    :param i: the row of ``sums``.
+    """
+    c, below, total = whole(of.sizes, 0), 0, lanes(0.0)
+    weighted = rows.choice.columns > 0
+    inverse = at(scale, t, 0)
+    for above in range(whole(of.starts, 1), whole(of.starts, 2)):
+        actor, first = whole(of.actors, below), whole(of.callers, above)
+        both = at(messages, t + 1, below) * at(back, 0, below)
+        total = total + both
+        _add(sums.control, i, actor, both)
+        over = at(back, 0, below) * at(rows.control, t, actor) * inverse
+        if weighted:
+            over = over * at(rows.choice, t, below)
+        if first >= 0:
+            mass = at(spread, t, above)
+            over = over * at(rows.selection, t, first)
+            _add(sums.selection, i, first, mass * over)
+            for j in range(1, c):
+                both = at(messages, t + 1, below + j) * at(back, 0, below + j)
+                total = total + both
+                _add(sums.control, i, j, both)
+                here = at(back, 0, below + j) * at(rows.control, t, j) * inverse
+                if weighted:
+                    here = here * at(rows.choice, t, below + j)
+                put(back, 0, below + j, here)
+                term = here * at(rows.selection, t, first + j)
+                over = over + term
+                _add(sums.selection, i, first + j, mass * term)
+        put(back, 0, above, over)
+        below += c
+    return total
+
+
+@jit
+def _adjoint_down(t: int, i: int, rows: Rows, spread: Plane, back: Plane, sums: Rows, of: Shape) -> None:
+    """Adjoint of the selections in :func:`_down`: ``back`` of levels 3 to D + 1 from level 2's."""
+    for d in range(1, of.depth):
+        c, below = whole(of.sizes, d), whole(of.starts, d)
+        for above in range(whole(of.starts, d + 1), whole(of.starts, d + 2)):
+            first = whole(of.callers, above)
+            if first < 0:
+                put(back, 0, above, at(back, 0, below))
+            else:
+                mass, total = at(spread, t, above), lanes(0.0)
+                for j in range(c):
+                    term = at(back, 0, below + j) * at(rows.selection, t, first + j)
+                    total = total + term
+                    _add(sums.selection, i, first + j, mass * term)
+                put(back, 0, above, total)
+            below += c
+
+
+@jit
+def _adjoint_up(t: int, i: int, rows: Rows, messages: Plane, back: Plane, sums: Rows, of: Shape) -> None:
+    """Adjoint of :func:`_up` and of the kept mass in :func:`_down`: ``back`` becomes that of row t of ``messages``."""
+    for d in range(of.depth - 1, -1, -1):
+        c, below = whole(of.sizes, d), whole(of.starts, d)
+        for above in range(whole(of.starts, d + 1), whole(of.starts, d + 2)):
+            over = at(back, 0, above)
+            put(back, 0, below, over)
+            for j in range(1, c):
+                column = whole(of.ends, d) + 2 * (j - 1)
+                mass = at(messages, t, below + j)
+                keeping = at(back, 0, below + j) * at(rows.termination, t, column)
+                stopping = over * at(rows.termination, t, column + 1)
+                _add(sums.termination, i, column, mass * keeping)
+                _add(sums.termination, i, column + 1, mass * stopping)
+                put(back, 0, below + j, keeping + stopping)
+            below += c
+
+
+@jit
+def _backward(
+    lot: Lot, rows: Rows, messages: Plane, spread: Plane, scale: Plane, back: Plane, sums: Rows, of: Shape
+) -> Any:
+    """Fill the posteriors of a block; the lanes in which Σ_s α_t(s) β_t(s) = 1 at every step.
+
+    Only underflow can change this sum.
+    """
+    apart()
+    exact = lanes(0.0) == 0.0
+    for t in range(lot.end - 1, lot.begin - 1, -1):
+        i = t - lot.begin
+        if sums.choice.columns:
+            for s in range(of.joint):
+                if whole(of.actors, s) >= 0:
+                    for d in range(of.depth):
+                        _add(
+                            sums.choice, i, whole(of.choices, s * of.depth + d), at(messages, t + 1, s) * at(back, 0, s)
+                        )
+        total = _adjoint_act(t, i, rows, messages, spread, scale, back, sums, of)
+        exact = exact & (absolute(total - 1.0) <= TOLERANCE)  # NaN is not
+        _adjoint_down(t, i, rows, spread, back, sums, of)
         if t > 0:
-            _adjoint_up(t, rows, messages, back, sums, of)
-        _flush(sums.selection, posterior.selection[t])
-        _flush(sums.termination, posterior.termination[t])
-        _flush(sums.control, posterior.control[t])
-    for adjoint in back:  # an overflow at t = 0 shows nowhere else
-        exact &= np.isfinite(adjoint)
+            _adjoint_up(t, i, rows, messages, back, sums, of)
+        if t >= whole(lot.lengths, 0):  # gradients add up over steps
+            alive = _alive(lot, t)
+            for own in (sums.selection, sums.termination, sums.control):
+                for column in range(own.columns):
+                    put(own, i, column, where(alive, at(own, i, column), 0.0))
+    for s in range(back.columns):  # an overflow at t = 0 shows nowhere else
+        exact = exact & (at(back, 0, s) <= LARGE)
     return exact
 
 
-@releasing
-def any_levels(
-    first: int, last: int, rows: Rows, starts: Array, lengths: Array, value: Array, exact: Array, posteriors: Rows,
-    of: Structure,
-) -> None:  # fmt: skip
-    """Of trajectories ``first`` to ``last``, fill log-likelihoods ``value`` [N], whether they are ``exact`` [N], and
-    the posteriors of the rows.
-
-    :param starts: the first row of each trajectory, [N].
-    """
-    for n in range(first, last):
-        steps, own = lengths[n], trajectory(rows, starts[n], lengths[n])
-        messages, spread = np.empty((1 + steps, of.starts[-1])), np.empty((steps, of.starts[-1]))
-        scale = np.empty(steps)
-        value[n] = _forward(own, messages, spread, scale, of)
-        exact[n] = _backward(own, messages, spread, scale, trajectory(posteriors, starts[n], steps), of)
-
-
-# One level is the common case, and four times faster on its own: nothing goes up or comes down. Its ``messages``
-# [1 + T, C] hold in row t the distribution of the choice at t - 1 before normalisation, so that a step need not wait
-# for the division. ``ended`` [T] is the mass that terminated at t. Column j of a row of controls is that of choice j.
+# --- whole trajectories -----------------------------------------------------------------------------------------------
 
 
 @jit
-def _forward_one(rows: Rows, messages: Array, ended: Array, scale: Array) -> float:
-    """Fill ``messages``, ``ended`` and ``scale`` [T]; the log-likelihood, NaN where a step leaves no mass."""
-    select, end = rows.selection, rows.termination
-    steps, c = rows.control.shape
-    messages[0] = 0.0
-    messages[0, 0] = 1.0  # at t = 0 everything is selected
-    value, before, product = 0.0, 1.0, 1.0
+def _fill(lot: Lot, tasks: Tasks, evidence: View, kept: Plane, rows: Rows, room: Room, of: Shape) -> Any:
+    """Fill a block of rows; the sum of the logarithms that densities of controls are scaled by.
+
+    A step past a trajectory's length keeps every choice and emits nothing, so it changes no probability. A step without
+    a finite largest density is not scaled.
+    """
+    apart()
+    choices, columns = rows.choice.columns, rows.control.columns
+    for t in range(lot.begin, lot.end):
+        for j in range(columns):
+            put(rows.control, t, j, 0.0)
+    for i in range(tasks.number):
+        fill(task(tasks.address + i * TASK), lot, tasks.constants, kept, rows, room)
+    if evidence.address != 0:
+        take(evidence, lot, whole(of.starts, 1), 1, room.raw)
+        for t in range(lot.begin, lot.end):
+            for s in range(whole(of.starts, 1)):
+                if choices > 0:
+                    put(rows.choice, t, s, exponential(at(room.raw, t - lot.begin, s)))
+                else:  # a choice of the only level has a column among the controls
+                    put(rows.control, t, s, at(rows.control, t, s) + at(room.raw, t - lot.begin, s))
+    for t in range(max(lot.begin, whole(lot.lengths, 0)), lot.end):
+        _rest(t, lot, rows, of)
+    shift = lanes(0.0)
+    for t in range(lot.begin, lot.end):
+        top = at(rows.control, t, 0)
+        for j in range(1, columns):
+            x = at(rows.control, t, j)
+            top = where(top < x, x, top)
+        top = where(absolute(top) < np.inf, top, 0.0)
+        shift = shift + top
+        for j in range(columns):
+            put(rows.control, t, j, exponential(at(rows.control, t, j) - top))
+    return shift
+
+
+@jit
+def _rest(t: int, lot: Lot, rows: Rows, of: Shape) -> None:
+    """Have the lanes whose trajectory is over keep every choice and emit nothing."""
+    apart()
+    alive = _alive(lot, t)
+    for j in range(rows.selection.columns):
+        put(rows.selection, t, j, where(alive, at(rows.selection, t, j), 0.0))
+    for above in range(whole(of.starts, 1), whole(of.starts, of.depth + 1)):
+        first = whole(of.callers, above)
+        if first >= 0:
+            put(rows.selection, t, first, where(alive, at(rows.selection, t, first), 1.0))
+    for j in range(rows.termination.columns):
+        put(rows.termination, t, j, where(alive, at(rows.termination, t, j), 1.0 - j % 2))
+    for j in range(rows.control.columns):
+        put(rows.control, t, j, where(alive, at(rows.control, t, j), 0.0))
+    for s in range(rows.choice.columns):
+        put(rows.choice, t, s, where(alive, at(rows.choice, t, s), 1.0))
+
+
+@jit
+def _clear(plane: Plane, steps: int) -> None:
+    apart()
     for t in range(steps):
-        mass = messages[t, 0]
-        for j in range(1, c):
-            mass += messages[t, j] * end[t, 2 * j - 1]
-        mass *= before
-        ended[t] = mass
-        total = mass * select[t, 0] * rows.control[t, 0]
-        messages[t + 1, 0] = total
-        for j in range(1, c):
-            kept = messages[t, j] * before * end[t, 2 * j - 2]
-            message = (mass * select[t, j] + kept) * rows.control[t, j]
-            messages[t + 1, j] = message
-            total += message
-        if total < SMALL:
-            value += np.log(total) if total > 0.0 else np.nan
-        else:
-            product *= total
-            if product < SMALL:
-                value += np.log(product)
-                product = 1.0
-        before = 1.0 / total
-        scale[t] = before
-    return value + np.log(product)
+        for j in range(plane.columns):
+            put(plane, t, j, 0.0)
 
 
 @jit
-def _backward_one(rows: Rows, messages: Array, ended: Array, scale: Array, posterior: Rows) -> bool:
-    """:func:`_backward` for one level; the marginals of choices are the posteriors of controls."""
-    select, end = rows.selection, rows.termination
-    steps, c = rows.control.shape
-    back, exact = np.ones(c), True
-    for t in range(steps - 1, -1, -1):
-        mass, total, over = ended[t], 0.0, 0.0
-        for j in range(c):
-            beta = back[j] * scale[t]
-            both = messages[t + 1, j] * beta
-            total += both
-            posterior.control[t, j] = both
-            back[j] = beta * rows.control[t, j]
-            term = back[j] * select[t, j]
-            over += term
-            posterior.selection[t, j] = mass * term
-        exact &= abs(total - 1.0) <= TOLERANCE and np.isfinite(over)  # NaN is not
-        if t == 0:
-            posterior.termination[0] = 0.0
-            break
-        back[0] = over
-        for j in range(1, c):
-            known = messages[t, j] * scale[t - 1]
-            keeping, stopping = back[j] * end[t, 2 * j - 2], over * end[t, 2 * j - 1]
-            posterior.termination[t, 2 * j - 2] = known * keeping
-            posterior.termination[t, 2 * j - 1] = known * stopping
-            back[j] = keeping + stopping
-    return exact
+def _carve(buffer: int, steps: int, columns: int) -> tuple[Plane, int]:
+    """Lanes [steps, columns] that begin at an address, and the address after them."""
+    return Plane(buffer, columns), buffer + steps * columns * LANES * 8
 
 
 @releasing
-def one_level(
-    first: int, last: int, rows: Rows, starts: Array, lengths: Array, value: Array, exact: Array, posteriors: Rows,
-    _: Structure,
+def eliminate(
+    first: int, last: int, lots: Lots, tasks: Tasks, evidence: View, marginals: View, found: int, buffer: int,
+    n: Sizes, of: Shape,
 ) -> None:  # fmt: skip
-    """:func:`any_levels` for one level, whose factors of choices are in the controls."""
-    for n in range(first, last):
-        steps, own = lengths[n], trajectory(rows, starts[n], lengths[n])
-        messages, ended, scale = np.empty((1 + steps, own.selection.shape[1])), np.empty(steps), np.empty(steps)
-        value[n] = _forward_one(own, messages, ended, scale)
-        exact[n] = _backward_one(own, messages, ended, scale, trajectory(posteriors, starts[n], steps))
+    """Of lots ``first`` to ``last``, fill what is ``found``, and write the posteriors and gradients that tasks ask for.
 
-
-@numba.njit(cache=True, error_model="numpy")
-def scale_densities(rows: Array, starts: Array, lengths: Array, shift: Array) -> None:
-    """Log-densities [M, n] to densities over the step's largest; ``shift`` [N] becomes the sum of its logarithms.
-
-    A step without a finite largest is not scaled.
+    :param found: address of a row for each trajectory, [N, n + 2]: the gradients of what steps share, then the
+        log-likelihood, and whether it is exact.
+    :param evidence: of the joint choices, [N, T, S]; ``marginals`` where those of the choices go, [N, T, Σ C_d].
+    :param buffer: address of :meth:`Sizes.numbers` numbers for the longest trajectory.
     """
-    for n in range(len(lengths)):
-        own, total = rows[starts[n] : starts[n] + lengths[n]], 0.0
-        for t in range(len(own)):
-            top = own[t, 0]
-            for j in range(1, own.shape[1]):
-                top = max(top, own[t, j])
-            if np.isfinite(top):
-                total += top
-                for j in range(own.shape[1]):
-                    own[t, j] -= top
-        shift[n] = total
-    exponentials(rows.reshape(-1))
+    raw, place = _carve(buffer, BLOCK, n.room)
+    controls, place = _carve(place, BLOCK, n.controls + 1)
+    std, place = _carve(place, BLOCK, n.room)
+    of_raw, place = _carve(place, BLOCK, n.room)
+    of_std, place = _carve(place, BLOCK, n.room)
+    room = Room(raw, controls, std, of_raw, of_std)
+    selected, place = _carve(place, BLOCK, n.selection)
+    ended, place = _carve(place, BLOCK, n.termination)
+    acted, place = _carve(place, BLOCK, n.control)
+    chosen, place = _carve(place, BLOCK, n.marginals)
+    sums = Rows(selected, ended, acted, chosen)
+    back, place = _carve(place, 1, n.messages)
+    total, place = _carve(place, 1, n.shared + 2)
+    for lot_number in range(first, last):
+        who, lengths = lots.trajectories + 8 * LANES * lot_number, lots.lengths + 8 * LANES * lot_number
+        steps = whole(lengths, LAST)
+        selection, after = _carve(place, steps, n.selection)
+        termination, after = _carve(after, steps, n.termination)
+        control, after = _carve(after, steps, n.control)
+        choice, after = _carve(after, steps, n.choice)
+        rows = Rows(selection, termination, control, choice)
+        kept, after = _carve(after, steps, n.kept)
+        spread, after = _carve(after, steps, n.messages)
+        scale, after = _carve(after, steps, 1)
+        messages, after = _carve(after, 1 + steps, n.messages)
+        for s in range(n.messages):
+            put(messages, 0, s, 0.0)
+            put(back, 0, s, 1.0)  # level 1: β
+        put(messages, 0, whole(of.starts, of.depth), 1.0)  # at t = 0 everything is selected
+        for lane in range(LANES):
+            write(total.address, lane, float(whole(lengths, lane)))
+        own = at(total, 0, 0)
+        _clear(total, 1)
+        value, exact = lanes(0.0), lanes(0.0) == 0.0
+        for begin in range(0, steps, BLOCK):
+            lot = Lot(who, lengths, begin, min(begin + BLOCK, steps), own)
+            value = value + _fill(lot, tasks, evidence, kept, rows, room, of)
+            value = value + _forward(lot, rows, messages, spread, scale, of)
+        for begin in range((steps - 1) // BLOCK * BLOCK, -1, -BLOCK):
+            lot = Lot(who, lengths, begin, min(begin + BLOCK, steps), own)
+            for plane in sums:
+                _clear(plane, BLOCK)
+            exact = exact & _backward(lot, rows, messages, spread, scale, back, sums, of)
+            for i in range(tasks.number):
+                slope(task(tasks.address + i * TASK), lot, tasks.constants, kept, rows, sums, total, room)
+            if marginals.address != 0:
+                give(marginals, lot, n.marginals, 1, sums.choice)
+        put(total, 0, n.shared, value)
+        put(total, 0, n.shared + 1, where(exact, 1.0, 0.0))
+        for lane in range(LANES):
+            if whole(lengths, lane) > 0:
+                row = whole(who, lane)
+                for column in range(n.shared + 2):
+                    one = number(total.address, column * LANES + lane)
+                    write(found, row * (n.shared + 2) + column, one)

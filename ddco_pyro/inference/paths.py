@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.inference.arguments import refuse_impossible
-from ddco_pyro.inference.fused import choice_factors
-from ddco_pyro.inference.kernel import Array, Rows, Structure, on_threads, releasing, trajectory
-from ddco_pyro.model.links import Alive
+from ddco_pyro.inference.kernel import Structure, on_threads, releasing
+from ddco_pyro.model.elementary import Array
+from ddco_pyro.model.passes import Rows
 from ddco_pyro.model.tables import Tables
 
 jit = numba.njit(cache=True, error_model="numpy")
@@ -92,17 +92,15 @@ def segment(tables: Tables, lengths: Tensor) -> tuple[Tensor, ...]:
 def _trace(tables: Tables, lengths: Tensor, best: bool, uniforms: np.ndarray) -> Path:
     if not tables.depth:
         return Path((), ())
-    structure, alive = Structure.of(tables.sizes), Alive.of(lengths, tables.steps)
+    structure = Structure.of(tables.sizes)
     joint, terminated = np.full((2, *uniforms.shape[:2], tables.steps), -1, dtype=np.int64)
     possible = np.ones(len(lengths), dtype=np.bool_)
     *levels, meta_policy = tables.control
-    groups = tables.selection, tables.termination, (meta_policy, *levels)
-    selection, termination, control = (
-        np.concatenate([alive.take(table.flatten(2)) for table in group], axis=1, dtype=np.float64) for group in groups
-    )
-    rows = Rows(selection, termination, control, choice_factors(tables, alive))
-    starts = (lengths.cumsum(0) - lengths).numpy()
-    others = rows, starts, lengths.numpy(), best, uniforms, joint, terminated, possible, structure
+    evidence = tables.joint_evidence()
+    groups = tables.selection, tables.termination, (meta_policy, *levels), () if evidence is None else (evidence,)
+    nothing = torch.empty(len(lengths), tables.steps, 0, dtype=torch.float64)
+    rows = Rows(*(torch.cat([nothing, *(table.flatten(2) for table in group)], -1).numpy() for group in groups))
+    others = rows, lengths.numpy(), best, uniforms, joint, terminated, possible, structure
     on_threads(lambda first, last: _trace_all(first, last, *others), lengths.numpy())
     refuse_impossible(torch.from_numpy(possible))
     digits = structure.digits(np.arange(len(structure.actors)))
@@ -218,20 +216,21 @@ def _back(keeps: Array, ways: Array, uniforms: Array, joint: Array, terminated: 
 
 @releasing
 def _trace_all(
-    first: int, last: int, rows: Rows, starts: Array, lengths: Array, best: bool, uniforms: Array, joint: Array,
-    terminated: Array, possible: Array, of: Structure,
+    first: int, last: int, rows: Rows, lengths: Array, best: bool, uniforms: Array, joint: Array, terminated: Array,
+    possible: Array, of: Structure,
 ) -> None:  # fmt: skip
     """Of trajectories ``first`` to ``last``, fill the ``joint`` choices [M, N, T] of M paths, and how many levels
     ``terminated`` before each.
 
     ``possible`` [N] says which trajectories have a probability above 0; the paths of others mean nothing.
 
-    :param rows: logarithms; ``choice`` holds the evidence of the joint choices.
+    :param rows: logarithms, [N, T, n]; ``choice`` holds the evidence of the joint choices.
     :param best: the most likely path instead of a draw from the posterior.
     :param uniforms: numbers uniform in [0, 1), [M, N, 1 + T, 2·D].
     """
     for n in range(first, last):
-        own, steps = trajectory(rows, starts[n], lengths[n]), lengths[n]
+        own = Rows(rows.selection[n], rows.termination[n], rows.control[n], rows.choice[n])
+        steps = lengths[n]
         keeps, ways = np.empty((1 + steps, of.starts[-1])), np.empty((1 + steps, of.starts[-1]))
         possible[n] = _forward(own, best, keeps, ways, of) > -np.inf
         for m in range(len(joint)):

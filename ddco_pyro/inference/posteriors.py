@@ -50,10 +50,9 @@ def posterior(tables: Tables, lengths: Tensor) -> Posterior:
     """
     if not tables.depth:
         return Posterior((), (), ())
-    found = fused.eliminate(tables, lengths, marginals=True)
+    found = fused.posteriors(tables, lengths, marginals=True)
     refuse_impossible(found.value > NEVER)
-    posteriors, shape = found.tables, torch.Size([len(lengths), tables.steps, sum(tables.sizes)])
-    u = found.alive.put(found.posteriors.choice, shape).split(tables.sizes, dim=-1)
+    posteriors, u = found.tables, found.marginals
     v = tuple(
         torch.cat([u_d[..., :1], selected.sum(2)[..., 1:]], dim=-1)  # choice 0 lasts one step: it is always selected
         for u_d, selected in zip(u, posteriors.selection, strict=True)
@@ -97,7 +96,7 @@ def decompose(outputs: Outputs, batch: Batch) -> Decomposition:
         exact, actions = outputs.map(Tensor.double), batch.actions.double()
         tables = exact.tables(actions)
         if tables.depth:
-            elimination = fused.eliminate(tables, batch.lengths)
+            elimination = fused.posteriors(tables, batch.lengths)
             value, actors = elimination.value, elimination.tables.control
         else:
             value = logspace.log_likelihood(complete(tables, batch.lengths))

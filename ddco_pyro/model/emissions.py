@@ -21,8 +21,8 @@ from torch.distributions import Normal, kl_divergence
 from torch.nn.functional import logsigmoid, one_hot, pad
 from torch.special import ndtr
 
-from ddco_pyro.model.elementary import BLOCK, Array, exponentials, jit, log_normal_cdf, logarithms
-from ddco_pyro.model.links import Alive, Gradients, Link, Posterior, softmax, softmax_gradient
+from ddco_pyro.model.links import Link
+from ddco_pyro.model.passes import CATEGORIES, NORMAL, SWITCHES, Pass
 from ddco_pyro.model.tables import NEVER
 
 LOG_2PI = math.log(2 * math.pi)
@@ -112,12 +112,8 @@ class Emission(ABC):
         return tuple(found)
 
     @abstractmethod
-    def add(self, actions: Tensor, alive: Alive, rows: Array, first: int) -> Any:
-        """Add log π(a | s) to K columns of ``rows`` [M, n], from ``first`` on; what :meth:`gradients` needs of it."""
-
-    @abstractmethod
-    def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
-        """The gradient of each of the :meth:`tensors`, given how likely each caller acts, in the same columns."""
+    def passes(self, actions: Tensor) -> list[Pass]:
+        """Compiled passes that add up to log π(a | s) of controls [N, T, A]; their tensors are :meth:`tensors`."""
 
     def _fields(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
@@ -148,51 +144,23 @@ class Gaussian(Emission):
         error = actions.to(self.mean.dtype).unsqueeze(-2) - self.mean
         return (error.square() * weight).sum(-1) - constant.to(self.mean.dtype)
 
-    def add(self, actions: Tensor, alive: Alive, rows: Array, first: int) -> Any:
-        """The density; kept are the arguments of the pass, and the controls on bounds with φ / Φ of their masses."""
-        std = self._std(alive)
-        constant = np.log(std) + (0.5 * LOG_2PI + self.log_scale.detach().numpy())
-        low, high = self._bounds()
-        given = alive.take(self.mean), 1 / std, low, high, alive.take(actions)
-        return *given, *_add_normal(*given, constant, rows, first)
+    def passes(self, actions: Tensor) -> list[Pass]:
+        """The density; log σ and 1/σ of a σ that steps share are computed once."""
+        return [self._pass(actions)]
 
-    def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
-        """The gradients of μ, σ and the units, and those of bounds."""
-        means, inverse, low, high, acts, places, masses = kept
-        mean, of_std, sums = alive.empty(self.mean), np.zeros(inverse.shape), np.zeros((3, *self.mean.shape[-2:]))
-        _normal_gradient(
-            means,
-            inverse,
-            low,
-            high,
-            acts,
-            places,
-            masses,
-            posterior.found,
-            posterior.weight,
-            first,
-            mean,
-            of_std,
-            sums,
-        )
-        by_step, fixed = ([mean, of_std], [*sums]) if self.std.dim() > 2 else ([mean], [of_std[0], *sums])
-        tensors = self.tensors()
-        found: list[Tensor | None] = [alive.gradient(own, of) for own, of in zip(by_step, tensors, strict=False)]
-        for own, of in zip(fixed, tensors[len(by_step) :], strict=False):
-            summed = torch.from_numpy(own).sum_to_size(of.shape).to(of.dtype) if of.requires_grad else None
-            found.append(summed)
-        return tuple(found)
+    def _pass(self, actions: Tensor, hurdle: bool = False) -> Pass:
+        callers, size = self.shape[-2:]
+        std, units = self.std.detach().double().numpy(), self.log_scale.detach().numpy() + 0.5 * LOG_2PI
+        by_step = 2 if std.ndim > 2 else 1
+        many, constants = callers * size, np.empty(2 * (callers + 1) * size)
+        inverse, constant = constants[: 2 * many].reshape(2, callers, size)
+        inverse[:], constant[:] = (1.0, units) if by_step > 1 else (1 / std, np.log(std) + units)
+        constants[-2 * size : -size], constants[-size:] = self._bounds()
+        return Pass(NORMAL, callers, size, self.tensors(), int(hurdle), actions, constants, many, by_step, 4 * many)
 
-    def _std(self, alive: Alive) -> Array:
-        """σ, [1, K, A]; [M, K, A] where it depends on the state."""
-        if self.std.dim() > 2:
-            return alive.take(self.std)
-        return np.array(np.broadcast_to(self.std.detach().numpy(), (1, *self.mean.shape[-2:])), dtype=np.float64)
-
-    def _bounds(self) -> tuple[Array, Array]:
-        """The lower and the upper bound of each dimension, float64 [A]."""
-        none = np.full(self.mean.shape[-1], np.inf)
-        return -none, none
+    def _bounds(self) -> tuple[Any, Any]:
+        """The lower and the upper bound of each dimension, [A] or one for all."""
+        return -np.inf, np.inf
 
     @property
     def mode(self) -> Tensor:
@@ -244,8 +212,8 @@ class Clipped(Gaussian):
         """The sum over dimensions, float64 [..., K]."""
         return self.by_dimension(actions).sum(-1)
 
-    def _bounds(self) -> tuple[Array, Array]:
-        return self.low.detach().double().numpy(), self.high.detach().double().numpy()
+    def _bounds(self) -> tuple[Any, Any]:
+        return self.low.detach().numpy(), self.high.detach().numpy()
 
     @property
     def mode(self) -> Tensor:
@@ -255,134 +223,6 @@ class Clipped(Gaussian):
     def draw(self, noise: Tensor) -> Tensor:
         """μ + σ·z within the bounds."""
         return super().draw(noise).clamp(self.low, self.high)
-
-
-SIDE_BY_SIDE = 128
-"""Steps whose densities are computed side by side in vector instructions."""
-
-
-@jit
-def _add_normal(
-    mean: Array, inverse: Array, low: Array, high: Array, actions: Array, constant: Array, rows: Array, first: int
-) -> tuple[Array, Array]:
-    """Add log-densities within the bounds and log-masses on them.
-
-    :param mean: [M, K, A].
-    :param inverse: 1/σ, [1, K, A], or [M, K, A] where σ depends on the state; ``constant`` likewise.
-    :returns: step and dimension of each control on a bound, [masses, 2]; and x and φ / Φ of its masses Φ(x),
-        [2, masses, K].
-    """
-    steps, callers, size = mean.shape
-    whole, masses, varied = rows[:, first : first + callers], 0, min(len(inverse) - 1, 1)
-    control, free, total = np.empty(SIDE_BY_SIDE), np.empty(SIDE_BY_SIDE), np.empty((callers, SIDE_BY_SIDE))
-    for begin in range(0, steps, SIDE_BY_SIDE):
-        own, act = mean[begin : begin + SIDE_BY_SIDE], actions[begin : begin + SIDE_BY_SIDE]
-        for j in range(callers):
-            for i in range(len(act)):
-                total[j, i] = 0.0
-        for d in range(size):
-            for i in range(len(act)):
-                control[i] = act[i, d]
-                free[i] = low[d] < act[i, d] < high[d]
-            for j in range(callers):
-                if varied:
-                    for i in range(len(act)):
-                        z = (control[i] - own[i, j, d]) * inverse[begin + i, j, d]
-                        total[j, i] += free[i] * (0.5 * z * z + constant[begin + i, j, d])
-                else:
-                    for i in range(len(act)):
-                        z = (control[i] - own[i, j, d]) * inverse[0, j, d]
-                        total[j, i] += free[i] * (0.5 * z * z + constant[0, j, d])
-            for i in range(len(act)):
-                masses += free[i] == 0.0
-        out = whole[begin : begin + SIDE_BY_SIDE]
-        for i in range(len(act)):
-            for j in range(callers):
-                out[i, j] -= total[j, i]
-    places, found = np.empty((masses, 2), np.int64), np.empty((2, masses, callers))
-    if not masses:
-        return places, found
-    i = 0
-    for m in range(steps):
-        for d in range(size):
-            if not low[d] < actions[m, d] < high[d]:
-                places[i, 0], places[i, 1] = m, d
-                i += 1
-    for i in range(masses):
-        m, d = places[i, 0], places[i, 1]
-        below, bound = actions[m, d] <= low[d], low[d] if actions[m, d] <= low[d] else high[d]
-        for j in range(callers):
-            x = (bound - mean[m, j, d]) * inverse[m * varied, j, d]
-            found[0, i, j] = x if below else -x
-    logs = np.empty((masses, callers))
-    for i in range(masses):
-        for j in range(callers):
-            logs[i, j] = found[0, i, j]
-    log_normal_cdf(logs.reshape(-1), found[1].reshape(-1))
-    for i in range(masses):
-        for j in range(callers):
-            whole[places[i, 0], j] += logs[i, j]
-    return places, found
-
-
-@jit
-def _normal_gradient(
-    mean: Array, inverse: Array, low: Array, high: Array, actions: Array, places: Array, found: Array,
-    posterior: Array, weight: Array, first: int, of_mean: Array, of_std: Array, sums: Array,
-) -> None:  # fmt: skip
-    """The gradients of μ and σ; those of the units' logarithms and both bounds are added to ``sums`` [3, K, A].
-
-    :param places: with ``found``, the result of :func:`_add_normal`.
-    :param of_std: 0 in the shape of ``inverse``.
-    """
-    steps, callers, size = mean.shape
-    acts, varied = posterior[:, first : first + callers], min(len(inverse) - 1, 1)
-    control, free, acting = np.empty(SIDE_BY_SIDE), np.empty(SIDE_BY_SIDE), np.empty((callers, SIDE_BY_SIDE))
-    squares, counts = np.zeros((2, size, callers, SIDE_BY_SIDE))
-    for begin in range(0, steps, SIDE_BY_SIDE):
-        own, act = mean[begin : begin + SIDE_BY_SIDE], actions[begin : begin + SIDE_BY_SIDE]
-        out, likely = of_mean[begin : begin + SIDE_BY_SIDE], acts[begin : begin + SIDE_BY_SIDE]
-        step = weight[begin : begin + SIDE_BY_SIDE]
-        for i in range(len(act)):
-            for j in range(callers):
-                acting[j, i] = step[i] * likely[i, j]
-        for d in range(size):
-            for i in range(len(act)):
-                control[i] = act[i, d]
-                free[i] = low[d] < act[i, d] < high[d]
-            for j in range(callers):
-                square, count = squares[d, j], counts[d, j]
-                if varied:
-                    for i in range(len(act)):
-                        over = inverse[begin + i, j, d]
-                        z, share = (control[i] - own[i, j, d]) * over, free[i] * acting[j, i]
-                        out[i, j, d] = share * z * over
-                        of_std[begin + i, j, d] = share * (z * z - 1.0) * over
-                        count[i] += share
-                else:
-                    over = inverse[0, j, d]
-                    for i in range(len(act)):
-                        z, share = (control[i] - own[i, j, d]) * over, free[i] * acting[j, i]
-                        out[i, j, d] = share * z * over
-                        square[i] += share * z * z
-                        count[i] += share
-    of_scale, of_bounds = sums[0], sums[1:]
-    for j in range(callers):
-        for d in range(size):
-            count = counts[d, j].sum()
-            of_scale[j, d] -= count
-            if not varied:
-                of_std[0, j, d] = (squares[d, j].sum() - count) * inverse[0, j, d]
-    for i in range(len(places)):
-        m, d = places[i, 0], places[i, 1]
-        side = 0 if actions[m, d] <= low[d] else 1
-        sign = 1.0 if side == 0 else -1.0
-        for j in range(callers):
-            over = inverse[m * varied, j, d]
-            share = weight[m] * acts[m, j] * found[1, i, j] * over
-            of_mean[m, j, d] = -sign * share
-            of_bounds[side, j, d] += sign * share
-            of_std[m * varied, j, d] -= share * found[0, i, j]
 
 
 @dataclass(frozen=True)
@@ -419,24 +259,10 @@ class Hurdle(Emission):
         at = _at_value(actions)
         return self._part(at.unsqueeze(-1)).squeeze(-1) + torch.where(at, 0.0, self.slab.log_density(actions))
 
-    def add(self, actions: Tensor, alive: Alive, rows: Array, first: int) -> Any:
-        """The switch between the parts at every step, the slab's density where the control is not at the value."""
-        at = _at_value(actions)
-        away = np.flatnonzero(alive.take(at) == 0)
-        others, own = alive.only(away), np.zeros((len(away), self.logit.shape[-2]))
-        switch = Binary(self.logit).add(at.to(self.logit.dtype), alive, rows, first)
-        slab = self.slab.add(actions, others, own, 0)
-        rows[away, first : first + own.shape[1]] += own
-        return away, others, switch, slab
-
-    def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
-        """That of the switch and those of the slab."""
-        away, others, switch, slab = kept
-        own = Posterior(*(part[away] for part in posterior))
-        return (
-            *Binary(self.logit).gradients(actions, alive, posterior, first, switch),
-            *self.slab.gradients(actions, others, own, first, slab),
-        )
+    def passes(self, actions: Tensor) -> list[Pass]:
+        """The switch between the parts, and the slab's density where the control is not at the value."""
+        switch = Pass(SWITCHES, self.shape[-2], 1, (self.logit,), self.shape[-1], actions, kept=self.shape[-2])
+        return [switch, self.slab._pass(actions, hurdle=True)]
 
     def _part(self, at: Tensor) -> Tensor:
         """The log-probability of being at the value, or of not being there, [..., K, 1]."""
@@ -485,16 +311,10 @@ class Binary(Emission):
         position = logsigmoid(torch.where(actions > 0.5, self.logits, -self.logits))
         return torch.where((actions == 0) | (actions == 1), position, NEVER)
 
-    def add(self, actions: Tensor, alive: Alive, rows: Array, first: int) -> Array:
-        """The log-probability of the positions; kept is its slope in each logit."""
-        return _add_switches(alive.take(self.logits), alive.take(actions), rows, first)
-
-    def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Array) -> Gradients:
-        """1 - logistic(y) where on, -logistic(y) where off, times the posterior of the caller."""
-        gradient = alive.empty(self.logits)
-        share = posterior.found[:, first : first + kept.shape[1]] * posterior.weight[:, None]
-        np.multiply(kept, share[..., None], out=gradient)
-        return (alive.gradient(gradient, self.logits),)
+    def passes(self, actions: Tensor) -> list[Pass]:
+        """The log-probabilities of the positions."""
+        callers, size = self.shape[-2:]
+        return [Pass(SWITCHES, callers, size, (self.logits,), 0, actions, kept=callers * size)]
 
     @property
     def mode(self) -> Tensor:
@@ -508,40 +328,6 @@ class Binary(Emission):
     def divergence(self, i: int, j: int) -> Tensor:
         """½ Σ (p_i - p_j)(y_i - y_j)."""
         return _of_switch(self.logits[..., i, :].double(), self.logits[..., j, :].double()).sum(-1)
-
-
-@jit
-def _add_switches(logits: Array, actions: Array, rows: Array, first: int) -> Array:
-    """Add log logistic(±y) of logits y [M, K, A]; its derivative in y."""
-    steps, callers, size = logits.shape
-    slope, block = np.empty(logits.shape), max(BLOCK // (callers * size), 1)
-    shape = block, callers, size
-    sign, x, part = np.empty(shape), np.empty(shape), np.empty(shape)
-    signs, xs, parts = sign.reshape(-1), x.reshape(-1), part.reshape(-1)
-    for begin in range(0, steps, block):
-        own, act = logits[begin : begin + block], actions[begin : begin + block]
-        for m in range(len(own)):
-            for d in range(size):
-                a = act[m, d]
-                on = 1.0 if a == 1.0 else (-1.0 if a == 0.0 else 0.0)
-                for j in range(callers):
-                    sign[m, j, d] = on
-                    x[m, j, d] = own[m, j, d] * on if on != 0.0 else -np.inf
-        n = own.size
-        for i in range(n):
-            parts[i] = -abs(xs[i])
-        exponentials(parts[:n])
-        for i in range(n):
-            signs[i] *= (parts[i] if xs[i] >= 0.0 else 1.0) / (1.0 + parts[i])
-            parts[i] += 1.0
-        logarithms(parts[:n])
-        out, derivative = rows[begin : begin + block, first : first + callers], slope[begin : begin + block]
-        for m in range(len(own)):
-            for j in range(callers):
-                for d in range(size):
-                    out[m, j] += min(x[m, j, d], 0.0) - part[m, j, d]
-                    derivative[m, j, d] = sign[m, j, d]
-    return slope
 
 
 @dataclass(frozen=True)
@@ -578,25 +364,11 @@ class Categorical(Emission):
         meant = one_hot(index.squeeze(-1), classes) if bool(self.rows) else index
         return index, (actions == meant).all(-1, keepdim=True)
 
-    def add(self, actions: Tensor, alive: Alive, rows: Array, first: int) -> Any:
-        """log softmax; kept are the probabilities, and the columns of the actions."""
-        logits, (index, possible) = alive.take(self.logits), map(alive.take, self._index(actions))
-        steps, callers, classes = logits.shape
-        shares = np.empty((steps, callers * classes))
-        softmax(logits, shares, 0, 0)
-        columns = index.astype(np.int64) + np.arange(callers) * classes
-        chosen = np.take_along_axis(logits.reshape(steps, -1), columns, 1) - logits.max(-1)
-        chosen += np.log(shares.reshape(logits.shape).max(-1))
-        rows[:, first : first + callers] += np.where(possible > 0, chosen, NEVER)
-        return shares, columns
-
-    def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
-        """The posterior of the caller at the action, minus the probabilities times it."""
-        shares, columns = kept
-        found, gradient = np.zeros_like(shares), alive.empty(self.logits)
-        np.put_along_axis(found, columns, posterior.found[:, first : first + columns.shape[1]], 1)
-        softmax_gradient(shares, found, posterior.weight, 0, 0, gradient)
-        return (alive.gradient(gradient, self.logits),)
+    def passes(self, actions: Tensor) -> list[Pass]:
+        """The log-softmax of the action's index, which is below 0 where there is no such action."""
+        (index, possible), (callers, size) = self._index(actions), self.logits.shape[-2:]
+        index = torch.where(possible, index, -1).double()
+        return [Pass(CATEGORIES, callers, size, (self.logits,), 0, index, kept=callers * size)]
 
     def log_density(self, actions: Tensor) -> Tensor:
         """log π(a | s), [..., K]."""
@@ -650,16 +422,9 @@ class Product(Emission):
         """Those of the groups."""
         return tuple(tensor for _, emission in self.groups for tensor in emission.tensors())
 
-    def add(self, actions: Tensor, alive: Alive, rows: Array, first: int) -> Any:
-        """The groups' one after the other."""
-        return [emission.add(actions[..., dims], alive, rows, first) for dims, emission in self.groups]
-
-    def gradients(self, actions: Tensor, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
+    def passes(self, actions: Tensor) -> list[Pass]:
         """Those of the groups."""
-        found: list[Tensor | None] = []
-        for (dims, emission), own in zip(self.groups, kept, strict=True):
-            found.extend(emission.gradients(actions[..., dims], alive, posterior, first, own))
-        return tuple(found)
+        return [own for dims, emission in self.groups for own in emission.passes(actions[..., dims])]
 
     @property
     def mode(self) -> Tensor:
@@ -711,14 +476,17 @@ class Density(Link):
         """[N, T, K]."""
         return self.emission.log_density(self.actions)
 
-    def fill(self, alive: Alive, rows: Array, first: int) -> Any:
-        """The log-density; kept is what its parts keep."""
-        rows[:, first : first + self.columns] = 0.0
-        return self.emission.add(self.actions, alive, rows, first)
+    def map(self, change: Callable[[Tensor], Tensor]) -> Density:
+        """The density of changed outputs and controls."""
 
-    def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
+        def changed(tensor: Tensor) -> Tensor:
+            return change(tensor) if tensor.is_floating_point() else tensor
+
+        return Density(self.emission.map(changed), change(self.actions))
+
+    def passes(self) -> list[Pass]:
         """Those of the emission."""
-        return self.emission.gradients(self.actions, alive, posterior, first, kept)
+        return self.emission.passes(self.actions)
 
 
 TAIL = -30.0

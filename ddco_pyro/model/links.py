@@ -1,30 +1,23 @@
-"""Links from networks' outputs to log-probabilities, each by a formula in torch and in compiled passes.
+"""Links from networks' outputs to log-probabilities, each by a formula in torch and by compiled passes.
 
 The formula defines a link: evaluation, the Pyro program and log space use it. The fused engine uses the compiled
-passes. They give the probabilities for the elimination, and turn its posteriors into gradients of the outputs, so that
-training builds no table of logarithms. Compiled arrays have M rows: the steps within their trajectories, one trajectory
-after the other.
+passes (:mod:`ddco_pyro.model.passes`). They give the probabilities for the elimination, and turn its posteriors into
+gradients of the outputs, so that training builds no table of logarithms.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid, pad
 
-from ddco_pyro.model.elementary import BLOCK, Array, exponentials, jit
+from ddco_pyro.model.passes import LOGARITHMS, PROBABILITIES, SOFTMAX, TERMINATION_BOUND, TERMINATIONS, Pass
 from ddco_pyro.model.tables import NEVER, Group, Tables, always_ending
-
-TERMINATION_BOUND = 12.0
-"""Termination logits lie within ±12 (ψ between 6e-6 and 1 - 6e-6), so no path's probability is ever exactly 0."""
-
-Gradients = tuple[Tensor | None, ...]
 
 
 def bounded(logits: Tensor) -> Tensor:
@@ -41,64 +34,6 @@ def log_termination(logits: Tensor) -> Tensor:
     """(log(1 - ψ), log ψ) [..., 2] of logits, which are bounded first."""
     within = bounded(logits)
     return torch.stack([logsigmoid(-within), logsigmoid(within)], dim=-1)
-
-
-class Alive(NamedTuple):
-    """The M steps of a batch within their trajectories, of N·T.
-
-    :param rows: their indices in a table [N·T, ...], int64 [M].
-    :param number: N·T.
-    """
-
-    rows: Array
-    number: int
-
-    @classmethod
-    def of(cls, lengths: Tensor, steps: int) -> Alive:
-        """The steps of trajectories with these lengths [N] in a batch padded to ``steps``."""
-        alive = np.arange(steps) < lengths.numpy()[:, None]
-        return cls(np.flatnonzero(alive), alive.size)
-
-    def only(self, some: Array) -> Alive:
-        """These of the M steps, int64 [...]."""
-        return Alive(self.rows[some], self.number)
-
-    def take(self, table: Tensor) -> Array:
-        """The rows of a table [N, T, ...], contiguous float64 [M, ...], so that a pass is compiled for one type."""
-        rows = table.detach().reshape(self.number, *table.shape[2:])
-        if len(self.rows) < self.number:
-            rows = rows[torch.from_numpy(self.rows)]
-        return np.ascontiguousarray(rows.numpy(), dtype=np.float64)
-
-    def empty(self, table: Tensor) -> Array:
-        """Room for the rows of a table [N, T, ...], float64 [M, ...]."""
-        return np.empty((len(self.rows), *table.shape[2:]))
-
-    def put(self, rows: Array, shape: torch.Size, dtype: torch.dtype = torch.float64) -> Tensor:
-        """The table of rows [M, ...]; 0 past the trajectories."""
-        own = torch.from_numpy(rows).to(dtype)
-        if len(self.rows) == self.number:
-            return own.reshape(shape)
-        table = own.new_zeros(self.number, *own.shape[1:])
-        table[torch.from_numpy(self.rows)] = own
-        return table.reshape(shape)
-
-    def gradient(self, rows: Array, of: Tensor) -> Tensor:
-        """The gradient of a tensor [N, T, ...] from its rows [M, ...]."""
-        return self.put(rows, of.shape, of.dtype)
-
-
-class Posterior(NamedTuple):
-    """The posterior of the rows of a group of tables.
-
-    :param rows: as links filled them, [M, n].
-    :param found: the posterior of each entry, [M, n].
-    :param weight: the gradient of a step's log-likelihood, [M].
-    """
-
-    rows: Array
-    found: Array
-    weight: Array
 
 
 class Link(ABC):
@@ -118,6 +53,17 @@ class Link(ABC):
     def formula(self) -> Tensor:
         """The table."""
 
+    @abstractmethod
+    def map(self, change: Callable[[Tensor], Tensor]) -> Link:
+        """The link of changed inputs, without a probe."""
+
+    @abstractmethod
+    def passes(self) -> list[Pass]:
+        """The compiled passes, whose tensors are :attr:`inputs`.
+
+        Passes of selections and terminations give probabilities; those of controls add up to log-densities.
+        """
+
     @cached_property
     def table(self) -> Tensor:
         """The table, with the probe."""
@@ -128,22 +74,11 @@ class Link(ABC):
         """Entries of the table in a step."""
         return self.shape[2:].numel()
 
-    @abstractmethod
-    def fill(self, alive: Alive, rows: Array, first: int) -> Any:
-        """Fill :attr:`columns` columns of ``rows`` [M, n] from ``first`` on; what :meth:`gradients` needs of it.
-
-        Links of selections and terminations fill in probabilities, those of controls log-densities.
-        """
-
-    @abstractmethod
-    def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
-        """The gradient of each input, given the posterior of the rows that :meth:`fill` filled."""
-
 
 class LogTable(Link):
     """A table that is given.
 
-    :param log: whether rows are filled with logarithms.
+    :param log: whether its pass gives logarithms.
     """
 
     def __init__(self, table: Tensor, log: bool = False) -> None:
@@ -153,25 +88,14 @@ class LogTable(Link):
         """The table."""
         return self.inputs[0]
 
-    def fill(self, alive: Alive, rows: Array, first: int) -> None:
-        """Copy the table, or its exponentials."""
-        own = torch.from_numpy(alive.take(self.inputs[0])).flatten(1)
-        torch.from_numpy(rows)[:, first : first + self.columns].copy_(own if self.log else own.exp())
+    def map(self, change: Callable[[Tensor], Tensor]) -> LogTable:
+        """The link of a changed table."""
+        return LogTable(change(self.inputs[0]), self.log)
 
-    def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
-        """The posterior itself."""
-        gradient = torch.empty(len(posterior.weight), self.columns, dtype=self.inputs[0].dtype).numpy()
-        _weigh(posterior.found, posterior.weight, first, gradient)
-        return (alive.gradient(gradient, self.inputs[0]),)
-
-
-@jit
-def _weigh(posterior: Array, weight: Array, first: int, gradient: Array) -> None:
-    steps, columns = gradient.shape
-    own = posterior[:, first : first + columns]
-    for m in range(steps):
-        for c in range(columns):
-            gradient[m, c] = weight[m] * own[m, c]
+    def passes(self) -> list[Pass]:
+        """A copy, or exponentials."""
+        size = self.shape[3:].numel()
+        return [Pass(LOGARITHMS if self.log else PROBABILITIES, self.columns // size, size, self.inputs)]
 
 
 class Selection(Link):
@@ -185,70 +109,14 @@ class Selection(Link):
         """[N, T, K, control + C]."""
         return log_selection(self.inputs[0], self.control)
 
-    def fill(self, alive: Alive, rows: Array, first: int) -> None:
-        """η."""
-        softmax(alive.take(self.inputs[0]), rows, first, self.control)
+    def map(self, change: Callable[[Tensor], Tensor]) -> Selection:
+        """The link of changed logits."""
+        return Selection(change(self.inputs[0]), self.control)
 
-    def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Any) -> Gradients:
-        """Posterior minus η times the posterior of its caller."""
-        logits = self.inputs[0]
-        gradient = alive.empty(logits)
-        softmax_gradient(*posterior, first, self.control, gradient)
-        return (alive.gradient(gradient, logits),)
-
-
-@jit
-def softmax(logits: Array, rows: Array, first: int, control: int) -> None:
-    """The softmax of logits [M, K, C] to K groups of columns of ``rows`` from ``first`` on, each after ``control`` 0s.
-
-    Blocks of steps lie side by side in memory, so that all but the copies vectorises.
-    """
-    steps, callers, choices = logits.shape
-    block = max(8, BLOCK // choices)
-    shares, top, total = np.empty((choices, block)), np.empty(block), np.empty(block)
-    for c in range(callers):
-        column = first + c * (control + choices)
-        for begin in range(0, steps, block):
-            own = logits[begin : begin + block, c]
-            out = rows[begin : begin + block, column : column + control + choices]
-            for i in range(len(own)):
-                for j in range(choices):
-                    shares[j, i] = own[i, j]
-            for i in range(len(own)):
-                top[i] = shares[0, i]
-                total[i] = 0.0
-            for j in range(1, choices):
-                for i in range(len(own)):
-                    top[i] = shares[j, i] if shares[j, i] > top[i] else top[i]
-            for j in range(choices):
-                for i in range(len(own)):
-                    shares[j, i] -= top[i]
-                exponentials(shares[j, : len(own)])
-                for i in range(len(own)):
-                    total[i] += shares[j, i]
-            for i in range(len(own)):
-                total[i] = 1.0 / total[i]
-            chosen = out[:, control:]
-            for i in range(len(own)):
-                for j in range(control):
-                    out[i, j] = 0.0
-                for j in range(choices):
-                    chosen[i, j] = shares[j, i] * total[i]
-
-
-@jit
-def softmax_gradient(rows: Array, posterior: Array, weight: Array, first: int, control: int, gradient: Array) -> None:
-    """The gradient of logits [M, K, C] whose :func:`softmax` stands in ``rows``."""
-    steps, callers, choices = gradient.shape
-    for c in range(callers):
-        column = first + c * (control + choices) + control
-        p, q = rows[:, column : column + choices], posterior[:, column : column + choices]
-        for m in range(steps):
-            total = 0.0
-            for j in range(choices):
-                total += q[m, j]
-            for j in range(choices):
-                gradient[m, c, j] = weight[m] * (q[m, j] - p[m, j] * total)
+    def passes(self) -> list[Pass]:
+        """A softmax."""
+        callers, size = self.inputs[0].shape[2:]
+        return [Pass(SOFTMAX, callers, size, self.inputs, self.control)]
 
 
 class Termination(Link):
@@ -261,54 +129,13 @@ class Termination(Link):
         """[N, T, k, 2]."""
         return log_termination(self.inputs[0])
 
-    def fill(self, alive: Alive, rows: Array, first: int) -> Array:
-        """1 - ψ and ψ; kept is tanh of the logits over their bound."""
-        logits = alive.take(self.inputs[0])
-        tanh = np.empty(logits.shape)
-        _terminate(logits.reshape(-1), tanh.reshape(-1), rows, first, logits.shape[1])
-        return tanh
+    def map(self, change: Callable[[Tensor], Tensor]) -> Termination:
+        """The link of changed logits."""
+        return Termination(change(self.inputs[0]))
 
-    def gradients(self, alive: Alive, posterior: Posterior, first: int, kept: Array) -> Gradients:
-        """(q_1 (1 - ψ) - q_0 ψ) times the slope of the bound, for posteriors q."""
-        logits = self.inputs[0]
-        gradient = alive.empty(logits)
-        _terminate_gradient(*posterior, first, kept, gradient)
-        return (alive.gradient(gradient, logits),)
-
-
-@jit
-def _terminate(logits: Array, tanh: Array, rows: Array, first: int, options: int) -> None:
-    block = max(BLOCK // options, 1) * options
-    x, ending = np.empty(block), np.empty(block)
-    for begin in range(0, len(logits), block):
-        own, bound = logits[begin : begin + block], tanh[begin : begin + block]
-        for i in range(len(own)):
-            v = own[i] * (2.0 / TERMINATION_BOUND)
-            x[i] = 700.0 if v > 700.0 else v  # NaN stays
-        exponentials(x[: len(own)])
-        for i in range(len(own)):
-            bound[i] = 1.0 - 2.0 / (1.0 + x[i])
-            x[i] = -TERMINATION_BOUND * bound[i]
-        exponentials(x[: len(own)])
-        for i in range(len(own)):
-            ending[i] = 1.0 / (1.0 + x[i])
-            x[i] *= ending[i]
-        out = rows[begin // options : (begin + block) // options, first : first + 2 * options]
-        i = 0
-        for m in range(len(out)):
-            for j in range(options):
-                out[m, 2 * j], out[m, 2 * j + 1] = x[i], ending[i]
-                i += 1
-
-
-@jit
-def _terminate_gradient(rows: Array, posterior: Array, weight: Array, first: int, tanh: Array, gradient: Array) -> None:
-    steps, options = gradient.shape
-    p, q = rows[:, first : first + 2 * options], posterior[:, first : first + 2 * options]
-    for m in range(steps):
-        for j in range(options):
-            change = q[m, 2 * j + 1] * p[m, 2 * j] - q[m, 2 * j] * p[m, 2 * j + 1]
-            gradient[m, j] = weight[m] * change * (1.0 - tanh[m, j] * tanh[m, j])
+    def passes(self) -> list[Pass]:
+        """A logistic function of bounded logits; kept is the slope of the bound."""
+        return [Pass(TERMINATIONS, self.shape[2], 1, self.inputs, kept=self.shape[2])]
 
 
 class LinkedTables(Tables):

@@ -57,7 +57,7 @@ class CallerOutputs:
         """log π(a | s) of each caller, [N, T, K], not computed; -inf for a caller that emits no control."""
         if self.emission is None:
             assert self.logits is not None  # a caller emits something
-            return LogTable(self.logits.new_full(self.logits.shape[:-1], NEVER), log=True)
+            return LogTable(self.logits.new_tensor(NEVER).expand(self.logits.shape[:-1]), log=True)
         if actions.requires_grad:
             return LogTable(self.emission.log_density(actions), log=True)
         return Density(self.emission, actions)

@@ -121,7 +121,7 @@ def improved(pieces: Sequence[Piece], constants: Constants) -> tuple[float, Cons
     selected = [torch.full_like(table, PSEUDO) for table in constants.selection]
     ended = [torch.stack([PSEUDO * (psi < 1), torch.full_like(psi, PSEUDO)], -1) for psi in constants.termination]
     for tables, lengths in pieces:
-        found = fused.eliminate(constants.within(tables), lengths)
+        found = fused.posteriors(constants.within(tables), lengths)
         value += float(found.value.sum())
         for total, counts in zip(selected, found.tables.selection, strict=True):
             total += counts.sum((0, 1))[:, 1:]
@@ -137,7 +137,7 @@ def expected(tables: Tables, lengths: Tensor, constants: Constants) -> Tensor:
     An M-step of the networks maximises their sum. The log-probability is that of selections, and of terminations above
     the lowest level. The expectation is over the posterior of ζ_n given the constants.
     """
-    counts = fused.eliminate(constants.within(tables), lengths).tables
+    counts = fused.posteriors(constants.within(tables), lengths).tables
     pairs = [
         *zip(tables.selection, counts.selection, strict=True),
         *zip(tables.termination[1:], counts.termination[1:], strict=True),
