@@ -151,7 +151,7 @@ def _forward(rows: Rows, best: bool, keeps: Array, ways: Array, of: Structure) -
     ways[t] has, for the choices of each level below one entry, the distribution function of the choice that terminated
     at t. The first entries of ways[T] are the distribution function of the last joint choice.
     """
-    depth, steps = len(of.sizes), len(rows.control)
+    depth, steps = len(of.sizes), len(ways) - 1
     messages, spread = np.full(of.starts[-1], -np.inf), np.empty(of.starts[-1])
     keeps[:] = 0.0
     messages[of.starts[depth]] = 0.0  # at t = 0 everything is selected
