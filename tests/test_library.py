@@ -186,7 +186,8 @@ def test_baselines_in_other_processes_are_the_same_also_after_a_kill(commanded: 
     for path in sorted((tmp_path / "1").rglob("*.safetensors")) + sorted((tmp_path / "1").rglob("*.csv")):
         assert path.read_bytes() == (tmp_path / "2" / path.relative_to(tmp_path / "1")).read_bytes()
     began = [[event for event in events if isinstance(event, TrainingBegan)] for events in told.values()]
-    assert began[0] == began[1] == [TrainingBegan(name, 8) for name in ("ddco", "flat", "flat_2")]
+    assert began[0] == [TrainingBegan(name, 8) for name in ("ddco", "flat", "flat_2")]
+    assert began[1] == [TrainingBegan(name, 8) for name in ("ddco", "flat_2", "flat")]  # this process has its share
     again = ddco_pyro.fit(parse_spec(data), two_skills(), jobs=2)  # without a folder
     assert numbers(again.baselines["flat_2"]) == numbers(fits[0].baselines["flat_2"])
 

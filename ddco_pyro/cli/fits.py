@@ -6,7 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from enum import StrEnum
 from pathlib import Path
 from types import MappingProxyType
@@ -70,7 +70,7 @@ def fit(
     jobs: Annotated[
         int | None,
         typer.Option(
-            help="Processes that train restarts, or long baselines beside the model; -1, the default, is one for each "
+            help="Processes that train restarts, or baselines beside the model; -1, the default, is one for each "
             "core, 1 is this process alone."
         ),
     ] = None,
@@ -128,12 +128,39 @@ def _fit(
     :param workers: jobs, None for the default, and processes that share each gradient step.
     """
     jobs, processes = workers
+    if jobs is None:
+        jobs = -1 if processes == 1 else 1
+    with _ready(loaded, jobs):
+        _fit_and_report(loaded, spec, out, (jobs, processes), seeds, resume, logs)
+
+
+@contextmanager
+def _ready(spec: Spec, jobs: int) -> Iterator[None]:
+    """Inside, another process is ready to fit baselines, if it is of use."""
+    from ddco_pyro.training.jobs import LONG, check_jobs, early_process, useful_jobs
+
+    check_jobs(jobs)
+    own = spec.training
+    long = own.epochs is None or own.epochs >= LONG
+    alone = own.restarts == 1 and own.device == "cpu" and useful_jobs(jobs, 1 + len(spec.compare_with)) == 2
+    with early_process("ddco_pyro.fitting.fit") if long and alone else nullcontext():
+        yield
+
+
+def _fit_and_report(
+    loaded: Spec,
+    spec: Path,
+    out: Path | None,
+    workers: tuple[int, int],
+    seeds: int | None,
+    resume: bool,
+    logs: Mapping[str, MakeLog],
+) -> None:
+    jobs, processes = workers
     import ddco_pyro
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.seeds import check_seeds, repeat
 
-    if jobs is None:
-        jobs = -1 if processes == 1 else 1
     if seeds is not None:
         check_seeds(loaded, seeds)
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"

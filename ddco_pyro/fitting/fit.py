@@ -6,7 +6,7 @@ import importlib.metadata
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -39,11 +39,12 @@ from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.data import dimensions, known_demonstrations, parts, refuse_unfit, seen
 from ddco_pyro.training.devices import device_of, repeatable
+from ddco_pyro.training.jobs import LONG, beside, check_jobs, end_with, useful_jobs
 from ddco_pyro.training.labels import used
 from ddco_pyro.training.launching import check_processes, together
 from ddco_pyro.training.networks import Dimensions, check_models, model_name, parameters
 from ddco_pyro.training.optimizers import optimizer_of
-from ddco_pyro.training.processes import ALONE, Ranks, check_jobs, end_with, pool, results, useful_jobs
+from ddco_pyro.training.processes import ALONE, Ranks
 from ddco_pyro.training.restarts import train_model
 
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
@@ -80,7 +81,7 @@ def fit(
     :param out: the run folder, as ``ddco-pyro fit`` makes it, with a copy of demonstrations from memory; None to write
         nothing. An unfinished run is continued; a finished one is loaded.
     :param on_event: called with progress events (:mod:`ddco_pyro.events`).
-    :param jobs: processes that train restarts, or long baselines beside the model, -1 for one on each core; 1 for this
+    :param jobs: processes that train restarts, or baselines beside the model, -1 for one on each core; 1 for this
         process alone. The result is the same for any number. In a script, more than one needs the usual
         ``if __name__ == "__main__":``.
     :param processes: processes that share the work of each gradient step instead, at most ``training.shards``; the
@@ -165,9 +166,10 @@ def _fit_model(
         baseline: partial(_fit_baseline, its, demos, folder and folder / "baselines" / baseline, folder, baseline)
         for baseline, (its, _) in baselines.items()
     }
-    far = {name: fits[name] for name, model in baselines.items() if _worth_a_process(*model, demos)}
+    far = _shared(jobs, [name for name, model in baselines.items() if _worth_a_process(*model, demos)])
     began = {name: TrainingBegan(name, its.training.epochs) for name, (its, _) in baselines.items()}
-    with _in_other_processes(far if ranks.size == 1 else {}, began, jobs, on_event) as begun:
+    others = {name: fits[name] for name in far} if ranks.size == 1 else {}
+    with _in_other_processes(others, began, jobs, on_event) as begun:
         with clock("training"):
             trained = train_model(
                 spec, size, split["train"], on_event, checkpoints, split.get("valid"), name, jobs, ranks
@@ -177,10 +179,11 @@ def _fit_model(
             write_history(folder, trained.history)
             write_model(folder, hierarchy)
         with clock("baselines"):
-            beside = {name: begun[name]() if name in begun else fits[name](on_event, jobs, ranks) for name in fits}
+            here = {name: fits[name](on_event, jobs, ranks) for name in fits if name not in begun}
+            by_name = {name: here[name] if name in here else begun[name]() for name in fits}
     with clock("training"):
         apart = _leave_one_out(spec, size, demos, folder, on_event, jobs, ranks)
-    fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=beside, apart=apart)
+    fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=by_name, apart=apart)
     train, valid = len(trained.data.train), len(split.get("valid", ()))
     counts = {"train": train, "tune": len(split["train"]) - train, "valid": valid, "left_out": bool(apart)}
     known = {"supervisor": json.loads(str(demos.attributes.get("supervisor", "{}")))}  # a collected file has it
@@ -264,9 +267,6 @@ def _fit_baseline(
 LITTLE = 256e6
 """Bytes of demonstrations, at most, that another process gets a copy of."""
 
-LONG = 1000
-"""Gradient steps, at least, of a training that takes longer than starting a process."""
-
 DEAD = (
     "a process that trained a baseline was ended from outside (too little memory?); what was trained is kept in a run "
     "folder: continue with the same command, with --jobs 1 if memory was short"
@@ -274,33 +274,37 @@ DEAD = (
 
 
 def _worth_a_process(spec: Spec, networks: Hierarchy, demos: Demonstrations) -> bool:
-    """Whether training takes many steps on minibatches, on a CPU and on demonstrations that are small and in memory.
+    """Whether training takes many steps, on a CPU and on demonstrations that are small and in memory.
 
     Several restarts share the processes among themselves instead.
     """
     own, arrays = spec.training, [array for demo in demos for array in demo.observations.values()]
-    steps = math.inf if own.epochs is None else own.epochs * math.ceil(len(demos) / own.batch_size)
+    whole = optimizer_of(own.optimizer, networks) in ("em", "lbfgs")
+    steps = math.inf if own.epochs is None else own.epochs * (1 if whole else math.ceil(len(demos) / own.batch_size))
     sizes = [array.nbytes if isinstance(array, np.ndarray) else math.inf for array in arrays]
-    alone = own.restarts == 1 and device_of(own).type == "cpu"
-    return (
-        alone and sum(sizes) < LITTLE and steps >= LONG and optimizer_of(own.optimizer, networks) not in ("em", "lbfgs")
-    )
+    return own.restarts == 1 and device_of(own).type == "cpu" and sum(sizes) < LITTLE and steps >= LONG
+
+
+def _shared(jobs: int, names: Sequence[str]) -> list[str]:
+    """The baselines that other processes fit. This process fits the model, then its share of the baselines."""
+    processes = useful_jobs(jobs, 1 + len(names))
+    return [name for number, name in enumerate(names) if number % processes != processes - 1]
 
 
 @contextmanager
 def _in_other_processes(
     fits: Mapping[str, Callable[[OnEvent], Fit]], began: Mapping[str, TrainingBegan], jobs: int, on_event: OnEvent
 ) -> Iterator[Mapping[str, Callable[[], Fit]]]:
-    """Inside, other processes fit baselines, unless there is one core or job alone.
+    """Inside, other processes fit baselines.
 
     :param began: the event with which the training of each begins; it is passed on when the wait begins.
-    :returns: for each baseline that has begun, a function that waits for the fit and then passes its events on.
+    :returns: for each of the baselines, a function that waits for the fit and then passes its events on.
     """
-    if not fits or useful_jobs(jobs, 2) == 1:
+    if not fits:
         yield {}
         return
-    with pool(max(2, useful_jobs(jobs, len(fits)))) as parallel:
-        left = results(parallel, [partial(_with_events, name, fit, os.getpid()) for name, fit in fits.items()], DEAD)
+    calls = [partial(_with_events, name, fit, os.getpid()) for name, fit in fits.items()]
+    with beside(useful_jobs(jobs, 1 + len(fits)) - 1, calls, DEAD) as left:
         done: dict[str, tuple[Fit, list[Event]]] = {}
 
         def wait(name: str) -> Fit:

@@ -16,7 +16,7 @@ from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import is_finished
 from ddco_pyro.metrics import Metrics, Seeds, SuccessOfSeeds
 from ddco_pyro.spec import Spec, user_code, with_overrides
-from ddco_pyro.training.processes import pool, results, useful_jobs
+from ddco_pyro.training.jobs import pool, results, useful_jobs
 
 DEAD = "a process that repeated the fit was ended from outside (too little memory?); the same command goes on"
 

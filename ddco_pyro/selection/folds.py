@@ -21,9 +21,9 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.selection.grid import Candidate
-from ddco_pyro.training import processes
+from ddco_pyro.training import jobs
+from ddco_pyro.training.jobs import ALL_CORES, BackendError
 from ddco_pyro.training.networks import Dimensions
-from ddco_pyro.training.processes import ALL_CORES, BackendError
 from ddco_pyro.training.restarts import train_model
 
 CONNECT_SECONDS = 10
@@ -188,7 +188,7 @@ class Workers:
     scheduler: str | None = None
 
     def __post_init__(self) -> None:
-        processes.check_jobs(self.jobs)
+        jobs.check_jobs(self.jobs)
 
     @contextmanager
     def pool(self) -> Iterator[Parallel]:
@@ -200,7 +200,7 @@ class Workers:
             if self.scheduler is not None:
                 stack.enter_context(_client(self.scheduler))
                 stack.enter_context(parallel_config(backend="dask"))
-            yield stack.enter_context(processes.pool(self.jobs))
+            yield stack.enter_context(jobs.pool(self.jobs))
 
     def check(self) -> None:
         """Check that the scheduler and its workers answer.
@@ -239,7 +239,7 @@ def scores(pool: Parallel, folds: Folds, pending: Sequence[tuple[Candidate, int]
     # The demonstrations are bound into the function. As an argument, dask would store them with one worker and lose
     # them with the worker.
     calls = [partial(score, folds, candidate, fold) for candidate, fold in pending]
-    yield from processes.results(
+    yield from jobs.results(
         pool,
         calls,
         "a process that trained a fold was ended from outside (too little memory?); finished folds are kept: "

@@ -41,7 +41,7 @@ from ddco_pyro.simulation.episodes import run_episodes
 from ddco_pyro.spec import DemonstrationsSpec, Spec, SpecError, parse_spec, with_overrides
 from ddco_pyro.spec.yaml import read_yaml
 from ddco_pyro.study.declaration import NATS, Study
-from ddco_pyro.training import data, processes
+from ddco_pyro.training import data, jobs
 from ddco_pyro.training.networks import Dimensions, baseline_spec, named_baselines
 
 
@@ -316,7 +316,7 @@ class Folder:
                 before = self._state(cells)
                 on_event(StudyBegan(len(cells), len(before.done)))
                 calls = [partial(there.do, cell) for number, cell in enumerate(cells) if number not in before.done]
-                for cell, failed in processes.results(pool, calls, DEAD) if calls else ():
+                for cell, failed in jobs.results(pool, calls, DEAD) if calls else ():
                     on_event(CellDone(str(cell), failed))
                 state = self._state(cells)
                 cells = list(self.state().cells)  # development, once done, adds those of the test

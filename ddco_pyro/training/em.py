@@ -24,7 +24,6 @@ from torch.nn.functional import softplus
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Caller, Hierarchy
 from ddco_pyro.model.links import TERMINATION_BOUND, bounded
-from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.perceptrons import Mlp, StackedLinear
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import Tables
@@ -40,6 +39,8 @@ TOLERANCE = 1e-5
 """EM has converged where a step gains less, in nats per step of the demonstrations."""
 ROUGHLY = 1e-3
 """The same in a stage whose end is a start alone."""
+PRODUCTS = 2**22
+"""The most products of two features that are held at once."""
 BIAS = 1e-6
 """Ridge of biases, and the least of weights: an option that is never active keeps its own."""
 
@@ -53,6 +54,37 @@ def is_linear(model: Hierarchy) -> bool:
         isinstance(network, Mlp) and network.trunk_size is None and len(network.layers) == 1
         for network in model.networks().values()
     )
+
+
+class Features:
+    """The features of a piece of the demonstrations and their products, in float64.
+
+    :param vector: what networks read, [N, T, F - 1].
+    :ivar x: with a 1 at the end, [N, T, F].
+    """
+
+    def __init__(self, vector: Tensor) -> None:
+        self.x = torch.cat([vector.double(), vector.new_ones(*vector.shape[:-1], 1).double()], dim=-1)
+        self._rows = self.x.flatten(0, 1)
+        self._first, self._second = torch.tril_indices(self.x.shape[-1], self.x.shape[-1])
+        self._kept: list[Tensor] = []
+
+    def moments(self, weights: Tensor) -> Tensor:
+        """Σ_t h_t x_t x_t^T for each column of weights [N·T, W]: [W, F, F]."""
+        (steps, features), triangle = self._rows.shape, len(self._first)
+        size = max(1, PRODUCTS // triangle)
+        blocks = self._kept or map(self._products, self._rows.split(size))
+        if size >= steps:
+            self._kept = list(blocks)
+            blocks = self._kept
+        found = torch.stack([own.T @ block for own, block in zip(weights.split(size), blocks, strict=True)]).sum(0)
+        whole = found.new_empty(len(found), features, features)
+        whole[:, self._first, self._second] = whole[:, self._second, self._first] = found
+        return whole
+
+    def _products(self, rows: Tensor) -> Tensor:
+        """x_f x_g of each pair of features, [M, F (F + 1) / 2]."""
+        return rows[:, self._first] * rows[:, self._second]
 
 
 @dataclass(frozen=True)
@@ -71,44 +103,52 @@ class Information:
     probabilities: Tensor | None = None
     std: tuple[int, ...] = ()
 
+    def weights(self) -> Tensor:
+        """h as columns, [N·T, W]; of probabilities those of each pair of outputs, the lower triangle."""
+        if self.probabilities is None:
+            return self.weight.flatten(0, 1).flatten(1)
+        p = self.probabilities.flatten(0, 1)
+        i, j = torch.tril_indices(p.shape[-1], p.shape[-1])
+        return (self.weight.flatten(0, 1).unsqueeze(-1) * p[..., i] * ((i == j).double() - p[..., j])).flatten(1)
+
+    def matrices(self, moments: Tensor) -> Tensor:
+        """Σ_t h_t x_t x_t^T from the moments [W, F, F] of :meth:`weights`.
+
+        [K, F, F] for a weight of all outputs, [K, n, F, F] for one of each, [K, nF, nF] of logits.
+        """
+        if self.probabilities is None:
+            return moments.unflatten(0, self.weight.shape[2:])
+        (copies, outputs), features = self.probabilities.shape[2:], moments.shape[-1]
+        i, j = torch.tril_indices(outputs, outputs)
+        whole = moments.new_empty(copies, outputs, outputs, features, features)
+        whole[:, i, j] = whole[:, j, i] = moments.unflatten(0, (copies, -1))
+        return whole.transpose(2, 3).reshape(copies, outputs * features, outputs * features)
+
 
 @dataclass
 class Sums:
-    """Sums over all steps for one network: the gradient of W, [K, F, n], and the information of each group."""
+    """Sums over all steps for one network: the gradient of W, [K, F, n], and the information of groups of outputs.
+
+    :ivar groups: by their first output; of the last piece.
+    :ivar information: the matrix of each group.
+    """
 
     gradient: Tensor | float = 0.0
-    groups: list[Information] = field(default_factory=list)
-    information: list[Tensor] = field(default_factory=list)
     std: Tensor | float = 0.0
+    groups: dict[int, Information] = field(default_factory=dict)
+    information: dict[int, Tensor] = field(default_factory=dict)
 
-    def add(self, x: Tensor, gradient: Tensor, groups: Sequence[Information], std: Tensor | None) -> None:
-        """Add those of a piece: features x [N, T, F] and gradients of outputs [N, T, K, n]."""
-        rows, copies = x.flatten(0, 1), gradient.shape[2]
-        own = rows.T @ gradient.flatten(2).flatten(0, 1)
-        self.gradient = self.gradient + own.unflatten(1, (copies, -1)).transpose(0, 1)
+    def add_gradient(self, x: Tensor, gradient: Tensor, std: Tensor | None) -> None:
+        """Add that of a piece: features x [N, T, F], gradients of outputs [N, T, K, n] and of σ."""
+        own = x.flatten(0, 1).T @ gradient.flatten(2).flatten(0, 1)
+        self.gradient = self.gradient + own.unflatten(1, (gradient.shape[2], -1)).transpose(0, 1)
         self.std = self.std + (0.0 if std is None else std)
-        found = [_information(rows, group) for group in groups]
-        if self.groups:
-            found = [one + more for one, more in zip(self.information, found, strict=True)]
-        self.groups, self.information = list(groups), found
 
-
-def _information(rows: Tensor, group: Information) -> Tensor:
-    """Σ_t h_t x_t x_t^T: [K, F, F] for a weight of all outputs, [K, n, F, F] for one of each, [K, nF, nF] of logits."""
-    weight = group.weight.flatten(0, 1)
-    if group.probabilities is None:
-        weighted = weight.movedim(0, -1).unsqueeze(-2) * rows.T  # [K, (n,) F, M]
-        return weighted @ rows
-    p = group.probabilities.flatten(0, 1)
-    copies, outputs = p.shape[1:]
-    features = rows.shape[1]
-    whole = rows.new_empty(copies, outputs, features, outputs, features)
-    for i in range(outputs):
-        for j in range(i, outputs):
-            own = weight * p[..., i] * (float(i == j) - p[..., j])
-            block = (own.T.unsqueeze(1) * rows.T) @ rows
-            whole[:, i, :, j], whole[:, j, :, i] = block, block.mT
-    return whole.reshape(copies, outputs * features, outputs * features)
+    def add_information(self, group: Information, moments: Tensor) -> None:
+        """Add that of a piece from the moments of its weights."""
+        place, found = group.columns.start, group.matrices(moments)
+        self.information[place] = found + self.information[place] if place in self.information else found
+        self.groups[place] = group
 
 
 class Linear:
@@ -123,11 +163,6 @@ class Linear:
         assert isinstance(layer, StackedLinear)
         self.layer, self.ridge, self.trained, self.reads = layer, ridge, trained, tuple(network.reads)
         self.weight = torch.cat([layer.weight.detach(), layer.bias.detach()], dim=1).double().cpu()
-
-    def features(self, inputs: Inputs) -> Tensor:
-        """x, [N, T, F]."""
-        vector = inputs.select(self.reads).vector.double()
-        return torch.cat([vector, vector.new_ones(*vector.shape[:-1], 1)], dim=-1)
 
     def outputs(self, x: Tensor) -> Tensor:
         """W^T x, [N, T, K, n]."""
@@ -207,7 +242,7 @@ class Expectation:
             if caller.std is not None
         }
         self._before: dict[str, Tensor] | None = None
-        self._pieces: list[tuple[Tensor, Batch, dict[tuple[str, ...], Tensor]]] = []
+        self._pieces: list[tuple[Tensor, Batch, dict[tuple[str, ...], Features]]] = []
         self.value, self.gain = -math.inf, math.inf
 
     def converged(self, roughly: bool = False) -> bool:
@@ -297,14 +332,14 @@ class Expectation:
         return total, sums
 
     def _expect_piece(
-        self, rows: Tensor, piece: Batch, xs: dict[tuple[str, ...], Tensor], sums: dict[str, Sums]
+        self, rows: Tensor, piece: Batch, xs: dict[tuple[str, ...], Features], sums: dict[str, Sums]
     ) -> float:
         levels = self.model.option_levels()[: self._discovering]
         said: dict[str, Tensor] = {}
         for name, network in self._networks.items():
             if network.reads not in xs:
-                xs[network.reads] = network.features(piece.inputs)
-            said[name] = network.outputs(xs[network.reads]).requires_grad_()
+                xs[network.reads] = Features(piece.inputs.select(network.reads).vector)
+            said[name] = network.outputs(xs[network.reads].x).requires_grad_()
         stds = {name: std.value.clone().requires_grad_() for name, std in self._stds.items()}
         callers = {
             name: caller(said[name], self.model.scaling, stds.get(name)) for name, caller in self._callers.items()
@@ -328,6 +363,7 @@ class Expectation:
         every = [*(f"{name}.policy" for name in named), *([] if self._discovering else ["meta_policy"])]
         choosing = [name for name in every if callers[name].options]
         selection = dict(zip(choosing, chosen, strict=False))
+        learned: dict[str, list[Information]] = {}
         for place, name in enumerate(every):
             if name not in sums or of[name] is None:
                 continue
@@ -342,7 +378,8 @@ class Expectation:
                     caller, self.model, said[name].detach(), self._stds[name].value, acting, piece.actions
                 )
                 groups.extend(emitted)
-            sums[name].add(xs[self._networks[name].reads], of[name], groups, of_std.get(name))
+            sums[name].add_gradient(xs[self._networks[name].reads].x, of[name], of_std.get(name))
+            learned[name] = groups
         for place, prefix in enumerate(named):
             name = f"{prefix}.termination"
             if name in sums and of[name] is not None:
@@ -350,7 +387,15 @@ class Expectation:
                 slope = 1 - (within / TERMINATION_BOUND).square()
                 ending = within.sigmoid()
                 weight = ended[place].sum(-1, keepdim=True) * ending * (1 - ending) * slope.square()
-                sums[name].add(xs[self._networks[name].reads], of[name], [Information(slice(0, 1), weight)], None)
+                sums[name].add_gradient(xs[self._networks[name].reads].x, of[name], None)
+                learned[name] = [Information(slice(0, 1), weight)]
+        for reads, x in xs.items():
+            its = [(name, group) for name in learned if self._networks[name].reads == reads for group in learned[name]]
+            if its:
+                weights = [group.weights() for _, group in its]
+                moments = x.moments(torch.cat(weights, dim=1)).split([each.shape[1] for each in weights])
+                for (name, group), part in zip(its, moments, strict=True):
+                    sums[name].add_information(group, part)
         return float(value.detach())
 
     def _maximise(self, sums: dict[str, Sums]) -> None:
@@ -362,8 +407,8 @@ class Expectation:
             change = torch.zeros_like(network.weight)
             std = self._stds.get(name)
             value = None if std is None else std.value
-            for group, information in zip(own.groups, own.information, strict=True):
-                columns = group.columns
+            for place, information in own.information.items():
+                group, columns = own.groups[place], own.groups[place].columns
                 gradient, weight = own.gradient[..., columns], network.weight[..., columns]
                 if group.std:
                     assert std is not None

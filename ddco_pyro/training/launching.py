@@ -16,7 +16,8 @@ from multiprocessing.process import BaseProcess
 from torch import distributed
 
 from ddco_pyro.errors import Failed
-from ddco_pyro.training.processes import ALONE, BackendError, LostProcess, Ranks, connected
+from ddco_pyro.training.jobs import BackendError
+from ddco_pyro.training.processes import ALONE, LostProcess, Ranks, connected
 from ddco_pyro.training.restarts import follow
 
 HERE = "127.0.0.1"

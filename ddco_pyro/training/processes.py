@@ -1,4 +1,4 @@
-"""Processes: jobs that work side by side (joblib), and ranks that train one restart together (``torch.distributed``).
+"""Ranks: processes that train one restart together (``torch.distributed``).
 
 All ranks come to the same exchanges in the same order. Results are passed on in the order of the calls that gave them,
 whichever rank computed them.
@@ -6,72 +6,18 @@ whichever rank computed them.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, TypeVar
 
-import joblib
-from joblib import Parallel, delayed
 from torch import distributed
 
-from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.errors import Failed
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-ALL_CORES = -1
-"""The number of ``jobs`` that stands for one for each core."""
-
-
-class BackendError(BadInput):
-    """Work cannot be done by these processes or on this backend."""
-
-
-def check_jobs(jobs: int) -> None:
-    """Refuse what is no number of processes.
-
-    :raises BackendError: ``jobs`` is none.
-    """
-    if jobs != ALL_CORES and jobs < 1:
-        raise BackendError(f"--jobs {jobs}: give a number of processes, or -1 for one on each core")
-
-
-def useful_jobs(jobs: int, calls: int) -> int:
-    """The number of processes for so many calls, at most one for each call."""
-    return min(joblib.cpu_count() if jobs == ALL_CORES else jobs, calls)
-
-
-def pool(jobs: int) -> Parallel:
-    """Processes for :func:`results`, to be used in a ``with`` statement."""
-    # one call at a time: each takes long, and each result is kept at once; no read-only maps of arrays
-    return Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None)
-
-
-def results(parallel: Parallel, calls: Iterable[Callable[[], Result]], dead: str) -> Iterator[Result]:
-    """The results of calls, as they are completed. Processes other than this one begin at once.
-
-    :param dead: the message for a process that dies.
-    :raises Failed: a process died.
-    """
-    found = parallel([delayed(call)() for call in calls])
-
-    def completed() -> Iterator[Result]:
-        try:
-            yield from found
-        except BrokenProcessPool as error:
-            raise Failed(dead) from error
-
-    return completed()
-
-
-def end_with(parent: int) -> None:
-    """End this process where the process that waits for it is gone: another command may go on in the same folder."""
-    if os.getppid() != parent:
-        os._exit(1)
 
 
 class LostProcess(Failed):

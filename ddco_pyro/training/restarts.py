@@ -42,12 +42,13 @@ from ddco_pyro.spec import Spec
 from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData
 from ddco_pyro.training.data import tuning_split
 from ddco_pyro.training.devices import described, device_of
+from ddco_pyro.training.jobs import end_with, pool, results, useful_jobs
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
 from ddco_pyro.training.optimizers import optimizer_of
-from ddco_pyro.training.processes import ALONE, Ranks, end_with, pool, results, useful_jobs
+from ddco_pyro.training.processes import ALONE, Ranks
 from ddco_pyro.training.stages import StageEnd, plan
 
 SHORT = 10.0

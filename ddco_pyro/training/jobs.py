@@ -1,0 +1,116 @@
+"""Jobs: processes that work side by side, each on a call of its own (joblib)."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import TypeVar
+
+import joblib
+from joblib import Parallel, delayed
+from joblib.externals.loky import ProcessPoolExecutor
+
+from ddco_pyro.errors import BadInput, Failed
+
+Result = TypeVar("Result")
+
+ALL_CORES = -1
+"""The number of ``jobs`` that stands for one for each core."""
+LONG = 1000
+"""Gradient steps, at least, of a training that takes longer than starting a process."""
+
+
+class BackendError(BadInput):
+    """Work cannot be done by these processes or on this backend."""
+
+
+def check_jobs(jobs: int) -> None:
+    """Refuse what is no number of processes.
+
+    :raises BackendError: ``jobs`` is none.
+    """
+    if jobs != ALL_CORES and jobs < 1:
+        raise BackendError(f"--jobs {jobs}: give a number of processes, or -1 for one on each core")
+
+
+def useful_jobs(jobs: int, calls: int) -> int:
+    """The number of processes for so many calls, at most one for each call."""
+    return min(joblib.cpu_count() if jobs == ALL_CORES else jobs, calls)
+
+
+def pool(jobs: int) -> Parallel:
+    """Processes for :func:`results`, to be used in a ``with`` statement."""
+    # one call at a time: each takes long, and each result is kept at once; no read-only maps of arrays
+    return Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None)
+
+
+def results(parallel: Parallel, calls: Iterable[Callable[[], Result]], dead: str) -> Iterator[Result]:
+    """The results of calls, as they are completed. Processes other than this one begin at once.
+
+    :param dead: the message for a process that dies.
+    :raises Failed: a process died.
+    """
+    found = parallel([delayed(call)() for call in calls])
+
+    def completed() -> Iterator[Result]:
+        try:
+            yield from found
+        except BrokenProcessPool as error:
+            raise Failed(dead) from error
+
+    return completed()
+
+
+def end_with(parent: int) -> None:
+    """End this process where the process that waits for it is gone: another command may go on in the same folder."""
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+# --- processes beside this one ----------------------------------------------------------------------------------------
+
+_EARLY: list[ProcessPoolExecutor] = []
+
+
+@contextmanager
+def early_process(module: str) -> Iterator[None]:
+    """Inside, a process is ready for :func:`beside`. Its imports go on during those of this process.
+
+    :param module: what it imports.
+    """
+    executor = ProcessPoolExecutor(1)
+    _EARLY.append(executor)
+    executor.submit(importlib.import_module, module)
+    try:
+        yield
+    finally:
+        _EARLY.remove(executor)
+        executor.shutdown(kill_workers=True)
+
+
+@contextmanager
+def beside(workers: int, calls: Iterable[Callable[[], Result]], dead: str) -> Iterator[Iterator[Result]]:
+    """Inside, other processes work on calls while this one does something else; the results, as they are completed.
+
+    :param dead: the message for a process that dies.
+    :raises Failed: a process died.
+    """
+    early = workers == 1 and bool(_EARLY)
+    executor = _EARLY[-1] if early else ProcessPoolExecutor(workers)
+    futures = [executor.submit(call) for call in calls]
+
+    def completed() -> Iterator[Result]:
+        try:
+            yield from (future.result() for future in as_completed(futures))
+        except BrokenProcessPool as error:
+            raise Failed(dead) from error
+
+    try:
+        yield completed()
+    finally:
+        if not early:
+            executor.shutdown(kill_workers=True)
