@@ -398,6 +398,7 @@ def test_a_failed_cell_says_why_and_is_tried_again(made, monkeypatch):
     assert (len(state.done), len(state.failed)) == (2, 0)
 
 
+@pytest.mark.slow
 def test_a_killed_study_goes_on_with_what_is_done(made):
     folder = made(demonstrations={**STUDY["demonstrations"], "counts": [6]})
     where = folder.study.path.parent

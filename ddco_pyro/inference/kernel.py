@@ -59,6 +59,8 @@ TASK = 8 * (PLAIN + 6 * VIEW)
 """Bytes of a task."""
 
 releasing = numba.njit(cache=True, error_model="numpy", nogil=True)
+"""Keeps the compiled function on disk, with all that it calls. numba looks at this file alone: delete ``*.nb?`` in
+``__pycache__`` after a change to :mod:`ddco_pyro.model.passes` or :mod:`ddco_pyro.model.elementary`."""
 
 
 class Structure(NamedTuple):
