@@ -593,6 +593,7 @@ def test_pages_of_the_project_agree_with_the_tables(path):
         ("pushing", set()),
         ("arena", {"options by em", "options by em without ridges"}),
         ("bins", set()),
+        ("tuned", set()),
         ("planted", {"joint", "layer-wise", "segments, mixture", "joint, mixture"}),
     ],
 )
