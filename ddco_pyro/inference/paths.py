@@ -99,7 +99,9 @@ def _trace(tables: Tables, lengths: Tensor, best: bool, uniforms: np.ndarray) ->
     evidence = tables.joint_evidence()
     groups = tables.selection, tables.termination, (meta_policy, *levels), () if evidence is None else (evidence,)
     nothing = torch.empty(len(lengths), tables.steps, 0, dtype=torch.float64)
-    rows = Rows(*(torch.cat([nothing, *(table.flatten(2) for table in group)], -1).numpy() for group in groups))
+    rows = Rows(
+        *(torch.cat([nothing, *(table.detach().flatten(2) for table in group)], -1).numpy() for group in groups)
+    )
     others = rows, lengths.numpy(), best, uniforms, joint, terminated, possible, structure
     on_threads(lambda first, last: _trace_all(first, last, *others), lengths.numpy())
     refuse_impossible(torch.from_numpy(possible))
