@@ -95,6 +95,7 @@ $(DEMO): pyproject.toml setup.py constraints.txt | python
 	$(BIN)/python -c 'import torch' 2>/dev/null \
 		|| $(PIP) --retries 1 --timeout 20 --find-links $(TORCH_CPU) --no-deps torch
 	$(PIP) -e .
+	$(BIN)/python -c 'from ddco_pyro.inference import compile_all; compile_all()'
 	@touch $@
 
 $(DEV): $(DEMO)

@@ -34,7 +34,7 @@ from ddco_pyro.fitting.run import (
     write_history,
     write_model,
 )
-from ddco_pyro.inference.fused import compile_pass
+from ddco_pyro.inference import compile_all
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
@@ -304,7 +304,7 @@ def _in_other_processes(
     if not fits:
         yield {}
         return
-    compile_pass()
+    compile_all()
     calls = [partial(_with_events, name, fit, os.getpid()) for name, fit in fits.items()]
     with beside(useful_jobs(jobs, 1 + len(fits)) - 1, calls, DEAD) as left:
         done: dict[str, tuple[Fit, list[Event]]] = {}

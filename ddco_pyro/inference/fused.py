@@ -145,12 +145,6 @@ def log_likelihood(tables: Tables, lengths: Tensor) -> Tensor:
     return value
 
 
-def compile_pass() -> None:
-    """Compile the pass, or read it from numba's cache, before other processes look for it there."""
-    half = torch.zeros(1, 1, 1, 2).log_softmax(-1)
-    log_likelihood(Tables((half,), (half,), (half[..., 0], half[..., 1])), torch.ones(1, dtype=torch.int64))
-
-
 def posteriors(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elimination:
     """Log-likelihoods and the posteriors of tables on the CPU with at least one option level, without a gradient.
 

@@ -18,7 +18,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.inference.fused import compile_pass
+from ddco_pyro.inference import compile_all
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.selection.grid import Candidate
@@ -202,7 +202,7 @@ class Workers:
                 stack.enter_context(_client(self.scheduler))
                 stack.enter_context(parallel_config(backend="dask"))
             else:
-                compile_pass()
+                compile_all()
             yield stack.enter_context(jobs.pool(self.jobs))
 
     def check(self) -> None:
