@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from functools import partial
 
 import pytest
@@ -40,3 +41,15 @@ def test_a_process_that_is_killed_is_one_line() -> None:
     kill = partial(signal.raise_signal, signal.SIGKILL)
     with beside(1, [kill], "a process was ended") as results, pytest.raises(Failed, match=r"^a process was ended$"):
         next(results)
+
+
+def test_so_is_one_that_is_killed_before_there_is_work() -> None:
+    with early_process("json"):
+        with beside(1, [os.getpid], "dead") as results:
+            (process,) = results
+        os.kill(process, signal.SIGKILL)
+        while alive(process):
+            time.sleep(0.01)
+        ended = beside(1, [os.getpid], "a process was ended")
+        with pytest.raises(Failed, match=r"^a process was ended$"), ended as results:
+            next(results)

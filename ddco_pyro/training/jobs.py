@@ -54,15 +54,18 @@ def results(parallel: Parallel, calls: Iterable[Callable[[], Result]], dead: str
     :param dead: the message for a process that dies.
     :raises Failed: a process died.
     """
-    found = parallel([delayed(call)() for call in calls])
+    return _sound(parallel([delayed(call)() for call in calls]), dead)
 
-    def completed() -> Iterator[Result]:
-        try:
-            yield from found
-        except BrokenProcessPool as error:
-            raise Failed(dead) from error
 
-    return completed()
+def _sound(found: Iterable[Result], dead: str) -> Iterator[Result]:
+    """What is found.
+
+    :raises Failed: a process died.
+    """
+    try:
+        yield from found
+    except BrokenProcessPool as error:
+        raise Failed(dead) from error
 
 
 def end_with(parent: int) -> None:
@@ -101,16 +104,11 @@ def beside(workers: int, calls: Iterable[Callable[[], Result]], dead: str) -> It
     """
     early = workers == 1 and bool(_EARLY)
     executor = _EARLY[-1] if early else ProcessPoolExecutor(workers)
-    futures = [executor.submit(call) for call in calls]
-
-    def completed() -> Iterator[Result]:
-        try:
-            yield from (future.result() for future in as_completed(futures))
-        except BrokenProcessPool as error:
-            raise Failed(dead) from error
-
     try:
-        yield completed()
+        futures = [executor.submit(call) for call in calls]
+        yield _sound((future.result() for future in as_completed(futures)), dead)
+    except BrokenProcessPool as error:  # before it was given any call
+        raise Failed(dead) from error
     finally:
         if not early:
             executor.shutdown(kill_workers=True)
