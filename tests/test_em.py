@@ -19,6 +19,7 @@ from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.spec import RidgeSpec, SpecError, parse_spec, with_overrides
+from ddco_pyro.training import em
 from ddco_pyro.training.checkpoint import Progress, Restart
 from ddco_pyro.training.em import Expectation, is_linear
 from ddco_pyro.training.loop import train
@@ -71,10 +72,11 @@ def linear(counts, parts=None, emits=("options",), memoryless=(), **control):
     )  # fmt: skip
 
 
-def expectation(model, ridge, batch, trained=EVERYTHING, discovering=None):
-    def score(tables, piece, rows):
-        return log_likelihood(tables, piece.lengths).sum()
+def score(tables, piece, rows=None):
+    return log_likelihood(tables, piece.lengths).sum()
 
+
+def expectation(model, ridge, batch, trained=EVERYTHING, discovering=None):
     made = Expectation(model, trained, score, ridge, discovering)
     values = []
     for _ in range(400):
@@ -171,6 +173,34 @@ def test_levels_are_discovered_under_a_uniform_meta_policy(discovering):
 def _at_floor(model, name):
     caller = model.get_submodule(name.rsplit(".std.", 1)[0])
     return bool((caller.std() < caller.std.floor + 2e-4).any())
+
+
+@pytest.mark.parametrize("room", [0, 10**6], ids=["in blocks", "kept"])
+def test_moments_of_features_are_those_of_einsum(monkeypatch, room):
+    monkeypatch.setattr(em, "BLOCK", 100)  # 16 steps
+    generator = torch.Generator().manual_seed(0)
+    vector, weights = (torch.randn(*shape, generator=generator) for shape in ((5, 7, 2), (35, 4)))
+    features = em.Features(vector, room)
+    x = torch.cat([vector, torch.ones(5, 7, 1)], -1).double().flatten(0, 1)
+    for _ in range(2):
+        torch.testing.assert_close(
+            features.moments(weights.double()), torch.einsum("mw,mf,mg->wfg", weights.double(), x, x)
+        )
+
+
+@pytest.mark.parametrize("room", [500, 2000])
+def test_products_that_are_kept_are_bounded_in_all_pieces_together(monkeypatch, room):
+    """Of at most twelve demonstrations of nine steps, two at a time; four features have ten products in a step."""
+    monkeypatch.setattr("ddco_pyro.model.hierarchy.STEPS_AT_ONCE", 20)
+    monkeypatch.setattr(em, "KEPT", 3 * room)  # for the networks of options, terminations and the meta-policy
+    batch = batch_for(None)
+    made = Expectation(linear((2,)), EVERYTHING, score, RidgeSpec())
+    made.step(batch)
+    read = [features for *_, of in made._pieces for features in of.values()]
+    kept = [features._kept.numel() for features in read if features._kept is not None]
+    assert len(read) == 6
+    assert sum(kept) <= room
+    assert len(kept) == (6 if room == 2000 else 0)
 
 
 def test_only_what_is_trained_changes():

@@ -39,8 +39,10 @@ TOLERANCE = 1e-5
 """EM has converged where a step gains less, in nats per step of the demonstrations."""
 ROUGHLY = 1e-3
 """The same in a stage whose end is a start alone."""
-PRODUCTS = 2**22
-"""The most products of two features that are held at once."""
+KEPT = 2**24
+"""The most products of two features that are kept from step to step (128 MB)."""
+BLOCK = 2**20
+"""The most of them that are made at once where they are not kept."""
 BIAS = 1e-6
 """Ridge of biases, and the least of weights: an option that is never active keeps its own."""
 
@@ -60,24 +62,24 @@ class Features:
     """The features of a piece of the demonstrations and their products, in float64.
 
     :param vector: what networks read, [N, T, F - 1].
+    :param room: the most products that are kept.
     :ivar x: with a 1 at the end, [N, T, F].
     """
 
-    def __init__(self, vector: Tensor) -> None:
+    def __init__(self, vector: Tensor, room: int) -> None:
         self.x = torch.cat([vector.double(), vector.new_ones(*vector.shape[:-1], 1).double()], dim=-1)
         self._rows = self.x.flatten(0, 1)
         self._first, self._second = torch.tril_indices(self.x.shape[-1], self.x.shape[-1])
-        self._kept: list[Tensor] = []
+        self._kept = self._products(self._rows) if len(self._rows) * len(self._first) <= room else None
 
     def moments(self, weights: Tensor) -> Tensor:
         """Σ_t h_t x_t x_t^T for each column of weights [N·T, W]: [W, F, F]."""
-        (steps, features), triangle = self._rows.shape, len(self._first)
-        size = max(1, PRODUCTS // triangle)
-        blocks = self._kept or map(self._products, self._rows.split(size))
-        if size >= steps:
-            self._kept = list(blocks)
-            blocks = self._kept
-        found = torch.stack([own.T @ block for own, block in zip(weights.split(size), blocks, strict=True)]).sum(0)
+        size, features = max(1, BLOCK // len(self._first)), self._rows.shape[1]
+        if self._kept is not None:
+            found = weights.T @ self._kept
+        else:
+            blocks = zip(weights.split(size), self._rows.split(size), strict=True)
+            found = torch.stack([own.T @ self._products(rows) for own, rows in blocks]).sum(0)
         whole = found.new_empty(len(found), features, features)
         whole[:, self._first, self._second] = whole[:, self._second, self._first] = found
         return whole
@@ -338,7 +340,8 @@ class Expectation:
         said: dict[str, Tensor] = {}
         for name, network in self._networks.items():
             if network.reads not in xs:
-                xs[network.reads] = Features(piece.inputs.select(network.reads).vector)
+                room = KEPT // (len(self._pieces) * len(self._networks))
+                xs[network.reads] = Features(piece.inputs.select(network.reads).vector, room)
             said[name] = network.outputs(xs[network.reads].x).requires_grad_()
         stds = {name: std.value.clone().requires_grad_() for name, std in self._stds.items()}
         callers = {
