@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from functools import partial
 
@@ -53,3 +55,22 @@ def test_so_is_one_that_is_killed_before_there_is_work() -> None:
         ended = beside(1, [os.getpid], "a process was ended")
         with pytest.raises(Failed, match=r"^a process was ended$"), ended as results:
             next(results)
+
+
+KILLED = """
+import os, signal
+from ddco_pyro.training.jobs import beside, early_process
+with early_process("json"), beside(1, [os.getpid], "dead") as results:
+    print(*results, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_process_ends_with_the_one_that_is_killed_while_it_waits_for_work(tmp_path) -> None:
+    with open(tmp_path / "process", "w") as file:
+        killed = subprocess.run([sys.executable, "-c", KILLED], stdout=file)
+    assert killed.returncode == -signal.SIGKILL
+    process, deadline = int((tmp_path / "process").read_text()), time.monotonic() + 10
+    while alive(process) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not alive(process)

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -360,21 +361,21 @@ class Readers:
         while len(self._begun) <= self._processes and (job := next(self._planned, None)) is not None:
             if self._pool is None:
                 spawn = multiprocessing.get_context("spawn")
-                self._pool = ProcessPoolExecutor(self._processes, mp_context=spawn, initializer=_end_with_parent)
+                self._pool = ProcessPoolExecutor(self._processes, mp_context=spawn, initializer=end_with_parent)
             try:
                 self._begun.append((job.key, self._pool.submit(read, job)))
             except BrokenProcessPool as error:
                 raise Failed(DEAD) from error
 
 
-def _end_with_parent() -> None:
-    """End this process when its parent ends, even by kill -9, and ignore Ctrl-C."""
+def end_with_parent() -> None:
+    """End this process within a second of its parent's end, even by kill -9, and ignore Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None  # this process was spawned
+    parent = os.getppid()
 
     def wait() -> None:
-        parent.join()
+        while os.getppid() == parent:
+            time.sleep(0.5)
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()

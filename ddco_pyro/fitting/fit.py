@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -40,7 +39,7 @@ from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.data import dimensions, known_demonstrations, parts, refuse_unfit, seen
 from ddco_pyro.training.devices import device_of, repeatable
-from ddco_pyro.training.jobs import LONG, beside, check_jobs, end_with, useful_jobs
+from ddco_pyro.training.jobs import LONG, beside, check_jobs, useful_jobs
 from ddco_pyro.training.labels import used
 from ddco_pyro.training.launching import check_processes, together
 from ddco_pyro.training.networks import Dimensions, check_models, model_name, parameters
@@ -305,7 +304,7 @@ def _in_other_processes(
         yield {}
         return
     compile_all()
-    calls = [partial(_with_events, name, fit, os.getpid()) for name, fit in fits.items()]
+    calls = [partial(_with_events, name, fit) for name, fit in fits.items()]
     with beside(useful_jobs(jobs, 1 + len(fits)) - 1, calls, DEAD) as left:
         done: dict[str, tuple[Fit, list[Event]]] = {}
 
@@ -323,15 +322,7 @@ def _in_other_processes(
         yield {name: partial(wait, name) for name in fits}
 
 
-def _with_events(name: str, fit: Callable[[OnEvent], Fit], parent: int) -> tuple[str, Fit, list[Event]]:
-    """A baseline's name, its fit without demonstrations, and its events, in another process.
-
-    :param parent: the process that waits.
-    """
+def _with_events(name: str, fit: Callable[[OnEvent], Fit]) -> tuple[str, Fit, list[Event]]:
+    """A baseline's name, its fit without demonstrations, and its events, in another process."""
     events: list[Event] = []
-
-    def tell(event: Event) -> None:
-        end_with(parent)
-        events.append(event)
-
-    return name, replace(fit(tell), given=None), events
+    return name, replace(fit(events.append), given=None), events

@@ -14,6 +14,7 @@ import joblib
 from joblib import Parallel, delayed
 from joblib.externals.loky import ProcessPoolExecutor
 
+from ddco_pyro.data.pictures import end_with_parent
 from ddco_pyro.errors import BadInput, Failed
 
 Result = TypeVar("Result")
@@ -85,7 +86,7 @@ def early_process(module: str) -> Iterator[None]:
 
     :param module: what it imports.
     """
-    executor = ProcessPoolExecutor(1)
+    executor = ProcessPoolExecutor(1, initializer=end_with_parent)
     _EARLY.append(executor)
     executor.submit(importlib.import_module, module)
     try:
@@ -103,7 +104,7 @@ def beside(workers: int, calls: Iterable[Callable[[], Result]], dead: str) -> It
     :raises Failed: a process died.
     """
     early = workers == 1 and bool(_EARLY)
-    executor = _EARLY[-1] if early else ProcessPoolExecutor(workers)
+    executor = _EARLY[-1] if early else ProcessPoolExecutor(workers, initializer=end_with_parent)
     try:
         futures = [executor.submit(call) for call in calls]
         yield _sound((future.result() for future in as_completed(futures)), dead)
