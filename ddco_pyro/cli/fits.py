@@ -143,7 +143,7 @@ def _ready(spec: Spec, jobs: int) -> Iterator[None]:
     own = spec.training
     long = own.epochs is None or own.epochs >= LONG
     alone = own.restarts == 1 and own.device == "cpu" and useful_jobs(jobs, 1 + len(spec.compare_with)) == 2
-    with early_process("ddco_pyro.fitting.fit") if long and alone else nullcontext():
+    with early_process("ddco_pyro.fitting.fit", "sklearn.cluster") if long and alone else nullcontext():
         yield
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import os
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing import get_context
 from typing import TypeVar
 
 import joblib
@@ -81,14 +84,24 @@ _EARLY: list[ProcessPoolExecutor] = []
 
 
 @contextmanager
-def early_process(module: str) -> Iterator[None]:
-    """Inside, a process is ready for :func:`beside`. Its imports go on during those of this process.
+def early_process(*modules: str) -> Iterator[None]:
+    """Inside, a process is ready for :func:`beside`. On Linux it is a fork of this process after the imports.
 
-    :param module: what it imports.
+    Elsewhere its imports go on during those of this process: there a fork of a process with threads is not safe.
+
+    :param modules: what it imports.
     """
-    executor = ProcessPoolExecutor(1, initializer=end_with_parent)
+    forks = sys.platform == "linux"
+    if forks:
+        gc.disable()  # nothing that is imported is garbage
+        for module in modules:
+            importlib.import_module(module)
+        gc.freeze()  # both processes share these pages
+        gc.enable()
+    executor = ProcessPoolExecutor(1, context=get_context("fork") if forks else None, initializer=end_with_parent)
     _EARLY.append(executor)
-    executor.submit(importlib.import_module, module)
+    for module in modules:
+        executor.submit(importlib.import_module, module)  # the first of them starts the process
     try:
         yield
     finally:
