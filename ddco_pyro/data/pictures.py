@@ -371,6 +371,7 @@ class Readers:
 def end_with_parent() -> None:
     """End this process within a second of its parent's end, even by kill -9, and ignore Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a fork has its parent's handler
     parent = os.getppid()
 
     def wait() -> None:

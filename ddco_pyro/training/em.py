@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 
 import torch
 from torch import Tensor, nn
@@ -70,6 +71,9 @@ class Features:
         self.x = torch.cat([vector.double(), vector.new_ones(*vector.shape[:-1], 1).double()], dim=-1)
         self._rows = self.x.flatten(0, 1)
         self._first, self._second = torch.tril_indices(self.x.shape[-1], self.x.shape[-1])
+        place = torch.empty(self.x.shape[-1], self.x.shape[-1], dtype=torch.long)
+        place[self._first, self._second] = place[self._second, self._first] = torch.arange(len(self._first))
+        self._place = place.flatten()
         self._kept = self._products(self._rows) if len(self._rows) * len(self._first) <= room else None
 
     def moments(self, weights: Tensor) -> Tensor:
@@ -80,9 +84,7 @@ class Features:
         else:
             blocks = zip(weights.split(size), self._rows.split(size), strict=True)
             found = torch.stack([own.T @ self._products(rows) for own, rows in blocks]).sum(0)
-        whole = found.new_empty(len(found), features, features)
-        whole[:, self._first, self._second] = whole[:, self._second, self._first] = found
-        return whole
+        return found.index_select(1, self._place).unflatten(1, (features, features))
 
     def _products(self, rows: Tensor) -> Tensor:
         """x_f x_g of each pair of features, [M, F (F + 1) / 2]."""
@@ -111,7 +113,8 @@ class Information:
             return self.weight.flatten(0, 1).flatten(1)
         p = self.probabilities.flatten(0, 1)
         i, j = torch.tril_indices(p.shape[-1], p.shape[-1])
-        return (self.weight.flatten(0, 1).unsqueeze(-1) * p[..., i] * ((i == j).double() - p[..., j])).flatten(1)
+        first, second = p.index_select(-1, i), p.index_select(-1, j)
+        return (self.weight.flatten(0, 1).unsqueeze(-1) * first * ((i == j).double() - second)).flatten(1)
 
     def matrices(self, moments: Tensor) -> Tensor:
         """Σ_t h_t x_t x_t^T from the moments [W, F, F] of :meth:`weights`.
@@ -188,18 +191,16 @@ class Std:
         copies = caller.copies
         self.value = self.module.table().detach().double().expand(copies, -1).clone()
 
-    def updated(self, square: Tensor, count: Tensor, places: Sequence[int]) -> Tensor:
-        """σ from sums of squares [K, C'] and counts [K] at these places."""
-        value = self.value.clone()
-        for column, place in enumerate(places):
-            if place in self.module.own:
-                mean = square[:, column] / count
-            elif place in self.module.shared:
-                mean = (square[:, column].sum() / count.sum()).expand(len(count))
-            else:
-                continue
-            least = float(self.module.floor[place]) + ABOVE_FLOOR
-            value[:, place] = torch.where(count > 0, mean, value[:, place] ** 2).clamp(min=0).sqrt().clamp(min=least)
+    def updated(self, value: Tensor, square: Tensor, count: Tensor, places: Sequence[int]) -> Tensor:
+        """A table of σ [K, C] with those at these places from sums of squares [K, C'] and counts [K]."""
+        own, shared = self.module.own, self.module.shared
+        columns = [column for column, place in enumerate(places) if place in own or place in shared]
+        at = [places[column] for column in columns]
+        square, value, known = square[:, columns], value.clone(), value[:, at].square()
+        together = torch.tensor([place in shared for place in at], dtype=torch.bool)
+        mean = torch.where(together, square.sum(0) / count.sum(), square / count.unsqueeze(1))
+        mean = torch.where(count.unsqueeze(1) > 0, mean, known).clamp(min=0)
+        value[:, at] = mean.sqrt().maximum(self.module.floor[at].double() + ABOVE_FLOOR)
         return value
 
     def store(self) -> None:
@@ -416,13 +417,14 @@ class Expectation:
                 if group.std:
                     assert std is not None
                     scale = std.value[:, list(group.std)].unsqueeze(1)  # [K, 1, n]
-                    ridge = _ridges(weight, self._ridge.policy)
+                    ridge = _ridges(weight.shape[1], self._ridge.policy)
                     solved = torch.linalg.solve(
-                        information + torch.diag_embed(ridge), scale.square() * gradient - ridge.unsqueeze(-1) * weight
+                        information + ridge.diag(), scale.square() * gradient - ridge.unsqueeze(-1) * weight
                     )
                     count = information[:, -1, -1]  # of the bias
                     square = self._squares(std, own.std, group, information, gradient, weight, solved)
-                    value = _merged(value, std.updated(square, count + self._prior_count(weight), group.std), group.std)
+                    assert value is not None
+                    value = std.updated(value, square, count + self._prior_count(weight), group.std)
                 else:
                     solved = _damped(information, gradient, weight, network.ridge)
                 change[..., columns] = solved
@@ -444,38 +446,30 @@ class Expectation:
         return before + moved + _penalties(weight + change, self._ridge.policy)
 
 
-def _ridges(weight: Tensor, ridge: float) -> Tensor:
-    """The ridge of each feature, [K, F]."""
-    each = torch.full(weight.shape[:2], max(ridge, BIAS), dtype=weight.dtype)
-    each[:, -1] = BIAS
-    return each
+@cache
+def _ridges(features: int, ridge: float) -> Tensor:
+    """The ridge of each feature, [F]."""
+    return torch.tensor([max(ridge, BIAS)] * (features - 1) + [BIAS], dtype=torch.float64)
 
 
 def _penalties(weight: Tensor, ridge: float) -> Tensor:
     """Σ_f ρ_f W_f² of each copy and output, [K, n]."""
-    return (_ridges(weight, ridge).unsqueeze(-1) * weight.square()).sum(1)
+    return (_ridges(weight.shape[1], ridge).unsqueeze(-1) * weight.square()).sum(1)
 
 
 def _damped(information: Tensor, gradient: Tensor, weight: Tensor, ridge: float) -> Tensor:
     """A Fisher scoring step [K, F, n], at most :data:`LARGEST` in any weight of a copy."""
     copies, features, outputs = weight.shape
-    each = _ridges(weight, ridge)
+    each = _ridges(features, ridge)
     right = gradient - each.unsqueeze(-1) * weight
     if information.dim() == 4:  # a weight for each output
-        solved = torch.linalg.solve(information + torch.diag_embed(each).unsqueeze(1), right.mT.unsqueeze(-1))
+        solved = torch.linalg.solve(information + each.diag(), right.mT.unsqueeze(-1))
         step = solved.squeeze(-1).mT
     else:
-        joint = information + torch.diag_embed(each.repeat(1, outputs))
+        joint = information + each.repeat(outputs).diag()
         step = torch.linalg.solve(joint, right.mT.reshape(copies, -1)).reshape(copies, outputs, features).mT
     most = step.abs().amax((1, 2), keepdim=True)
     return step * (LARGEST / most.clamp(min=LARGEST))
-
-
-def _merged(table: Tensor | None, other: Tensor, places: Sequence[int]) -> Tensor:
-    assert table is not None
-    merged = table.clone()
-    merged[:, list(places)] = other[:, list(places)]
-    return merged
 
 
 @dataclass(frozen=True)
