@@ -104,15 +104,6 @@ def test_another_version_of_a_simulator_or_of_the_tasks_package_has_another_file
     assert (cache_path(toy_task.task, TASK, SPEC) == named) == (package == "toy-task")
 
 
-def test_a_file_of_ones_own_is_written_and_then_kept(tmp_path):
-    path = tmp_path / "new" / "demos.hdf5"
-    assert collect(TASK, SPEC, path) == path
-    before = path.stat().st_mtime_ns
-    collect(TASK, SPEC, path)
-    assert path.stat().st_mtime_ns == before
-    assert [one.name for one in path.parent.iterdir()] == ["demos.hdf5"]
-
-
 def test_where_the_cache_is(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     monkeypatch.setenv("DDCO_PYRO_CACHE", str(tmp_path / "own"))

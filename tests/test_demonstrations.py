@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from random_demonstrations import demonstration, demonstrations
+from random_demonstrations import demonstrations
 
 from ddco_pyro.data.checks import LARGEST
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
@@ -62,11 +62,6 @@ def test_numbers_survive_exactly(tmp_path_factory: pytest.TempPathFactory, actio
     np.testing.assert_array_equal(read.observations["x"], actions, strict=True)
 
 
-def test_demonstrations_come_in_natural_order(path: Path) -> None:
-    demonstrations(12).write(path)
-    assert Demonstrations.read(path).names == tuple(f"demo_{index}" for index in range(12))
-
-
 def test_only_what_is_asked_for_is_read(path: Path) -> None:
     demonstrations().write(path)
     with h5py.File(path, "r+") as file:
@@ -94,12 +89,6 @@ def test_types_in_memory(path: Path) -> None:
     assert read.attributes == {}
 
 
-def test_keys_may_have_a_slash(path: Path) -> None:
-    Demonstrations((Demonstration("demo_0", {"arm/pose": np.ones((2, 3))}, np.ones((2, 1))),)).write(path)
-    assert Demonstrations.read(path).observation_shapes == {"arm/pose": (3,)}
-    assert Demonstrations.read(path, ["arm/pose"]).observation_shapes == {"arm/pose": (3,)}
-
-
 def test_the_layout_is_robomimics(path: Path) -> None:
     demonstrations(3, {"train": ("demo_1",)}).write(path)
     with h5py.File(path) as file:
@@ -108,16 +97,6 @@ def test_the_layout_is_robomimics(path: Path) -> None:
         assert file["data/demo_1"].attrs["num_samples"] == 4
         assert sorted(file["data/demo_1"]) == ["actions", "labels", "obs"]
         assert file["mask/train"][()].tolist() == [b"demo_1"]
-
-
-def test_a_write_that_fails_leaves_the_old_file(path: Path) -> None:
-    demonstrations(2).write(path)
-    before = path.read_bytes()
-    broken = Demonstrations((demonstration("demo_0"),), attributes={"task": {"not": "an attribute"}})  # type: ignore[dict-item]
-    with pytest.raises(TypeError):
-        broken.write(path)
-    assert path.read_bytes() == before
-    assert list(path.parent.iterdir()) == [path]
 
 
 def test_equal_demonstrations_give_equal_files(path: Path) -> None:

@@ -118,11 +118,7 @@ ALONE = {"network": "mlp", "hidden": [4], "inputs": ["place"]}
     ("model", "camera", "message"),
     [
         (flat(ALONE), {}, "its lowest policy has no convolutions that read camera alone; make them a branch"),
-        (
-            options(BRANCHES),
-            {},
-            "each option has a network of its own for camera; take a flat policy, or one with shared",
-        ),
+        (options(BRANCHES), {}, "each option has a network of its own for camera; take a flat policy"),
         (flat(BRANCHES), {"frames": 2}, "this fit sees 2 pictures at once; take one with frames: 1"),
     ],
 )

@@ -24,10 +24,7 @@ def out(tmp_path):
     ("options", "message"),
     [
         (["--observation", "camra"], "there is no observation 'camra' (did you mean 'camera'?); pictures are: camera"),
-        (
-            ["--observation", "place"],
-            "obs/place is float64 [8, 2]; pictures are uint8 [steps, height, width, channels]",
-        ),
+        (["--observation", "place"], "obs/place is float64 [8, 2]; pictures are uint8 [steps, height, width"),
         (["--size", "129"], "--size 129: encoder 'random_conv' gives 128 features; take at most as many"),
         (["--size", "60"], "--size 60: there are 35 training pictures; take at most as many"),
         (["--as", "place"], "obs/place is there already; choose another name with --as"),

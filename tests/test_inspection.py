@@ -130,13 +130,6 @@ def test_demonstrations_that_are_left_out_do_not_count(path: Path) -> None:
     assert rest.masks == {"valid": (), "20_percent": ("demo_0",)}
 
 
-def test_a_place_that_holds_nothing_known_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DemonstrationsError, match="there is no such file or folder; check the path"):
-        inspect(tmp_path / "none")
-    with pytest.raises(DemonstrationsError, match="is a folder of no known format; name an HDF5 file"):
-        inspect(tmp_path)
-
-
 def test_the_command_shows_it_and_a_spec(path: Path) -> None:
     ended = call("inspect", path)
     assert (ended.status, ended.err) == (0, "")

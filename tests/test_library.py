@@ -25,7 +25,7 @@ from ddco_pyro.events import TrainingBegan
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import RunError
 from ddco_pyro.report import write_report
-from ddco_pyro.spec import SpecError, load_spec, parse_spec, with_overrides
+from ddco_pyro.spec import load_spec, parse_spec, with_overrides
 
 FLAT = {"kind": "flat", "policy": {"network": "linear"}}
 
@@ -292,14 +292,3 @@ def test_check_reads_no_observations(commanded: Path, reads: Counter) -> None:
     """The controls are read: which are constant, or take two values, is part of what it says."""
     assert call("check", commanded / "spec.yaml").status == 0
     assert reads == {name: 1.0 for name in everything(commanded / "demos.hdf5") if name.endswith("/actions")}
-
-
-def test_a_spec_that_does_not_fit_is_refused_before_anything_is_written(commanded: Path, tmp_path: Path) -> None:
-    spec = with_overrides(load_spec(commanded / "spec.yaml"), {"control.scale": [1.0, 2.0, 3.0]})
-    with pytest.raises(SpecError, match=r"control\.scale: has 3 numbers, but the control has 2 dimensions"):
-        ddco_pyro.fit(spec, out=tmp_path / "run")
-    with pytest.raises(SpecError, match=r"control\.scale: has 3 numbers"):
-        ddco_pyro.fit(spec, two_skills(), out=tmp_path / "run")
-    with pytest.raises(BadInput, match=r"nowhere\.hdf5: there is no such file"):
-        ddco_pyro.fit(spec, tmp_path / "nowhere.hdf5", out=tmp_path / "run")
-    assert not any(tmp_path.iterdir())

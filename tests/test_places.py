@@ -18,7 +18,7 @@ from command_line import call
 from killing import HANGS
 from random_demonstrations import demonstrations
 
-from ddco_pyro.data.files import Busy, NoSpace, NotWritable, only_one, whole_file, write_text
+from ddco_pyro.data.files import only_one, whole_file
 
 NOBODY = 65534
 
@@ -87,14 +87,6 @@ def test_a_full_disk_while_fitting(tmp_path: Path, cache) -> None:
     assert (tmp_path / "run/model.safetensors").read_bytes() == (tmp_path / "other/model.safetensors").read_bytes()
 
 
-def test_what_was_there_before_stays_when_the_disk_is_full(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    write_text(path, "before")
-    with room(10), pytest.raises(NoSpace, match="file: there is no room"):
-        write_text(path, "x" * 1000)
-    assert path.read_text() == "before"
-
-
 AS_NOBODY = """
 import os, sys
 from pathlib import Path
@@ -120,21 +112,6 @@ def test_a_read_only_folder(tmp_path: Path) -> None:
     lines = ended.stdout.splitlines()
     reason = "cannot be written: Permission denied; choose another place or change this one"
     assert lines == [f"{folder}/file: {reason}", f"{folder}/run: {reason}"], ended.stderr
-
-
-def test_a_folder_that_is_a_file(tmp_path: Path, source: Path) -> None:
-    with pytest.raises(NotWritable, match="cannot be written"):
-        write_text(source / "file", "x")
-    ended = call("import", source, "--out", source / "out.hdf5")
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-
-
-def test_one_process_at_a_time(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    with only_one(folder), pytest.raises(Busy, match="run: another process is at work on it; wait for it, or choose"):
-        only_one(folder).__enter__()
-    with only_one(folder):
-        pass
 
 
 def test_who_waits_goes_on_when_the_other_has_ended(tmp_path: Path) -> None:

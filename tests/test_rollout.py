@@ -145,10 +145,6 @@ def test_a_rate_has_its_wilson_interval(successes, trials):
     np.testing.assert_allclose(found["interval"], wilson(successes, trials), atol=1e-12)
 
 
-def test_a_rate_of_nothing_is_unknown():
-    assert rate(0, 0) == {"successes": 0, "trials": 0, "rate": None, "interval": None}
-
-
 @pytest.mark.parametrize(("only_ours", "only_theirs", "both"), [(0, 0, 5), (6, 1, 3), (1, 6, 3), (4, 4, 0), (12, 0, 0)])
 def test_mcnemars_exact_p_value(only_ours, only_theirs, both):
     """Under equal chances the number of wins among the discordant pairs is Binomial(n, 1/2); both tails."""

@@ -152,10 +152,7 @@ def test_a_copy_with_subtasks(lerobot_run, tmp_path, form, features, more):
     assert (out / "meta" / "info.json").stat().st_mtime_ns == time  # it is this very copy
     other = {"0.4": "0.6", "0.6": "0.4"}[form]
     for wrong, message in (
-        (
-            [LEROBOT, "--lerobot", out, "--lerobot-format", form],
-            "annotated: exists; choose another --lerobot",
-        ),
+        ([LEROBOT, "--lerobot", out, "--lerobot-format", form], "annotated: exists; choose another --lerobot"),
         ([LEROBOT, "--lerobot", out, "--level", "phase", "--lerobot-format", other], "annotated: exists"),
         ([out, "--lerobot", tmp_path / "twice"], "has subtasks already; name a dataset without them"),
         ([out, "--lerobot", tmp_path / "twice", "--lerobot-format", other], "has subtasks already; name a dataset"),

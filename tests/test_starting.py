@@ -150,14 +150,6 @@ def test_of_many_broken_demonstrations_the_key_is_left_out(path: Path) -> None:
         broken(path, 4, ["demo_1"], "actions")  # a quarter
 
 
-def test_a_control_that_never_changes_is_refused(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        for group in file["data"].values():
-            group["actions"][:] = 1.5
-    with pytest.raises(DemonstrationsError, match=r"actions: every dimension is constant \(1.5, 1.5\)"):
-        starting_spec(inspect(path), path)
-
-
 def test_pictures_alone_are_seen_by_one_network(tmp_path: Path) -> None:
     """Two cameras, a small one as it is and a larger one reduced; what is written can be fitted."""
     random, records = np.random.default_rng(2), []

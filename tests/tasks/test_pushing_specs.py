@@ -41,10 +41,6 @@ def short(path: Path, demonstrations: Path) -> Spec:
     return load_spec(path, [f"demonstrations.path={demonstrations}", "training.epochs=6"])
 
 
-def test_all_specs_are_here() -> None:
-    assert {path.stem.removeprefix("pushing_") for path in SPECS} == set(LEVELS)
-
-
 @pytest.mark.parametrize(
     "path",
     [pytest.param(path, marks=[] if path.stem in QUICK else pytest.mark.slow) for path in SPECS],
