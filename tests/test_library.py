@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import call
+from random_demonstrations import demonstrations
 from selecting import DATA, data_at, two_skills
 
 import ddco_pyro
@@ -24,6 +25,7 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.events import TrainingBegan
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import RunError
+from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import load_spec, parse_spec, with_overrides
 
@@ -292,3 +294,39 @@ def test_check_reads_no_observations(commanded: Path, reads: Counter) -> None:
     """The controls are read: which are constant, or take two values, is part of what it says."""
     assert call("check", commanded / "spec.yaml").status == 0
     assert reads == {name: 1.0 for name in everything(commanded / "demos.hdf5") if name.endswith("/actions")}
+
+
+# --- how often a fit builds a model -----------------------------------------------------------------------------------
+
+
+MOST_BUILDS = 4
+
+
+def make_spec(*baselines):
+    return parse_spec(
+        yaml.safe_load(
+            f"""
+            demonstrations: {{path: unused.hdf5, valid_fraction: 0.2}}
+            observations: [pose]
+            hierarchy:
+              levels: [{{count: 2, policy: {{network: mlp, hidden: [8]}}, termination: {{network: linear}}}}]
+              meta_policy: {{network: linear}}
+            training: {{epochs: 1, layerwise: false, initialize: random}}
+            compare_with: [{", ".join(baselines)}]
+            """
+        )
+    )
+
+
+@pytest.mark.parametrize("baselines", [(), ("flat", "mixture")])
+def test_a_model_is_built_a_few_times(monkeypatch, baselines):
+    builds, init = [], Hierarchy.__init__
+
+    def counted(self, *arguments, **named):
+        builds.append(arguments)
+        init(self, *arguments, **named)
+
+    monkeypatch.setattr(Hierarchy, "__init__", counted)
+    ddco_pyro.fit(make_spec(*baselines), demonstrations(6))
+    print(f"{len(builds)} builds of {1 + len(baselines)} models")
+    assert len(builds) <= MOST_BUILDS * (1 + len(baselines))
