@@ -358,15 +358,6 @@ def test_check_finds_tasks_beside_it_and_loads_no_package_that_it_does_not_use(s
     assert set(ast.literal_eval(ended.stdout.splitlines()[-1])) <= {"h5py", "torch"}
 
 
-def test_the_packages_names_are_there_when_asked_for():
-    for name in ddco_pyro.__all__:
-        assert name in dir(ddco_pyro)
-        assert getattr(ddco_pyro, name) is not None
-    assert ddco_pyro.load_spec is load_spec
-    with pytest.raises(AttributeError, match="module 'ddco_pyro' has no attribute 'nothing'"):
-        _ = ddco_pyro.nothing
-
-
 # --- progress where there is no terminal ------------------------------------------------------------------------------
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -144,17 +145,22 @@ def test_a_picture_has_to_be_bytes():
 # --- what acts otherwise ----------------------------------------------------------------------------------------------
 
 
-def damage_numpy(folder, tensor="caller_0.0.bias", by=1e-3):
+@contextmanager
+def edited_numpy(folder):
     with np.load(folder / "weights.npz") as file:
         weights = {name: file[name] for name in file.files}
-    weights[tensor][-1, :, -1] += by
+    yield weights
     np.savez(folder / "weights.npz", **weights)
+
+
+def damage_numpy(folder, tensor="caller_0.0.bias", by=1e-3):
+    with edited_numpy(folder) as weights:
+        weights[tensor][-1, :, -1] += by
 
 
 @pytest.fixture
 def damaged(monkeypatch):
     """Damage what was written, on the disk, before it is compared."""
-
     write = module._write
 
     def damaging(damage):
@@ -444,11 +450,14 @@ def test_no_fit_is_so_unsound_that_anything_goes(tmp_path):
 
 @pytest.mark.parametrize("array", [f"caller_0.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")])
 @pytest.mark.usefixtures("numpy_alone")
-def test_weights_that_are_off_by_a_thousandth_are_refused(array, tmp_path, monkeypatch):
+def test_weights_that_are_off_by_a_thousandth_are_refused(array, tmp_path, monkeypatch, damaged):
     """Each array alone, of numpy's form; replaying it later shows it too."""
-    refused(tmp_path, monkeypatch, lambda folder: scale(folder / "weights.npz", array), "numpy")
     export(steep(STEEP), tmp_path / "later")
-    scale(tmp_path / "later" / "weights.npz", array)
+    scale(tmp_path / "later", array)
+    damaged(lambda folder: scale(folder, array))
+    with pytest.raises(Failed, match=r"^nothing was written: as numpy it differs from the run by "):
+        export(steep(STEEP), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
     monkeypatch.setattr("sys.argv", ["runner.py", str(tmp_path / "later")])
     with pytest.raises(SystemExit) as ended:
         runner.main()
@@ -456,15 +465,16 @@ def test_weights_that_are_off_by_a_thousandth_are_refused(array, tmp_path, monke
 
 
 @pytest.mark.parametrize("form", ["torch", "onnx"])
-def test_programs_that_are_off_by_a_thousandth_are_refused(form, tmp_path, monkeypatch):
-    refused(tmp_path, monkeypatch, {"torch": scale_torch, "onnx": scale_onnx}[form], form)
+def test_programs_that_are_off_by_a_thousandth_are_refused(form, tmp_path, damaged):
+    damaged({"torch": scale_torch, "onnx": scale_onnx}[form])
+    with pytest.raises(Failed, match=rf"^nothing was written: as {form} it differs from the run by "):
+        export(steep(STEEP), tmp_path / "out", onnx=form == "onnx")
+    assert list(tmp_path.iterdir()) == []
 
 
-def scale(path: Path, array: str) -> None:
-    with np.load(path) as file:
-        weights = {name: file[name] for name in file.files}
-    weights[array] = weights[array] * np.float32(1.001)
-    np.savez(path, **weights)
+def scale(folder: Path, array: str) -> None:
+    with edited_numpy(folder) as weights:
+        weights[array] = weights[array] * np.float32(1.001)
 
 
 def scale_torch(folder: Path) -> None:
@@ -479,19 +489,3 @@ def scale_onnx(folder: Path) -> None:
     values = onnx.numpy_helper.to_array(weight) * np.float32(1.001)
     weight.CopyFrom(onnx.numpy_helper.from_array(values, weight.name))
     onnx.save(model, folder / "controller.onnx")
-
-
-def refused(tmp_path, monkeypatch, damage, form):
-    """The export, where what was written is damaged on the disk before it is compared."""
-    write = module._write
-
-    def damaging(fit, folder, onnx):
-        forms = write(fit, folder, onnx)
-        damage(folder)
-        return forms
-
-    with monkeypatch.context() as patched:
-        patched.setattr(module, "_write", damaging)
-        with pytest.raises(Failed, match=rf"^nothing was written: as {form} it differs from the run by "):
-            export(steep(STEEP), tmp_path / "out", onnx=form == "onnx")
-    assert not (tmp_path / "out").exists()

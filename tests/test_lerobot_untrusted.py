@@ -148,15 +148,6 @@ def test_rows_of_an_episode_that_is_not_named_are_not_annotated(tmp_path: Path, 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["dataset"]
 
 
-def test_a_copy_into_the_dataset_itself_is_refused(tmp_path: Path, run: Path) -> None:
-    dataset = odd.changed()(tmp_path)
-    before = contents(tmp_path)
-    refused(
-        call("segment", run, dataset, "--lerobot", dataset / "data" / "new"), "lies in .*, which this command reads"
-    )
-    assert contents(tmp_path) == before
-
-
 def test_data_need_not_lie_under_data(tmp_path: Path, run: Path) -> None:
     dataset = odd.changed(odd.info(data_path="steps/{episode_index}-{file_index:03d}.parquet"))(tmp_path)
     (dataset / "steps").mkdir()

@@ -329,19 +329,6 @@ def test_two_processes_of_torchrun_give_the_bits_of_one(demos, tmp_path):
     assert_same_run(tmp_path / "run", tmp_path / "alone")
 
 
-@pytest.mark.slow
-def test_torchrun_goes_on_and_refuses_as_one_process_does(whole, tmp_path):
-    spec, run = whole
-    folder = shutil.copytree(run, tmp_path / "run")
-    ended = torchrun(spec, folder, "--resume")  # it is finished
-    assert (ended.returncode, ended.stdout.count("report: ")) == (0, 1), ended.stderr
-    assert_same_run(folder, run)
-    ended = torchrun(spec, folder)
-    assert (ended.returncode, ended.stdout) == (1, "")
-    assert ended.stderr.count("ddco-pyro: ") == 1
-    assert f"ddco-pyro: {folder}: holds a run of this spec already; show it with --resume" in ended.stderr
-
-
 # --- what is refused --------------------------------------------------------------------------------------------------
 
 

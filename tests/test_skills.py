@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb
 from scipy.cluster.hierarchy import linkage
 
 from ddco_pyro.data.demonstrations import Demonstration
-from ddco_pyro.drawing.colours import CONTROL, OPTIONS, option_colour, option_rgb
+from ddco_pyro.drawing.colours import CONTROL, OPTIONS, option_rgb
 from ddco_pyro.drawing.diagrams import dendrogram, transition_graph
 from ddco_pyro.drawing.shown import frames, projection
 from ddco_pyro.report.inputs import _shares
@@ -205,9 +205,3 @@ def lab(colour, sight):
 def test_colours_are_told_apart_from_each_other_and_from_control(sight, count, distance):
     for one, other in combinations((CONTROL, *OPTIONS[:count]), 2):
         assert np.linalg.norm(lab(one, sight) - lab(other, sight)) > distance, (one, other)
-
-
-def test_control_is_grey_and_ten_colours_repeat():
-    assert option_colour(0) == CONTROL
-    assert option_colour(11) == option_colour(1)
-    assert option_rgb(1) == (63, 144, 218)

@@ -24,26 +24,6 @@ def test_a_task_is_found_by_module_and_name():
     assert find_task("toy_task:task") is toy_task.task
 
 
-def test_a_registered_task_is_found_by_its_name(monkeypatch):
-    class Point:
-        name = "toy"
-
-        @staticmethod
-        def load():
-            return toy_task.task
-
-    def entry_points(group):
-        assert group == TASKS
-        return [Point]
-
-    monkeypatch.setattr("ddco_pyro.simulation.task.entry_points", entry_points)
-    assert find_task("toy") is toy_task.task
-    with pytest.raises(
-        UnknownTask, match=r"^no task is registered as 'toi' \(registered: toy\); module:name works too$"
-    ):
-        find_task("toi")
-
-
 def test_a_registered_task_whose_packages_are_missing_is_one_line(monkeypatch):
     point = EntryPoint("needs", "no_such_package.of_mine:task", TASKS)
     monkeypatch.setattr("ddco_pyro.simulation.task.entry_points", lambda group: [point])
