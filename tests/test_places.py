@@ -328,11 +328,6 @@ def test_a_folder_that_cannot_be_replaced_is_said(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_text_is_utf_8(tmp_path):
-    write_text(tmp_path / "file", "σ = 0.1\n")
-    assert (tmp_path / "file").read_bytes() == "σ = 0.1\n".encode()
-
-
 def test_tensors_and_metadata_come_back_bit_for_bit(tmp_path):
     tensors = {
         "float": torch.randn(3, 4, generator=torch.Generator().manual_seed(0)),

@@ -17,7 +17,6 @@ from command_line import call
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import Pictures
-from ddco_pyro.exporting import export
 from ddco_pyro.selection import Workers, select
 from ddco_pyro.spec import parse_spec
 
@@ -100,18 +99,6 @@ def test_a_monitor_and_a_controller(both: Both) -> None:
         np.testing.assert_array_equal(*acted)
         control = acted[0]
     assert monitors[0].log_likelihood == monitors[1].log_likelihood != 0
-
-
-@pytest.mark.slow
-def test_exports(both: Both, tmp_path: Path) -> None:
-    for name, fit in (("streamed", both.streamed), ("memory", both.whole)):
-        export(fit, tmp_path / name)
-    for name in ("controller.json", "check.npz"):
-        assert (tmp_path / "streamed" / name).read_bytes() == (tmp_path / "memory" / name).read_bytes()
-    with np.load(tmp_path / "streamed/weights.npz") as one, np.load(tmp_path / "memory/weights.npz") as other:
-        assert set(one) == set(other)
-        for name in one:
-            np.testing.assert_array_equal(one[name], other[name])
 
 
 @pytest.mark.slow
