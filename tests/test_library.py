@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import signal
 import subprocess
@@ -130,28 +129,6 @@ def test_the_spec_says_what_is_seen_of_demonstrations_from_memory(in_memory: ddc
         ddco_pyro.fit(with_overrides(in_memory.spec, {"observations": ["plac"]}), two_skills())
     with pytest.raises(DemonstrationsError, match=r"there is no labels/phase; there is: nothing"):
         ddco_pyro.fit(with_overrides(in_memory.spec, {"demonstrations.labels": "phase"}), two_skills())
-
-
-def test_several_baselines_of_a_kind(commanded: Path, tmp_path: Path) -> None:
-    wide = {"kind": "flat", "policy": {"network": "mlp", "hidden": [4]}}
-    grid = {"grid": {"hierarchy.levels.0.count": [1, 2]}}  # which baselines have nothing to do with
-    data = spec_for(commanded / "demos.hdf5", compare_with=[FLAT, wide], selection=grid)
-    fit = ddco_pyro.fit(parse_spec(data), out=tmp_path / "run")
-    loaded = ddco_pyro.load(tmp_path / "run")
-    for one in (fit, loaded):
-        assert list(one.metrics.comparison) == list(one.baselines) == ["flat", "flat_2"]
-        networks = [beside.spec.baseline.policy.network for beside in one.baselines.values()]
-        assert networks == ["linear", "mlp"]
-    outcomes = {"ddco": (1, 1), "flat": (0, 1), "flat_2": (0, 0)}
-    rows = [f"{name},{seed},{value}" for name, values in outcomes.items() for seed, value in enumerate(values)]
-    (tmp_path / "run" / "rollouts.csv").write_text("\n".join(["method,seed,success", *rows]))
-    both = [tmp_path / "run" / "baselines" / name for name in ("flat", "flat_2")]
-    assert call("compare", tmp_path / "run", *both, "--out", tmp_path / "compared").status == 0
-    pairs = json.loads((tmp_path / "compared" / "compare.json").read_text())["rollouts"]
-    successes = {
-        Path(pair[name]).name: pair[rate] for pair in pairs for name, rate in (("run", "rate"), ("other", "other_rate"))
-    }
-    assert {name: rate["successes"] for name, rate in successes.items()} == {"run": 2, "flat": 1, "flat_2": 0}
 
 
 BESIDE = {"kind": "flat", "policy": {"network": "mlp", "hidden": [4]}, "optimizer": {"name": "adam"}}
