@@ -285,9 +285,7 @@ def test_a_key_that_differs_between_demonstrations_is_refused(path: Path) -> Non
 
 def test_a_misspelt_key_is_refused_with_the_nearest(path: Path) -> None:
     demonstrations(2).write(path)
-    with pytest.raises(
-        DemonstrationsError, match=r"demo_0: obs/poze is missing \(did you mean 'pose'\?\); there is: camera, pose$"
-    ):
+    with pytest.raises(DemonstrationsError, match=r"demo_0: obs/poze is missing \(did you mean 'pose'\?\); there is:"):
         Demonstrations.read(path, ["poze"])
 
 

@@ -6,13 +6,11 @@ import json
 import os
 import signal
 import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from killing import struck
+from killing import COMMAND, struck
 from selecting import Told, data_at, kept, score, spec_at, two_skills
 
 import ddco_pyro
@@ -23,7 +21,6 @@ from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import train_model
 
 ONE = Workers(1)
-COMMAND = Path(sys.executable).with_name("ddco-pyro")
 
 
 @pytest.fixture(scope="module")
